@@ -20,13 +20,14 @@ def rendered(document: Mapping[str, Any]) -> str:
     """Render one evidence document as Markdown.
 
     Args:
-        document: `title`, `about` and `sections`. A section has a `title`, `commands` (shell
-            lines that make its figures; none if its last column is `command`, or if it has
-            `sources` of what it cites), and may have `measured` (date, machine, load), `text`
-            (paragraphs), `columns` and `rows` (cells in Markdown).
+        document: `title`, `about` and `sections`. A section has a `title`, `commands`
+            (shell lines that make its figures; none if its last column is `command`, or
+            if it has `sources` of what it cites), and may have `measured` (date, machine,
+            load), `text` (paragraphs), `columns` and `rows` (cells in Markdown).
 
     Returns:
-        The page. Headings of sections are its anchors.
+        The page. Headings of sections are its anchors. Of a section: title, text,
+        commands, sources, table, in this order.
     """
     parts = [f"# {document['title']}", document["about"]]
     for section in document["sections"]:
@@ -42,6 +43,9 @@ def rendered(document: Mapping[str, Any]) -> str:
 
 
 def _commands(section: Mapping[str, Any]) -> str:
+    """Name a section's commands, and in brackets when and where they were measured, if
+    that is stated.
+    """
     lines = ", ".join(f"`{line}`" for line in section["commands"])
     measured = section.get("measured")
     return f"Command: {lines}" + (f" ({measured})" if measured else "")
@@ -61,10 +65,10 @@ def pages(folder: Path) -> dict[str, str]:
     Returns:
         `NAME.md` -> Markdown whose links are relative to `folder`.
     """
-    found = {}
+    texts = {}
     for path in sorted(folder.glob("*.json")):
-        found[f"{path.stem}.md"] = rendered(json.loads(path.read_text("utf-8")))
-    return found
+        texts[f"{path.stem}.md"] = rendered(json.loads(path.read_text("utf-8")))
+    return texts
 
 
 def moved(text: str) -> str:

@@ -31,7 +31,9 @@ MODULE_OPTIONS = {
 
 
 def wire() -> str:
-    """Every method of `rpc.discover`, its parameters, result and types, as Markdown."""
+    """Describe every method of `rpc.discover`, its parameters and result, all types and
+    error codes, as Markdown.
+    """
     from flexdt.protocol.methods import openrpc_document
 
     document = openrpc_document()
@@ -83,7 +85,9 @@ def wire() -> str:
 
 
 def commands() -> str:
-    """Every command of `flexdt`, its arguments and options, as Markdown."""
+    """Describe every command of `flexdt`, its arguments and options that are not hidden,
+    as Markdown.
+    """
     from typer.main import get_command
 
     from flexdt.clients.cli.command_tree import build
@@ -107,6 +111,9 @@ def commands() -> str:
 
 
 def _walk(command: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield path and command of every command below a group, depth first; groups
+    themselves are left out.
+    """
     inner = getattr(command, "commands", None)
     if inner is None:
         yield path, command
@@ -116,6 +123,9 @@ def _walk(command: Any, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _option(parameter: Any) -> str:
+    """Make the table row of an argument or option: its names and value's form, its
+    default (texts and numbers only, or "required"), and its help.
+    """
     if parameter.param_type_name == "argument":
         name = parameter.metavar or parameter.name.upper()
     else:
@@ -133,7 +143,9 @@ def _option(parameter: Any) -> str:
 
 
 def _value(parameter: Any) -> str:
-    """Return the form of an option's value; typer's own click and the click package differ."""
+    """Return the form of an option's value: its choices, divided by |, or the type's name
+    in capitals. Typer's own click and the click package differ in where that is.
+    """
     kind = getattr(parameter, "type", None)
     if kind is not None:
         choices = getattr(kind, "choices", None)
@@ -146,6 +158,9 @@ def _value(parameter: Any) -> str:
 
 
 def _parameter(p: Mapping[str, Any]) -> str:
+    """Make the table row of a parameter or field: name, type, whether it is optional, its
+    default (none if it is empty), and its description.
+    """
     need = "" if p.get("required") else ", optional"
     default = p["schema"].get("default")
     if default is not None and default != {} and default != []:
@@ -154,6 +169,9 @@ def _parameter(p: Mapping[str, Any]) -> str:
 
 
 def _type(schema: Mapping[str, Any]) -> str:
+    """Write a JSON schema's type as Markdown: a link to a named type, alternatives,
+    values, lists, tuples and maps; "any" for anything else.
+    """
     match schema:
         case {"$ref": str(ref)}:
             name = ref.rsplit("/", 1)[1]
@@ -177,6 +195,9 @@ def _type(schema: Mapping[str, Any]) -> str:
 
 
 def _sentence(text: str) -> str:
+    """Return a text as one sentence for Markdown, with a capital and a full stop; "" for
+    none.
+    """
     text = _cell(text)
     return (
         text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".") if text else ""
@@ -184,6 +205,9 @@ def _sentence(text: str) -> str:
 
 
 def _cell(text: str, paragraph: str = " ") -> str:
+    """Join the lines of a text and escape Markdown's |, < and *; paragraphs are divided
+    by `paragraph`.
+    """
     parts = [" ".join(part.split()) for part in text.split("\n\n")]
     return (
         paragraph.join(parts).replace("|", "\\|").replace("<", "\\<").replace("*", "\\*")
@@ -232,19 +256,20 @@ def module_pages(pages: Path) -> dict[str, str]:
     Returns:
         Path below `_generated/` -> Markdown.
     """
-    found = {}
+    texts = {}
     for page, folder in MODULE_LISTS.items():
         for name in MODULE.findall((pages / f"{page}.md").read_text("utf-8")):
             options = MODULE_OPTIONS.get(name, "")
             text = (
                 f"# `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}\n{options}```\n"
             )
-            found[f"{folder}/{name}.md"] = text
-    return found
+            texts[f"{folder}/{name}.md"] = text
+    return texts
 
 
 def with_summaries(text: str, folder: str) -> str:
-    """Put each listed module's first sentence and the link to its page below its heading.
+    """Return a page with each listed module's heading linked to its page, and the first
+    paragraph of the module's docstring below it.
 
     Args:
         text: a page that lists modules.
@@ -266,7 +291,9 @@ def summaries(app: Any, docname: str, content: list[str]) -> None:
 
 
 def write(app: Any) -> None:
-    """Write what has changed and delete what no longer follows (hook `builder-inited`)."""
+    """Write the generated pages whose text has changed, and delete pages that nothing
+    makes any more (hook `builder-inited`).
+    """
     pages = Path(app.srcdir)
     generated = pages / "_generated"
     texts = {name: make() for name, make in PAGES.items()}

@@ -29,31 +29,35 @@ def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
     """Return a page's text with links out of the site as paths, and the links that lead
     nowhere.
 
+    Links to evidence and benchmark files become links to their rendered pages. Other
+    links, to pages, to files out of the repository and of the web, stay; so do pictures.
+
     Args:
         text: Markdown.
         page: its file.
         pages: the folder of all pages.
+
+    Returns:
+        The text, and the targets that do not exist, whose links stay.
     """
     lost: list[str] = []
 
     def replace(match: re.Match[str]) -> str:
         words, target = match[1], match[2]
-        found = (page.parent / target).resolve()
-        if not found.exists():
+        path = (page.parent / target).resolve()
+        if not path.exists():
             lost.append(target)
             return match[0]
-        if found.suffix == ".json" and (
-            found.parent == pages / EVIDENCE or found == pages / BENCHMARK
+        if path.suffix == ".json" and (
+            path.parent == pages / EVIDENCE or path == pages / BENCHMARK
         ):
-            rendered = pages / RENDERED / f"{found.stem}.md"
+            rendered = pages / RENDERED / f"{path.stem}.md"
             link = Path(os.path.relpath(rendered, page.parent)).as_posix()
             return f"[{words}]({link}{match[3] or ''})"
-        inside = found.is_relative_to(pages) and found.suffix == ".md"
-        if inside or not found.is_relative_to(pages.parent):
+        inside = path.is_relative_to(pages) and path.suffix == ".md"
+        if inside or not path.is_relative_to(pages.parent):
             return match[0]
-        name = found.relative_to(pages.parent).as_posix() + (
-            "/" if found.is_dir() else ""
-        )
+        name = path.relative_to(pages.parent).as_posix() + ("/" if path.is_dir() else "")
         plain = words.strip("`")
         return (
             f"`{name}`"
@@ -65,7 +69,9 @@ def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
 
 
 def read(app: Any, docname: str, content: list[str]) -> None:
-    """Sphinx's hook: the text of a page, before it is parsed."""
+    """Rewrite the links of a page in place, before it is parsed, and warn of those that
+    lead nowhere (hook `source-read`); pages of `_generated` itself stay.
+    """
     page = Path(app.env.doc2path(docname)).resolve()
     if page.parent.name == "_generated":
         return

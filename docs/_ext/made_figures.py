@@ -27,8 +27,12 @@ def digest() -> str:
 
 
 def make(app: Any) -> None:
-    """Make the figures unless those of this script and version exist (hook
-    `builder-inited`)."""
+    """Make the figures in `_generated/figures` by the script, in a process of its own,
+    unless those of this script and version exist (hook `builder-inited`).
+
+    Raises:
+        CalledProcessError: the script failed.
+    """
     folder = Path(app.srcdir) / "_generated" / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     key = folder / "made-by.txt"

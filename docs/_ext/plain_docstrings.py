@@ -16,7 +16,10 @@ LABEL = re.compile(r"^(\s*)([\w, *\[\]\(\)]+): (.*)$")
 
 
 def plain(text: str) -> str:
-    """One line of a docstring as reStructuredText."""
+    """Convert one line of a docstring to reStructuredText: code in single backticks
+    becomes a literal; elsewhere asterisks, bars, backslashes and trailing underscores are
+    escaped.
+    """
     parts = CODE.split(text)
     for i, part in enumerate(parts):
         if part.startswith("`") and part.endswith("`") and len(part) > 2:
@@ -29,7 +32,9 @@ def plain(text: str) -> str:
 def rewrite(
     app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]
 ) -> None:
-    """Sphinx's hook: `lines` are changed in place."""
+    """Convert the lines of a docstring in place (Sphinx's hook
+    `autodoc-process-docstring`).
+    """
     lines[:] = [plain(line) for line in lines]
 
 

@@ -20,7 +20,9 @@ PAGE = """<!doctype html>
 
 
 def write(app: Any, exception: Exception | None) -> None:
-    """Write the forwarding pages after a build to HTML (Sphinx's hook `build-finished`)."""
+    """Write a forwarding page for each of `MOVED` after a build to HTML (Sphinx's hook
+    `build-finished`); nothing after an error or for another builder.
+    """
     if exception is not None or app.builder.name != "html":
         return
     for old, new in MOVED.items():

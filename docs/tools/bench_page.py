@@ -57,7 +57,9 @@ class Target:
     find: Callable[[Entries], Found]
 
     def verdict(self, value: float) -> str:
-        """In words."""
+        """Judge a figure: "wanted: met", else "accepted: met", else "**missed**"; a
+        figure on the bar meets it.
+        """
         for bar, words in (
             (self.wanted, "wanted: met"),
             (self.accepted, "accepted: met"),
@@ -68,7 +70,16 @@ class Target:
 
 
 def target_table(document: Mapping[str, Any]) -> list[str]:
-    """Return the table as lines of Markdown."""
+    """Make the table of targets as lines of Markdown: bars, figure, its origin and
+    verdict.
+
+    Args:
+        document: of a benchmark, with `cases`.
+
+    Returns:
+        Head and a row for each of `TARGETS` ("not measured" without a figure), then an
+        empty line.
+    """
     entries = {entry["name"]: entry for entry in document["cases"]}
     lines = [
         "| target | to be accepted | wanted | measured | |",
@@ -77,11 +88,11 @@ def target_table(document: Mapping[str, Any]) -> list[str]:
     for target in TARGETS:
         both = (target.accepted, target.wanted)
         bars = " | ".join("" if bar is None else target.form.format(bar) for bar in both)
-        found = target.find(entries)
-        if found is None:
+        figure_and_origin = target.find(entries)
+        if figure_and_origin is None:
             lines.append(f"| {target.what} | {bars} | not measured | |")
         else:
-            value, where = found
+            value, where = figure_and_origin
             measured = target.form.format(value) + (f" ({where})" if where else "")
             lines.append(
                 f"| {target.what} | {bars} | {measured} | {target.verdict(value)} |"
@@ -90,6 +101,10 @@ def target_table(document: Mapping[str, Any]) -> list[str]:
 
 
 def _ratio(name: str, peer: str = "itk-rtk") -> Callable[[Entries], Found]:
+    """Make the function that finds a case's ratio to a peer in the entries; None where it
+    was not measured.
+    """
+
     def find(entries: Entries) -> Found:
         value = entries.get(name, {}).get("ratio", {}).get(peer)
         return None if value is None else (value, "")
@@ -98,17 +113,24 @@ def _ratio(name: str, peer: str = "itk-rtk") -> Callable[[Entries], Found]:
 
 
 def _leap(name: str) -> Callable[[Entries], Found]:
+    """Make the function that derives a case's ratio to LEAP: that to itk-rtk times
+    `LEAP_TO_RTK`, with a note of the derivation; None where that was not measured.
+    """
     leap, rtk = LEAP_TO_RTK[name]
 
     def find(entries: Entries) -> Found:
-        found = _ratio(name)(entries)
+        ratio = _ratio(name)(entries)
         where = f"derived: our ratio to itk-rtk, times {leap} / {rtk} ms"
-        return None if found is None else (found[0] * leap / rtk, where)
+        return None if ratio is None else (ratio[0] * leap / rtk, where)
 
     return find
 
 
 def _value(name: str, key: str) -> Callable[[Entries], Found]:
+    """Make the function that finds a case's figure of a name; None where it was not
+    measured.
+    """
+
     def find(entries: Entries) -> Found:
         value = entries.get(name, {}).get(key)
         return None if value is None else (value, "")
@@ -117,6 +139,14 @@ def _value(name: str, key: str) -> Callable[[Entries], Found]:
 
 
 def _worst(key: str, chosen: Callable[[str], bool]) -> Callable[[Entries], Found]:
+    """Make the function that finds the largest figure of a name among cases, with the
+    case's name; None without any.
+
+    Args:
+        key: name of the figure.
+        chosen: returns whether a case, by its name, takes part. The case FDK never does.
+    """
+
     def find(entries: Entries) -> Found:
         values = [
             (entry[key], f"worst: {name}")
@@ -129,6 +159,9 @@ def _worst(key: str, chosen: Callable[[str], bool]) -> Callable[[Entries], Found
 
 
 def _of_peers(name: str) -> bool:
+    """Return whether a case is one of C1, C2 and C3, or an adjoint of one, that peers
+    run, too.
+    """
     return (
         name.removeprefix("adjoint-").startswith(("C1", "C2", "C3"))
         and "x1000" not in name
@@ -217,7 +250,9 @@ SHOWN = (
 
 
 def tables(document: dict[str, Any]) -> str:
-    """Machine, targets, cases and growth as Markdown."""
+    """Make the Markdown of a benchmark document: machine, cases of another run, targets,
+    cases and growth.
+    """
     return "\n".join(
         [
             *_machine(document["machine"]),
@@ -233,10 +268,16 @@ BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
 
 
 def into_page(page: str, document: dict[str, Any], picture: str) -> str:
-    """Replace the text between the two marks of a Markdown page by the figures.
+    """Return a Markdown page with the text between its two marks replaced by the tables
+    and the picture.
+
+    Args:
+        page: its text.
+        document: of a benchmark.
+        picture: path of the picture, from the page.
 
     Raises:
-        ValueError: the page has no marks.
+        ValueError: the page lacks a mark.
     """
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
@@ -247,13 +288,18 @@ def into_page(page: str, document: dict[str, Any], picture: str) -> str:
 
 
 def _machine(machine: dict[str, Any]) -> list[str]:
+    """Describe the machine of a run in one line of Markdown, and an empty one: processor,
+    threads, read speed of the memory (if measured), load at start, numba, and the peers.
+    """
     read = machine.get("memory_read", {})
     memory = "".join(
         f", {read[key]:.0f} GB/s read by {words}"
         for key, words in (("one_thread_GB_s", "one thread"), ("all_threads_GB_s", "all"))
         if key in read
     )
-    took_part = ", ".join(f"{name}: {what}" for name, what in machine["peers"].items())
+    took_part = ", ".join(
+        f"{name}: {version}" for name, version in machine["peers"].items()
+    )
     return [
         f"{machine['cpu']}, {machine['threads']} threads{memory}; load at start "
         f"{machine['load_at_start']:.1f}; numba {machine['numba']}. Peers: "
@@ -263,7 +309,9 @@ def _machine(machine: dict[str, Any]) -> list[str]:
 
 
 def _runs(cases: Sequence[dict[str, Any]]) -> list[str]:
-    """Which cases are of another run than most."""
+    """Name the cases of another run than most, as a line of Markdown and an empty one; []
+    if all are of one run.
+    """
     runs = Counter(case.get("measured") for case in cases)
     if len(runs) < 2:
         return []
@@ -273,6 +321,12 @@ def _runs(cases: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
+    """Make the table of cases as lines of Markdown, and an empty one.
+
+    A column each for name, milliseconds a view (mean, median), errors, peers'
+    milliseconds, ratios (of medians), load, and further figures of `SHOWN`; figures that
+    a case lacks are left out.
+    """
     lines = [
         "| case | ms a view (median) | mean / worst error | peers, ms | ratio (of medians) "
         "| load | |",
@@ -303,6 +357,9 @@ def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _growth(document: dict[str, Any]) -> list[str]:
+    """List milliseconds against rays, voxels and threads, one line of Markdown for each
+    series; [] without growth.
+    """
     lines = []
     for key, points in document.get("growth", {}).items():
         for series in dict.fromkeys(p["series"] for p in points):
@@ -314,19 +371,20 @@ def _growth(document: dict[str, Any]) -> list[str]:
 
 
 def merged(old: Document, new: Document) -> Document:
-    """Merge two runs: what `new` did not measure is taken from `old`, in its order.
+    """Merge two runs: cases and growth that `new` did not measure are those of `old`.
 
-    What the machine was at the start is the new run's; each case keeps the load it met.
+    Cases are in the order of `old`, further ones last. The machine's figures are the new
+    run's where it has them, with the peers of both; each case keeps its own load.
     """
     fresh = {entry["name"]: entry for entry in new["cases"]}
-    kept = [fresh.pop(entry["name"], entry) for entry in old["cases"]]
+    cases = [fresh.pop(entry["name"], entry) for entry in old["cases"]]
     machine = {**old["machine"], **new["machine"]}
     return {
         "machine": {
             **machine,
             "peers": {**old["machine"]["peers"], **new["machine"]["peers"]},
         },
-        "cases": [*kept, *fresh.values()],
+        "cases": [*cases, *fresh.values()],
         "growth": {**old["growth"], **new["growth"]},
     }
 
@@ -336,7 +394,9 @@ COLOURS = ("#1b6ca8", "#d1495b", "#2e933c", "#8f5db7")
 
 
 def figure(document: dict[str, Any]) -> str:
-    """SVG text of a benchmark document."""
+    """Draw a benchmark document as the text of an SVG: bars of the ratios, then a panel
+    for each growth that was measured.
+    """
     panels = [_bars(document["cases"])]
     names = {"rays": "rays", "voxels": "voxels a side", "threads": "threads"}
     for key, label in names.items():
@@ -360,7 +420,9 @@ def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
 
 
 def _bars(cases: Sequence[dict[str, Any]]) -> str:
-    """Draw how many times faster we are than the first peer, one bar a case."""
+    """Draw how many times faster we are than the first peer of each case, one bar a case
+    that has one, as SVG; a sentence without any.
+    """
     bars = [(c["name"], *next(iter(c["ratio"].items()))) for c in cases if c["ratio"]]
     if not bars:
         return _text(WIDTH / 2, PANEL / 2, "no peer took part")
@@ -383,8 +445,16 @@ def _bars(cases: Sequence[dict[str, Any]]) -> str:
 
 
 def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
-    """Milliseconds against the work, both logarithmic; figures above, below or beside a
-    line."""
+    """Draw milliseconds against the work, a line for each series, both axes logarithmic,
+    as SVG.
+
+    Figures are below the points of the first series, above those of the second, and
+    beside those of others.
+
+    Args:
+        points: with the keys x, ms and series.
+        label: of the work.
+    """
     xs = [math.log10(p["x"]) for p in points]
     ys = [math.log10(p["ms"]) for p in points]
     x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
@@ -397,12 +467,12 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
 
     parts = [_text(WIDTH / 2, 20, f"ms a view against {label} (C1; logarithmic)")]
     for i, series in enumerate(dict.fromkeys(p["series"] for p in points)):
-        own = [p for p in points if p["series"] == series]
-        places = [at(math.log10(p["x"]), math.log10(p["ms"])) for p in own]
+        its_points = [p for p in points if p["series"] == series]
+        places = [at(math.log10(p["x"]), math.log10(p["ms"])) for p in its_points]
         colour = COLOURS[i % len(COLOURS)]
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
         parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}"/>')
-        for (x, y), p in zip(places, own, strict=True):
+        for (x, y), p in zip(places, its_points, strict=True):
             parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" fill="{colour}"/>')
             figure_of = f"{p['ms']:.3g}"
             if i < 2:
@@ -418,7 +488,7 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
 
 
 def renew(folder: Path, document: Document, page: Path | None = None) -> None:
-    """Merge a document into the kept one, and draw it.
+    """Merge a document into the kept one, if there is one, write both files, and draw it.
 
     Args:
         folder: of the pages; the kept document and its picture are in `images/` there.
@@ -427,10 +497,10 @@ def renew(folder: Path, document: Document, page: Path | None = None) -> None:
     """
     picture = folder / "images" / "bench.svg"
     picture.parent.mkdir(exist_ok=True)
-    kept = picture.with_suffix(".json")
-    if kept.exists():
-        document = merged(json.loads(kept.read_text("utf-8")), document)
-    kept.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
+    stored = picture.with_suffix(".json")
+    if stored.exists():
+        document = merged(json.loads(stored.read_text("utf-8")), document)
+    stored.write_text(json.dumps(document, indent=1) + "\n", "utf-8")
     picture.write_text(figure(document), "utf-8")
     if page is not None:
         page.write_text(
@@ -439,6 +509,9 @@ def renew(folder: Path, document: Document, page: Path | None = None) -> None:
 
 
 def main() -> None:
+    """Read a benchmark document, and renew the kept one, its picture and the page's
+    figures; with --out write bench.md and bench.svg there instead.
+    """
     parser = argparse.ArgumentParser(description="Tables and figure of a benchmark.")
     parser.add_argument("document", type=Path, help="bench.json")
     parser.add_argument(

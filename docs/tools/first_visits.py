@@ -44,7 +44,7 @@ def x_rays_on(page: Any) -> None:
 
 
 def script_written(page: Any) -> None:
-    """Write a script in the Scan tab."""
+    """Switch X-rays off, compose a script in the Scan tab, and wait for its verdict."""
     page.evaluate("flexdt.call('tube.set', {on: false})")
     page.click("#tabs [data-tab=scan]")
     page.click("#compose")
@@ -66,7 +66,15 @@ STATES: dict[str, Callable[[Any], None]] = {
 
 
 def visit(browser: Any, url: str, size: tuple[int, int], theme: str) -> list[Image.Image]:
-    """Return a picture of each state, from one visit."""
+    """Return a picture of each of `STATES`, in order, from one visit by a browser that
+    has never been there.
+
+    Args:
+        browser: of playwright.
+        url: of the page.
+        size: of the window, (width, height) [px].
+        theme: of `THEMES`.
+    """
     width, height = size
     context = browser.new_context(viewport={"width": width, "height": height})
     page = context.new_page()
@@ -86,7 +94,7 @@ def visit(browser: Any, url: str, size: tuple[int, int], theme: str) -> list[Ima
 
 
 def sheet(rows: list[list[Image.Image]]) -> Image.Image:
-    """Put pictures of one size side by side, a row each."""
+    """Put pictures of one size side by side, a row each, scaled to a width of `SHEET_PX`."""
     width, height = rows[0][0].size
     small = (SHEET_PX, round(SHEET_PX * height / width))
     whole = Image.new("RGB", (small[0] * len(rows[0]), small[1] * len(rows)))
@@ -97,6 +105,9 @@ def sheet(rows: list[list[Image.Image]]) -> Image.Image:
 
 
 def main() -> None:
+    """Save a picture of each size, theme and state, and a sheet of each size, in the
+    folder --out; starts a lab of its own without --url.
+    """
     from playwright.sync_api import sync_playwright
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -33,6 +33,7 @@ class Sheet:
         self.parts: list[str] = []
 
     def at(self, point: np.ndarray) -> tuple[float, float]:
+        """Convert a place (x, y) to the pixel (right, down) of the drawing."""
         return (
             self.origin[0] + self.scale * float(point[0]),
             self.origin[1] - self.scale * float(point[1]),
@@ -46,6 +47,9 @@ class Sheet:
         width: float = 1.5,
         more: str = "",
     ) -> None:
+        """Draw a line from a to b, in places of the drawing; `more` is put among the
+        element's attributes.
+        """
         (x0, y0), (x1, y1) = self.at(a), self.at(b)
         self.parts.append(
             f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="{colour}" '
@@ -53,6 +57,9 @@ class Sheet:
         )
 
     def arrow(self, a: np.ndarray, b: np.ndarray, colour: str, label: str) -> None:
+        """Draw an arrow from a to b with a label beyond its tip; beside it if it points
+        to the right.
+        """
         self.line(a, b, colour, 2.2, f'marker-end="url(#{colour[1:]})"')
         way = (b - a) / np.linalg.norm(b - a)
         where = "start" if way[0] > 0.8 else "middle"
@@ -72,6 +79,7 @@ class Sheet:
         size: int = 13,
         where: str = "middle",
     ) -> None:
+        """Write words at a place, with the anchor `where` (start, middle, end) of SVG."""
         x, y = self.at(at)
         self.parts.append(
             f'<text x="{x:.1f}" y="{y + 4:.1f}" fill="{colour}" font-size="{size}" {FONT} '
@@ -79,12 +87,14 @@ class Sheet:
         )
 
     def dot(self, at: np.ndarray, colour: str, radius: float) -> None:
+        """Draw a filled circle; `radius` in pixels."""
         x, y = self.at(at)
         self.parts.append(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="{colour}"/>'
         )
 
     def ring(self, at: np.ndarray, colour: str, radius: float) -> None:
+        """Draw an empty circle; `radius` in pixels."""
         x, y = self.at(at)
         self.parts.append(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius}" fill="none" stroke="{colour}" '
@@ -92,6 +102,9 @@ class Sheet:
         )
 
     def svg(self, title: str) -> str:
+        """Return the drawing as the text of an SVG, with a title, arrow heads in each
+        colour and a white ground.
+        """
         heads = "".join(
             f'<marker id="{c[1:]}" viewBox="0 0 10 10" refX="8" refY="5" markerWidth="6" '
             'markerHeight="6" orient="auto-start-reverse">'
@@ -108,7 +121,9 @@ class Sheet:
 
 
 def stand(angle_deg: float) -> Poses:
-    """Return the default scanner's pose at one stage angle."""
+    """Return the default scanner's poses (one), at a stage angle and 600 mm from the
+    source.
+    """
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
     where = {"ver_tube": 26.3, "ver_det": 20.0, "rot_obj": angle_deg, "mag_obj": 600.0}
@@ -116,7 +131,7 @@ def stand(angle_deg: float) -> Poses:
 
 
 def from_above() -> str:
-    """World and object frame seen from above, stage at 30 deg."""
+    """Draw the world's and the object's frame seen from above, stage at 30 deg, as SVG."""
     pose, start = stand(30.0), stand(0.0)
     sheet = Sheet(640, 640, (300.0, 590.0), 0.48)
     source, axis, panel = pose.source[0, :2], pose.axis[0, :2], pose.detector[0, :2]
@@ -174,7 +189,9 @@ def from_above() -> str:
 
 
 def detector() -> str:
-    """Where points of the object fall on the image, seen from the source."""
+    """Draw the panel seen from the source, with the pixels at which points of the object
+    are seen at 0 deg, as SVG.
+    """
     pose = stand(0.0)
     rows, cols = builtin_machine().detector.camera.shape
     cone = pose.cone_vec()
@@ -206,7 +223,7 @@ def detector() -> str:
 
 
 def unity() -> str:
-    """Draw the thesis's axes beside ours."""
+    """Draw the thesis's axes (left-handed) beside ours, each with its meaning, as SVG."""
     sheet = Sheet(640, 250, (110.0, 190.0), 1.0)
     slant = np.array([0.6, 0.45])
 
@@ -243,6 +260,7 @@ FIGURES = {
 
 
 def main() -> None:
+    """Write every figure of `FIGURES` into the folder --out, and print its path."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "images")
     out = parser.parse_args().out

@@ -60,7 +60,9 @@ right."""
 
 @contextmanager
 def lab() -> Iterator[str]:
-    """`flexdt up` on free ports; the address of its page."""
+    """Start `flexdt up` on free ports with a temporary data folder, yield the address of
+    its page, and end it (30 s).
+    """
     with tempfile.TemporaryDirectory() as folder:
         words = [
             "--port",
@@ -87,6 +89,18 @@ def lab() -> Iterator[str]:
 
 
 def opened(browser: Any, url: str, view: str, tab: str) -> Any:
+    """Open the page in a new tab, and wait until it has an image and a session, and its
+    notes have faded.
+
+    Args:
+        browser: of playwright.
+        url: of the page.
+        view: of the scene.
+        tab: that is open.
+
+    Returns:
+        The tab.
+    """
     page = browser.new_page(viewport=SIZE)
     page.set_default_timeout(PATIENCE_MS)
     page.goto(f"{url}?view={view}&tab={tab}&theme=light&light=fine&patience=60")
@@ -96,7 +110,9 @@ def opened(browser: Any, url: str, view: str, tab: str) -> Any:
 
 
 def taken(page: Any, path: Path) -> None:
-    """Save a picture of the page once its scenes rest and it marks nothing as old."""
+    """Save a picture of the page as PNG of `COLORS` colours, once two pictures of its
+    scenes are equal and none is marked as old.
+    """
     last = b""
     while (now := page.locator("#views").screenshot()) != last:
         page.wait_for_timeout(FADED_MS)
@@ -110,6 +126,7 @@ def taken(page: Any, path: Path) -> None:
 
 
 def first(browser: Any, url: str, to: Path) -> None:
+    """Picture the page with X-rays on, as `viewer-first.png`; switches them off again."""
     page = opened(browser, url, "iso", "move")
     page.evaluate("flexdt.call('tube.set', {on: true})")
     page.locator("#beam", has_text="ON").wait_for()
@@ -125,7 +142,9 @@ def four_views(browser: Any, url: str, to: Path) -> None:
 
 
 def scan_it(browser: Any, url: str, to: Path) -> None:
-    """Picture the gear's volume in the scene and beside its truth; the stage stays nearer."""
+    """Scan and reconstruct the gear by one click, and picture its volume in the scene and
+    beside its truth, as `viewer-scan-it.png`; the stage stays nearer.
+    """
     page = opened(browser, url, "iso", "move")
     page.locator("#scan-it-sample option[value=gear]").wait_for(state="attached")
     page.select_option("#scan-it-sample", "gear")
@@ -136,7 +155,10 @@ def scan_it(browser: Any, url: str, to: Path) -> None:
 
 
 def scan(browser: Any, url: str, to: Path) -> None:
-    """Save a plan's timeline and the scan designer, and run the scan for `virtual`."""
+    """Picture a plan's timeline and the scan designer, as `viewer-scan.png` and
+    `viewer-design.png`, and run the scan, with a wrong correction in force, for
+    `virtual`.
+    """
     page = opened(browser, url, "iso", "scan")
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     page.select_option("#wish-kind", "step")
@@ -158,7 +180,9 @@ def scan(browser: Any, url: str, to: Path) -> None:
 
 
 def virtual(browser: Any, url: str, to: Path) -> None:
-    """Save recorded less virtual image of the newest data set, with a fit's beads."""
+    """Calibrate the newest data set, and picture its recorded less virtual image with the
+    fit's beads, as `viewer-virtual.png`; reverts the correction.
+    """
     page = opened(browser, url, "iso", "data")
     page.locator(".data-set").first.click()
     page.get_by_role("button", name="Calibrate", exact=True).click()
@@ -173,8 +197,9 @@ def virtual(browser: Any, url: str, to: Path) -> None:
 
 
 def turning(browser: Any, url: str, to: Path) -> None:
-    """Film the gear while it turns by the angle after which it looks the same: the scene, near
-    the sample, and its radiograph.
+    """Film the gear while it turns by the angle after which it looks the same: the scene,
+    near the sample, and its radiograph, as `viewer-turning.gif` of `TURNING_FRAMES`
+    frames. Takes control, and turns the stage back to 0.
     """
     page = opened(browser, url, "iso", "move")
     page.evaluate("flexdt.call('session.control', {action: 'force'})")
@@ -215,6 +240,9 @@ PICTURES = (first, four_views, turning, scan, virtual, scan_it)
 
 
 def main() -> None:
+    """Make all pictures, or the one of --only, in the folder --out, of the page at --url
+    or of a lab of its own.
+    """
     from playwright.sync_api import sync_playwright
 
     parser = argparse.ArgumentParser(description=__doc__)

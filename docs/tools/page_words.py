@@ -27,7 +27,9 @@ CONTENTS = re.compile(r"```\{toctree\}\n(.*?)```", re.DOTALL)
 
 
 def contents(page: Path) -> Iterator[Path]:
-    """Yield the pages that a page's lists of contents name, and theirs in turn."""
+    """Yield the pages that a page's lists of contents name, each followed by those that
+    it names in turn; entries without a file are skipped.
+    """
     for block in CONTENTS.findall(page.read_text("utf-8")):
         for entry in block.splitlines():
             path = (page.parent / entry.strip().removesuffix(".md")).with_suffix(".md")
@@ -37,19 +39,22 @@ def contents(page: Path) -> Iterator[Path]:
 
 
 def shelves() -> dict[str, list[Path]]:
-    """Return the pages of each shelf, and under `other` those of none."""
-    found: dict[str, list[Path]] = {}
+    """Return the pages of each shelf, a page in the first shelf that lists it, and under
+    `other` those of none, sorted; generated pages and the changelog's history are left
+    out.
+    """
+    pages_of: dict[str, list[Path]] = {}
     placed: set[Path] = set()
     for shelf, name in SHELVES.items():
         index = DOCS / name
         pages = [index, *(path.resolve() for path in contents(index))]
-        found[shelf] = [path for path in dict.fromkeys(pages) if path not in placed]
-        placed |= {*found[shelf]}
+        pages_of[shelf] = [path for path in dict.fromkeys(pages) if path not in placed]
+        placed |= {*pages_of[shelf]}
     rest = {path.resolve() for path in DOCS.rglob("*.md")} - placed
     generated = {path for path in rest if path.relative_to(DOCS).parts[0].startswith("_")}
     history = {path for path in rest if path.parent.name == "history"}
-    found["other"] = sorted(rest - generated - history)
-    return found
+    pages_of["other"] = sorted(rest - generated - history)
+    return pages_of
 
 
 def words(path: Path) -> int:
@@ -63,7 +68,9 @@ def pictures(path: Path) -> int:
 
 
 def main() -> None:
-    """Print the counts."""
+    """Print words, pages and pages without a picture of each shelf; with --pages a line
+    for each page, too.
+    """
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument(
         "--pages", action="store_true", help="a line for each page, too"

@@ -26,7 +26,9 @@ LAST_ELEMENT = 92
 
 
 def main() -> None:
-    """Compute and write."""
+    """Compute spectra (spekpy) and attenuation (xraydb) at the tables' energies, and
+    write them with their provenance to the .npz file OUT.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     out: Path = parser.parse_args().out
@@ -44,7 +46,7 @@ def main() -> None:
     elements = range(1, LAST_ELEMENT + 1)
     names = [str(xraydb.atomic_symbol(z)) for z in elements]
     total = np.stack([xraydb.mu_elam(name, energy * 1000.0) for name in names])
-    found = [
+    edges_of = [
         sorted(
             e.energy / 1e3
             for e in xraydb.xray_edges(n).values()
@@ -52,8 +54,8 @@ def main() -> None:
         )
         for n in names
     ]
-    edges = np.full((len(names), max(map(len, found))), np.nan)
-    for row, values in zip(edges, found, strict=True):
+    edges = np.full((len(names), max(map(len, edges_of))), np.nan)
+    for row, values in zip(edges, edges_of, strict=True):
         row[: len(values)] = values
     provenance = {
         "spectra": f"spekpy {spekpy.__version__}, physics {PHYSICS}, tungsten, "

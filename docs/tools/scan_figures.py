@@ -42,11 +42,11 @@ Figure = Any
 def slices(
     images: Mapping[str, Image], low: float, high: float, unit: str = "1/mm"
 ) -> Figure:
-    """Draw images beside each other in one window.
+    """Draw images beside each other in one window of grey, with one colour bar.
 
     Args:
         images: title -> image; the first row is drawn lowest.
-        low, high: the window.
+        low, high: values of black and of white.
         unit: of the values.
     """
     figure, axes = plt.subplots(
@@ -65,7 +65,8 @@ def slices(
 
 
 def correlation(one: Image, other: Image) -> float:
-    """Return Pearson's correlation of two images at the shift at which it is greatest.
+    """Return Pearson's correlation of two images of one shape at the (cyclic) shift at
+    which it is greatest.
 
     A calibration leaves the object's place in its frame open by its sigmas.
     """
@@ -76,7 +77,9 @@ def correlation(one: Image, other: Image) -> float:
 
 
 def before_and_after(images: Mapping[str, Image], truth: Image) -> Numbers:
-    """Return the correlations of two images, before and after, with the true one."""
+    """Return the correlations of two images, in order before and after, with the true
+    one: correlation_before and correlation_after.
+    """
     names = "correlation_before", "correlation_after"
     return {
         name: correlation(one, truth)
@@ -87,7 +90,9 @@ def before_and_after(images: Mapping[str, Image], truth: Image) -> Numbers:
 def scan(
     angles: int = 120, shape: tuple[int, int] = (96, 120), **changes: Any
 ) -> fx.ConeVec:
-    """Return a circular scan at the FleX-ray's usual distances, with coarse pixels."""
+    """Return a circular scan at the FleX-ray's usual distances, with pixels of 1 mm;
+    `changes` replace arguments of `ConeVec.circular`.
+    """
     settings = {
         "sod": 600,
         "sdd": 1059,
@@ -104,7 +109,9 @@ def as_seen(images: Image, believed: fx.ConeVec) -> fx.DataSet:
 
 
 def pieces() -> fx.phantoms.Phantom:
-    """Return an unsymmetrical object of solids without a bead: a body with holes and pins."""
+    """Return an unsymmetrical object of solids without a bead: a body of PMMA with air
+    holes and aluminium pins, twelve balls with drawn radii.
+    """
     solids: list[dict[str, Any]] = [
         {
             "kind": "cylinder",
@@ -132,7 +139,9 @@ def pieces() -> fx.phantoms.Phantom:
 
 @cache
 def misaligned() -> tuple[fx.DataSet, fx.ConeVec]:
-    """Return a noisy scan of the LEGO phantom as believed, and its true geometry."""
+    """Simulate a noisy scan of the LEGO phantom with a shifted, rolled panel; return it
+    with the geometry as believed, and the true geometry. Cached.
+    """
     fine = {"angles": 72, "shape": (190, 239), "pixel": 0.5984}
     true = scan(**fine, offset=(2.0, 1.0), tilts=(1.5, 0.0, 0.0))
     seen = fx.simulate("lego", true, noise=SEED)
@@ -142,10 +151,12 @@ def misaligned() -> tuple[fx.DataSet, fx.ConeVec]:
 
 
 def calibrated() -> tuple[Figure, Numbers]:
-    """Show the LEGO phantom before and after a calibration."""
+    """Show the LEGO phantom before and after a calibration; numbers: the largest miss of
+    its beads, before and after [px].
+    """
     data, true = misaligned()
-    found = data.calibrate("lego")
-    right = data.with_correction(found.correction)
+    calibration = data.calibrate("lego")
+    right = data.with_correction(calibration.correction)
     beads = fx.phantoms.load_phantom("lego").beads
     miss = [
         float(np.abs(g.project_points(beads) - true.project_points(beads)).max())
@@ -183,13 +194,13 @@ def gap() -> tuple[Figure, Numbers]:
     fine = {"angles": 90, "pixel": 0.5984}
     wide = scan(shape=(190, 241), **fine)
     seen = fx.simulate("lego", wide, noise=SEED)
-    kept = np.delete(np.arange(241), [90, 91])
+    columns = np.delete(np.arange(241), [90, 91])
     # The tile beyond the gap is taken to follow without one: it appears 1 pixel to either side.
     data = fx.DataSet.from_arrays(
-        seen.counts()[:, :, kept],
+        seen.counts()[:, :, columns],
         scan(shape=(190, 239), **fine),
-        dark=seen.dark[:, kept],
-        flat=seen.flat[:, kept],
+        dark=seen.dark[:, columns],
+        flat=seen.flat[:, columns],
     )
     right = data.with_correction(data.calibrate("lego").correction)
     whole = fx.DataSet.from_arrays(seen.counts(), wide, dark=seen.dark, flat=seen.flat)
@@ -571,7 +582,7 @@ FIGURES: dict[str, Callable[[], tuple[Figure, Numbers]]] = {
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG of a few colours."""
+    """Write a figure as PNG of `COLOURS` colours, and close it."""
     from PIL import Image as Picture
 
     figure.savefig(path, dpi=DPI, metadata={"Software": None})
@@ -581,10 +592,12 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def make(folder: Path, names: list[str]) -> None:
-    """Draw figures into a folder and renew their numbers in its `figures.json`."""
+    """Draw figures of `FIGURES`, by name, into a folder, and renew their numbers in its
+    `figures.json`, rounded to four digits; those of other names are kept.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    kept = folder / "figures.json"
-    numbers = json.loads(kept.read_text()) if kept.exists() else {}
+    stored = folder / "figures.json"
+    numbers = json.loads(stored.read_text()) if stored.exists() else {}
     for name in names:
         with warnings.catch_warnings():
             warnings.simplefilter(
@@ -597,16 +610,16 @@ def make(folder: Path, names: list[str]) -> None:
         for name in FIGURES
         if name in numbers
     }
-    kept.write_text(json.dumps(rounded, indent=1) + "\n")
+    stored.write_text(json.dumps(rounded, indent=1) + "\n")
 
 
 def main() -> None:
-    """Make all figures, or some."""
+    """Make all figures, or those of --only, in the folder --out."""
     arguments = argparse.ArgumentParser(description=__doc__)
     arguments.add_argument("--out", type=Path, default=KEPT, metavar="DIR")
     arguments.add_argument("--only", nargs="+", choices=FIGURES, default=list(FIGURES))
-    asked = arguments.parse_args()
-    make(asked.out, asked.only)
+    options = arguments.parse_args()
+    make(options.out, options.only)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,10 @@ LEAST = 1.5e-3
 
 
 def main() -> None:
-    """Compute and write."""
+    """Compute form factors and incoherent scattering functions (xraylib) of all elements
+    at `POINTS` values of x, evenly spaced in its root, and write them with their
+    provenance to the .npz file OUT.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     out: Path = parser.parse_args().out
