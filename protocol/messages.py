@@ -481,7 +481,7 @@ class Correlation(Generic[_W]):
         if self.violation is not None:
             raise self.violation
         if isinstance(message, Batch):
-            return [found for item in message.items for found in self.receive(item)]
+            return [each for item in message.items for each in self.receive(item)]
         if self.role is Role.SERVER:
             return self._receive_call(message)
         match message:

@@ -43,6 +43,9 @@ def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
     lost: list[str] = []
 
     def replace(match: re.Match[str]) -> str:
+        """Return the replacement of one link; a target that does not exist is added to
+        `lost`, and its link stays.
+        """
         words, target = match[1], match[2]
         path = (page.parent / target).resolve()
         if not path.exists():

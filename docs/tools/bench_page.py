@@ -148,6 +148,7 @@ def _worst(key: str, chosen: Callable[[str], bool]) -> Callable[[Entries], Found
     """
 
     def find(entries: Entries) -> Found:
+        """Find the largest figure of `key` among the chosen cases, with the case's name."""
         values = [
             (entry[key], f"worst: {name}")
             for name, entry in entries.items()
@@ -460,6 +461,9 @@ def _lines(points: Sequence[dict[str, Any]], label: str) -> str:
     x0, x1, y0, y1 = min(xs), max(xs), min(ys), max(ys)
 
     def at(x: float, y: float) -> tuple[float, float]:
+        """Convert logarithms of work and milliseconds to the pixel (right, down) of the
+        panel.
+        """
         return (
             MARGIN + (x - x0) / max(x1 - x0, 1e-9) * (WIDTH - 2 * MARGIN),
             PANEL - 65 - (y - y0) / max(y1 - y0, 1e-9) * (PANEL - 145),

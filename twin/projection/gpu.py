@@ -273,8 +273,8 @@ def is_there(x: object) -> bool:
 def check_host(there: bool, what: str) -> None:
     """Raise NotBuiltError unless an array is in the processor's memory."""
     if not there:
-        said = f"{what} is in the memory of a device"
-        raise NotBuiltError.instead(said, "device", "arrays in the processor's memory")
+        message = f"{what} is in the memory of a device"
+        raise NotBuiltError.instead(message, "device", "arrays in the processor's memory")
 
 
 def taken(x: Any) -> Any:

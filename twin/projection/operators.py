@@ -503,8 +503,8 @@ def require_line_integrals(projections: Any) -> None:
 def require_finite(values: Any) -> None:
     """Raise GeometryError for projections in memory that are not finite."""
     if not gpu.is_there(values) and not _are_finite(values):
-        said = "projections hold values that are not finite"
-        raise GeometryError.instead(said, "NaN or infinity", "finite line integrals")
+        message = "projections hold values that are not finite"
+        raise GeometryError.instead(message, "NaN or infinity", "finite line integrals")
 
 
 def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:

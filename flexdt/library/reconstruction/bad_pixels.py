@@ -78,19 +78,19 @@ def _bad_pixels(
     if not np.isfinite(axis_column):
         return None
 
-    kept: list[Float32Array] = []
+    held: list[Float32Array] = []
     keeps = 4 * len(some) * math.prod(dataset.shape) <= MOST_KEPT_BYTES
 
     def images() -> Iterator[Float32Array]:
         """Yield some line integrals, rows along the axis; kept for the next pass if they fit
         the memory.
         """
-        yield from kept
-        for index in some[len(kept) :].tolist():
+        yield from held
+        for index in some[len(held) :].tolist():
             made = dataset.normalisation(counts(index))
             image = made.T if lies else made
             if keeps:
-                kept.append(image)
+                held.append(image)
             yield image
 
     pixels = bad_pixels(images, axis_column)

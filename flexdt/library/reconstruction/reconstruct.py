@@ -526,10 +526,10 @@ def _reconstruct_in_process(
     grid = task.grid
     _require_room_for_images(folder, plan, grid.bytes)
     with (
-        _reading_once(task, plan, folder, tell) as (kept, work),
+        _reading_once(task, plan, folder, tell) as (kept_images, work),
         volume_writer(out, grid) as write,
     ):
-        views = _apply_corrections(replace(task.views, kept=kept), task.request)
+        views = _apply_corrections(replace(task.views, kept=kept_images), task.request)
         if not task.direct:
             volume = _iterative(views, grid, task.request, tell)
             write(volume.data)
@@ -538,7 +538,7 @@ def _reconstruct_in_process(
         # Before images are prepared: this looks at images as they were recorded.
         bias = _bias(views)
         lost = LostVoxels()
-        for slab in _fdk_slabs(task, views, kept, plan, work):
+        for slab in _fdk_slabs(task, views, kept_images, plan, work):
             write(slab.data)
             slices.take(slab.data)
             lost += LostVoxels.of(slab.data)
@@ -549,7 +549,7 @@ def _reconstruct_in_process(
 def _fdk_slabs(
     task: ReconstructionTask,
     views: ScanFrames,
-    kept: KeptImages,
+    kept_images: KeptImages,
     plan: MemoryPlan,
     work: Work,
     *,
@@ -563,7 +563,7 @@ def _fdk_slabs(
     Args:
         task: the reconstruction.
         views: corrected frames.
-        kept: keeps prepared images.
+        kept_images: keeps prepared images.
         plan: of slabs and memory.
         work: gets the progress.
         errors: estimate `sigma`.
@@ -573,7 +573,14 @@ def _fdk_slabs(
         images = replace(task.standing, truncation=views.truncation)
         view = partial(views.view, again=False)
         return fdk_slabs(
-            view, kept, images, task.grid, plan.slabs, window, work.slab, errors=errors
+            view,
+            kept_images,
+            images,
+            task.grid,
+            plan.slabs,
+            window,
+            work.slab,
+            errors=errors,
         )
     whole = fdk_parts(
         views.parts,
@@ -611,8 +618,8 @@ def _reading_once(
     else:
         work = Work(1, 1.0, (), _untold)
     store = ImagesOnDisk(folder, plan.most_pixels) if plan.on_disk else ImagesInMemory()
-    with KeptImages(partial(views.measured, dataset), store, work.read) as kept:
-        yield kept, work
+    with KeptImages(partial(views.measured, dataset), store, work.read) as kept_images:
+        yield kept_images, work
 
 
 def reconstruct_volume(
@@ -652,14 +659,16 @@ def reconstruct_volume(
         _require_layer(grid)
     plan = task.plan(None, slabs=not in_memory)
     _require_room_for_images(folder, plan, 0 if in_memory else grid.bytes)
-    with _reading_once(task, plan, folder, tell) as (kept, work):
-        views = _apply_corrections(replace(task.views, kept=kept), task.request)
+    with _reading_once(task, plan, folder, tell) as (kept_images, work):
+        views = _apply_corrections(replace(task.views, kept=kept_images), task.request)
         for doubt in views.doubts:
             warn_caller(doubt)
         if not fdk:
             return _iterative(views, grid, task.request, tell)
         bias = _bias(views) if errors else None
-        slabs = _fdk_slabs(task, views, kept, plan, work, errors=errors and in_memory)
+        slabs = _fdk_slabs(
+            task, views, kept_images, plan, work, errors=errors and in_memory
+        )
         if in_memory:
             volume = next(slabs)
         else:

@@ -148,7 +148,7 @@ class StandingImages:
 
 def fdk_slabs(
     view: Callable[[int], Float32Array],
-    kept: KeptImages,
+    kept_images: KeptImages,
     images: StandingImages,
     grid: Grid,
     slabs: Sequence[tuple[int, int]],
@@ -163,7 +163,7 @@ def fdk_slabs(
 
     Args:
         view: gives the corrected image of a view as recorded.
-        kept: keeps prepared images.
+        kept_images: keeps prepared images.
         images: geometry of the upright images.
         grid: of the entire volume.
         slabs: layers (first, last) of each.
@@ -182,7 +182,9 @@ def fdk_slabs(
 
         def parts(rows: slice = rows) -> Iterator[Float32Array]:
             for some in _parts(len(images.cone_vec)):
-                yield np.stack([kept.prepared(number, prepare, rows) for number in some])
+                yield np.stack(
+                    [kept_images.prepared(number, prepare, rows) for number in some]
+                )
 
         def told(part: float, k: int = k) -> None:
             tell(k, part)
