@@ -151,8 +151,10 @@ def misaligned() -> tuple[fx.DataSet, fx.ConeVec]:
 
 
 def calibrated() -> tuple[Figure, Numbers]:
-    """Show the LEGO phantom before and after a calibration; numbers: the largest miss of
-    its beads, before and after [px].
+    """Show the LEGO phantom before and after a calibration.
+
+    Returns the figure, and by how much its beads are missed at most, before and after
+    [px].
     """
     data, true = misaligned()
     calibration = data.calibrate("lego")
@@ -174,7 +176,12 @@ def calibrated() -> tuple[Figure, Numbers]:
 
 
 def aligned() -> tuple[Figure, Numbers]:
-    """Show an object without beads before and after an alignment of a rolled, shifted panel."""
+    """Show an object without beads before and after an alignment of a rolled, shifted
+    panel.
+
+    Returns the figure, and the correlations of both slices with that of the true
+    geometry.
+    """
     true = scan(180, offset=(2.4, 0.0), tilts=(2.0, 0.0, 0.0))
     images = fx.project(pieces(), true)
     data = as_seen(images, scan(180))
@@ -189,8 +196,12 @@ def aligned() -> tuple[Figure, Numbers]:
 
 
 def gap() -> tuple[Figure, Numbers]:
-    """Show a panel of two tiles with a gap of 2 pixels, before and after a calibration finds
-    it."""
+    """Show a panel of two tiles with a gap of 2 pixels, before and after a calibration
+    finds it.
+
+    Returns the figure, and the correlations of both slices with that of a scan by the
+    whole panel.
+    """
     fine = {"angles": 90, "pixel": 0.5984}
     wide = scan(shape=(190, 241), **fine)
     seen = fx.simulate("lego", wide, noise=SEED)
@@ -214,7 +225,11 @@ def gap() -> tuple[Figure, Numbers]:
 
 
 def motion() -> tuple[Figure, Numbers]:
-    """Show a stage that rises by 1 mm during the scan, without and with `per_frame`."""
+    """Show a stage that rises by 1 mm during the scan, without and with `per_frame`.
+
+    Returns the figure, and the correlations of both slices with that of the true
+    geometry.
+    """
     still = scan(angles=90, shape=(190, 239), pixel=0.5984)
     rows = still.rows.copy()
     rows[:, [2, 5]] -= np.linspace(0.0, 1.0, len(rows))[:, None]
@@ -235,7 +250,11 @@ def motion() -> tuple[Figure, Numbers]:
 
 
 def streaks() -> tuple[Figure, Numbers]:
-    """Show what few views do to FDK, and to total variation."""
+    """Show what few views do to FDK, and to total variation.
+
+    Returns the figure, and the rms differences of FDK and total variation of 20 views
+    from FDK of 240 views [1/mm].
+    """
     turn = scan(240)
     images = fx.project(pieces(), turn)
     grid = fx.Grid((3, 96, 96), 0.55)
@@ -253,7 +272,11 @@ def streaks() -> tuple[Figure, Numbers]:
 
 
 def rings() -> tuple[Figure, Numbers]:
-    """Show pixels whose gain the flat image does not have, without and with `rings=True`."""
+    """Show pixels whose gain the flat image does not have, without and with `rings=True`.
+
+    Returns the figure, and the rms differences of both slices from that without wrong
+    gains [1/mm].
+    """
     turn = scan(240)
     images = fx.project(pieces(), turn)
     gains = np.random.default_rng(SEED).normal(0.0, 0.03, images.shape[1:])
@@ -272,7 +295,11 @@ def rings() -> tuple[Figure, Numbers]:
 
 
 def cupping() -> tuple[Figure, Numbers]:
-    """Show beam hardening in an aluminium rod, and its correction, as profiles."""
+    """Show beam hardening in an aluminium rod, and its correction, as profiles.
+
+    Returns the figure, two slices and their profiles, and by how much the middle's
+    attenuation exceeds that near the rim, as a share of it, before and after.
+    """
     rod = {"kind": "cylinder", "center": [0, 0, 0], "radius": 12, "height": 40}
     turn = scan(180, shape=(24, 120), pixel=0.5)
     tube = fx.Tube(kV=90)
@@ -308,7 +335,12 @@ def cupping() -> tuple[Figure, Numbers]:
 
 
 def metal() -> tuple[Figure, Numbers]:
-    """Show streaks between two steel pins in PMMA, and the correction inside the iterations."""
+    """Show streaks between two steel pins in PMMA, and the correction inside the
+    iterations.
+
+    Returns the figure, three slices, and the mean attenuation between the pins in each
+    [1/mm].
+    """
     disc: dict[str, Any] = {"kind": "cylinder", "center": [0, 0, 0], "height": 40}
     parts = [disc | {"radius": 14, "material": "pmma"}]
     for x in (-6, 6):
@@ -341,7 +373,10 @@ def metal() -> tuple[Figure, Numbers]:
 
 
 def bound() -> tuple[Figure, Numbers]:
-    """Show a volume with the noise and the bound of its bias at each place."""
+    """Show a volume with the noise and the bound of its bias at each place.
+
+    Returns the figure, and the median of `sigma` in the slice [1/mm].
+    """
     turn = scan(150, shape=(64, 100), pixel=0.9)
     data = fx.simulate(
         pieces(), turn, tube=fx.Tube(mono_keV=50), noise=SEED, exposure_ms=4
@@ -367,7 +402,11 @@ def bound() -> tuple[Figure, Numbers]:
 
 
 def contradiction() -> tuple[Figure, Numbers]:
-    """Show images that were read in the alphabetical order of numbers without leading zeros."""
+    """Show images that were read in the alphabetical order of numbers without leading
+    zeros.
+
+    Returns the figure, a slice of each order, and their correlation.
+    """
     turn = scan(180)
     images = fx.project(pieces(), turn)
     grid = fx.Grid((3, 96, 96), 0.55)
@@ -383,7 +422,10 @@ def contradiction() -> tuple[Figure, Numbers]:
 
 
 def frames() -> tuple[Figure, Numbers]:
-    """Show the images of a data set: dark, flat, one projection, its line integrals."""
+    """Show the images of a data set: dark, flat, one projection, its line integrals.
+
+    Returns the figure, and no numbers.
+    """
     data = fx.simulate("lego", scan(4, shape=(190, 239), pixel=0.5984), noise=SEED)
     images = {
         "dark (di000000)": (data.dark, 90, 110),
@@ -400,7 +442,10 @@ def frames() -> tuple[Figure, Numbers]:
 
 
 def timeline() -> tuple[Figure, Numbers]:
-    """Show a scan script over time: axes, X-rays, exposures, least clearance."""
+    """Show a scan script over time: axes, X-rays, exposures, least clearance.
+
+    Returns the figure of the example script step-72.txt, and its duration [s].
+    """
     plan = fx.plan(ROOT / "examples" / "scripts" / "step-72.txt", machine="flexray")
     report = plan.check()
     figure = plan.plot(report)
@@ -409,7 +454,11 @@ def timeline() -> tuple[Figure, Numbers]:
 
 
 def chain() -> tuple[Figure, Numbers]:
-    """Show one radiograph by the three kinds of physics."""
+    """Show one radiograph by the three kinds of physics.
+
+    Returns the figure: one energy without noise, and the spectrum at 50 W and at 2 W; and
+    no numbers.
+    """
     view = scan(1, shape=(190, 239), pixel=0.5984)
     exact = fx.project("lego", view)[0]
     quiet = fx.simulate(
@@ -428,7 +477,11 @@ def chain() -> tuple[Figure, Numbers]:
 
 
 def growth() -> tuple[Figure, Numbers]:
-    """Show times of the projector against rays, voxels and threads, from the kept benchmark."""
+    """Show times of the projector against rays, voxels and threads, from the kept
+    benchmark.
+
+    Returns the figure, and no numbers.
+    """
     document = json.loads((ROOT / "docs" / "images" / "bench.json").read_text("utf-8"))
     figure, axes = plt.subplots(
         1, 3, figsize=(WIDTH_INCH, HEIGHT_INCH), layout="constrained", sharey=True
@@ -460,11 +513,15 @@ ADJOINT_OVER_FORWARD = 1.2
 
 
 def sizes() -> tuple[Figure, Numbers]:
-    """Show memory and time against voxels a side, for n views into n^3 voxels.
+    """Show memory of fdk, sirt and tv, and time of FDK and of an iteration, against
+    voxels a side, for n views into n^3 voxels.
 
-    Memory is of n x n pixels a view. Times are those of the kept benchmark: FDK scaled with
-    views and voxels; an iteration is one forward and one adjoint a view of 956 x 760 pixels,
-    not extrapolated.
+    Memory is of n x n pixels a view. Times are those of the kept benchmark: FDK scaled
+    with views and voxels; an iteration is one forward and one adjoint a view of 956 x 760
+    pixels, not extrapolated.
+
+    Returns the figure, and the numbers by name: NAME_n_GiB, fdk_n_s, and iteration_n_s
+    where n was measured.
     """
     from flexdt.twin.algorithms import ALGORITHMS
 
@@ -509,7 +566,10 @@ def sizes() -> tuple[Figure, Numbers]:
 
 
 def geometry() -> tuple[Figure, Numbers]:
-    """Show a circle and a helix as `.plot()` draws them."""
+    """Show a circle and a helix as `.plot()` draws them.
+
+    Returns the figure, and no numbers.
+    """
     figure = plt.figure(figsize=(WIDTH_INCH, 3.2), layout="constrained")
     helix = fx.ConeVec.helical(
         sod=600, sdd=1059, angles=60, turns=3, rise=40, shape=(95, 120), pixel=1.196
@@ -529,7 +589,11 @@ def geometry() -> tuple[Figure, Numbers]:
 
 def clearance() -> tuple[Figure, Numbers]:
     """Show the least clearance while a sample nears the source, and where the motion is
-    stopped."""
+    stopped.
+
+    Writes the script beside this module for the time of its check. Returns the figure,
+    and the time of the contact [s].
+    """
     lines = [
         "tube xrayoff",
         "mag_obj move absolute 600 ACK",
