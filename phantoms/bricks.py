@@ -61,10 +61,17 @@ def lego_data() -> dict[str, Any]:
 
 
 def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
-    """Compute the bead centres of the LEGO phantom (k, 3) [mm], one a brick, bottom first.
+    """Compute the bead centres of the LEGO phantom, one a brick, bottom first.
 
     They are on an elliptic spiral, inside the walls by the clearance and the bead's
-    `radius`.
+    radius, each at the same height in its brick.
+
+    Args:
+        stack: the bricks with their measures.
+        radius: of the beads [mm].
+
+    Returns:
+        (bricks, 3) [mm].
     """
     v = stack.measures
     k = np.arange(stack.bricks)

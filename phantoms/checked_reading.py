@@ -121,8 +121,8 @@ def string(value: object, where: str) -> str:
 
 
 def number(value: object, where: str) -> float:
-    """Return `value` as a float if it is a number up to `MAX_NUMBER`; raise PhantomError
-    otherwise.
+    """Return `value` as a float if it is a number from -`MAX_NUMBER` to `MAX_NUMBER`;
+    raise PhantomError, with the key path `where`, otherwise.
 
     Truth values and NaN are no numbers.
     """
@@ -332,9 +332,16 @@ def _solid(document: object, where: str) -> analytic.Solid:
 
 
 def shape_from_dict(document: object, where: str) -> analytic.Shape:
-    """Make a shape from `{kind, ...}`; raise PhantomError, naming the key path.
+    """Make a shape from a document `{kind, ...}`, whose other keys are the fields of the
+    shape's class.
 
-    An unknown kind, missing or unknown fields and wrong values are errors.
+    Args:
+        document: of one shape; axis and axes may be left out.
+        where: its key path.
+
+    Raises:
+        PhantomError: an unknown kind, a missing or unknown field, or a wrong value; names
+            the key path.
     """
     kind = get(document, "kind", where)
     if not isinstance(kind, str) or kind not in _KINDS:

@@ -441,10 +441,16 @@ class _Layers:
     """
 
     def __init__(self, parts: Sequence[Channel], machine: Machine, asked: str) -> None:
-        """Compute the chain of tube, filter, sample and panel for `asked` and for each of
-        `FILTERS`.
+        """Compute the chain of tube, filter, sample and panel for each filter: `chains`,
+        filter -> chain.
 
-        An empty filter name stands for no added filter. `chains`: filter -> chain.
+        Args:
+            parts: of the sample.
+            machine: its tube and detector.
+            asked: filter MATERIAL:MM, or "" for no added filter; `FILTERS` are added.
+
+        Raises:
+            LimitError, UnknownNameError: another text, or an unknown material.
         """
         panel = detector_of(machine.detector)
         tube = tube_of(machine.tube)
@@ -624,12 +630,14 @@ class _Ray:
 
 
 def _layer(what: str, words: str) -> tuple[str, float]:
-    """Parse MATERIAL:MM to name and thickness [mm].
+    """Parse MATERIAL:MM to name and thickness [mm]; the material is not looked up here.
 
-    The thickness is above 0 and at most 1000; the material is not looked up here.
+    Args:
+        what: name of the argument, for the message.
+        words: the text; the last colon divides it.
 
     Raises:
-        LimitError: anything else.
+        LimitError: no number above 0 and at most 1000 after the colon.
     """
     name, _, size = words.rpartition(":")
     try:

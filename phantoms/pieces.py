@@ -115,9 +115,8 @@ def freeze(target: object, **arrays: npt.NDArray[np.generic]) -> None:
 def boxes(
     scene: analytic.Scene, surfaces: Sequence[Surface] = (), voxels: Voxels | None = None
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Compute the low and high corner of the box around each part, (3,) each [mm].
-
-    In order: solids, surfaces, then the voxels (whole grid, empty ones included).
+    """List the low and high corner, (3,) each [mm], of the box around each part: solids,
+    surfaces, then the voxels (whole grid, empty ones included). [] without parts.
     """
     corners = [bounds(solid.shape) for solid in scene.solids]
     corners += [(one.vertices.min(axis=0), one.vertices.max(axis=0)) for one in surfaces]

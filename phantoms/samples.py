@@ -394,9 +394,16 @@ def _labelled(
 
 
 def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
-    """Make the phantom of an object with vertices [mm] and faces, filled with one material.
+    """Make the phantom of an object with vertices [mm] and faces, filled with one
+    material.
 
-    `material` None is `abs`; it is centred unless `keep`.
+    Args:
+        mesh: has (n, 3) vertices and (m, 3) faces; not changed.
+        material: None is `abs`.
+        keep: leave it where it is instead of centring it.
+
+    Raises:
+        PhantomError: it is not closed, or its size is 0 or too large.
     """
     import trimesh
 

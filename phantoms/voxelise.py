@@ -182,10 +182,15 @@ def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
 
 
 def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
-    """Compute the lowest and highest z of the shape above each (x, y) [mm]; lowest >
-    highest: no hit.
+    """Compute the lowest and highest z of a shape above each (x, y); exact, not sampled.
 
-    `x` and `y` broadcast; exact, not sampled.
+    Args:
+        shape: convex.
+        x: of the columns, broadcast with y [mm].
+        y: of the columns [mm].
+
+    Returns:
+        Lower and upper end [mm]; lower > upper where the column misses the shape.
     """
     one = as_convex(shape)
     bottom, top = _between_slabs(one.slabs, x, y)

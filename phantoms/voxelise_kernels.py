@@ -111,10 +111,13 @@ def _winding(t, px, py):
 
 @linked
 def _height(t, px, py):
-    """Compute the height of the plane of triangle t above (px, py), within
-    the triangle's heights.
+    """Compute the height of the plane of a triangle above (px, py), cut to the triangle's
+    heights.
 
-    The triangle must not be vertical.
+    Args:
+        t: (3, 3) corners; not vertical.
+        px: x of the place.
+        py: y of the place.
     """
     ux, uy, uz = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     vx, vy, vz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]

@@ -113,8 +113,10 @@ class Connection:
     ) -> None:
         """Make an open connection that has received nothing.
 
-        Without `codec` the first bytes received decide it. `max_message` limits a message
-        in bytes, `max_batch` the number of items of a batch.
+        Args:
+            codec: None: the first byte received decides it.
+            max_message: largest line or frame accepted [bytes].
+            max_batch: largest number of messages in one batch.
         """
         self.codec = codec
         self.max_message = max_message

@@ -279,10 +279,15 @@ def _request(document: dict[object, object], id: Id) -> Single:
 
 
 def _failure(id: Id, error: object) -> Single:
-    """Convert the answer to a failed request to `Failure`; `data` may be missing.
+    """Convert the answer to a failed request to `Failure`; its `data` may be missing.
 
-    Returns `Malformed` with the id unless `error` is an object with a whole `code` and a
-    text `message`.
+    Args:
+        id: of the request, valid.
+        error: the member of this name.
+
+    Returns:
+        `Failure`; `Malformed` with the id unless `error` is an object with a whole `code`
+        and a text `message`.
     """
     if isinstance(error, dict):
         code = error.get("code")

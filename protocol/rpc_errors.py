@@ -176,9 +176,14 @@ def cancelled(request: object) -> RpcError:
 
 
 def clip(value: object, limit: int = 200) -> str:
-    """Convert `value` to text, cut after `limit` characters with "..." appended.
+    """Convert a value to text, cut after `limit` characters with "..." appended.
 
-    No more of it than needed is formatted; lone surrogates are escaped (before the cut).
+    Lone surrogates are escaped before the cut.
+
+    Args:
+        value: a text is taken as it is; other plain data are formatted as by `repr`, no
+            more of them than needed.
+        limit: number of characters.
     """
     if isinstance(value, str):
         text = value[: limit + 1]

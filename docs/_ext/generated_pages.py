@@ -219,7 +219,9 @@ def _code(text: str) -> str:
 
 
 def benchmark() -> str:
-    """Return the kept benchmark's tables and figure as Markdown."""
+    """Make the page of the kept benchmark (`docs/images/bench.json`) as Markdown:
+    commands, tables and figure.
+    """
     tools = Path(__file__).resolve().parent.parent / "tools"
     if str(tools) not in sys.path:
         sys.path.append(str(tools))

@@ -152,9 +152,16 @@ def virtual(
 def _figures(
     residual: FloatArray, images: Float32Array | None
 ) -> dict[str, float | None]:
-    """Compute rms and largest length of residuals (n, k, 2) [px], and the rms of the
-    images of differences (None without images), by the names of FIGURES; nan is left out
-    of the largest length."""
+    """Compute the figures of residuals and difference images by the names of `FIGURES`.
+
+    Args:
+        residual: (n, k, 2) [px]; nan where unseen.
+        images: difference images; None without.
+
+    Returns:
+        rms_px (per coordinate), max_px (largest length, nan left out), image_rms (None
+        without images).
+    """
     length = np.linalg.norm(residual, axis=2)
     if images is None:
         of_images = None

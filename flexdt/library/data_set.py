@@ -128,6 +128,8 @@ class DataSet(ImageSet):
     ) -> Volume:
         """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options.
 
+        Unless `progress` is False or a function, a bar is shown after two seconds.
+
         Example:
             >>> import numpy as np
             >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)

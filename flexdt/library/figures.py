@@ -79,8 +79,8 @@ def blank(width: float, height: float) -> Figure:
 
 
 def svg(figure: Figure) -> str:
-    """Render a figure as an SVG element with text as text, all points and reproducible
-    ids; without date or XML header.
+    """Render a figure as an SVG element: text stays text, no point is left out, and equal
+    figures have equal ids; without date and XML header.
     """
     import matplotlib as mpl
 

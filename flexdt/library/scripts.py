@@ -73,10 +73,14 @@ def plan(
 
 
 def check(plan: ScanPlan, sample: object = None) -> CheckReport:
-    """Check a plan, with the exposures of `sample` (None: no sample) and, if the machine
-    has components, its collisions; see `ScanPlan.check`.
+    """Check a plan; see `ScanPlan.check`. Collisions are checked if the machine has
+    components, and exposures if there is a sample and the plan has no errors.
 
-    The start of the plan counts as known unless it is that of a machine just switched on.
+    The plan's start counts as known unless it is the machine's default one.
+
+    Args:
+        plan: of a script.
+        sample: on the stage, anything that `flexdt.simulate` takes; None: no sample.
     """
     if sample is None:
         phantom = None

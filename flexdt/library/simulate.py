@@ -411,10 +411,12 @@ def simulate(
 
 
 def _check_sampling(noise: int | None, rays: int, spot_points: int) -> None:
-    """Check the seed of the noise, the rays per pixel side and the points of the focal spot.
+    """Check the seed of the noise, the rays per pixel side and the points of the focal
+    spot, in this order.
 
     Raises:
-        LimitError: a value is not allowed.
+        LimitError: a seed below 0, rays other than 1 to `MAX_RAYS`, or points other than
+            1 or 3 to `MOST_POINTS`.
     """
     if noise is not None and noise < 0:
         raise LimitError.instead(f"noise is {noise}", noise, "a seed >= 0, or None")

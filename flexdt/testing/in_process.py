@@ -119,9 +119,11 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
 def _work(
     done: asyncio.Future[Any], func: Callable[..., Any], args: tuple[Any, ...]
 ) -> None:
-    """Run a function to its end, even if its future was cancelled, as a thread would.
+    """Run a function, even if its future was cancelled, as a thread would, and complete
+    the future.
 
-    The result, or the `Exception` raised, then goes to the future, if it was not cancelled.
+    The future gets the result or the `Exception` raised, unless it was cancelled. Other
+    exceptions, such as KeyboardInterrupt, pass.
     """
     try:
         result = func(*args)

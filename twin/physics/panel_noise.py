@@ -67,7 +67,8 @@ class NoiseTerm:
 
 
 def draw_quanta(exposed: Exposed, rng: np.random.Generator) -> Float32Array:
-    """Draw the deviation of the charge from its mean [electrons], of variance / averages.
+    """Draw the deviation of the charge from its mean, of variance / averages, float32
+    (rows, cols) [electrons].
 
     Gaussian; below `MIN_GAUSSIAN_PHOTONS` quanta whole ones (Poisson), of the size that
     gives the variance.

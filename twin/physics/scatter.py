@@ -158,9 +158,16 @@ class ScatterImage:
 
 
 def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
-    """Interpolate values at nodes, (v, u), at every pixel: cubic splines (of lower order
-    for fewer than 4 nodes), float32 (rows, cols). Nodes reach from the first to the last
-    pixel, evenly."""
+    """Interpolate values at nodes at every pixel, by cubic splines (of lower order for
+    fewer than 4 nodes).
+
+    Args:
+        values: (v, u) at nodes that reach from the first to the last pixel, evenly.
+        shape: the panel's (rows, cols).
+
+    Returns:
+        float32 (rows, cols).
+    """
     from scipy.interpolate import RectBivariateSpline
 
     rows, cols = shape

@@ -93,8 +93,16 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Any, rows: Any, a: TorchOperator) -> Any:
-        """Project a batch of volumes (..., nz, ny, nx) to images (..., n, rows, cols); keep
-        what `backward` needs.
+        """Project a batch of volumes, on their device, and store them for `backward`.
+
+        Args:
+            ctx: of torch.
+            x: volumes (..., nz, ny, nx).
+            rows: cone_vec (n, 12).
+            a: the operator, for grid and detector.
+
+        Returns:
+            float32 (..., n, rows, cols).
         """
         ctx.save_for_backward(x, rows)
         ctx.a = a
@@ -126,8 +134,17 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
-        """Apply the transpose of the projection to images (..., n, rows, cols); keep what
-        `backward` needs.
+        """Apply the transpose of the projection to a batch of images, on their device,
+        and store them for `backward`.
+
+        Args:
+            ctx: of torch.
+            y: images (..., n, rows, cols).
+            rows: cone_vec (n, 12).
+            a: the operator, for grid and detector.
+
+        Returns:
+            float32 (..., nz, ny, nx).
         """
         ctx.save_for_backward(y, rows)
         ctx.a = a

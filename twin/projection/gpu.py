@@ -253,8 +253,8 @@ def finish() -> None:
 
 
 def zeros(count: int, kind: Any = np.float32) -> Any:
-    """Create a flat array of `count` zeros on the device by a kernel; nothing is
-    transferred.
+    """Create a flat array of `count` zeros of the type `kind` on the device by a kernel;
+    nothing is transferred.
     """
     from numba import cuda
 

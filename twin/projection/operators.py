@@ -553,7 +553,8 @@ def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32A
     The new array is not initialised.
 
     Raises:
-        GeometryError: out has another shape, type or memory order.
+        GeometryError: out has another shape or type, is not C-ordered, or cannot be
+            written.
     """
     if out is None:
         return np.empty(shape, np.float32)

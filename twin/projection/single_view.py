@@ -114,6 +114,8 @@ class SingleViews:
     def _memory(self, shape: tuple[int, int]) -> ViewMemory | None:
         """Take the memory that was spared last, if it is for images of this shape on the
         current device, or make new; None where the device has no room.
+
+        Memory for other images is dropped.
         """
         device = gpu.current_device()
         spared: list[ViewMemory] = []
@@ -203,7 +205,17 @@ class ViewMemory:
         return True
 
     def _launch(self, views: SingleViews, kind: int) -> Launch | None:
-        """Prepare the launch of a kind of view; None if numba has not compiled its kernel."""
+        """Prepare the launch of a kind of view by the driver, with the addresses of its
+        arguments.
+
+        Args:
+            views: voxels and box.
+            kind: of `prepare`.
+
+        Returns:
+            The launch, which keeps its arguments alive; None if numba has not compiled
+            the kernel for these arguments.
+        """
         from flexdt.twin.projection.kernels import gpu_kernels
 
         walk, grid, sizes = gpu.launch_sizes(kind, 1, self.shape)
@@ -269,7 +281,8 @@ class ViewMemory:
             raise RuntimeError(f"a single view results in {error}")
 
     def _proves(self, views: SingleViews, kind: int) -> bool:
-        """Compare the image with that of numba's launch, once for each kernel of a process.
+        """Compare the image with that of numba's launch, once for each kernel of a
+        process; a kernel that was equal before is not compared.
 
         Returns:
             Whether all bytes are equal; a line of the log says if not.

@@ -163,8 +163,8 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
 
 
 def _ellipses(c: Certificate) -> list[str]:
-    """Plot (SVG) the joint 95 % ellipses of the `ELLIPSES` most correlated pairs of
-    parameters, after a heading.
+    """Make HTML parts: a heading, and an SVG of the joint 95 % ellipse for each of the
+    `ELLIPSES` most correlated pairs of parameters (fewer if there are no more).
     """
     names = list(c.estimates)
     pairs = [

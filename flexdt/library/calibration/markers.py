@@ -315,7 +315,7 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
 
 
 def seen_alone(data: Images, markers: Markers) -> tuple[list[Images], Markers]:
-    """Select the frames in which a marker was marked.
+    """Select the frames in which at least one marker was marked.
 
     Returns:
         The data set of these frames, in a list of one, and their markers.

@@ -56,9 +56,15 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Return `ENDINGS` or `WRITERS`, made from `FORMATS`, with a DeprecationWarning.
+    """Return the deprecated names `ENDINGS` and `WRITERS`, made from `FORMATS`, with a
+    DeprecationWarning.
 
-    Raises AttributeError on any other name.
+    Args:
+        name: ENDINGS, format -> file endings; WRITERS, format -> function of a geometry
+            that makes the file's content, of formats that are written.
+
+    Raises:
+        AttributeError: any other name.
     """
     if name == "ENDINGS":
         value: dict[str, Any] = {form.name: form.endings for form in FORMATS.values()}

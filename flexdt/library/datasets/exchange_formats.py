@@ -122,8 +122,8 @@ def _read_rtk(path: Path, given: Given) -> ScanGeometry:
 
 
 def _write_astra(geometry: ScanGeometry, out: Path) -> Content:
-    """Return ASTRA's vectors (n, 12) as text, or as the content of an .npy file if `out`
-    ends so; `out` is not written.
+    """Return ASTRA's vectors (n, 12) as text, or as the bytes of an .npy file if `out`
+    ends in .npy; `out` is not written.
     """
     import numpy as np
 
@@ -137,8 +137,11 @@ def _write_astra(geometry: ScanGeometry, out: Path) -> Content:
 
 
 def _read_astra(path: Path, given: Given) -> ScanGeometry:
-    """Read ASTRA's vectors from an .npy file or else from text; the panel's shape is that
-    of `given`.
+    """Read ASTRA's vectors from a file that ends in .npy, or else from text; the panel's
+    shape is that of `given`.
+
+    Raises:
+        ExchangeError: the file has no rows of twelve numbers.
     """
     from flexdt.library.datasets.geometry_content import arrays_of, text_of
     from flexdt.twin.exchange.geometry import ScanGeometry

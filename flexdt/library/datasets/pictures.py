@@ -107,6 +107,9 @@ def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 def legend(marks: npt.NDArray[np.generic]) -> list[str]:
     """List the meanings of the colours that occur in a picture of marks, with their share
     of the pixels (but for the band at the edges); [] without marks.
+
+    Args:
+        marks: (rows, cols) of bits, see `MARKS`.
     """
     values = np.asarray(marks, dtype=np.uint8)
     lines = []

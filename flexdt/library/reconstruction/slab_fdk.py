@@ -131,8 +131,11 @@ class StandingImages:
         return slice(max(first - MARGIN, 0), min(last + MARGIN, self.shape[0]))
 
     def part(self, rows: slice) -> tuple[ConeVec, tuple[int, int], Truncation | None]:
-        """Return geometry, (rows, cols) and truncation of a range of detector rows; all
-        columns, rows counted from its first.
+        """Return geometry, (rows, cols) and truncation (None if there is none) of a range
+        of detector rows, of the upright images.
+
+        All columns are taken, and rows count from the first of the range. For all rows
+        they are this object's own.
         """
         shape = rows.stop - rows.start, self.shape[1]
         if shape == self.shape:

@@ -282,7 +282,7 @@ def _nifti_header(places: VoxelPlaces) -> bytes:
     """Make NIfTI-1's header, padded to the data's first byte (352): x to the right, y to
     the front, z up, [mm].
 
-    Requires nibabel.
+    Raises TwinError if nibabel is missing.
     """
     nibabel = _nibabel()
     nz, ny, nx = places.shape

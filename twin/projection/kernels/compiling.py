@@ -231,8 +231,8 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> A
 
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
-    """Compile to a fetch of array[index]'s cache line for reading; any index is safe,
-    even outside the array.
+    """Compile to a fetch of array[index]'s cache line, for reading, into all caches; it
+    returns nothing, and any index is safe, even outside the array.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:

@@ -189,8 +189,12 @@ def work_on(
 
 
 def _entry_points(key: int):  # type: ignore[no-untyped-def]
-    """Compile `project_fans` and `spread_fans` for one key, which is part of their machine
-    code's name; return both.
+    """Make the entry points `project_fans` and `spread_fans`, compiled at their first
+    call.
+
+    Args:
+        key: hash of the sources that they inline; it is part of their machine code, so
+            that other sources are compiled anew.
     """
 
     @parallel

@@ -149,8 +149,8 @@ def levels_between(grid, fan, t0, t1):
 
 @inline
 def difference(flat, grid, j, i, a, b):
-    """Compute level a minus level b in voxel column (l = i, t = j); 0 for a column
-    outside, and levels outside count as 0. Level k + 1 is voxel z = k.
+    """Compute level a minus level b of `flat` in voxel column (l = i, t = j); 0 for a
+    column outside, and levels outside count as 0. Level k + 1 is voxel z = k.
     """
     if i < 0 or i >= grid.nl:
         return ZERO

@@ -216,8 +216,8 @@ def crossing(t, slope, distance, steps):
 
 
 def slab_kernel(transposed):
-    """Compile the kernel that walks rays slab by slab; forward, or transposed (back
-    projection, adds to voxels).
+    """Make the kernel that walks rays slab by slab: forward it writes images, transposed
+    (back projection) it adds to voxels. It is compiled at its first launch.
     """
 
     @cuda.jit(device=True, inline=True)
