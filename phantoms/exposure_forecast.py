@@ -224,7 +224,7 @@ def expose(
         machine: a machine (see `flexdt.machine`) or the name of one that ships.
         material, voxel_mm: of a mesh or an array, as for `flexdt.simulate`.
         profile, start: zero offsets and the scanner before a scan of `kind`; default: the
-            machine's.
+            machine's. A start without `kind` needs sod and sdd.
 
     Returns:
         The forecast. It is as good as the panel's figures, most of which are assumed, and

@@ -513,8 +513,9 @@ def renew(folder: Path, document: Document, page: Path | None = None) -> None:
 
 
 def main() -> None:
-    """Read a benchmark document, and renew the kept one, its picture and the page's
-    figures; with --out write bench.md and bench.svg there instead.
+    """Read a benchmark document, and renew the kept one, its picture and the figures of
+    --page, in that page's folder or `docs`; with --out write bench.md and bench.svg there
+    instead.
     """
     parser = argparse.ArgumentParser(description="Tables and figure of a benchmark.")
     parser.add_argument("document", type=Path, help="bench.json")

@@ -290,13 +290,16 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
 
     Without a body the beads are in air and the size is that around them about the origin.
     Exactly one of beads and spiral must be given. Only listed beads are checked for
-    overlap. The default description counts the beads and names the body's material or air.
+    overlap. The default description counts the beads and names the body's material or
+    air.
 
     Args:
         document: of the file.
 
     Raises:
-        PhantomError: beads and a spiral, a spiral without a body, or beads that overlap.
+        PhantomError: beads and a spiral, neither of them, a spiral without a body, or
+            beads that overlap.
+        LimitError: beads that do not fit into the body.
     """
     given = reading.fields(
         document,
@@ -394,11 +397,11 @@ def _spiral(value: object, where: str) -> tuple[int, float, str]:
 
 
 def sent_scene(text: bytes, *, name: str) -> Phantom:
-    """Parse the phantom of a text that names no other file, and check its size and its
-    meshes.
+    """Parse the phantom of a text that names no other file, and check its size, and that
+    its meshes are closed.
 
-    Limits are `MAX_SENT_SOLIDS`, `MAX_FACES` triangles and `MAX_EXTENT_MM`; voxels must be
-    alone. The size is at least the stated one; that of voxels is the stated one.
+    Limits are `MAX_SENT_SOLIDS`, `MAX_FACES` triangles and `MAX_EXTENT_MM`; voxels must
+    be alone. The size is at least the stated one; that of voxels is the stated one.
 
     Args:
         text: UTF-8, TOML or JSON.
@@ -409,7 +412,7 @@ def sent_scene(text: bytes, *, name: str) -> Phantom:
 
     Raises:
         PhantomError, UnknownNameError: names the key path, the value and the allowed
-            ones.
+            ones; another size or number, or an open mesh.
     """
     try:
         document = text.decode("utf-8")

@@ -163,8 +163,13 @@ def pixel_variance(
 
 
 def _kept_by_blur(sigmas_px: tuple[float, float]) -> float:
-    """Compute the part of a flat image's white noise that remains in a pixel
-    where light spreads."""
+    """Compute the part of a flat image's white noise that remains in a pixel where light
+    spreads, 0 to 1.
+
+    Args:
+        sigmas_px: standard deviations of the light's spread along rows and across; if
+            both are below `MIN_SIGMA_PX` the part is 1.
+    """
     if max(sigmas_px) < MIN_SIGMA_PX:
         return 1.0
     return math.prod(

@@ -570,8 +570,8 @@ def way_of(rows: FloatArray) -> FloatArray:
     distances, (n,) [rad].
 
     0 for the first. Of each step the largest of three counts: source's, over its least
-    distance from the axis; panel's, over its least distance from the source; and that of
-    u and v, over the least length of u.
+    distance from the object's origin; panel's, over its least distance from the source;
+    and that of u and v, over the least length of u.
 
     Args:
         rows: cone_vec of the views, (n, 12).

@@ -289,8 +289,11 @@ class Tube:
 
 
 def _filter(layer: tuple[str, float] | Filter) -> Filter:
-    """Convert (material, thickness [mm]) to a filter; raises unless its thickness is 0 to
-    1000 mm.
+    """Convert (material, thickness [mm]) to a filter; a filter itself is only checked.
+
+    Raises:
+        LimitError: the thickness is not 0 to 1000 mm.
+        UnknownNameError: an unknown material.
     """
     if not isinstance(layer, Filter):
         layer = Filter(Substance.called(layer[0]), float(layer[1]))

@@ -44,16 +44,17 @@ def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
     """Return measured and predicted bead positions of every frame, (column, row) in
     pixels.
 
-    `before` is the correction in force during the scan, or the nominal geometry; `after`
-    the fitted one, null where it must not be used. Unseen beads are null.
+    `before` is by the correction in force during the scan, or the nominal geometry;
+    `after` by the fitted one, null where it must not be used. Beads that were not seen
+    are null in `measured`.
 
     Args:
         outcome: of a calibration.
 
     Returns:
-        phantom, and datasets: for each dataset (name), folder, rms_before_px,
-        rms_after_px and frames; of each frame file, measured, before and after. No
-        datasets without a fit.
+        phantom (name), and datasets: for each dataset (name), folder, before (name of the
+        correction, or "nominal"), rms_before_px, rms_after_px and frames; of each frame
+        file, measured, before and after. No datasets without a fit.
     """
     result = outcome.calibration
     fit = result.fit

@@ -205,7 +205,8 @@ def calibrate_datasets(
         markers: their pixels in one data set, or a file of them (see `read_markers`);
             None: they are detected in the images.
         scale: a known distance of two unknown markers, or its text (see `Scale.of`).
-        radius_px: of their spots; None: any that `SpotFinder` accepts.
+        radius_px: of their spots; spots of 0.65 to 1.5 times of it are taken; None: any
+            that `SpotFinder` accepts.
 
     Returns:
         Calibration, the document of `flexdt calibrate` with the commands to run next, the

@@ -62,7 +62,8 @@ def _bad_pixels(
 
     Returns:
         The pixels; None with fewer than `MIN_VIEWS` views, no open beam, a source that
-        moves by less than `MIN_TURN` of its distance, or no bad pixels.
+        moves by less than `MIN_TURN` of its distance, an axis that is projected nowhere,
+        or no bad pixels.
     """
     present = np.array(dataset.present)
     if len(present) < MIN_VIEWS or not (dataset.flat > dataset.dark).any():
