@@ -156,10 +156,11 @@ class Phantom(ArrayValue):
             oversample: samples per voxel along each side.
 
         Returns:
-            Volume of attenuation [1/mm], data [z, y, x], about the origin.
+            Volume of attenuation [1/mm], data [z, y, x], about the origin (voxels: about
+            their own centre).
 
         Raises:
-            PhantomError: voxels together with other parts.
+            PhantomError: voxels together with other parts, or as `voxelise`.
         """
         if self.voxels is not None:
             if not self.is_voxels:

@@ -280,6 +280,7 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
 
     Raises:
         UnknownNameError: neither a file nor a shipped name.
+        PhantomError: a material for anything but a mesh, or an invalid file.
     """
     path = Path(word)
     kind = path.suffix.lower()

@@ -112,7 +112,8 @@ class AcquilaEvent:
 
     @property
     def key(self) -> float | str:
-        """Key that a command and its replies share: the UUID as a float, else as text.
+        """Key that a command and its replies share: the UUID as a float if it is a number
+        or the digits of one, else as text.
 
         Programs whose JSON has no integers return the UUID as a float. Without a UUID the
         key is "component command".

@@ -333,7 +333,8 @@ def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
 
 
 def _format(path: Path, among: Iterable[Format]) -> str:
-    """Return the name of the format with a file's ending; `OWN_ENDING` is flexdt's.
+    """Return the name of the format with a file's ending, in either case; `OWN_ENDING`,
+    flexdt's own, matches none.
 
     Args:
         path: file.

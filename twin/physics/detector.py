@@ -310,7 +310,8 @@ class Detector:
         return self.read_noise_e * (LOW_READ_NOISE if _is_low(camera) else 1.0)
 
     def dark_charge(self, camera: CameraSettings) -> float:
-        """Compute the charge of an image pixel without X-rays [electrons/s].
+        """Compute the charge of an image pixel without X-rays [electrons/s]: that of an
+        unbinned pixel, stated or `DARK_E_PER_S`, times the binned pixels.
 
         Example:
             >>> panel = Detector(dark_e_per_s=100.0)
