@@ -553,7 +553,9 @@ def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, 
 
 
 def _shares(parts: Sequence[Channel], chain: Chain, probe: SampleProbe) -> CountShares:
-    """Project the sample's materials along the rays of a probe, and count the pixels by share."""
+    """Project the sample's materials along the rays of a probe, and return the shares of
+    its pixels that are saturated or starved, as `shares_behind` does.
+    """
     cone = probe.cone_vec
     shape = cone.of_shape(None)
     paths = np.zeros((len(parts), len(cone), *shape), np.float32)

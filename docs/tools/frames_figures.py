@@ -131,7 +131,9 @@ def stand(angle_deg: float) -> Poses:
 
 
 def from_above() -> str:
-    """Draw the world's and the object's frame seen from above, stage at 30 deg, as SVG."""
+    """Draw source, panel, the world's and the object's frame seen from above, as SVG:
+    stage at 30 deg, with the axes at 0 deg dashed, its sense of rotation, SOD and SDD.
+    """
     pose, start = stand(30.0), stand(0.0)
     sheet = Sheet(640, 640, (300.0, 590.0), 0.48)
     source, axis, panel = pose.source[0, :2], pose.axis[0, :2], pose.detector[0, :2]

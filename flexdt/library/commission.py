@@ -180,8 +180,10 @@ def commission(
     texts, times from executed scripts, zero offsets from alignments.
 
     The machine to begin with is the shipped one that most texts name; else the one whose
-    motors have the limits of an executed script; else the FleX-ray, with a question.
-    Scans are sorted by date, those without one last; a folder given twice counts once.
+    motors have the limits of an executed script; else the FleX-ray. Where no text names
+    one, that is a question; so are limits and times that no executed script tells (fewer
+    than `MIN_DURATIONS` commands of a kind). Scans are sorted by date, those without one
+    last; a folder given twice counts once.
 
     Args:
         folders: of scans, as the scanner or a twin writes them.
