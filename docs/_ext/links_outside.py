@@ -46,7 +46,8 @@ def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
         """Return the replacement of one link; a target that does not exist is added to
         `lost`, and its link stays.
         """
-        words, target = match[1], match[2]
+        words = match[1]
+        target = match[2]
         path = (page.parent / target).resolve()
         if not path.exists():
             lost.append(target)

@@ -173,7 +173,9 @@ def _into_memory(name: str) -> bool:
     return name.startswith("adjoint-") and not name.endswith("-new")
 
 
-TIMES, SHARE, MS = "{:.1f} x", "{:.0e}", "{:.1f} ms"
+TIMES = "{:.1f} x"
+SHARE = "{:.0e}"
+MS = "{:.1f} ms"
 TARGETS = (
     Target("C1, level", 10, 20, True, TIMES, _ratio("C1")),
     Target("C2, level", 8, 15, True, TIMES, _ratio("C2")),
@@ -265,7 +267,8 @@ def tables(document: dict[str, Any]) -> str:
     )
 
 
-BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
+BEGIN = "<!-- figures -->"
+END = "<!-- end of figures -->"
 
 
 def into_page(page: str, document: dict[str, Any], picture: str) -> str:
@@ -390,7 +393,9 @@ def merged(old: Document, new: Document) -> Document:
     }
 
 
-WIDTH, PANEL, MARGIN = 900, 300, 60
+WIDTH = 900
+PANEL = 300
+MARGIN = 60
 COLOURS = ("#1b6ca8", "#d1495b", "#2e933c", "#8f5db7")
 
 
@@ -431,7 +436,8 @@ def _bars(cases: Sequence[dict[str, Any]]) -> str:
     step = (WIDTH - 2 * MARGIN) / len(bars)
     parts = [_text(WIDTH / 2, 20, "times faster than the peer named above each bar")]
     for i, (name, peer, ratio) in enumerate(bars):
-        x, h = MARGIN + i * step, (PANEL - 110) * ratio / top
+        x = MARGIN + i * step
+        h = (PANEL - 110) * ratio / top
         y = PANEL - 40 - h
         parts.append(
             f'<rect x="{x + 0.15 * step:.1f}" y="{y:.1f}" width="{0.7 * step:.1f}" '

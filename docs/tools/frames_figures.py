@@ -19,7 +19,11 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.kinematics import poses
 
-INK, SOURCE, SAMPLE, PANEL, WORLD = "#1f2933", "#b36b00", "#14507f", "#9b2226", "#3a7d44"
+INK = "#1f2933"
+SOURCE = "#b36b00"
+SAMPLE = "#14507f"
+PANEL = "#9b2226"
+WORLD = "#3a7d44"
 FONT = 'font-family="DejaVu Sans, Verdana, sans-serif"'
 
 
@@ -29,7 +33,10 @@ class Sheet:
     def __init__(
         self, width: int, height: int, origin: tuple[float, float], scale: float
     ) -> None:
-        self.width, self.height, self.origin, self.scale = width, height, origin, scale
+        self.width = width
+        self.height = height
+        self.origin = origin
+        self.scale = scale
         self.parts: list[str] = []
 
     def at(self, point: np.ndarray) -> tuple[float, float]:
@@ -134,9 +141,12 @@ def from_above() -> str:
     """Draw source, panel, the world's and the object's frame seen from above, as SVG:
     stage at 30 deg, with the axes at 0 deg dashed, its sense of rotation, SOD and SDD.
     """
-    pose, start = stand(30.0), stand(0.0)
+    pose = stand(30.0)
+    start = stand(0.0)
     sheet = Sheet(640, 640, (300.0, 590.0), 0.48)
-    source, axis, panel = pose.source[0, :2], pose.axis[0, :2], pose.detector[0, :2]
+    source = pose.source[0, :2]
+    axis = pose.axis[0, :2]
+    panel = pose.detector[0, :2]
     u = pose.u[0] / np.linalg.norm(pose.u[0])
     half = 956 / 2 * float(np.linalg.norm(pose.u[0]))
     ends = panel - half * u[:2], panel + half * u[:2]

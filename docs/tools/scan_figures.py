@@ -29,7 +29,8 @@ import flexdt as fx
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / "docs" / "images" / "made"
 SEED = 7
-WIDTH_INCH, HEIGHT_INCH = 7.2, 2.5
+WIDTH_INCH = 7.2
+HEIGHT_INCH = 2.5
 DPI = 100
 COLOURS = 64
 """Levels of a picture in grey, so that a file is small."""
@@ -123,7 +124,8 @@ def pieces() -> fx.phantoms.Phantom:
     ]
     rng = np.random.default_rng(SEED)
     for number in range(12):
-        turn, out = 2 * np.pi * number / 12, (7.0, 14.5)[number % 2]
+        turn = 2 * np.pi * number / 12
+        out = (7.0, 14.5)[number % 2]
         place = [2 + out * np.cos(turn), -1 + out * np.sin(turn), 6.0 * (number % 3 - 1)]
         solids.append(
             {

@@ -218,7 +218,8 @@ class InProcessTransport(asyncio.Transport):
     ) -> None:
         """Make an unconnected transport; `serve` makes the server's side of each connection."""
         super().__init__({"peername": ("in-process", 0)})
-        self._loop, self._serve = loop, serve
+        self._loop = loop
+        self._serve = serve
         self._server: _Receiver | None = None
 
     async def open(self) -> None:
@@ -235,7 +236,8 @@ class InProcessTransport(asyncio.Transport):
             raise RuntimeError(f"{say}, or twin.run(...)")
         self.close()
         await asyncio.sleep(0.0)  # the end of an earlier connection comes first
-        self._wire, self._inbox = Connection(Codec.MSGPACK), asyncio.Queue[bytes]()
+        self._wire = Connection(Codec.MSGPACK)
+        self._inbox = asyncio.Queue[bytes]()
         self._server = self._serve()
         self._server.connection_made(self)
 
@@ -313,7 +315,9 @@ class InProcessTwin:
 
         Starts neither of them and connects nothing; `client` is set by `twin`.
         """
-        self.loop, self.server, self.data = loop, server, server.root
+        self.loop = loop
+        self.server = server
+        self.data = server.root
         self._shell = TcpServer(
             partial(TwinSession, server), ConnectionLimits(), None, METHODS
         )

@@ -70,11 +70,9 @@ def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
         # Source or pixels inside the box, or rays along a voxel plane: each ray on its own.
         for q in range(n):
             # As integers: single rays come with such, and one form of `walk_ray` serves both.
-            at, r, c = (
-                collected.slot[q],
-                np.int64(collected.row[q]),
-                np.int64(collected.column[q]),
-            )
+            at = collected.slot[q]
+            r = np.int64(collected.row[q])
+            c = np.int64(collected.column[q])
             if not transposed:
                 buffer[at] = walk_ray(box, g, r, c, ZERO, False)
             elif buffer[at] != ZERO:
@@ -86,7 +84,9 @@ def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
         return
     start(grid, fan, rays, work, count)
     # The walk adds up pieces in units of the ray; its length in mm enters once, here.
-    acc, slot, length = rays.acc, rays.slot, rays.length
+    acc = rays.acc
+    slot = rays.slot
+    length = rays.length
     if transposed:
         for q in range(count):
             acc[q] = buffer[slot[q]] * length[q]
@@ -217,9 +217,11 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         # Each worker keeps its memory and takes the next job when it is free: jobs differ in
         # cost.
         for _ in prange(workers):
-            collected, rays = make_collected(room), make_rays(room)
+            collected = make_collected(room)
+            rays = make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
-            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+            starts = np.empty(rows, np.int64)
+            ends = np.empty(rows, np.int64)
             buffer = np.empty(rows * widest, np.float32)
             job = fetch_next(counter)
             while job < len(jobs):
@@ -262,9 +264,11 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         counter = np.zeros(1, np.int64)
         done = np.zeros(len(turns), np.int64)
         for _ in prange(workers):
-            collected, rays = make_collected(room), make_rays(room)
+            collected = make_collected(room)
+            rays = make_rays(room)
             work = make_work(max(box.nx, box.ny), box.nz)
-            starts, ends = np.empty(rows, np.int64), np.empty(rows, np.int64)
+            starts = np.empty(rows, np.int64)
+            ends = np.empty(rows, np.int64)
             buffer = np.empty(rows * widest, np.float32)
             g = np.empty(12)
             turn = first_item = before = 0
@@ -272,12 +276,15 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             while turn < len(turns):
                 count = (turns[turn, 1] - turns[turn, 0]) * len(slices)
                 if item >= first_item + count:
-                    first_item, before, turn = first_item + count, count, turn + 1
+                    first_item = first_item + count
+                    before = count
+                    turn = turn + 1
                     continue
                 if turn > 0:
                     wait_until(done, turn - 1, before)
                 at = item - first_item
-                part, unit = at % len(slices), turns[turn, 0] + at // len(slices)
+                part = at % len(slices)
+                unit = turns[turn, 0] + at // len(slices)
                 low, high = slices[part]
                 # The slice as a box of its own: its first voxel is z = 0 of the piece.
                 piece = Box(

@@ -185,15 +185,17 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
         r1: at its end.
         share: of the slab, that the line is in r0.
     """
-    cross, pace, slope, weight, ratio = (
-        rays.cross,
-        rays.pace,
-        rays.slope,
-        rays.weight,
-        rays.ratio,
-    )
-    all_acc, all_level, following = rays.acc, rays.level, rays.following
-    head, total, moment = work.head, work.total, work.moment
+    cross = rays.cross
+    pace = rays.pace
+    slope = rays.slope
+    weight = rays.weight
+    ratio = rays.ratio
+    all_acc = rays.acc
+    all_level = rays.level
+    following = rays.following
+    head = work.head
+    total = work.total
+    moment = work.moment
     stop = float(fan.j1)
     inside = np.uint32(grid.nz)
     both = np.uint32(grid.nz - 1)
@@ -204,9 +206,13 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
     r = head[j]
     while r != NONE:
         later = following[r]
-        t, every, m, w = cross[r], pace[r], slope[r], weight[r]
+        t = cross[r]
+        every = pace[r]
+        m = slope[r]
+        w = weight[r]
         step = np.int32(math.copysign(1.0, every))
-        level, acc = all_level[r], all_acc[r]
+        level = all_level[r]
+        acc = all_acc[r]
         while True:
             after = np.uint32(np.int32(level) + step)
             here, there = ZERO, ZERO
@@ -265,7 +271,9 @@ def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
                     following[r] = head[slab]
                     head[slab] = r
                 break
-        cross[r], all_level[r], all_acc[r] = t, level, acc
+        cross[r] = t
+        all_level[r] = level
+        all_acc[r] = acc
         r = later
 
 
@@ -292,21 +300,27 @@ def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
 
     Crossings of the rays and their lists are changed too, as by `cross_levels`.
     """
-    cross, pace, slope, weight, ratio = (
-        rays.cross,
-        rays.pace,
-        rays.slope,
-        rays.weight,
-        rays.ratio,
-    )
-    value, all_level, following = rays.acc, rays.level, rays.following
-    head, total, moment = work.head, work.total, work.moment
+    cross = rays.cross
+    pace = rays.pace
+    slope = rays.slope
+    weight = rays.weight
+    ratio = rays.ratio
+    value = rays.acc
+    all_level = rays.level
+    following = rays.following
+    head = work.head
+    total = work.total
+    moment = work.moment
     stop = float(fan.j1)
     inside = np.uint32(grid.nz)
     r = head[j]
     while r != NONE:
         later = following[r]
-        t, every, m, level, y = cross[r], pace[r], slope[r], all_level[r], value[r]
+        t = cross[r]
+        every = pace[r]
+        m = slope[r]
+        level = all_level[r]
+        y = value[r]
         step = np.int32(math.copysign(1.0, every))
         w = weight[r] * y
         while True:
@@ -345,7 +359,8 @@ def cross_levels_back(flat, grid, fan, rays, work, j, r0, r1, share):
                     following[r] = head[slab]
                     head[slab] = r
                 break
-        cross[r], all_level[r] = t, level
+        cross[r] = t
+        all_level[r] = level
         r = later
 
 
@@ -366,7 +381,9 @@ def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
         x: place of the reference line there, l = x.
         transposed: voxels receive the rays' values.
     """
-    bins, jump, zeros = work.bins, work.jump, work.zeros
+    bins = work.bins
+    jump = work.jump
+    zeros = work.zeros
     w0, w1 = levels_between(grid, fan, j, j)
     reach = j - grid.st
     if w1 <= w0 or reach <= 0:
@@ -453,7 +470,8 @@ def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
         share: of the slab, that the line is in r0.
         transposed: see above.
     """
-    total, moment = work.total, work.moment
+    total = work.total
+    moment = work.moment
     w0, w1 = levels_between(grid, fan, j, j + 1)
     if not transposed:
         low0, high0 = occupied(spans, grid, j, r0)
@@ -545,8 +563,11 @@ def settle(rays, work, n):
     Integrals of levels grow along the whole line, a ray takes a difference of two: without
     this, a ray with a short path through a long volume would lose digits.
     """
-    acc, ratio, level = rays.acc, rays.ratio, rays.level
-    total, moment = work.total, work.moment
+    acc = rays.acc
+    ratio = rays.ratio
+    level = rays.level
+    total = work.total
+    moment = work.moment
     for q in range(n):
         k = level[q]
         acc[q] += total[k] + ratio[q] * moment[k]
@@ -558,8 +579,11 @@ def settle(rays, work, n):
 def share_out(rays, work, n):
     """Replace the sums in `work` by the rays' values and first moments, added up in each
     level: these are what the voxels of that level receive."""
-    acc, ratio, level = rays.acc, rays.ratio, rays.level
-    total, moment = work.total, work.moment
+    acc = rays.acc
+    ratio = rays.ratio
+    level = rays.level
+    total = work.total
+    moment = work.moment
     total[:] = ZERO
     moment[:] = ZERO
     for q in range(n):

@@ -75,7 +75,8 @@ def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
 
 CHECKED = 1 << 16
 """Numbers that a thread checks at a time."""
-SIZE_BITS, INFINITE = np.uint32(0x7FFFFFFF), np.uint32(0x7F800000)
+SIZE_BITS = np.uint32(0x7FFFFFFF)
+INFINITE = np.uint32(0x7F800000)
 """Bits of a float32 without its sign, and those of infinity; NaN has larger ones."""
 
 

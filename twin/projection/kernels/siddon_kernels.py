@@ -130,10 +130,15 @@ def walk_ray(box, g, r, c, value, transposed):
     ix, left_x, next_x, every_x, hop_x = first_step(g[0], dx, nx, enter, box.hop_x)
     iy, left_y, next_y, every_y, hop_y = first_step(g[1], dy, ny, enter, box.hop_y)
     iz, left_z, next_z, every_z, hop_z = first_step(g[2], dz, nz, enter, 1)
-    flat, marks = box.flat, box.spans
-    column, mark = box.base + ix * box.hop_x + iy * box.hop_y, 2 * (iy * nx + ix)
+    flat = box.flat
+    marks = box.spans
+    column = box.base + ix * box.hop_x + iy * box.hop_y
+    mark = 2 * (iy * nx + ix)
     mark_x, mark_y = (2 if hop_x > 0 else -2), (2 * nx if hop_y > 0 else -2 * nx)
-    p, t, total, scaled = column + iz, enter, 0.0, value * length
+    p = column + iz
+    t = enter
+    total = 0.0
+    scaled = value * length
     if transposed:
         open_column(flat, marks, mark, column, nz)
     while True:
@@ -152,13 +157,17 @@ def walk_ray(box, g, r, c, value, transposed):
             if left_x == 0:
                 break
             next_x += every_x
-            p, column, mark = p + hop_x, column + hop_x, mark + mark_x
+            p = p + hop_x
+            column = column + hop_x
+            mark = mark + mark_x
         elif next_y == upto:
             left_y -= 1
             if left_y == 0:
                 break
             next_y += every_y
-            p, column, mark = p + hop_y, column + hop_y, mark + mark_y
+            p = p + hop_y
+            column = column + hop_y
+            mark = mark + mark_y
         else:
             left_z -= 1
             if left_z == 0:
@@ -229,7 +238,8 @@ def spread_rays(box, views, chosen, values, slices, marks, first_column, last_co
         )
         g = np.empty(12)
         for column in range(first_column, last_column):
-            view, c = chosen[column // cols], column % cols
+            view = chosen[column // cols]
+            c = column % cols
             g[:] = views[view]
             g[2] -= z0
             for r in range(rows):

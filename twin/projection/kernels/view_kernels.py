@@ -15,7 +15,9 @@ COPIED = 1 << 16
 """Numbers that a thread copies at a time."""
 UNFIT = -1
 """Kind of a view that `prepare` does not judge."""
-LYING, SLABS, UPRIGHT = 3, 1, 1
+LYING = 3
+SLABS = 1
+UPRIGHT = 1
 """What a panel on its side, the slab walk, and upright columns add to a view's kind."""
 
 
