@@ -44,7 +44,7 @@ def claim(check: Callable[[Draw], None]) -> Callable[[Draw], None]:
 def lines(draw: Draw, count: int) -> Any:
     """Start at slab 0, slope, slabs and voxels across of drawn lines that meet their box."""
     for _ in range(count):
-        slabs, across = (int(n) for n in draw.integers(2, gpu.SIDE, 2))
+        slabs, across = (int(n) for n in draw.integers(2, gpu.MAX_SIDE_VOXELS, 2))
         slope = float(draw.choice([1.0, draw.uniform(0, 1), 10 ** draw.uniform(-7, 0)]))
         slab = draw.uniform(0, slabs)
         yield draw.uniform(0, across) - slab * slope, slope, slabs, across
@@ -55,7 +55,7 @@ def no_rounding_adds_up_in_fixed_point(draw: Draw) -> None:
     for start, slope, slabs, across in lines(draw, 300):
         position, rate, *_ = kernels.fixed_line.fn(start, slope, across)
         for k in (0, 1, slabs // 2, slabs):
-            found = Fraction(int(position) + k * int(rate), 2**kernels.BITS)
+            found = Fraction(int(position) + k * int(rate), 2**kernels.FIXED_BITS)
             off = abs(found - Fraction(start) - k * Fraction(slope))
             assert off <= Fraction(1, 2**44) + k * Fraction(1, 2**45), (
                 start,
@@ -63,14 +63,17 @@ def no_rounding_adds_up_in_fixed_point(draw: Draw) -> None:
                 k,
                 float(off),
             )
-        assert abs(int(position)) + gpu.SIDE * int(rate) < 2**63
+        assert abs(int(position)) + gpu.MAX_SIDE_VOXELS * int(rate) < 2**63
 
 
 @claim
 def a_slope_rounds_to_6e_11_voxels_after_2000_slabs(draw: Draw) -> None:
     for slope in draw.uniform(0, 1, 300):
         _, rate, *_ = kernels.fixed_line.fn(0.0, float(slope), 10)
-        assert 2000 * abs(Fraction(int(rate), 2**kernels.BITS) - Fraction(slope)) < 6e-11
+        assert (
+            2000 * abs(Fraction(int(rate), 2**kernels.FIXED_BITS) - Fraction(slope))
+            < 6e-11
+        )
 
 
 @claim
@@ -80,9 +83,9 @@ def a_crossing_is_off_by_1e_5_slabs_whatever_the_slope(draw: Draw) -> None:
         position, rate, slope_32, steps, *_ = kernels.fixed_line.fn(start, slope, across)
         if rate == 0:
             continue
-        begin = int(draw.integers(0, slabs)) & -kernels.ANCHORED
+        begin = int(draw.integers(0, slabs)) & -kernels.ANCHOR_SLABS
         plane, distance = kernels.anchor.fn(position, rate, begin)
-        for k in range(kernels.ANCHORED):
+        for k in range(kernels.ANCHOR_SLABS):
             t = np.float32(k + 1)
             bits, share = kernels.crossing.fn(t, slope_32, distance, steps)
             before, after = (
@@ -120,7 +123,7 @@ def a_ray_enters_and_leaves_within_the_margin(draw: Draw) -> None:
         for place, wanted in zip(found[4:], exact, strict=True):
             if 0 <= wanted <= slabs:
                 off = abs(Fraction(float(place)) - wanted)
-                assert off < Fraction(float(kernels.MARGIN)) / 2, (
+                assert off < Fraction(float(kernels.MARGIN_SLABS)) / 2, (
                     start,
                     slope,
                     float(off),

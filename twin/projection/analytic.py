@@ -47,10 +47,10 @@ from flexdt.twin.projection.operators import (
 from flexdt.twin.projection.portions import equal_portions
 from flexdt.twin.projection.volume import Volume, blank_layout, bring_over
 
-LEVEL = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
-END_ON = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
+LEVEL_VIEW = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1))
+END_ON_VIEW = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
 IntArray = npt.NDArray[np.int64]
-ASIDE = (1.37e-7, 0.73e-7)
+RAY_OFFSET_PX = (1.37e-7, 0.73e-7)
 """Offset of each ray from its pixel's centre [columns, rows]. Made objects have
 corners exactly on pixel centres; there, rounding alone would decide which triangles a
 ray meets."""
@@ -175,7 +175,7 @@ def _project(
     slabs = np.concatenate([one.slabs for one in shapes])
     slab_range = np.column_stack([ends[:-1], ends[1:]])
     seen = shadows(shapes, rays, shape)
-    band = analytic_kernels.BAND
+    band = analytic_kernels.BAND_ROWS
     jobs = len(rays) * -(-shape[0] // band)
     for first, last in equal_portions(
         jobs, CHORD_NS * band * shape[1] * len(shapes), threads()
@@ -205,12 +205,14 @@ def warm_up_forward() -> None:
         Box((0, 0, 0), (1, 1, 1)),
         Cylinder((0, 0, 0), 1.0, 1.0),
     )
-    project_scene(Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), LEVEL, (5, 6))
+    project_scene(
+        Scene(tuple(Solid(s, "water", 0.02) for s in shapes)), LEVEL_VIEW, (5, 6)
+    )
     for volume in _tiny_volumes():
-        forward(volume, END_ON, (5, 6))
+        forward(volume, END_ON_VIEW, (5, 6))
         layout = volume.layout  # so small a problem would not be walked in fans
         images = np.empty((1, 5, 6), np.float32)
-        cpu.project(box_of(layout), voxel_rays(LEVEL, layout, (5, 6)), images)
+        cpu.project(box_of(layout), voxel_rays(LEVEL_VIEW, layout, (5, 6)), images)
 
 
 def warm_up_back() -> None:
@@ -218,9 +220,9 @@ def warm_up_back() -> None:
     its kernels are compiled; the same for adding a volume of another order."""
     images = np.ones((1, 5, 6), np.float32)
     for volume in _tiny_volumes():
-        back(images, END_ON, volume)
+        back(images, END_ON_VIEW, volume)
         target = blank_layout(volume)
-        cpu.spread(box_of(target), voxel_rays(LEVEL, target, (5, 6)), images)
+        cpu.spread(box_of(target), voxel_rays(LEVEL_VIEW, target, (5, 6)), images)
         bring_over(
             layout_data(target),
             target.flat,
@@ -336,10 +338,10 @@ def project_mesh(
     ends = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)], axis=1)
     geometry = run_through(geometry, np.array(list(product(*ends))))
     rays = geometry.rays(shape)
-    rays[:, 3:6] += ASIDE[0] * geometry.u + ASIDE[1] * geometry.v
+    rays[:, 3:6] += RAY_OFFSET_PX[0] * geometry.u + RAY_OFFSET_PX[1] * geometry.v
     basis = np.stack([geometry.u, geometry.v, rays[:, 3:6]], axis=2)
     inverses = np.ascontiguousarray(np.linalg.inv(basis))
-    band = analytic_kernels.MESH_BAND
+    band = analytic_kernels.MESH_BAND_ROWS
     jobs = len(rays) * -(-shape[0] // band)
     job_ns = TRIANGLE_NS * (len(mesh.faces) + len(mesh.vertices) + band * shape[1])
     for first, last in equal_portions(jobs, job_ns, threads()):

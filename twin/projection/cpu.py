@@ -33,11 +33,11 @@ from flexdt.twin.projection.portions import (
     ray_ns,
     turn_portions,
 )
-from flexdt.twin.projection.volume import LANES
+from flexdt.twin.projection.volume import LANE_FLOATS
 
-ROOM = 64 << 20
+MAX_TRANSPOSED_BYTES = 64 << 20
 """Largest size of the transposed images held at a time [bytes], at least one image."""
-TILE = 8
+TILE_COLUMNS = 8
 """Detector columns in a job of single rays."""
 
 
@@ -45,15 +45,15 @@ def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, boo
     """Yield ranges of neighbouring views of one orientation, each with its transposition.
 
     The second value is True when rows and columns of these views are exchanged; such a
-    range holds at most as many views as fit into ROOM (at least one), as their images are
-    copied.
+    range holds at most as many views as fit into `MAX_TRANSPOSED_BYTES` (at least one),
+    as their images are copied.
 
     Args:
         views: (n, 12) rays in voxel units.
         shape: detector (rows, cols).
     """
     on_side = lying(views, shape)
-    most = max(1, ROOM // (4 * shape[0] * shape[1]))
+    most = max(1, MAX_TRANSPOSED_BYTES // (4 * shape[0] * shape[1]))
     edges = np.flatnonzero(np.diff(on_side)) + 1
     for begin, end in zip(
         [0, *edges.tolist()], [*edges.tolist(), len(views)], strict=True
@@ -120,14 +120,14 @@ def _project_alone(
     """
     from flexdt.twin.projection.kernels import siddon_kernels
 
-    jobs = len(chosen) * -(-out.shape[2] // TILE)
+    jobs = len(chosen) * -(-out.shape[2] // TILE_COLUMNS)
     for first, last in equal_portions(jobs, tile_ns(box, out.shape[1]), threads()):
-        siddon_kernels.project_rays(box, views, chosen, out, TILE, first, last)
+        siddon_kernels.project_rays(box, views, chosen, out, TILE_COLUMNS, first, last)
 
 
 def tile_ns(box: Box, rows: int) -> float:
-    """Estimate the time of TILE detector columns of single rays [ns]."""
-    return TILE * rows * ray_ns((box.nx, box.ny, box.nz))
+    """Estimate the time of TILE_COLUMNS detector columns of single rays [ns]."""
+    return TILE_COLUMNS * rows * ray_ns((box.nx, box.ny, box.nz))
 
 
 def spread(
@@ -162,8 +162,8 @@ def spread(
 def _spread(
     box: Box, views: FloatArray, values: Float32Array, clean: bool, fans: bool
 ) -> None:
-    """Add the transpose of the projection of `values` to the box's voxels: fans first, then
-    single rays.
+    """Add the transpose of the projection of `values` to the box's voxels: fans first,
+    then single rays.
 
     No voxel is added to by two threads at once.
 
@@ -221,10 +221,11 @@ def _spread(
 def z_slices(nz: int, count: int) -> IntArray:
     """Cut nz levels into at most `count` ranges (s, 2) of about equal height.
 
-    Cuts are at multiples of `LANES` voxels; fewer ranges where there are fewer of these.
+    Cuts are at multiples of `LANE_FLOATS` voxels; fewer ranges where there are fewer of
+    these.
     """
-    lines = -(-nz // LANES)
-    edges = np.unique(np.arange(count + 1) * lines // count) * LANES
+    lines = -(-nz // LANE_FLOATS)
+    edges = np.unique(np.arange(count + 1) * lines // count) * LANE_FLOATS
     edges[-1] = nz
     return np.column_stack([edges[:-1], edges[1:]]).astype(np.int64)
 

@@ -27,14 +27,14 @@ from flexdt.twin.projection.kernels.fan_types import Fans
 
 IntArray = npt.NDArray[np.int64]
 
-FANS = 16
+FANS_A_JOB = 16
 """Fans in a job: their columns fill whole cache lines of the image."""
-SPREAD = 0.9
+MAX_SPREAD_VOXELS = 0.9
 """Largest lateral spread of a fan [voxels]: less than one, as the kernel's corrections
 demand."""
-WIDEST = 4.0
+MAX_FAN_COLUMNS = 4.0
 """Widest fan [columns]."""
-FACING = 0.25
+MIN_FACING_COSINE = 0.25
 """Least cosine between any ray and the view's horizontal direction for the view to have
 fans."""
 MIN_GAP_SHARE = 0.25
@@ -45,7 +45,7 @@ MAX_FANS_A_PIXEL_LINE = 64
 EXCHANGED = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
 """Order of a view's numbers (source, first pixel minus source, u, v) with u and v
 exchanged."""
-LEVEL = 1e-12
+MAX_LEVEL_OFFSET_VOXELS = 1e-12
 """Largest distance in x and y of the ends of a detector column parallel to z [voxels]."""
 MIN_UNIT_WIDTH = 8.0
 """Least width of a unit where it enters the volume [voxels]. A fan reaches at most two
@@ -109,9 +109,9 @@ def plan_fans(
     """Cut views into fans.
 
     Of level views, whose columns are parallel to z, each column is a fan; the others are
-    cut as `_plan_tilted`. A view that has a corner whose ray is more than `FACING` (a
-    cosine, seen along z) off the panel's middle, or that tilts too much, gets no fans:
-    `alone` lists it.
+    cut as `_plan_tilted`. A view that has a corner whose ray is more than
+    `MIN_FACING_COSINE` (a cosine, seen along z) off the panel's middle, or that tilts too
+    much, gets no fans: `alone` lists it.
 
     Args:
         views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the
@@ -125,14 +125,14 @@ def plan_fans(
     corners += np.array([0, 0, rows - 1, rows - 1])[:, None] * v[:, None]
     flat = corners[:, :, :2]
     ahead = flat.mean(axis=1)
-    # cosine >= FACING for all corners, without roots of zero
+    # cosine >= MIN_FACING_COSINE for all corners, without roots of zero
     along = np.einsum("nki,ni->nk", flat, ahead)
     size = (
         np.einsum("nki,nki->nk", corners, corners)
         * np.einsum("ni,ni->n", ahead, ahead)[:, None]
     )
-    facing = ((along > 0) & (along**2 >= FACING**2 * size)).all(axis=1)
-    level = np.abs(v[:, :2]).max(axis=1) * rows < LEVEL
+    facing = ((along > 0) & (along**2 >= MIN_FACING_COSINE**2 * size)).all(axis=1)
+    level = np.abs(v[:, :2]).max(axis=1) * rows < MAX_LEVEL_OFFSET_VOXELS
     parts = [_plan_level(np.flatnonzero(facing & level), shape)]
     tilted = np.flatnonzero(facing & ~level)
     if len(tilted):
@@ -159,13 +159,13 @@ def _plan_level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
     """
     rows, cols = shape
     edges = np.arange(cols + 1) - 0.5
-    starts = np.arange(0, cols, FANS)
+    starts = np.arange(0, cols, FANS_A_JOB)
     jobs = np.empty((len(chosen), len(starts), 3), np.int64)
     jobs[:, :, 0] = chosen[:, None]
     jobs[:, :, 1] = starts
-    jobs[:, :, 2] = np.minimum(starts + FANS, cols)
+    jobs[:, :, 2] = np.minimum(starts + FANS_A_JOB, cols)
     lines = np.column_stack([edges, np.zeros(cols + 1)])
-    return FanPlan(lines, jobs.reshape(-1, 3), rows, min(cols, FANS), chosen)
+    return FanPlan(lines, jobs.reshape(-1, 3), rows, min(cols, FANS_A_JOB), chosen)
 
 
 def _plan_tilted(
@@ -225,9 +225,9 @@ def _plan_tilted(
         [-_cross(first[view], direction) / across, -_cross(v[view], direction) / across]
     )
     starts = np.concatenate([[0], np.cumsum(fans + 1)[:-1]])
-    of, part = _expand_counts(-(-fans // FANS))
-    begins = part * FANS
-    ends = np.minimum(begins + FANS, fans[of])
+    of, part = _expand_counts(-(-fans // FANS_A_JOB))
+    begins = part * FANS_A_JOB
+    ends = np.minimum(begins + FANS_A_JOB, fans[of])
     jobs = np.column_stack([chosen[use[of]], starts[of] + begins, starts[of] + ends])
     gaps = _widths((lines[1:] - lines[:-1])[view[1:] == view[:-1]], rows)
     widths = _widths(lines[jobs[:, 2]] - lines[jobs[:, 1]], rows)
@@ -252,7 +252,8 @@ def _expand_counts(counts: IntArray) -> tuple[IntArray, IntArray]:
 def _fan_columns(
     source: FloatArray, u: FloatArray, rays: FloatArray, counts: tuple[int, int, int]
 ) -> FloatArray:
-    """Compute the columns a fan may span so that its rays stay within SPREAD voxels.
+    """Compute the columns a fan may span so that its rays stay within
+    `MAX_SPREAD_VOXELS`.
 
     Args:
         source: (n, 3) [voxels].
@@ -261,7 +262,7 @@ def _fan_columns(
         counts: the box's voxels along x, y and z.
 
     Returns:
-        (n,) columns, at most `WIDEST`.
+        (n,) columns, at most `MAX_FAN_COLUMNS`.
     """
     ends = np.array(
         [[x, y] for x in (0, counts[0]) for y in (0, counts[1])], dtype=np.float64
@@ -274,7 +275,7 @@ def _fan_columns(
     flat = np.abs(rays[..., :2])
     slant = np.linalg.norm(flat, axis=2) / flat.max(axis=2)
     widest = (slant * turn).max(axis=1) * far
-    return np.asarray(np.minimum(WIDEST, SPREAD / widest))
+    return np.asarray(np.minimum(MAX_FAN_COLUMNS, MAX_SPREAD_VOXELS / widest))
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -41,14 +41,14 @@ VIEWS_A_THREAD = 7 / 16
 WORTH_BYTES = 64 * 2**20
 """Smallest volume that is moved to the device for single views [bytes]. For a smaller
 one the processor is as fast (an H200 against 16 threads: C1, 76 MB, 1.95 and 1.8 ms)."""
-SIDE = 2**14
+MAX_SIDE_VOXELS = 2**14
 """Largest number of voxels along an axis for the slab walk. In longer boxes single
 precision does not locate the ends of a ray in the box within the margin of the slab
 walk."""
 MIN_CLEARANCE = 1e-9
 """Least distance of a box from source and detector plane, as a share of their
 distance."""
-KINDS = 3
+WALK_KINDS = 3
 """Number of kinds of walks: single rays, slabs, slabs with upright columns; the kinds of views
 are these, and again these for panels on their side."""
 LINEAR = 256
@@ -237,8 +237,8 @@ def on(device: int) -> Any:
 
 
 def current_device() -> int:
-    """Return the number of the current device, whose context this thread has from now on; 0 in
-    the simulator.
+    """Return the number of the current device, whose context this thread has from now on;
+    0 in the simulator.
     """
     from numba import cuda
 
@@ -464,8 +464,8 @@ def clear_of(
 ) -> npt.NDArray[np.bool_]:
     """Find the views whose source is before a box and whose detector plane is behind it.
 
-    By a share `MIN_CLEARANCE` of the distance. A box with a side of `SIDE` voxels or
-    more, or 2^31 values, is too large for the slab walk: all are False.
+    By a share `MIN_CLEARANCE` of the distance. A box with a side of `MAX_SIDE_VOXELS`
+    voxels or more, or 2^31 values, is too large for the slab walk: all are False.
 
     Args:
         box: the layout's voxels.
@@ -476,7 +476,9 @@ def clear_of(
         (n,) bool.
     """
     counts = (box.nx, box.ny, box.nz)
-    if max(counts) >= SIDE or (box.flat is not None and box.flat.size >= 2**31):
+    if max(counts) >= MAX_SIDE_VOXELS or (
+        box.flat is not None and box.flat.size >= 2**31
+    ):
         return np.zeros(len(views), np.bool_)
     source, first, u, v = (views[:, i : i + 3] for i in (0, 3, 6, 9))
     # Where the box's corners are on the way from the source (0) to the detector's plane (1).
@@ -552,9 +554,11 @@ def launcher(
     rise = rises(views, (rows, cols))
     slabs = clear_of(box, views, (rows, cols)) & (rise <= 1.0)
     upright = (
-        kernels.LANES_MEET & (rays[:, 9:11] == 0.0).all(axis=1) & (rise <= kernels.RISE)
+        kernels.LANES_MEET
+        & (rays[:, 9:11] == 0.0).all(axis=1)
+        & (rise <= kernels.MAX_RISE_VOXELS)
     )
-    kind = KINDS * turned + slabs + (slabs & upright)
+    kind = WALK_KINDS * turned + slabs + (slabs & upright)
     order = np.argsort(kind, kind="stable")
     table = cuda.to_device(np.column_stack([rays, np.arange(len(views))])[order])
     if transposed:
@@ -579,7 +583,9 @@ def launcher(
 
 
 def forward_kernels() -> tuple[Any, Any, Any]:
-    """Return the forward kernels by the walk's number: single rays, slabs, upright columns."""
+    """Return the forward kernels by the walk's number: single rays, slabs, upright
+    columns.
+    """
     from flexdt.twin.projection.kernels import gpu_kernels as kernels
 
     return kernels.project_rays, kernels.project_slabs, kernels.project_columns
@@ -591,17 +597,18 @@ def launch_sizes(
     """Find what a kernel is launched with for views of one kind.
 
     Args:
-        kind: KINDS for a panel on its side, plus the walk's number.
+        kind: WALK_KINDS for a panel on its side, plus the walk's number.
         count: views.
         shape: the detector's (rows, cols).
 
     Returns:
-        The walk's number, the grid of blocks, and lanes, columns and their steps in the image.
+        The walk's number, the grid of blocks, and lanes, columns and their steps in the
+        image.
     """
     from flexdt.twin.projection.kernels import gpu_kernels as kernels
 
     rows, cols = shape
-    lying_down, walk = divmod(kind, KINDS)
+    lying_down, walk = divmod(kind, WALK_KINDS)
     sizes = (cols, rows, 1, cols) if lying_down else (rows, cols, cols, 1)
     lanes, columns, *_ = sizes
     grid = (count * -(-columns // kernels.BLOCK[1]), -(-lanes // kernels.BLOCK[0]))

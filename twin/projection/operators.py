@@ -41,8 +41,12 @@ from flexdt.twin.geometry.virtual_panel import (
     stretches,
 )
 from flexdt.twin.projection import cpu, fan_plan, gpu, single_view
-from flexdt.twin.projection.cpu import TILE
-from flexdt.twin.projection.fan_plan import FACING, SPREAD, WIDEST
+from flexdt.twin.projection.cpu import TILE_COLUMNS
+from flexdt.twin.projection.fan_plan import (
+    MAX_FAN_COLUMNS,
+    MAX_SPREAD_VOXELS,
+    MIN_FACING_COSINE,
+)
 from flexdt.twin.projection.kernels.fan_types import Box
 from flexdt.twin.projection.portions import equal_portions
 from flexdt.twin.projection.volume import (
@@ -119,7 +123,8 @@ def level_axes(
     """Choose an index into ORDERS for each view, or NO_FANS, by estimated time.
 
     Orders other than the first must take less than `MAX_TIME_SHARE` of the time of the
-    others. An order is not chosen if some ray is within acos(`FACING`) of its level axis.
+    others. An order is not chosen if some ray is within acos(`MIN_FACING_COSINE`) of its
+    level axis.
 
     Args:
         rays: (n, 12) source relative to the volume's centre, first pixel minus source, u,
@@ -155,7 +160,10 @@ def level_axes(
         columns = np.where(lying[:, None], v, u)
         along = np.where(lying[:, None], u, v)
         length = np.where(lying, cols, rows)
-        flat = np.abs(along[:, [a, b]]).max(axis=1) * length < fan_plan.LEVEL
+        flat = (
+            np.abs(along[:, [a, b]]).max(axis=1) * length
+            < fan_plan.MAX_LEVEL_OFFSET_VOXELS
+        )
         far = np.hypot(source[:, a], source[:, b]) + 0.5 * math.hypot(
             counts[2 - a], counts[2 - b]
         )
@@ -164,12 +172,14 @@ def level_axes(
             * far
             / np.maximum(np.hypot(middle[:, a], middle[:, b]), 1e-9) ** 2
         )
-        fans = steps * np.where(flat, 1.0, np.maximum(wide / SPREAD, 1.0 / WIDEST))
+        fans = steps * np.where(
+            flat, 1.0, np.maximum(wide / MAX_SPREAD_VOXELS, 1.0 / MAX_FAN_COLUMNS)
+        )
         levels = np.minimum(counts[2 - w], np.abs(along[:, w]) * length)
         slab = FAN_SLAB_NS + np.where(flat, *FAN_LEVEL_NS) * levels
         crossings = np.where(flat, *FAN_CROSSING_NS) * every[:, w]
         slabs = np.maximum(size[:, :, a], size[:, :, b]).mean(axis=1)
-        facing = (np.hypot(size[:, :, a], size[:, :, b]) >= FACING).all(axis=1)
+        facing = (np.hypot(size[:, :, a], size[:, :, b]) >= MIN_FACING_COSINE).all(axis=1)
         fanned = PLAN_VIEW_NS + through * (crossings + fans * slab * slabs)
         times[:, i] = np.where(facing, fanned, np.inf)
     times[:, 1:NO_FANS] /= MAX_TIME_SHARE
@@ -289,8 +299,8 @@ def _on_device(
         out: (n, rows, cols) filled.
 
     Returns:
-        Whether it is filled; False without a device, where the processor is faster, or if the
-        device failed.
+        Whether it is filled; False without a device, where the processor is faster, or if
+        the device failed.
     """
     if not gpu.availability().present or len(geometry) == 0 or volume.layout.empty:
         return False
@@ -400,7 +410,8 @@ def _spread(
 ) -> None:
     """Apply `back` on the processor, adding to a layout.
 
-    Views with levels along x or y are summed in a volume of that order, which is added last.
+    Views with levels along x or y are summed in a volume of that order, which is added
+    last.
 
     Args:
         like: place and size of the voxels.
@@ -467,7 +478,8 @@ def layout_data(layout: Layout) -> Float32Array:
 
 
 def check_projections(projections: npt.ArrayLike, n: int) -> Any:
-    """Convert projections to C-ordered float32 (n, rows, cols); those on a device stay there.
+    """Convert projections to C-ordered float32 (n, rows, cols); those on a device stay
+    there.
 
     Args:
         projections: an array of any library.
@@ -615,7 +627,7 @@ def geometry_gradient(
     geometry.of_shape((rows, cols))
     times = stretches(geometry, corners_of(volume))
     geometry = stretched(geometry, times)
-    tiles = -(-cols // TILE)
+    tiles = -(-cols // TILE_COLUMNS)
     parts = np.zeros((n * tiles, 12))
     layout = volume.layout
     if not layout.empty and n:
@@ -623,7 +635,7 @@ def geometry_gradient(
         box = box_of(layout)
         job_ns = DERIVATIVE_COST * cpu.tile_ns(box, rows)
         for first, last in equal_portions(len(parts), job_ns, cpu.threads()):
-            siddon_kernels.gather(box, views, values, TILE, parts, first, last)
+            siddon_kernels.gather(box, views, values, TILE_COLUMNS, parts, first, last)
     return relaxed_gradient(parts.reshape(n, tiles, 12).sum(axis=1), times)
 
 
@@ -678,8 +690,8 @@ def geometry_change(
         each = np.broadcast_to(moved, (len(geometry), 12))
         steps = np.ascontiguousarray(stretched_steps(each, times))
         box = box_of(layout)
-        jobs = len(geometry) * -(-shape[1] // TILE)
+        jobs = len(geometry) * -(-shape[1] // TILE_COLUMNS)
         job_ns = DERIVATIVE_COST * cpu.tile_ns(box, shape[0])
         for first, last in equal_portions(jobs, job_ns, cpu.threads()):
-            siddon_kernels.follow(box, views, steps, TILE, result, first, last)
+            siddon_kernels.follow(box, views, steps, TILE_COLUMNS, result, first, last)
     return result

@@ -80,7 +80,7 @@ class SingleViews:
         self.frame = np.array([np.asarray(side, float) for side in sides])
         self.box = box
         self.voxels = layout.device_copy.uploaded()
-        short = max(layout.counts) < gpu.SIDE and layout.flat.size < 2**31
+        short = max(layout.counts) < gpu.MAX_SIDE_VOXELS and layout.flat.size < 2**31
         self.clearance = gpu.MIN_CLEARANCE if short else math.inf
         self.usable = True
         self.spare: list[ViewMemory] = []
@@ -178,7 +178,7 @@ class ViewMemory:
         """
         from flexdt.twin.projection.kernels import gpu_kernels, view_kernels
 
-        rise = gpu_kernels.RISE if gpu_kernels.LANES_MEET else -1.0
+        rise = gpu_kernels.MAX_RISE_VOXELS if gpu_kernels.LANES_MEET else -1.0
         kind = view_kernels.prepare(
             row,
             views.frame,
@@ -243,7 +243,8 @@ class ViewMemory:
         return Launch(function, grid, gpu_kernels.BLOCK, addresses, held)
 
     def _run(self, launch: Launch) -> None:
-        """Copy the table to the device, launch, copy the image to page-locked memory, and wait.
+        """Copy the table to the device, launch, copy the image to page-locked memory, and
+        wait.
 
         Raises:
             RuntimeError: the driver gives an error.
@@ -287,11 +288,11 @@ class ViewMemory:
         Returns:
             Whether all bytes are equal; a line of the log says if not.
         """
-        kernel = gpu.forward_kernels()[kind % gpu.KINDS]
+        kernel = gpu.forward_kernels()[kind % gpu.WALK_KINDS]
         if kernel in _proved:
             return True
         rays = self.host_table[:, : NUMBERS_A_VIEW - 1]
-        if kind >= gpu.KINDS:
+        if kind >= gpu.WALK_KINDS:
             rays = exchanged(rays)
         right = np.empty((1, *self.shape), np.float32)
         gpu.project(views.box, views.voxels, rays, right)
@@ -309,8 +310,8 @@ def _address(array: Any) -> int:
 
 
 def _array(array: Any) -> list[ctypes.c_int64]:
-    """List what numba passes to a kernel for a C-ordered array on the device: two pointers that
-    are not used, size, bytes a number, address, shape and strides.
+    """List what numba passes to a kernel for a C-ordered array on the device: two
+    pointers that are not used, size, bytes a number, address, shape and strides.
     """
     item = int(array.dtype.itemsize)
     after = [math.prod(array.shape[i + 1 :]) for i in range(array.ndim)]

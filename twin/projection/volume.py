@@ -48,7 +48,7 @@ NOT_BOUNDED: Final = (
 )
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
-LANES = 16
+LANE_FLOATS = 16
 """Voxel columns start at multiples of this many floats: one cache line, one wide
 register."""
 
@@ -164,7 +164,7 @@ def room_like(volume: Volume) -> Float32Array:
         4
     """
     nz, ny, nx = volume.shape
-    stride = math.ceil(nz / LANES) * LANES
+    stride = math.ceil(nz / LANE_FLOATS) * LANE_FLOATS
     flat = aligned_zeros(ny * nx * stride)
     return flat.reshape(ny, nx, stride)[:, :, :nz].transpose(2, 0, 1)
 
@@ -238,8 +238,8 @@ class Volume:
     center_mm: Vector3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check data, voxel sizes and centre, and store them: data as a read-only view, sizes
-        as (x, y, z).
+        """Check data, voxel sizes and centre, and store them: data as a read-only view,
+        sizes as (x, y, z).
 
         Raises:
             GeometryError: data is not three-dimensional, or a size is not positive.
@@ -359,11 +359,13 @@ class Volume:
     def show(self, window: Sequence[float] | None = None) -> Any:
         """Show three slices in a notebook, with a slider for each.
 
-        With ipywidgets (the extra `notebook`) every layer and any window can be chosen; without
-        it it is a page of HTML with some layers, which `.save("volume.html")` writes.
+        With ipywidgets (the extra `notebook`) every layer and any window can be chosen;
+        without it it is a page of HTML with some layers, which `.save("volume.html")`
+        writes.
 
         Args:
-            window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
+            window: attenuation of black and of white [1/mm]; None: percentiles of the
+                volume.
 
         Returns:
             Display form in a notebook.
@@ -391,8 +393,8 @@ class Volume:
         return backend("xarray").volume_to_xarray(self)
 
     def save(self, file: File) -> None:
-        """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz, .h5,
-        .zarr.
+        """Write the volume; the ending chooses the format: .tif, .nrrd, .mha, .nii.gz,
+        .h5, .zarr.
 
         Raises:
             TwinError: another ending, or the package that writes it is not installed.
@@ -582,7 +584,7 @@ class Volume:
             stride_x = row
             stride_y = plane
         else:
-            stride_x = math.ceil(nz / LANES) * LANES
+            stride_x = math.ceil(nz / LANE_FLOATS) * LANE_FLOATS
             stride_y = nx * stride_x
             flat = aligned_zeros(ny * stride_y)
             bring_over(self.data, flat, stride_x, stride_y)
@@ -676,7 +678,8 @@ class DeviceVolume:
         return {**memory, "shape": self.shape, "strides": self.strides}
 
     def to(self, device: str) -> Any:
-        """Return this volume for "cuda", or a `Volume` downloaded from the device for "cpu".
+        """Return this volume for "cuda", or a `Volume` downloaded from the device for
+        "cpu".
 
         Raises:
             NotBuiltError: another device.
@@ -789,8 +792,8 @@ def aligned_zeros(count: int) -> Float32Array:
     """Create `count` float32 zeros that start on a cache line (pages touched at first
     writing).
     """
-    raw = np.zeros(count + LANES, np.float32)
-    skip = (-raw.ctypes.data // raw.itemsize) % LANES
+    raw = np.zeros(count + LANE_FLOATS, np.float32)
+    skip = (-raw.ctypes.data // raw.itemsize) % LANE_FLOATS
     return raw[skip : skip + count]
 
 

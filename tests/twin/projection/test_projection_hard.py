@@ -210,7 +210,7 @@ def test_views_on_either_side_in_one_call_equal_single_calls(circle, monkeypatch
     ]
     geometry = ConeVec(np.concatenate(parts))
     monkeypatch.setattr(
-        sides, "ROOM", 3 * 4 * SHAPE[0] * SHAPE[1]
+        sides, "MAX_TRANSPOSED_BYTES", 3 * 4 * SHAPE[0] * SHAPE[1]
     )  # three images at a time
     found = list(runs(voxel_rays(geometry, volume.layout, SHAPE), SHAPE))
     assert [(some.start, some.stop, turned) for some, turned in found] == [
@@ -349,8 +349,8 @@ def test_a_sheet_of_rays_in_a_voxel_plane_stays_between_its_neighbours(
     axes, seed
 ) -> None:
     """The detector is turned about its normal; where rays lie in a plane between voxels,
-    rounding decides the side, slab by slab at worst: never less than the lesser neighbours all
-    the way.
+    rounding decides the side, slab by slab at worst: never less than the lesser
+    neighbours all the way.
     """
     draw = np.random.default_rng(seed)
     order = list(AXES[axes])

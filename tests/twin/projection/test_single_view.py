@@ -60,9 +60,9 @@ def test_rays_and_walk_of_a_view_are_those_of_numpy(monkeypatch) -> None:
             ] <= RISE
             slabs = gpu.by_slabs(box, right, case.shape)[0]
             assert np.array_equal(table[0], [*rays[0], 0.0])
-            assert kind == gpu.KINDS * on_side + slabs + (slabs & upright), case.kind
+            assert kind == gpu.WALK_KINDS * on_side + slabs + (slabs & upright), case.kind
             kinds.add(kind)
-    assert kinds == set(range(2 * gpu.KINDS))
+    assert kinds == set(range(2 * gpu.WALK_KINDS))
     assert unfit > CASES / 20
 
 

@@ -22,7 +22,7 @@ from numba import prange
 from flexdt.twin.projection.kernels.compiling import fetch_next, kernel, maker, parallel
 
 TINY = 1e-300
-BAND = 16
+BAND_ROWS = 16
 """Detector rows in a job."""
 
 
@@ -130,8 +130,8 @@ def mapped(m, p, out):
 def project_convex(
     quadric, slabs, slab_range, shadow, rays, weight, channel, out, first_job, last_job
 ):
-    """Fill `out` with weighted chord lengths of convex solids, job by job: BAND rows of a
-    view each.
+    """Fill `out` with weighted chord lengths of convex solids, job by job: BAND_ROWS rows
+    of a view each.
 
     The rows of these jobs are set to zero in every channel first. Chords end at the
     source and at the pixel.
@@ -150,11 +150,11 @@ def project_convex(
         last_job: number of the job after the last.
     """
     channels, _, rows, cols = out.shape
-    bands = (rows + BAND - 1) // BAND
+    bands = (rows + BAND_ROWS - 1) // BAND_ROWS
     for job in prange(first_job, last_job):
         view = job // bands
-        row0 = (job - view * bands) * BAND
-        row1 = min(rows, row0 + BAND)
+        row0 = (job - view * bands) * BAND_ROWS
+        row1 = min(rows, row0 + BAND_ROWS)
         # A job owns its rows of the view in every channel, so jobs need no order.
         for k in range(channels):
             out[k, view, row0:row1] = np.float32(0)
@@ -197,7 +197,7 @@ def project_convex(
                 add_chords(out[channel[s], view, r, c0:c1], t0, t1, weight[s], d, e, c0)
 
 
-MESH_BAND = 64
+MESH_BAND_ROWS = 64
 """Detector rows in a job of meshes."""
 
 
@@ -321,15 +321,16 @@ def draw_triangle(sums, p, pixels, face, g, row0, row1, cols, forms, flips, plan
 
 @kernel
 def locate(vertices, g, inverse, p, pixels):
-    """Transform vertices to positions seen from the source and compute their pixel coordinates.
+    """Transform vertices to positions seen from the source and compute their pixel
+    coordinates.
 
     Args:
         vertices: (k, 3) [mm].
         g: (12,) source, first pixel minus source, u, v [mm].
         inverse: (3, 3) of the matrix with columns u, v, first pixel minus source.
         p: (k, 3) filled with positions minus source.
-        pixels: (k, 3) filled with column, row and 1; 0 as the third for a vertex behind the
-            source.
+        pixels: (k, 3) filled with column, row and 1; 0 as the third for a vertex behind
+            the source.
     """
     for i in range(len(vertices)):
         x = vertices[i, 0] - g[0]
@@ -351,10 +352,11 @@ def locate(vertices, g, inverse, p, pixels):
 
 @maker
 def make_band(vertices, cols):
-    """Create a worker's arrays, not initialised: sums (MESH_BAND, cols), positions and
-    pixels of the vertices (k, 3) each, edge forms (3, 3), flips (3,), plane (4,)."""
+    """Create a worker's arrays, not initialised: sums (MESH_BAND_ROWS, cols), positions
+    and pixels of the vertices (k, 3) each, edge forms (3, 3), flips (3,), plane (4,).
+    """
     return (
-        np.empty((MESH_BAND, cols)),
+        np.empty((MESH_BAND_ROWS, cols)),
         np.empty((vertices, 3)),
         np.empty((vertices, 3)),
         np.empty((3, 3)),
@@ -365,8 +367,8 @@ def make_band(vertices, cols):
 
 @parallel
 def project_triangles(vertices, faces, rays, inverses, workers, out, first_job, last_job):
-    """Fill `out` with path lengths through a closed mesh, job by job: MESH_BAND rows of a view
-    each.
+    """Fill `out` with path lengths through a closed mesh, job by job: MESH_BAND_ROWS rows
+    of a view each.
 
     Args:
         vertices: (k, 3) [mm].
@@ -379,7 +381,7 @@ def project_triangles(vertices, faces, rays, inverses, workers, out, first_job, 
         last_job: number of the job after the last.
     """
     rows, cols = out.shape[1:]
-    bands = (rows + MESH_BAND - 1) // MESH_BAND
+    bands = (rows + MESH_BAND_ROWS - 1) // MESH_BAND_ROWS
     counter = np.full(1, first_job, np.int64)
     for _ in prange(workers):
         sums, p, pixels, forms, flips, plane = make_band(len(vertices), cols)
@@ -387,8 +389,8 @@ def project_triangles(vertices, faces, rays, inverses, workers, out, first_job, 
         job = fetch_next(counter)
         while job < last_job:
             view = job // bands
-            row0 = job % bands * MESH_BAND
-            row1 = min(rows, row0 + MESH_BAND)
+            row0 = job % bands * MESH_BAND_ROWS
+            row1 = min(rows, row0 + MESH_BAND_ROWS)
             g = rays[view]
             if view != seen:
                 locate(vertices, g, inverses[view], p, pixels)

@@ -41,7 +41,7 @@ from flexdt.twin import kernel_threads, long_work
 
 LOG = logging.getLogger("flexdt.kernels")
 """Logger of the kernels, to standard error unless the program has set up logging."""
-SLOW = (
+SLOW_MESSAGE = (
     "flexdt: compiling %s (once on this machine; some seconds, and perhaps other kernels)"
 )
 """Message of a process that compiles for the first time instead of loading the disk
@@ -162,7 +162,7 @@ class _EntryPoint(_Linked):
         logged that it takes long."""
         name = self.state.func_id.func_name
         if not _EntryPoint.silent:
-            LOG.warning(SLOW, name)
+            LOG.warning(SLOW_MESSAGE, name)
             _EntryPoint.silent = True
         library = JITCodeLibrary(self.state.targetctx.codegen(), name)
         library.enable_object_caching()
@@ -296,16 +296,17 @@ _sleep, _SLEEP = (
 SLEEP = "flexdt_sleep"
 binding.add_symbol(SLEEP, ctypes.cast(_sleep, ctypes.c_void_p).value)
 _rest = types.ExternalFunction(SLEEP, types.int32(types.uint32))
-LOOKS = 2000
+MAX_LOOKS = 2000
 """Polls before a thread sleeps: some 20 microseconds, the time that a sleep takes."""
 
 
 @kernel
 def wait_until(counters, index, count):
-    """Wait until counters[index] has reached count; after `LOOKS` looks the thread sleeps
-    between them, as the thread that is waited for may need its core."""
+    """Wait until counters[index] has reached count; after `MAX_LOOKS` looks the thread
+    sleeps between them, as the thread that is waited for may need its core.
+    """
     looks = 0
     while _look(counters, index) < count:
         looks += 1
-        if looks > LOOKS:
+        if looks > MAX_LOOKS:
             _rest(_SLEEP)

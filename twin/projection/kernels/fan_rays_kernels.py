@@ -12,11 +12,11 @@ import numpy as np
 
 from flexdt.twin.projection.kernels.compiling import kernel, maker
 from flexdt.twin.projection.kernels.fan_types import Collected, Fan, Grid, Rays, Work
-from flexdt.twin.projection.kernels.fan_walk_kernels import BINS, NONE, ZERO
+from flexdt.twin.projection.kernels.fan_walk_kernels import NONE, SLOPE_BINS, ZERO
 
-SPREAD = 1e-7
+MIN_SPREAD_VOXELS = 1e-7
 """Lateral spread [voxels] below which the rays of a fan share one line."""
-DRIFT = 0.95
+MAX_DRIFT_VOXELS = 0.95
 """Largest distance [voxels] of a ray from its reference line: the corrections reach one
 voxel."""
 ON_AXIS = 0.2
@@ -154,7 +154,8 @@ def collect(collected, grid, g, lines, line, starts, width, shadow):
         line: number of the fan's first line.
         starts: first column of the job's buffer in each row.
         width: its columns.
-        shadow: rows and columns that the box can reach, the first of them the buffer's first.
+        shadow: rows and columns that the box can reach, the first of them the buffer's
+            first.
     """
     row = collected.row
     column = collected.column
@@ -217,7 +218,8 @@ def describe(grid, collected, n):
     walked together.
 
     They cannot with the source in the box, rays that end within it, spreading rays nearly
-    along an axis (`ON_AXIS`), or rays that drift more than `DRIFT` voxels off the line.
+    along an axis (`ON_AXIS`), or rays that drift more than `MAX_DRIFT_VOXELS` off
+    the line.
     """
     slope = collected.slope[:n]
     rise = collected.rise[:n]
@@ -248,11 +250,11 @@ def describe(grid, collected, n):
     # The reference line has the mean slope, so a ray lies farthest beside it at the far end.
     far = max(j1 - grid.st, 0.0)
     drift = 0.5 * (m_high - m_low) * far
-    spread = drift > SPREAD
+    spread = drift > MIN_SPREAD_VOXELS
     inside = grid.st > 0.0 and -1.0 < grid.sl < grid.nl + 1.0
     too_short = nearest <= 0.0 or nearest < far
     on_axis = spread and m_low * grid.nt < ON_AXIS
-    together = not (inside or too_short or on_axis or drift > DRIFT)
+    together = not (inside or too_short or on_axis or drift > MAX_DRIFT_VOXELS)
     low = m_low - m0
     width = m_high - m_low
     return Fan(m0, low, width, rise_low, rise_high, j0, j1, begin, spread, together)
@@ -260,8 +262,8 @@ def describe(grid, collected, n):
 
 @kernel
 def sort_by_slope(grid, fan, collected, rays, bins, n):
-    """Sort the rays that meet the box by slope (in bins) into `rays`, and fill `bins`; returns
-    their number.
+    """Sort the rays that meet the box by slope (in bins) into `rays`, and fill `bins`;
+    returns their number.
 
     Within a bin the order is that of the pixels; rays that miss the box are left out.
 
@@ -281,8 +283,8 @@ def sort_by_slope(grid, fan, collected, rays, bins, n):
     reach1 = fan.j1 - grid.st
     # A counting sort: count the rays of each bin, turn counts into first places, deal out.
     bins[:] = 0
-    scale = BINS / fan.width if fan.spread else 0.0
-    top = BINS - 1.0
+    scale = SLOPE_BINS / fan.width if fan.spread else 0.0
+    top = SLOPE_BINS - 1.0
     for q in range(n):
         z0 = grid.sz + rise[q] * reach0
         z1 = grid.sz + rise[q] * reach1
@@ -293,7 +295,7 @@ def sort_by_slope(grid, fan, collected, rays, bins, n):
     for q in range(n):
         if part[q] >= 0.0:
             bins[np.uint64(part[q]) + np.uint64(1)] += 1
-    for b in range(BINS):
+    for b in range(SLOPE_BINS):
         bins[b + 1] += bins[b]
     to_slope = rays.slope
     to_rise = rays.rise
@@ -307,10 +309,10 @@ def sort_by_slope(grid, fan, collected, rays, bins, n):
             to_rise[at] = rise[q]
             to_slot[at] = slot[q]
     # Dealing out has moved each bin's first place to the next bin's: shift them back.
-    for b in range(BINS, 0, -1):
+    for b in range(SLOPE_BINS, 0, -1):
         bins[b] = bins[b - 1]
     bins[0] = 0
-    return bins[BINS]
+    return bins[SLOPE_BINS]
 
 
 @kernel
@@ -426,7 +428,7 @@ def make_work(slabs, levels):
     f32 = np.float32
     return Work(
         head=np.empty(slabs + 2, np.uint32),
-        bins=np.empty(BINS + 1, np.int64),
+        bins=np.empty(SLOPE_BINS + 1, np.int64),
         total=np.zeros(levels + 2, f32),
         moment=np.zeros(levels + 2, f32),
         jump=np.zeros(levels + 2, f32),

@@ -30,11 +30,11 @@ NONE = np.uint32(0xFFFFFFFF)
 """End of a list of rays."""
 ONE = np.uint32(1)
 ZERO = np.float32(0)
-AHEAD = 3
+PREFETCH_SLABS = 3
 """Slabs between prefetching a voxel column and using it."""
-SETTLED = 64
+SETTLE_SLABS = 64
 """Slabs after which each ray takes over its level's integral; see `settle`."""
-BINS = 64
+SLOPE_BINS = 64
 """Rays of a fan are sorted by slope into this many bins."""
 
 
@@ -166,13 +166,13 @@ def difference(flat, grid, j, i, a, b):
 
 @inline
 def cross_levels(flat, grid, fan, rays, work, j, r0, r1, share):
-    """Process all z crossings in slab j from the list head[j]: add their integrals to the rays,
-    and list each ray's next crossing.
+    """Process all z crossings in slab j from the list head[j]: add their integrals to the
+    rays, and list each ray's next crossing.
 
-    The integral inside the slab is counted from the reference line's column r0 to the ray's
-    own. Rays that share the line change columns where it does: (x - r1) / m would be the same,
-    but rays within a voxel plane have slopes of rounding errors, by which nothing can be
-    divided.
+    The integral inside the slab is counted from the reference line's column r0 to the
+    ray's own. Rays that share the line change columns where it does: (x - r1) / m would
+    be the same, but rays within a voxel plane have slopes of rounding errors, by which
+    nothing can be divided.
 
     Args:
         flat: voxels.
@@ -399,11 +399,11 @@ def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
         # Only bins of slope that can hold a ray beyond the vertex; `correct` clamps d at 0 for
         # the rays of the outermost bin that are not.
         if side == 0:
-            part = (gap / reach - fan.low) / fan.width * BINS
-            first, last = bins[min(max(math.floor(part), 0), BINS)], n
+            part = (gap / reach - fan.low) / fan.width * SLOPE_BINS
+            first, last = bins[min(max(math.floor(part), 0), SLOPE_BINS)], n
         else:
-            part = (-gap / reach - fan.low) / fan.width * BINS
-            first, last = 0, bins[min(max(math.floor(part) + 1, 0), BINS)]
+            part = (-gap / reach - fan.low) / fan.width * SLOPE_BINS
+            first, last = 0, bins[min(max(math.floor(part) + 1, 0), SLOPE_BINS)]
         if last <= first:
             continue
         # Levels at which any of the four columns holds something: elsewhere the jump is zero.
@@ -453,7 +453,8 @@ def pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed):
 
 @inline
 def pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed):
-    """Add slab j along the reference line to S and Q (or, transposed, from them to the slab).
+    """Add slab j along the reference line to S and Q (or, transposed, from them to the
+    slab).
 
     The line is in column r0 for `share` of the slab, for the rest in r1. Q takes the jump
     between them at its distance from the source (arm).
@@ -560,8 +561,8 @@ def open_slab(flat, marks, grid, j, i0, i1):
 def settle(rays, work, n):
     """Add the integral of its level to each ray, and start all levels again from zero.
 
-    Integrals of levels grow along the whole line, a ray takes a difference of two: without
-    this, a ray with a short path through a long volume would lose digits.
+    Integrals of levels grow along the whole line, a ray takes a difference of two:
+    without this, a ray with a short path through a long volume would lose digits.
     """
     acc = rays.acc
     ratio = rays.ratio
@@ -597,7 +598,7 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
     """Carry a sorted fan of n rays through its slabs: fill the rays' sums, or
     (transposed) add them to the voxels.
 
-    Every `SETTLED` slabs the sums of levels are settled and begin again.
+    Every `SETTLE_SLABS` slabs the sums of levels are settled and begin again.
 
     Args:
         flat: voxels; transposed, changed in place.
@@ -621,7 +622,7 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
             open_slab(flat, spans, grid, fan.j0 - 1, r0 - 1, r0 + 1)
     # One slab more than there are: its vertices are on the far side of the last slab.
     for j in range(fan.j0, fan.j1 + 1):
-        if (j - fan.j0) % SETTLED == SETTLED - 1:
+        if (j - fan.j0) % SETTLE_SLABS == SETTLE_SLABS - 1:
             if transposed:
                 share_out(rays, work, n)
             else:
@@ -635,8 +636,8 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
             pass_vertices(flat, spans, grid, fan, rays, work, n, j, x, transposed)
         if j == fan.j1:
             break
-        if j + AHEAD < fan.j1:
-            prefetch_slab(flat, spans, grid, fan, j + AHEAD, transposed)
+        if j + PREFETCH_SLABS < fan.j1:
+            prefetch_slab(flat, spans, grid, fan, j + PREFETCH_SLABS, transposed)
         # Within one slab the line, of slope 0 <= m0 <= 1, is in column r0 and then perhaps in
         # r1.
         share = min(max((r1 - x) / fan.m0, 0.0), 1.0) if r1 > r0 else 1.0

@@ -51,27 +51,27 @@ config.CUDA_LOW_OCCUPANCY_WARNINGS = (
 
 BLOCK = (32, 4)
 """Threads a block: detector rows (one warp), and columns."""
-UNROLLED = 4
+UNROLLED_SLABS = 4
 """Slabs at a time in the middle loop."""
-ANCHORED = 32
+ANCHOR_SLABS = 32
 """Slabs between two positions from fixed point; a power of 2."""
-BITS = 44
+FIXED_BITS = 44
 """Bits of a position behind the point."""
-FIXED = float(2**BITS)
-HALF_FIXED = 2 ** (BITS - 1)
+FIXED = float(2**FIXED_BITS)
+HALF_FIXED = 2 ** (FIXED_BITS - 1)
 UNIT = np.float32(1.0 / FIXED)
-REACH = float(2**18)
+MAX_POSITION_VOXELS = float(2**18)
 """Limit of positions; larger ones are clipped to it, outside of every box."""
 MAGIC = np.float32(1.5 * 2**23)
 MAGIC_BITS = 0x4B400000
-MARGIN = np.float32(0.01)
+MARGIN_SLABS = np.float32(0.01)
 """Slabs this near to where a ray enters or leaves the box are checked; single precision places
 these points within 4e-3 slabs in boxes of up to 2^14: 3 roundings, each of 2^-24."""
-STEEP = np.float32(1e30)
+STEEP_INVERSE = np.float32(1e30)
 """Value used for one over a slope of zero."""
 ZERO, ONE = np.float32(0), np.float32(1)
 NEVER = 1 << 30
-RISE = 0.25
+MAX_RISE_VOXELS = 0.25
 """Largest rise along z of a ray of `project_columns` in a slab [voxels]."""
 LANES = 0xFFFFFFFF
 
@@ -134,7 +134,9 @@ else:
 
     @cuda.jit(device=True, inline=True)
     def meet_lanes():
-        """Wait for the lanes of the warp; what they wrote into shared memory is seen by all."""
+        """Wait for the lanes of the warp; what they wrote into shared memory is seen by
+        all.
+        """
         cuda.syncwarp(LANES)
 
     @cuda.jit(device=True, inline=True)
@@ -175,20 +177,27 @@ def direction(views, view, r, c, axis):
 
 @cuda.jit(device=True, inline=True)
 def fixed_line(start, slope, n):
-    """Compute a line over the slabs, start + k slope, in fixed point of `BITS` bits;
-    start is cut to `REACH`.
+    """Compute a line over the slabs, start + k slope, in fixed point of `FIXED_BITS`
+    bits; start is cut to `MAX_POSITION_VOXELS`.
 
     Returns:
         position and slope in fixed point, slope and its inverse in single precision, and
         the places, in slabs, between which the line is within [0, n). A line without
-        slope is inside everywhere or from `STEEP` on, nowhere.
+        slope is inside everywhere or from `STEEP_INVERSE` on, nowhere.
     """
-    start = min(max(start, -REACH), REACH)
+    start = min(max(start, -MAX_POSITION_VOXELS), MAX_POSITION_VOXELS)
     position = np.int64(math.floor(start * FIXED))
     rate = np.int64(math.floor(slope * FIXED + 0.5))
     if rate == 0:
-        inside = 0 <= (position >> BITS) < n
-        return position, rate, ZERO, STEEP, ZERO if inside else STEEP, STEEP
+        inside = 0 <= (position >> FIXED_BITS) < n
+        return (
+            position,
+            rate,
+            ZERO,
+            STEEP_INVERSE,
+            ZERO if inside else STEEP_INVERSE,
+            STEEP_INVERSE,
+        )
     steps = np.float32(1.0 / slope)
     enter, leave = np.float32(-start) * steps, np.float32(n - start) * steps
     return position, rate, np.float32(slope), steps, enter, leave
@@ -198,8 +207,8 @@ def fixed_line(start, slope, n):
 def anchor(position, rate, k):
     """Find the nearest plane at slab k, less the bits of MAGIC, and its signed distance."""
     at = position + k * rate
-    plane = (at + HALF_FIXED) >> BITS
-    return narrow(plane - MAGIC_BITS), np.float32(at - (plane << BITS)) * UNIT
+    plane = (at + HALF_FIXED) >> FIXED_BITS
+    return narrow(plane - MAGIC_BITS), np.float32(at - (plane << FIXED_BITS)) * UNIT
 
 
 @cuda.jit(device=True, inline=True)
@@ -257,10 +266,11 @@ def slab_kernel(transposed):
         """Walk the ray to a thread's pixel slab by slab: write its line integral, or
         (transposed) add the pixel's value to the voxels.
 
-        Voxel (x, y, z) is flat[base + x hop_x + y hop_y + z] for nx, ny, nz voxels of size_x,
-        size_y, size_z [mm]. Rows start to start + n - 1 of `views` are walked: a ray each in
-        voxels, and the number of its image. Pixel (r, c) of image k is images[k rows cols + r
-        step_r + c step_c]; written values are multiplied by factor.
+        Voxel (x, y, z) is flat[base + x hop_x + y hop_y + z] for nx, ny, nz voxels of
+        size_x, size_y, size_z [mm]. Rows start to start + n - 1 of `views` are walked: a
+        ray each in voxels, and the number of its image. Pixel (r, c) of image k is
+        images[k rows cols + r step_r + c step_c]; written values are multiplied by
+        factor.
         """
         # Views are fastest in the grid: blocks at work together read the same part of the
         # volume.
@@ -303,18 +313,18 @@ def slab_kernel(transposed):
         # Slabs [first, last) that some lane crosses, and [quick, slow) that all cross well
         # inside.
         first, last, quick, slow = NEVER, 0, 0, 0
-        if leave + MARGIN >= enter:
-            first = max(int(math.floor(enter - MARGIN)), 0)  # noqa: RUF046
-            last = min(int(math.floor(leave + MARGIN)) + 1, na)  # noqa: RUF046
-            quick = int(math.ceil(enter + MARGIN))  # noqa: RUF046
-            slow = int(math.floor(leave - MARGIN))  # noqa: RUF046
+        if leave + MARGIN_SLABS >= enter:
+            first = max(int(math.floor(enter - MARGIN_SLABS)), 0)  # noqa: RUF046
+            last = min(int(math.floor(leave + MARGIN_SLABS)) + 1, na)  # noqa: RUF046
+            quick = int(math.ceil(enter + MARGIN_SLABS))  # noqa: RUF046
+            slow = int(math.floor(leave - MARGIN_SLABS))  # noqa: RUF046
         # Lanes with different axes a have different numbers of slabs, and each keeps to its
         # own.
         first, last = least(narrow(first)), min(most(narrow(last)), narrow(na))
         quick, slow = most(narrow(quick)), least(narrow(slow))
         hop_a, hop_b, hop_z = narrow(hop_a), narrow(hop_b), narrow(hop_z)
         total = ZERO
-        begin = narrow(first & -ANCHORED)
+        begin = narrow(first & -ANCHOR_SLABS)
         while begin < last:
             # In integers of 32 bits that wrap around: only sums that are places have a meaning.
             plane_b, distance_b = anchor(at_b, rate_b, begin)
@@ -322,11 +332,11 @@ def slab_kernel(transposed):
             origin = narrow(base + begin * hop_a + plane_b * hop_b + plane_z * hop_z)
             k, end = (
                 narrow(max(begin, first) - begin),
-                narrow(min(ANCHORED, last - begin)),
+                narrow(min(ANCHOR_SLABS, last - begin)),
             )
             inner = narrow(min(max(quick - begin, k), end))
             outer = narrow(min(max(slow - begin, inner), end))
-            outer = narrow(inner + ((outer - inner) & -UNROLLED))
+            outer = narrow(inner + ((outer - inner) & -UNROLLED_SLABS))
             b, _ = crossing(np.float32(k), slope_b, distance_b, steps_b)
             z, _ = crossing(np.float32(k), slope_z, distance_z, steps_z)
             part = ZERO
@@ -359,7 +369,7 @@ def slab_kernel(transposed):
                     p = narrow(level + b * hop_b)
                     t = np.float32(k)
                     while k < outer:
-                        for _ in range(UNROLLED):
+                        for _ in range(UNROLLED_SLABS):
                             t += ONE
                             next_b, h = crossing(t, slope_b, distance_b, steps_b)
                             next_z, l = crossing(t, slope_z, distance_z, steps_z)  # noqa: E741
@@ -387,9 +397,9 @@ def slab_kernel(transposed):
                             origin_k = narrow(origin_k + hop_a)
                             level, p = narrow(above + hop_a), narrow(w + hop_a)
                             b, z = next_b, next_z
-                        k = narrow(k + UNROLLED)
+                        k = narrow(k + UNROLLED_SLABS)
             total += part
-            begin = narrow(begin + ANCHORED)
+            begin = narrow(begin + ANCHOR_SLABS)
         if not transposed and written:
             images[pixel] = total * scale
 
@@ -402,9 +412,9 @@ def column_kernel(transposed):
 
     Rays of one column have their line in x and y in common, and a warp has rays of one
     column: each lane finds the crossing of one of the next 32 slabs with the planes of b,
-    for all lanes. Rays rise by at most `RISE` voxels a slab, so that a lane knows the
-    slab of its next crossing with a plane of z, and adds up to 8 times from one position
-    of fixed point to the next.
+    for all lanes. Rays rise by at most `MAX_RISE_VOXELS` a slab, so that a lane
+    knows the slab of its next crossing with a plane of z, and adds up to 8 times from one
+    position of fixed point to the next.
     """
 
     @cuda.jit(device=True, inline=True)
@@ -441,8 +451,8 @@ def column_kernel(transposed):
         step_c,
         factor,
     ):
-        """Walk the rays of a warp together where they share voxel columns; arguments as those
-        of `slab_kernel`'s walk.
+        """Walk the rays of a warp together where they share voxel columns; arguments as
+        those of `slab_kernel`'s walk.
         """
         view = start + cuda.blockIdx.x % n
         lane, warp = cuda.threadIdx.x, cuda.threadIdx.y
@@ -481,11 +491,11 @@ def column_kernel(transposed):
         if transposed and written:
             value = np.float32(images[pixel] * scale * factor)
         first, last, quick, slow = NEVER, 0, 0, 0
-        if leave + MARGIN >= enter:
-            first = max(int(math.floor(enter - MARGIN)), 0)  # noqa: RUF046
-            last = min(int(math.floor(leave + MARGIN)) + 1, na)  # noqa: RUF046
-            quick = int(math.ceil(enter + MARGIN))  # noqa: RUF046
-            slow = int(math.floor(leave - MARGIN))  # noqa: RUF046
+        if leave + MARGIN_SLABS >= enter:
+            first = max(int(math.floor(enter - MARGIN_SLABS)), 0)  # noqa: RUF046
+            last = min(int(math.floor(leave + MARGIN_SLABS)) + 1, na)  # noqa: RUF046
+            quick = int(math.ceil(enter + MARGIN_SLABS))  # noqa: RUF046
+            slow = int(math.floor(leave - MARGIN_SLABS))  # noqa: RUF046
         first, last = least(narrow(first)), most(narrow(last))
         quick, slow = most(narrow(quick)), least(narrow(slow))
         hop_a, hop_b, hop_z = narrow(hop_a), narrow(hop_b), narrow(hop_z)
@@ -493,10 +503,10 @@ def column_kernel(transposed):
         pairs = cuda.shared.array(128, np.int64)
         places = cuda.shared.array(128, np.int32)
         inside = cuda.shared.array(128, np.int32)
-        own = narrow(warp * ANCHORED)
+        own = narrow(warp * ANCHOR_SLABS)
         mine = place(own + lane)
         total = ZERO
-        begin = narrow(first & -ANCHORED)
+        begin = narrow(first & -ANCHOR_SLABS)
         while begin < last:
             plane_b, distance_b = anchor(at_b, rate_b, begin)
             plane_z, distance_z = anchor(at_z, rate_z, begin)
@@ -512,11 +522,11 @@ def column_kernel(transposed):
             meet_lanes()
             k, end = (
                 narrow(max(begin, first) - begin),
-                narrow(min(ANCHORED, last - begin)),
+                narrow(min(ANCHOR_SLABS, last - begin)),
             )
             inner = narrow(min(max(quick - begin, k), end))
             outer = narrow(min(max(slow - begin, inner), end))
-            outer = narrow(inner + ((outer - inner) & -UNROLLED))
+            outer = narrow(inner + ((outer - inner) & -UNROLLED_SLABS))
             part = ZERO
             for after in range(2):
                 stop = end if after else inner
@@ -553,7 +563,7 @@ def column_kernel(transposed):
                     p = narrow(places[place(own + k)] + z)
                     at = place(own + k)
                     while k < outer:
-                        for i in range(UNROLLED):
+                        for i in range(UNROLLED_SLABS):
                             jump, h = unpacked(pairs[at + place(i)])
                             t += ONE
                             l = clamped(t - ahead)  # noqa: E741
@@ -578,10 +588,10 @@ def column_kernel(transposed):
                                     l, high - mid, fused(h, mid - low, part + low)
                                 )
                             p = narrow(w + hop_a)
-                        at = place(at + place(UNROLLED))
-                        k = narrow(k + UNROLLED)
+                        at = place(at + place(UNROLLED_SLABS))
+                        k = narrow(k + UNROLLED_SLABS)
             total += part
-            begin = narrow(begin + ANCHORED)
+            begin = narrow(begin + ANCHOR_SLABS)
         if not transposed and written:
             images[pixel] = total * scale
 
@@ -765,7 +775,7 @@ ADD, SUBTRACT, MULTIPLY, MAXIMUM, RATIO = range(5)
 DOT, SUM, LARGEST = range(3)
 FOLDING = (256, 256)
 """Blocks, and threads a block, of `fold`."""
-RUN = 64
+RUN_NUMBERS = 64
 """Numbers added in single precision before they join the sum in double precision, in
 which consumer cards are 64 times slower."""
 
@@ -802,8 +812,8 @@ def combine(kind, a, b, number, alone, out):
 
 @cuda.jit
 def fold(kind, a, b, parts):
-    """Reduce every parts.size-th run of `RUN` numbers into parts[i], one thread each:
-    single precision within a run, double over the runs.
+    """Reduce every parts.size-th run of `RUN_NUMBERS` into parts[i], one thread
+    each: single precision within a run, double over the runs.
 
     The bytes of the result are the same at every call. Kinds: DOT adds a b, SUM adds a,
     LARGEST takes the largest a.
@@ -814,8 +824,8 @@ def fold(kind, a, b, parts):
     # Which numbers a thread adds depends on `parts` alone, and the host adds the parts in
     # order.
     total = -math.inf if kind == LARGEST else 0.0
-    for first in range(i * RUN, a.size, parts.size * RUN):
-        last = min(first + RUN, a.size)
+    for first in range(i * RUN_NUMBERS, a.size, parts.size * RUN_NUMBERS):
+        last = min(first + RUN_NUMBERS, a.size)
         part = a[first]  # single precision within a run
         if kind == DOT:
             part *= b[first]

@@ -10,7 +10,7 @@ from numba import prange
 
 from flexdt.twin.projection.kernels.compiling import parallel
 
-BLOCK = 32
+BLOCK_VOXELS = 32
 """Edge of a block [voxels]: two blocks are 8 kB, a quarter of a usual first cache."""
 
 
@@ -30,10 +30,10 @@ def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
     """
     nz, _, nx = data.shape
     for y in prange(first_y, last_y):
-        for x0 in range(0, nx, BLOCK):
-            x1 = min(nx, x0 + BLOCK)
-            for z0 in range(0, nz, BLOCK):
-                z1 = min(nz, z0 + BLOCK)
+        for x0 in range(0, nx, BLOCK_VOXELS):
+            x1 = min(nx, x0 + BLOCK_VOXELS)
+            for z0 in range(0, nz, BLOCK_VOXELS):
+                z1 = min(nz, z0 + BLOCK_VOXELS)
                 # Reading goes along x and writing along z; a block of both stays in the cache,
                 # so that no line of memory is fetched twice.
                 for x in range(x0, x1):
@@ -45,8 +45,8 @@ def transpose(data, flat, stride_x, stride_y, adding, first_y, last_y):
 
 @parallel
 def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
-    """Fill `first` and `last` for first_y <= y < last_y: the range of z outside which a voxel
-    column is zero.
+    """Fill `first` and `last` for first_y <= y < last_y: the range of z outside which a
+    voxel column is zero.
 
     Args:
         flat: voxels, flat[y * stride_y + x * stride_x + z].
@@ -73,26 +73,26 @@ def occupied(flat, stride_x, stride_y, nz, first, last, first_y, last_y):
             last[y, x] = high
 
 
-CHECKED = 1 << 16
+CHECKED_NUMBERS = 1 << 16
 """Numbers that a thread checks at a time."""
 SIZE_BITS = np.uint32(0x7FFFFFFF)
-INFINITE = np.uint32(0x7F800000)
+INFINITE_BITS = np.uint32(0x7F800000)
 """Bits of a float32 without its sign, and those of infinity; NaN has larger ones."""
 
 
 @parallel
 def unfit_parts(bits):
-    """Count the runs of `CHECKED` float32 numbers, given as uint32 bits, in which any is
-    not finite; 0 if all are finite.
+    """Count the runs of `CHECKED_NUMBERS` float32 numbers, given as uint32 bits, in which
+    any is not finite; 0 if all are finite.
     """
-    runs = (bits.size + CHECKED - 1) // CHECKED
+    runs = (bits.size + CHECKED_NUMBERS - 1) // CHECKED_NUMBERS
     unfit = 0
     for run in prange(runs):
-        some = bits[run * CHECKED : min(bits.size, (run + 1) * CHECKED)]
+        some = bits[run * CHECKED_NUMBERS : min(bits.size, (run + 1) * CHECKED_NUMBERS)]
         most = np.uint32(0)
         for i in range(len(some)):
             most = max(most, np.uint32(some[i] & SIZE_BITS))
-        if most >= INFINITE:
+        if most >= INFINITE_BITS:
             unfit += 1
     return unfit
 

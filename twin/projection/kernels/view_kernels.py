@@ -11,7 +11,7 @@ from numba import prange
 
 from flexdt.twin.projection.kernels.compiling import kernel, parallel, serial
 
-COPIED = 1 << 16
+COPIED_NUMBERS = 1 << 16
 """Numbers that a thread copies at a time."""
 UNFIT = -1
 """Kind of a view that `prepare` does not judge."""
@@ -24,8 +24,10 @@ UPRIGHT = 1
 @parallel
 def copy(source, target):
     """Copy numbers (k,) to others by all cores."""
-    for part in prange((source.size + COPIED - 1) // COPIED):
-        for i in range(part * COPIED, min(source.size, (part + 1) * COPIED)):
+    for part in prange((source.size + COPIED_NUMBERS - 1) // COPIED_NUMBERS):
+        for i in range(
+            part * COPIED_NUMBERS, min(source.size, (part + 1) * COPIED_NUMBERS)
+        ):
             target[i] = source[i]
 
 
@@ -37,20 +39,20 @@ def prepare(row, frame, rows, cols, least_sine, clearance, rise, table):
 
     Args:
         row: (12,) source, detector's centre, u and v [mm].
-        frame: (5, 3) low corner of the occupied box, voxel, centre and half sides of the whole
-            box [mm]; voxels of the occupied box.
+        frame: (5, 3) low corner of the occupied box, voxel, centre and half sides of the
+            whole box [mm]; voxels of the occupied box.
         rows: of the detector.
         cols: of the detector.
         least_sine: smallest sine of u with v, and of a panel with the ray to its centre.
-        clearance: least distance of the box from source and panel over their distance; infinite
-            for a box that the slab walk does not take.
+        clearance: least distance of the box from source and panel over their distance;
+            infinite for a box that the slab walk does not take.
         rise: largest rise of rays in a slab for upright columns [voxels].
-        table: (1, 13) filled: source, first pixel minus source, step from lane to lane, step from
-            row to row [voxels], and 0.
+        table: (1, 13) filled: source, first pixel minus source, step from lane to lane,
+            step from row to row [voxels], and 0.
 
     Returns:
-        The kind: LYING + SLABS + UPRIGHT, each where it holds; UNFIT where pixels have no rays of
-        their own or the panel cuts the whole box.
+        The kind: LYING + SLABS + UPRIGHT, each where it holds; UNFIT where pixels have no
+        rays of their own or the panel cuts the whole box.
     """
     if not _spreads_behind(row, frame, least_sine):
         return UNFIT
@@ -89,8 +91,8 @@ def _length(x, y, z):
 
 @kernel
 def _spreads_behind(row, frame, least_sine):
-    """Return whether each pixel has a ray of its own, and the panel is behind the whole box;
-    arguments as those of `prepare`.
+    """Return whether each pixel has a ray of its own, and the panel is behind the whole
+    box; arguments as those of `prepare`.
     """
     ux, uy, uz, vx, vy, vz = row[6], row[7], row[8], row[9], row[10], row[11]
     bx, by, bz = row[3] - row[0], row[4] - row[1], row[5] - row[2]
