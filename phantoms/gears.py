@@ -19,7 +19,7 @@ from flexdt.phantoms.pieces import Surface, size_about_origin
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Cylinder, Ellipsoid, Scene, Solid
 
-MATERIAL: Final = "abs"
+GEAR_MATERIAL: Final = "abs"
 BORE_RADIUS_MM: Final = 3.0
 """Of the hole along the axis."""
 GEAR_TEETH: Final = 20
@@ -34,9 +34,9 @@ SLANT_DEG: Final = (9.0, 18.0)
 """By which teeth are turned at half their height: of the gear, of the pinion."""
 STEPS_PER_TOOTH: Final = 8
 """Corners of a ring for each of the gear's teeth."""
-LAYERS: Final = 6
+RINGS_A_HALF: Final = 6
 """Rings in each half of a gear's height."""
-WINDOWS: Final = 6
+WINDOW_COUNT: Final = 6
 """Number of holes through the gear."""
 WINDOW_RADIUS_MM: Final = 2.4
 WINDOW_PLACE_MM: Final = 12.6
@@ -62,7 +62,7 @@ def gear_phantom() -> Phantom:
     >>> gear_phantom().size_mm
     (40.0, 40.0, 30.0)
     """
-    plastic = material(MATERIAL)
+    plastic = material(GEAR_MATERIAL)
     rings = [
         *_teeth(GEAR_TEETH, GEAR_RADII_MM, LEVELS_MM[:2], SLANT_DEG[0]),
         *_teeth(PINION_TEETH, PINION_RADII_MM, LEVELS_MM[1:], SLANT_DEG[1]),
@@ -86,15 +86,15 @@ def gear_phantom() -> Phantom:
 
 
 def _holes(plastic: Material) -> list[Solid]:
-    """Make the gear's holes as solids of the plastic's negative attenuation: windows, then
-    pores.
+    """Make the gear's holes as solids of the plastic's negative attenuation: windows,
+    then pores.
 
     Windows are cylinders through the whole height, pores are balls.
     """
     bottom, top, _ = LEVELS_MM
     shapes: list[Cylinder | Ellipsoid] = []
-    for k in range(WINDOWS):
-        x, y = _polar(WINDOW_PLACE_MM, 360.0 * k / WINDOWS)
+    for k in range(WINDOW_COUNT):
+        x, y = _polar(WINDOW_PLACE_MM, 360.0 * k / WINDOW_COUNT)
         middle = (x, y, 0.5 * (bottom + top))
         shapes.append(Cylinder(middle, WINDOW_RADIUS_MM, top - bottom))
     for away, angle, height, radius in PORES_MM:
@@ -133,7 +133,7 @@ def _teeth(
     """Compute the rings of a gear's outer surface from its bottom to its top, turned by
     the slant towards the middle.
 
-    The first and last ring are not turned; 2 `LAYERS` + 1 rings.
+    The first and last ring are not turned; 2 `RINGS_A_HALF` + 1 rings.
 
     Args:
         teeth: number of teeth.
@@ -149,7 +149,7 @@ def _teeth(
     wave = np.clip(1.6 * np.cos(teeth * angle), -1.0, 1.0)
     radius = 0.5 * (foot + tip) + 0.5 * (tip - foot) * wave
     made = []
-    for share in np.linspace(0.0, 1.0, 2 * LAYERS + 1):
+    for share in np.linspace(0.0, 1.0, 2 * RINGS_A_HALF + 1):
         turn = math.radians(slant_deg) * (1.0 - abs(2.0 * share - 1.0))
         level = levels_mm[0] + share * (levels_mm[1] - levels_mm[0])
         x, y = radius * np.cos(angle + turn), radius * np.sin(angle + turn)
@@ -158,7 +158,8 @@ def _teeth(
 
 
 def _closed(rings: Sequence[Ring]) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Build a closed surface through rings, each joined to the next and the last to the first.
+    """Build a closed surface through rings, each joined to the next and the last to the
+    first.
 
     All rings have as many points.
 

@@ -38,7 +38,7 @@ COLOURS = (
     "#9b2226",
     "#5f6c7b",
 )
-MARK = "#c62828"
+MARK_COLOUR = "#c62828"
 Floats = npt.NDArray[np.float64]
 DPI = 72.0
 """Resolution at which pixels, the unit of the sizes below, are matplotlib's points."""
@@ -131,7 +131,7 @@ def plot(
         y = np.asarray(s.y, dtype=np.float64)
         axes.plot(x, y, color=colour, label=s.name, gid=_id(title, s.name), **style)
     for k, (at, _) in enumerate(marked):
-        axes.axvline(at, color=MARK, lw=1.2, gid=_id(title, "mark", k))
+        axes.axvline(at, color=MARK_COLOUR, lw=1.2, gid=_id(title, "mark", k))
     if flip_y:
         axes.invert_yaxis()
     if equal:

@@ -18,24 +18,25 @@ from flexdt.twin.geometry.panel_corners import panel_corners
 from flexdt.twin.projection.volume import Volume
 from flexdt.twin.script import CheckReport, ScanPlan
 
-SAMPLES = 2000
+PATH_SAMPLES = 2000
 """Number of moments at which motors are drawn."""
-KINDS = {"dark": "k", "flat": "C1", "projection": "C0", "preview": "C7"}
-LAYERS = {
+KIND_COLOURS = {"dark": "k", "flat": "C1", "projection": "C0", "preview": "C7"}
+LAYER_LABELS = {
     "data": "attenuation",
     "sigma": "noise of attenuation",
     "bias_bound": "bound of its bias",
 }
 DOT_PT = 6.0
 """Size of the dots of sources and panels."""
-PANELS = 12
+MAX_PANELS = 12
 """Largest number of panels drawn, evenly chosen."""
 
 
 def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
-    """Plot sources, panels and central rays in the object's frame [mm], in three dimensions.
+    """Plot sources, panels and central rays in the object's frame [mm], in three
+    dimensions.
 
-    At most `PANELS` panels and rays are drawn; a panel only if its shape is known.
+    At most `MAX_PANELS` panels and rays are drawn; a panel only if its shape is known.
 
     Args:
         cone_vec: the geometry.
@@ -48,7 +49,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
         axes = _pyplot().figure().add_subplot(projection="3d")
     axes.plot(*cone_vec.source.T, "C0.", markersize=DOT_PT, label="source")
     shown = np.unique(
-        np.linspace(0, len(cone_vec) - 1, min(len(cone_vec), PANELS)).astype(int)
+        np.linspace(0, len(cone_vec) - 1, min(len(cone_vec), MAX_PANELS)).astype(int)
     )
     for view in cone_vec[shown]:
         centre = view.detector[0]
@@ -106,12 +107,12 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
     Raises:
         TwinError: the volume has no such values.
     """
-    if what in LAYERS:
+    if what in LAYER_LABELS:
         values = getattr(volume, what, None)
     else:
         values = None
     if values is None:
-        allowed = [name for name in LAYERS if getattr(volume, name) is not None]
+        allowed = [name for name in LAYER_LABELS if getattr(volume, name) is not None]
         raise TwinError(f"what: {what!r} is not there; there is {', '.join(allowed)}")
     if axes is None:
         axes = _pyplot().figure().add_subplot()
@@ -120,7 +121,7 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
     half = volume.voxel_xyz[0] / 2
     ends = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
     shown = axes.imshow(values[middle], cmap="gray", origin="lower", extent=ends)
-    axes.figure.colorbar(shown, ax=axes, label=f"{LAYERS[what]} [1/mm]")
+    axes.figure.colorbar(shown, ax=axes, label=f"{LAYER_LABELS[what]} [1/mm]")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"z = {z[middle]:g} mm")
     return axes
 
@@ -141,7 +142,7 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
     figure, (motors, beam, space) = _pyplot().subplots(
         3, 1, sharex=True, figsize=(9, 7), height_ratios=(5, 1, 2), layout="constrained"
     )
-    times = np.linspace(0.0, plan.duration_s, SAMPLES)
+    times = np.linspace(0.0, plan.duration_s, PATH_SAMPLES)
     turning = motors.twinx()
     places = plan.positions(times)
     for i, (name, path) in enumerate(plan.paths.items()):
@@ -161,7 +162,7 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
         motors.legend(handles=handles, fontsize="small")
     for on in plan.beam:
         beam.axvspan(on.start_s, on.end_s, color="gold", alpha=0.5)
-    for kind, colour in KINDS.items():
+    for kind, colour in KIND_COLOURS.items():
         starts = [g.starts for g in plan.groups if g.kind == kind]
         beam.eventplot(
             np.concatenate(starts or [np.empty(0)]), colors=colour, linewidths=0.8

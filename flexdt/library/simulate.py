@@ -65,12 +65,12 @@ from flexdt.twin.signatures import public
 
 BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
-MOST_POINTS: Final = 1024
+MAX_SPOT_POINTS: Final = 1024
 FILLED_SHARE: Final = 0.8
 """Part of the panel's range that the open beam fills with the default exposure."""
-DOUBTED_PX: Final = 0.25
+MIN_DOUBTED_PX: Final = 0.25
 """Difference of the spot's blur over a sample from which it is worth a warning [pixels]."""
-SAME_PITCH: Final = 1e-6
+PITCH_TOLERANCE: Final = 1e-6
 """Relative difference of pitches that count as equal."""
 
 
@@ -195,13 +195,13 @@ def project(
     """Project line integrals of attenuation, without tube, noise and detector; see
     `flexdt.simulate`.
 
-    Solids and meshes are exact path lengths times their attenuation at its effective energy,
-    voxels exact lengths through each voxel (Siddon). Bodies of one mesh that overlap count
-    once.
+    Solids and meshes are exact path lengths times their attenuation at its effective
+    energy, voxels exact lengths through each voxel (Siddon). Bodies of one mesh that
+    overlap count once.
 
     Args:
-        sample: a Volume, a phantom or its name, a file, a mesh, an array with `voxel_mm`, or a
-            list of them, which add up.
+        sample: a Volume, a phantom or its name, a file, a mesh, an array with `voxel_mm`,
+            or a list of them, which add up.
         geometry: of the views, in the sample's frame.
         shape: detector (rows, cols), where the geometry has none.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
@@ -262,34 +262,37 @@ def simulate(
     """Simulate a scan: counts, dark and flat images of a sample.
 
     Args:
-        sample: a phantom or its name, a file (phantom, scene, mesh), a Volume, an array with
-            `voxel_mm`, a mesh, or a list of them; see `flexdt.phantoms.samples.as_phantom`.
+        sample: a phantom or its name, a file (phantom, scene, mesh), a Volume, an array
+            with `voxel_mm`, a mesh, or a list of them; see
+            `flexdt.phantoms.samples.as_phantom`.
         geometry: of the views, in the sample's frame; it gives the pixels' pitch. Without
             one the sample is the path of a CTSimU scenario, which states everything but
             `noise`; `flexdt-extensions` does it.
         tube: default: 90 kV, 50 W; filters and focal spot that it leaves open are the
             machine's.
-        detector: default: the machine's, else the twin's panel with the geometry's pixels.
-        noise: seed, >= 0; None for the expectation. Image i has a random generator of its own,
-            counting the dark image (0), the flat image (1) and the projections.
+        detector: default: the machine's, else the twin's panel with the geometry's
+            pixels.
+        noise: seed, >= 0; None for the expectation. Image i has a random generator of its
+            own, counting the dark image (0), the flat image (1) and the projections.
         exposure_ms: of one read-out; None: the detector's or the machine's, or, where
             neither states one, so long that the brightest pixel of the open beam reaches
             80 % of the largest count. `truth` holds it.
-        scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the seed
-            of `noise`; 'first' has been removed, use 'mc'. `ScatterSettings` state more. It is
-            in the data set's `truth.scatter`.
-        machine: a machine, its name or file, whose tube and detector are taken where `tube` and
-            `detector` leave them open.
+        scatter: "mc" adds the radiation that the sample scatters, by Monte Carlo with the
+            seed of `noise`; 'first' has been removed, use 'mc'. `ScatterSettings` state
+            more. It is in the data set's `truth.scatter`.
+        machine: a machine, its name or file, whose tube and detector are taken where
+            `tube` and `detector` leave them open.
         shape: detector (rows, cols), where the geometry has none.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
-        rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel does.
-            With one, the default but for scenarios (3), edges along rows or columns come out in
-            steps, of which `align` has wider sigmas.
+        rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel
+            does. With one, the default but for scenarios (3), edges along rows or columns
+            come out in steps, of which `align` has wider sigmas.
         spot_points: of the focal spot from which rays start, 3 to 1024; their signals are
-            averaged, and each depth of the sample is blurred as it is. With 1 all are blurred
-            as the rotation axis is, and the data set warns where that matters. Ghosts of edges
-            stay where the blur [pixels] is more than about a quarter of the points.
+            averaged, and each depth of the sample is blurred as it is. With 1 all are
+            blurred as the rotation axis is, and the data set warns where that matters.
+            Ghosts of edges stay where the blur [pixels] is more than about a quarter of
+            the points.
         progress: a bar after two seconds; False for no bar, or a function of the fraction
             done.
 
@@ -416,16 +419,16 @@ def _check_sampling(noise: int | None, rays: int, spot_points: int) -> None:
 
     Raises:
         LimitError: a seed below 0, rays other than 1 to `MAX_RAYS`, or points other than
-            1 or 3 to `MOST_POINTS`.
+            1 or 3 to `MAX_SPOT_POINTS`.
     """
     if noise is not None and noise < 0:
         raise LimitError.instead(f"noise is {noise}", noise, "a seed >= 0, or None")
     check_rays(rays)
-    allowed = (1, *range(3, MOST_POINTS + 1))
+    allowed = (1, *range(3, MAX_SPOT_POINTS + 1))
     if spot_points not in allowed:
         raise LimitError(
-            f"spot_points is {spot_points}; allowed: 1, or 3 to {MOST_POINTS}",
-            {"asked": spot_points, "allowed": [1, 3, MOST_POINTS]},
+            f"spot_points is {spot_points}; allowed: 1, or 3 to {MAX_SPOT_POINTS}",
+            {"asked": spot_points, "allowed": [1, 3, MAX_SPOT_POINTS]},
         )
 
 
@@ -460,23 +463,23 @@ def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) ->
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:
     """Return the pixels' edges along u and v [mm]; those of the first view, and equal
-    numbers where they differ by less than `SAME_PITCH`.
+    numbers where they differ by less than `PITCH_TOLERANCE`.
 
     Raises:
         GeometryError: no views, or edges that differ between views by more than
-            `SAME_PITCH` of themselves.
+            `PITCH_TOLERANCE` of themselves.
     """
     lengths = np.linalg.norm([cone.u, cone.v], axis=2)
     if not lengths.size:
         raise GeometryError("a geometry without views cannot be simulated", {"asked": 0})
     u, v = lengths[:, 0].tolist()
     for name, values, first in zip("uv", lengths, (u, v), strict=True):
-        if np.abs(values - first).max() > SAME_PITCH * first:
+        if np.abs(values - first).max() > PITCH_TOLERANCE * first:
             least = float(values.min())
             most = float(values.max())
             message = f"pixels measure {least:.6g} to {most:.6g} mm along {name}"
             raise GeometryError.instead(message, [least, most], "alike in all views")
-    return u, u if abs(v - u) <= SAME_PITCH * u else v
+    return u, u if abs(v - u) <= PITCH_TOLERANCE * u else v
 
 
 def _panel(
@@ -510,7 +513,10 @@ def _panel(
     spec = machine.detector
     binning = max(1, round(pitch / spec.pitch_mm))
     edges = spec.pixels.edges_mm
-    if np.abs(binning * np.array(edges) / (pitch, row_pitch) - 1.0).max() > SAME_PITCH:
+    if (
+        np.abs(binning * np.array(edges) / (pitch, row_pitch) - 1.0).max()
+        > PITCH_TOLERANCE
+    ):
         raise LimitError(
             f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; allowed with "
             f"{spec.model}: "
@@ -571,7 +577,7 @@ def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
 
 def _spot_doubt(truth: Truth) -> Iterator[str]:
     """Warn if one blur does not hold for the sample's depth: with one spot point, when
-    the blur of its near and far side differ by more than `DOUBTED_PX`.
+    the blur of its near and far side differ by more than `MIN_DOUBTED_PX`.
 
     Yields at most one text, which proposes a number of spot points; nothing with several
     points. The first view is examined.
@@ -580,7 +586,7 @@ def _spot_doubt(truth: Truth) -> Iterator[str]:
     half = 0.5 * float(np.hypot(*truth.sample.size_mm[:2]))
     view = truth.geometry.rows[0]
     far, axis, near = (spot_blur_px(view, spot_mm, at) for at in (-half, 0.0, half))
-    if truth.spot_points == 1 and near - far > DOUBTED_PX:
+    if truth.spot_points == 1 and near - far > MIN_DOUBTED_PX:
         yield (
             f"the focal spot blurs the whole sample by {axis:.2g} pixels (standard deviation), "
             f"really by {far:.2g} to {near:.2g}, from its far side to its near one: "

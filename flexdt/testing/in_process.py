@@ -42,7 +42,7 @@ from flexdt.twin.machine.description import Machine
 from flexdt.twin.projection import Body, project_body
 from flexdt.twin.scanner.state import Sample
 
-LATER_S = (0.0, 0.0, 0.0004, 0.002, 0.03)
+THREAD_DELAYS_S = (0.0, 0.0, 0.0004, 0.002, 0.03)
 """How long a thread takes to begin, one of these [virtual s]."""
 
 
@@ -61,7 +61,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def __init__(self, rng: random.Random | None = None, start: float = 0.0) -> None:
         """Make a loop whose clock starts at `start` [s] and jumps.
 
-        `rng` draws delays of thread work from `LATER_S`; None: no delay.
+        `rng` draws delays of thread work from `THREAD_DELAYS_S`; None: no delay.
         """
         self._now = start
         self._rng = rng
@@ -107,11 +107,11 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     ) -> asyncio.Future[Any]:
         """Run `func` in the loop's thread, soon; `executor` is ignored.
 
-        With a random generator after a delay drawn from `LATER_S` [virtual s], else in the
-        next turn. The future gets the result or the error.
+        With a random generator after a delay drawn from `THREAD_DELAYS_S` [virtual s],
+        else in the next turn. The future gets the result or the error.
         """
         done: asyncio.Future[Any] = self.create_future()
-        later = 0.0 if self._rng is None else self._rng.choice(LATER_S)
+        later = 0.0 if self._rng is None else self._rng.choice(THREAD_DELAYS_S)
         self.call_later(later, _work, done, func, args)
         return done
 
@@ -216,7 +216,9 @@ class InProcessTransport(asyncio.Transport):
     def __init__(
         self, loop: asyncio.AbstractEventLoop, serve: Callable[[], _Receiver]
     ) -> None:
-        """Make an unconnected transport; `serve` makes the server's side of each connection."""
+        """Make an unconnected transport; `serve` makes the server's side of each
+        connection.
+        """
         super().__init__({"peername": ("in-process", 0)})
         self._loop = loop
         self._serve = serve
@@ -242,7 +244,9 @@ class InProcessTransport(asyncio.Transport):
         self._server.connection_made(self)
 
     async def send(self, message: Message) -> None:
-        """Hand one message to the server; raise ConnectionLost after the connection's end."""
+        """Hand one message to the server; raise ConnectionLost after the connection's
+        end.
+        """
         if self._server is None:
             raise ConnectionLost("the twin has ended the connection")
         self._server.data_received(self._wire.send(message))
@@ -266,7 +270,8 @@ class InProcessTransport(asyncio.Transport):
     def close(self) -> None:
         """End the connection, from either side; a second call does nothing.
 
-        A waiting `receive` returns []; the server learns of the end in the loop's next turn.
+        A waiting `receive` returns []; the server learns of the end in the loop's next
+        turn.
         """
         server, self._server = self._server, None
         if server is not None:
@@ -311,7 +316,8 @@ class InProcessTwin:
     client: TwinClient
 
     def __init__(self, loop: SimulatedLoop, server: TwinServer) -> None:
-        """Take a loop and a server; connections use the server's own shell, without sockets.
+        """Take a loop and a server; connections use the server's own shell, without
+        sockets.
 
         Starts neither of them and connects nothing; `client` is set by `twin`.
         """
@@ -323,7 +329,9 @@ class InProcessTwin:
         )
 
     def advance(self, seconds: float) -> None:
-        """Let virtual seconds of the laboratory pass, and whatever happens in them happen."""
+        """Let virtual seconds of the laboratory pass, and whatever happens in them
+        happen.
+        """
         self.run(asyncio.sleep(seconds))
 
     def connect(self, name: str = "flexdt.testing") -> TwinClient:
@@ -331,7 +339,9 @@ class InProcessTwin:
         return _Client(self, name)
 
     def transport(self) -> Transport:
-        """Make a connection of its own, for `AsyncTwinClient` and for Bluesky's `TwinLab`."""
+        """Make a connection of its own, for `AsyncTwinClient` and for Bluesky's
+        `TwinLab`.
+        """
         return InProcessTransport(self.loop, self._shell.connection)
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import flexdt as fx
-from flexdt.library.notebook.notebook_pages import MOST_PICTURES, NotebookPage
+from flexdt.library.notebook.notebook_pages import MAX_PICTURES, NotebookPage
 
 PICTURE = re.compile(
     r'<img data-of="(.*?)" .*?width="(\d+)" height="(\d+)" src="data:.*?,(.*?)"(.*?)>'
@@ -69,7 +69,7 @@ def test_a_window_that_is_none_is_refused(window: tuple[float, ...]) -> None:
 def test_a_large_volume_shows_some_layers() -> None:
     volume = fx.Volume(np.broadcast_to(np.float32(1.0), (300, 400, 500)), 0.1)
     page = volume.show()
-    assert len(pictures(page)) == 3 * MOST_PICTURES
+    assert len(pictures(page)) == 3 * MAX_PICTURES
     assert len(page.html) < 500_000
 
 

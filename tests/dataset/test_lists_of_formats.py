@@ -199,7 +199,7 @@ def test_pages_docstrings_and_wire_state_the_lists(differs: Differs) -> None:
         (get_args(script_commands.Kind), KINDS),
         (get_args(get_args(image_messages.ExposurePredict.model_fields["kind"].annotation)[0]),
          KINDS),
-        (get_args(ImageKind), plots.KINDS),
+        (get_args(ImageKind), plots.KIND_COLOURS),
         (get_args(radiography.Physics), get_args(process_settings.Physics)),
         (SIX, random_truth.RANGES),
     ],

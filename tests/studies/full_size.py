@@ -41,7 +41,7 @@ from flexdt.library.data_set import DataSet
 from flexdt.library.datasets import image_set
 from flexdt.library.datasets.image_set import Arrays
 from flexdt.library.reading.folders import load_dataset
-from flexdt.library.reconstruction.memory_plan import PART, plan_memory
+from flexdt.library.reconstruction.memory_plan import PART_IMAGES, plan_memory
 from flexdt.library.reconstruction.reconstruct import (
     VolumeRequest,
     grid_of,
@@ -199,7 +199,7 @@ def costs(fraction: float) -> None:
     """Print the work of a voxel, a filtered and a read pixel, in processor time of this
     machine."""
     _, rows, cols, pixel = sizes(fraction)
-    scan, shape = scan_of(PART, rows, cols, pixel), (rows, cols)
+    scan, shape = scan_of(PART_IMAGES, rows, cols, pixel), (rows, cols)
     with tempfile.TemporaryDirectory() as folder:
         scan_of_shadows(Shadows(scan, shape)).save(Path(folder, "scan"))
         data = load_dataset(Path(folder, "scan"))
@@ -217,8 +217,8 @@ def costs(fraction: float) -> None:
         seconds.append(time.process_time() - begun)
     filtering = seconds[1] / images.size
     seen = StandingImages.of(scan, shape, None).rows(many.blank())
-    filtered = (seen.stop - seen.start) * cols * PART
-    voxel = (seconds[3] - filtering * filtered) / (PART * math.prod(many.shape))
+    filtered = (seen.stop - seen.start) * cols * PART_IMAGES
+    voxel = (seconds[3] - filtering * filtered) / (PART_IMAGES * math.prod(many.shape))
     print(
         f"a voxel and view {voxel * 1e9:.3f} ns; a filtered pixel "
         f"{filtering / voxel:.1f} and one "
@@ -230,10 +230,10 @@ def costs(fraction: float) -> None:
 def held(fraction: float, radius: float) -> None:
     """Print how much FDK of an object of some radius [mm] holds beside the volume."""
     _, rows, cols, pixel = sizes(fraction)
-    scan, shape = scan_of(2 * PART, rows, cols, pixel), (rows, cols)
+    scan, shape = scan_of(2 * PART_IMAGES, rows, cols, pixel), (rows, cols)
     shadows = Shadows(scan, shape, (*BODY[:2], radius, BODY[3]))
-    some = scan_of(2 * PART, 24, 30, 1.0)
-    flat = np.zeros((2 * PART, 24, 30), np.float32)
+    some = scan_of(2 * PART_IMAGES, 24, 30, 1.0)
+    flat = np.zeros((2 * PART_IMAGES, 24, 30), np.float32)
     fdk_parts(lambda: [flat], some, (24, 30), Grid((8, 8, 8), 1.0))  # the kernels' code
 
     def image(number: int) -> np.ndarray:
@@ -242,8 +242,10 @@ def held(fraction: float, radius: float) -> None:
         )
 
     def parts() -> Iterator[np.ndarray]:
-        for first in range(0, len(scan), PART):
-            yield np.stack([image(number) for number in range(first, first + PART)])
+        for first in range(0, len(scan), PART_IMAGES):
+            yield np.stack(
+                [image(number) for number in range(first, first + PART_IMAGES)]
+            )
 
     truncation = truncation_of(image, scan, shape)
     grid = Grid((rows, 8, 8), pixel * SOD_MM / SDD_MM)
@@ -259,7 +261,9 @@ def held(fraction: float, radius: float) -> None:
 
 
 def plan(fraction: float, memory: int) -> None:
-    """Print slabs, bytes on disk and rows that slabs read, and the same of slabs of 512 MiB."""
+    """Print slabs, bytes on disk and rows that slabs read, and the same of slabs of 512
+    MiB.
+    """
     views, rows, cols, pixel = sizes(fraction)
     scan, shape = scan_of(views, rows, cols, pixel), (rows, cols)
     grid, images = field_of_view(scan, shape), StandingImages.of(scan, shape, None)

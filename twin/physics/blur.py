@@ -28,8 +28,8 @@ MIN_SIGMA_PX = 0.02
 """Standard deviation below which an image is not blurred [pixels]."""
 MAX_SIGMA_PX = 1000.0
 """Largest standard deviation of a blur [pixels]."""
-FREQUENCIES = 512
-FOLDS = 20
+MIN_FREQUENCIES = 512
+FOLDED_SPECTRA = 20
 """Samples of a noise spectrum at least, and spectra on either side that are folded into it."""
 
 
@@ -55,7 +55,7 @@ def noise_kernel(sigma_px: float) -> Float32Array:
     with `sigma_px` before pixels collect it; see `noise_spectrum`. r is 4 sigma + 3,
     rounded up; the last 16 are kept."""
     reach = int(np.ceil(4.0 * sigma_px + 3.0))
-    frequency = np.fft.fftfreq(max(FREQUENCIES, 4 * reach)).astype(np.float64)
+    frequency = np.fft.fftfreq(max(MIN_FREQUENCIES, 4 * reach)).astype(np.float64)
     modulation = np.sqrt(noise_spectrum(frequency, sigma_px))
     weights = np.fft.ifft(modulation).real
     return np.asarray(weights[np.arange(-reach, reach + 1)], dtype=np.float32)
@@ -63,9 +63,10 @@ def noise_kernel(sigma_px: float) -> Float32Array:
 
 def noise_spectrum(frequency: FloatArray, sigma_px: float) -> FloatArray:
     """Compute the noise power of a flat image by frequency [cycles a pixel], 1 at none:
-    light's (a Gaussian of `sigma_px`) and aperture's modulation squared, with the `FOLDS`
-    next frequencies on either side folded back."""
-    f = frequency[..., None] + np.arange(-FOLDS, FOLDS + 1)
+    light's (a Gaussian of `sigma_px`) and aperture's modulation squared, with the
+    `FOLDED_SPECTRA` next frequencies on either side folded back.
+    """
+    f = frequency[..., None] + np.arange(-FOLDED_SPECTRA, FOLDED_SPECTRA + 1)
     return np.asarray(
         (np.sinc(f) ** 2 * np.exp(-((2.0 * np.pi * f * sigma_px) ** 2))).sum(axis=-1)
     )

@@ -36,9 +36,9 @@ TALLIES = 6
 their energies [keV]."""
 DIMENSIONS = 6
 """Number of random numbers of the first interaction."""
-ROULETTE = 0.15
+ROULETTE_WEIGHT = 0.15
 """Weight, as part of the first, below which a photon survives with the chance
-weight / ROULETTE."""
+weight / ROULETTE_WEIGHT."""
 MAX_ORDERS = 100
 """Largest number of interactions of a photon."""
 
@@ -277,9 +277,9 @@ def coherent_cosine(state, energy, cumulated, root_step):
 
 @kernel
 def incoherent_cosine(state, energy, shell, root_step):
-    """Draw the angle of an incoherent interaction, by rejection from the even distribution:
-    Klein-Nishina, at most 1 here, and S over its greatest value. Half of the trials or more
-    succeed below 250 keV.
+    """Draw the angle of an incoherent interaction, by rejection from the even
+    distribution: Klein-Nishina, at most 1 here, and S over its greatest value. Half of
+    the trials or more succeed below 250 keV.
 
     Args:
         state: of the random stream.
@@ -473,8 +473,8 @@ def histories(
     """Follow histories in each batch and add their signals to the images.
 
     The first interaction is forced, as is each later one; absorption lowers the weight,
-    and below `ROULETTE` histories are ended by chance. A ray that misses the object
-    counts nothing.
+    and below `ROULETTE_WEIGHT` histories are ended by chance. A ray that misses the
+    object counts nothing.
 
     Args:
         points: (b, n, DIMENSIONS) numbers of the first interactions of each batch's n
@@ -620,8 +620,8 @@ def histories(
                 weight *= gain
                 # Light photons are ended by chance, and those that survive weigh more:
                 # the sum is the same on average, and no time is spent on light photons.
-                if weight < ROULETTE:
+                if weight < ROULETTE_WEIGHT:
                     state, pick = draw(state)
-                    if pick * ROULETTE >= weight:
+                    if pick * ROULETTE_WEIGHT >= weight:
                         break
-                    weight = ROULETTE
+                    weight = ROULETTE_WEIGHT

@@ -19,7 +19,7 @@ from flexdt.twin.calibration.fit.problem import from_printed_reading, values_in
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 
-DIGITS: Final = 3
+TRACK_DECIMALS: Final = 3
 """Decimals of pixel positions in a file of tracks."""
 
 
@@ -97,16 +97,18 @@ def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
 
 
 def write_tracks(outcome: Outcome[ImageSet], path: Path) -> None:
-    """Write `tracks_document` as JSON; the file appears under its name only when complete."""
+    """Write `tracks_document` as JSON; the file appears under its name only when
+    complete.
+    """
     write_whole(path, json.dumps(tracks_document(outcome)) + "\n")
 
 
 def _pixels(points: npt.NDArray[np.float64]) -> list[list[float] | None]:
-    """Convert points (k, 2) to [column, row], rounded to `DIGITS`; None for a point that
-    was not seen (not finite).
+    """Convert points (k, 2) to [column, row], rounded to `TRACK_DECIMALS`; None for a
+    point that was not seen (not finite).
     """
     return [
-        [round(c, DIGITS), round(r, DIGITS)]
+        [round(c, TRACK_DECIMALS), round(r, TRACK_DECIMALS)]
         if math.isfinite(c) and math.isfinite(r)
         else None
         for c, r in points.tolist()

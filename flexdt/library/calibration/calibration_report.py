@@ -28,7 +28,7 @@ from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.calibration.fit.certificate import Certificate
 from flexdt.twin.calibration.fit.fit import FitResult
 
-HEAD = (
+PARAMETER_COLUMNS = (
     "parameter",
     "value",
     "sigma",
@@ -38,9 +38,9 @@ HEAD = (
     "to",
     "unit",
 )
-ELLIPSES = 6
+MAX_ELLIPSES = 6
 """Number of parameter pairs drawn, most correlated first."""
-MAP_FRAMES = 180
+MAX_MAP_FRAMES = 180
 """Largest number of frames whose residuals are drawn over the detector; of more frames, every
 second, third... is drawn."""
 
@@ -127,7 +127,7 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
     ]
     body: list[str] = [
         heading("Parameters", level=2),
-        table(HEAD, rows),
+        table(PARAMETER_COLUMNS, rows),
         *(paragraph(f"{n} {t}.") for n, t in document.get("limited", {}).items()),
         heading("In the images", level=3) if seen else "",
         table(["quantity", "value", "sigma", "unit"], seen) if seen else "",
@@ -164,7 +164,7 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
 
 def _ellipses(c: Certificate) -> list[str]:
     """Make HTML parts: a heading, and an SVG of the joint 95 % ellipse for each of the
-    `ELLIPSES` most correlated pairs of parameters (fewer if there are no more).
+    `MAX_ELLIPSES` most correlated pairs of parameters (fewer if there are no more).
     """
     names = list(c.estimates)
     pairs = [
@@ -172,7 +172,7 @@ def _ellipses(c: Certificate) -> list[str]:
     ]
     scale = math.sqrt(2.0 * float(fdtri(2, c.dof, 0.95)))
     out: list[str] = [heading("Joint 95 % ellipses about the estimate", level=2)]
-    for _, i, j in sorted(pairs, reverse=True)[:ELLIPSES]:
+    for _, i, j in sorted(pairs, reverse=True)[:MAX_ELLIPSES]:
         part = c.covariance[np.ix_([j, i], [j, i])]
         out.append(figure(ellipse_plot(part, (names[j], names[i]), scale)))
     return out
@@ -268,7 +268,7 @@ def _maps(
 ) -> list[str]:
     """Draw residuals over the detector, one map a scan, enlarged to be visible.
 
-    At most `MAP_FRAMES` frames each; returns SVG maps, enlarged by a power of ten.
+    At most `MAX_MAP_FRAMES` frames each; returns SVG maps, enlarged by a power of ten.
 
     Args:
         outcome: gives the data sets.
@@ -283,7 +283,9 @@ def _maps(
         factor = 1.0
     out = []
     for dataset, part in outcome.parts:
-        every = slice(None, None, max(1, math.ceil(places[part].shape[0] / MAP_FRAMES)))
+        every = slice(
+            None, None, max(1, math.ceil(places[part].shape[0] / MAX_MAP_FRAMES))
+        )
         groups = [
             (f"bead {k}", places[part, k][every], residuals[part, k][every])
             for k in range(residuals.shape[1])

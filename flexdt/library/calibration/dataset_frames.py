@@ -20,8 +20,8 @@ from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.dataset.normalise import MIN_COUNTS
 from flexdt.twin.geometry.conventions import Float32Array
 
-THREADS: Final = 2
-KEEP_BYTES: Final = 1 << 30
+FRAME_THREADS: Final = 2
+MAX_KEPT_BYTES: Final = 1 << 30
 """Counts kept in memory at most."""
 _T = TypeVar("_T")
 
@@ -38,12 +38,13 @@ class DatasetFrames:
         self, dataset: ImageSet, seen: Callable[[], object] = lambda: None
     ) -> None:
         """Take a data set, whose counts are kept after the first reading if all need at
-        most `KEEP_BYTES`, and a function that is called after each frame of each pass.
+        most `MAX_KEPT_BYTES`, and a function that is called after each frame of each
+        pass.
         """
         self._dataset = dataset
         self._seen = seen
         rows, cols = dataset.shape
-        self._keep = 2 * rows * cols * len(dataset) <= KEEP_BYTES
+        self._keep = 2 * rows * cols * len(dataset) <= MAX_KEPT_BYTES
         self._kept: dict[int, Counts] = {}
         self._unreadable: dict[int, str] = {}
 
@@ -127,11 +128,11 @@ class DatasetFrames:
         return counts
 
     def _each(self, work: Callable[[int], _T]) -> list[_T]:
-        """Do work on every frame in `THREADS` threads, and report each frame in order;
-        returns the results in order.
+        """Do work on every frame in `FRAME_THREADS` threads, and report each frame in
+        order; returns the results in order.
         """
         results = []
-        with ThreadPoolExecutor(THREADS) as pool:
+        with ThreadPoolExecutor(FRAME_THREADS) as pool:
             for one in pool.map(work, range(len(self))):
                 results.append(one)
                 self._seen()

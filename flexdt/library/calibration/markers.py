@@ -57,20 +57,20 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
-ASSUMED_PX: Final = 0.5
+ASSUMED_SIGMA_PX: Final = 0.5
 """Assumed: standard deviation of a marker's position where the file states none [px]."""
-FAR_PX: Final = 1e5
+MAX_PLACE_PX: Final = 1e5
 """A coordinate of a marker is at most so large [px]."""
-WIDEST_PX: Final = 1e4
+MAX_SIGMA_PX: Final = 1e4
 """And its standard deviation."""
 FREE_SCALE: Final = 0.05
 """Relative uncertainty of SOD where no distance of two markers is known, assumed."""
-LONGEST_MM: Final = 1e5
+MAX_SCALE_MM: Final = 1e5
 """A known distance is at most so long."""
 SCALE_FORM: Final = (
     "A-B=MM or A-B=MM+-SIGMA, the distance of markers A and B, such as 0-3=41.5+-0.02"
 )
-NAMES: Final = {
+COLUMN_NAMES: Final = {
     "frame": ("frame", "view", "image", "projection"),
     "marker": ("marker", "bead", "point", "id"),
     "column": ("column", "col", "x", "u"),
@@ -81,7 +81,7 @@ NAMES: Final = {
 
 Mark = tuple[int, str, float, float, float | None]
 """A marker's place in a frame: frame (counted from 0), marker, column, row and sigma
-[px], None for `ASSUMED_PX`."""
+[px], None for `ASSUMED_SIGMA_PX`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class Scale:
 
         Raises:
             TwinError: the text has another form, a name is empty, or a size is not above
-                0 and at most `LONGEST_MM`.
+                0 and at most `MAX_SCALE_MM`.
         """
         pair, _, size = text.rpartition("=")
         a, dash, b = pair.partition("-")
@@ -134,7 +134,10 @@ class Scale:
             scale = cls(a, b, math.nan)
         sizes = (scale.mm, scale.sigma_mm)
         if not (
-            dash and scale.a and scale.b and all(0 < size <= LONGEST_MM for size in sizes)
+            dash
+            and scale.a
+            and scale.b
+            and all(0 < size <= MAX_SCALE_MM for size in sizes)
         ):
             raise TwinError.instead(f"scale {text!r}", text, SCALE_FORM)
         return scale
@@ -144,7 +147,8 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
     """Read the markers of a CSV or NumPy file, or collect given marks.
 
     Args:
-        source: the file's path (.npy is a NumPy file, anything else a CSV file), or the marks.
+        source: the file's path (.npy is a NumPy file, anything else a CSV file), or the
+            marks.
         views: how many frames there are.
 
     Raises:
@@ -179,19 +183,20 @@ def _of_array(path: Path, views: int) -> Markers:
         raise TwinError.of_shape(
             f"{path}: array", tracks.shape, (f"{views} frames", "markers", 2)
         )
-    if (np.abs(tracks) > FAR_PX).any():
+    if (np.abs(tracks) > MAX_PLACE_PX).any():
         farthest = float(np.nanmax(np.abs(tracks)))
-        allowed = f"{FAR_PX:g}, nan where unseen"
+        allowed = f"{MAX_PLACE_PX:g}, nan where unseen"
         raise TwinError.instead(f"{path}: pixels up to {farthest:g}", farthest, allowed)
     names = tuple(str(k) for k in range(tracks.shape[1]))
-    return Markers(names, tracks, np.full(tracks.shape[:2], ASSUMED_PX))
+    return Markers(names, tracks, np.full(tracks.shape[:2], ASSUMED_SIGMA_PX))
 
 
 def _of_table(path: Path, views: int) -> Markers:
     """Read markers of a CSV file whose first line names its columns.
 
-    The head's words are those of `NAMES`, in either case and any order. Empty lines are
-    skipped; an empty column or row is nan; without a sigma column sigma is None.
+    The head's words are those of `COLUMN_NAMES`, in either case and any order. Empty
+    lines are skipped; an empty column or row is nan; without a sigma column sigma is
+    None.
 
     Args:
         path: of the file.
@@ -211,7 +216,7 @@ def _of_table(path: Path, views: int) -> Markers:
         head = []
     at = {
         n: next((head.index(w) for w in words if w in head), -1)
-        for n, words in NAMES.items()
+        for n, words in COLUMN_NAMES.items()
     }
     if -1 in at.values():
         message = f"{path}, line 1: columns {', '.join(head) or 'none'}"
@@ -276,8 +281,8 @@ def _mark(where: str, row: Mark) -> tuple[str, Mark]:
 def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
     """Collect marks into a table, markers in the order of their names.
 
-    Without a sigma `ASSUMED_PX` is taken; decimal names come first, by number. Marks that
-    are missing are nan.
+    Without a sigma `ASSUMED_SIGMA_PX` is taken; decimal names come first, by number.
+    Marks that are missing are nan.
 
     Args:
         marks: each with its place in the source, for messages.
@@ -285,29 +290,33 @@ def _gathered(marks: Iterable[tuple[str, Mark]], views: int) -> Markers:
 
     Raises:
         TwinError: a frame that the scan has not, a sigma that is not above 0 and at most
-            `WIDEST_PX`, a pixel beyond `FAR_PX`, or a marker twice in one frame.
+            `MAX_SIGMA_PX`, a pixel beyond `MAX_PLACE_PX`, or a marker twice in one frame.
     """
     seen: dict[tuple[int, str], tuple[float, float, float]] = {}
     for where, (frame, name, x, y, stated) in marks:
         if stated is None:
-            sigma = ASSUMED_PX
+            sigma = ASSUMED_SIGMA_PX
         else:
             sigma = stated
-        if not 0 <= frame < views or (frame, name) in seen or not 0 < sigma <= WIDEST_PX:
+        if (
+            not 0 <= frame < views
+            or (frame, name) in seen
+            or not 0 < sigma <= MAX_SIGMA_PX
+        ):
             raise TwinError.instead(
                 f"{where}: marker {name!r} in frame {frame}, sigma {sigma:g} px",
                 [frame, name, sigma],
                 f"frames 0 to {views - 1}, each marker once in each, "
-                f"sigma above 0 to {WIDEST_PX:g}",
+                f"sigma above 0 to {MAX_SIGMA_PX:g}",
             )
-        if any(abs(v) > FAR_PX for v in (x, y)):
+        if any(abs(v) > MAX_PLACE_PX for v in (x, y)):
             message = f"{where}: pixel ({x:g}, {y:g})"
-            raise TwinError.instead(message, [x, y], f"up to {FAR_PX:g}")
+            raise TwinError.instead(message, [x, y], f"up to {MAX_PLACE_PX:g}")
         seen[frame, name] = x, y, sigma
     labels = {name for _, name in seen}
     names = tuple(sorted(labels, key=lambda n: (not n.isdecimal(), n.zfill(9))))
     tracks = np.full((views, len(names), 2), np.nan)
-    sigmas = np.full(tracks.shape[:2], ASSUMED_PX)
+    sigmas = np.full(tracks.shape[:2], ASSUMED_SIGMA_PX)
     for (frame, name), (x, y, sigma) in seen.items():
         tracks[frame, names.index(name)] = x, y
         sigmas[frame, names.index(name)] = sigma
@@ -359,7 +368,8 @@ def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots]
 def calibrate_known(
     data: ImageSet, markers: Markers, phantom: Phantom, request: CalibrationRequest
 ) -> Calibration:
-    """Calibrate from the marked beads of a phantom; marker "3" is its bead 3, counted from 0.
+    """Calibrate from the marked beads of a phantom; marker "3" is its bead 3, counted
+    from 0.
 
     Args:
         data: the scan.

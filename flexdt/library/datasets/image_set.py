@@ -39,7 +39,7 @@ from flexdt.twin.signatures import public
 
 Counts = npt.NDArray[np.uint16]
 OPEN_COUNTS: Final = 60_000.0
-FEWEST_COUNTS: Final = 25
+MIN_PEAK_COUNTS: Final = 25
 """Largest count of an image below which it is doubtful that these are counts."""
 Images = TypeVar("Images", bound="ImageSet")
 """An image set of the caller's kind, such as a `DataSet`."""
@@ -207,7 +207,7 @@ class ImageSet:
         if (
             values.dtype.kind in "ui"
             and flat is None
-            and 0 < int(values[0].max()) < FEWEST_COUNTS
+            and 0 < int(values[0].max()) < MIN_PEAK_COUNTS
         ):
             doubt = f"whole numbers up to {values[0].max()} without a flat image: counts, or line "
             warnings = [f"{doubt}integrals whose fractions are cut off?", *warnings]
@@ -366,7 +366,8 @@ class ImageSet:
 
     @cached_property
     def poses(self) -> Poses:
-        """Nominal poses of `frames`; where motors are not known, those that `cone_vec` implies.
+        """Nominal poses of `frames`; where motors are not known, those that `cone_vec`
+        implies.
 
         Raises:
             GeometryError: a panel on its side, so that the stage's angle is unknown.
@@ -515,8 +516,8 @@ class ImageSet:
     def _mean(
         self, files: Sequence[Path], images: npt.NDArray[Any] | None
     ) -> Float32Array | None:
-        """Average reference images, those in memory or those of files, as float32 (rows, cols);
-        None without any.
+        """Average reference images, those in memory or those of files, as float32 (rows,
+        cols); None without any.
         """
         if images is not None:
             return np.asarray(images.mean(axis=0), dtype=np.float32)

@@ -17,12 +17,12 @@ EDGE_PX: Final = 8
 """Distance of title and scale bar from the left edge [pixels]."""
 BAR_ROWS: Final = 3
 """Thickness of the scale bar [pixels]."""
-MOST_OF_WIDTH: Final = 0.4
+MAX_BAR_SHARE: Final = 0.4
 """Largest length of the scale bar, as a share of the picture's width."""
 FONT_SCALE: Final = 0.42
 """Size of the letters, in units of OpenCV's font."""
-PAPER: Final = 255
-INK: Final = 0
+PAPER_GREY: Final = 255
+INK_GREY: Final = 0
 """Grey of the strips and of what is written on them."""
 
 
@@ -30,7 +30,7 @@ def labelled(
     grey: npt.NDArray[np.uint8], title: str, mm_per_pixel: float
 ) -> npt.NDArray[np.uint8]:
     """Add a title above a picture and a scale bar with its length below it; the bar is a
-    round length of at most `MOST_OF_WIDTH` of the width.
+    round length of at most `MAX_BAR_SHARE` of the width.
 
     Args:
         grey: (rows, cols).
@@ -43,17 +43,17 @@ def labelled(
     import cv2
 
     cols = grey.shape[1]
-    head = np.full((HEAD_ROWS, cols), PAPER, np.uint8)
-    foot = np.full((FOOT_ROWS, cols), PAPER, np.uint8)
-    length_mm = round_length(MOST_OF_WIDTH * cols * mm_per_pixel)
+    head = np.full((HEAD_ROWS, cols), PAPER_GREY, np.uint8)
+    foot = np.full((FOOT_ROWS, cols), PAPER_GREY, np.uint8)
+    length_mm = round_length(MAX_BAR_SHARE * cols * mm_per_pixel)
     length_px = round(length_mm / mm_per_pixel)
     top = (FOOT_ROWS - BAR_ROWS) // 2
-    foot[top : top + BAR_ROWS, EDGE_PX : EDGE_PX + length_px] = INK
+    foot[top : top + BAR_ROWS, EDGE_PX : EDGE_PX + length_px] = INK_GREY
     for strip, text, left in (
         (head, title, EDGE_PX),
         (foot, f"{length_mm:g} mm", 2 * EDGE_PX + length_px),
     ):
         base = strip.shape[0] // 2 + 5
         font = cv2.FONT_HERSHEY_SIMPLEX
-        cv2.putText(strip, text, (left, base), font, FONT_SCALE, INK, 1, cv2.LINE_AA)
+        cv2.putText(strip, text, (left, base), font, FONT_SCALE, INK_GREY, 1, cv2.LINE_AA)
     return np.vstack([head, grey, foot])

@@ -32,8 +32,8 @@ PNG_FILTER_UP: Final = 2
 """Filter type of a row that holds differences from the row above."""
 PNG_EFFORT: Final = 3
 """Of zlib, 0 to 9: more takes longer and saves a few per cent."""
-BAND: Final = 100
-"""Marks on the edge are drawn 1 / BAND of the picture wide, to be visible."""
+BAND_DIVISOR: Final = 100
+"""Marks on the edge are drawn 1 / BAND_DIVISOR of the picture wide, to be visible."""
 
 
 def round_length(most: float) -> float:
@@ -92,10 +92,10 @@ def coloured(
 
 
 def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Widen marks of the outermost pixels into the picture, to a band of 1 / `BAND` of
-    the longer side, at least 2 pixels; returns a copy.
+    """Widen marks of the outermost pixels into the picture, to a band of 1 /
+    `BAND_DIVISOR` of the longer side, at least 2 pixels; returns a copy.
     """
-    wide = max(2, max(edge.shape) // BAND)
+    wide = max(2, max(edge.shape) // BAND_DIVISOR)
     out = edge.copy()
     out[:wide] |= edge[0]
     out[-wide:] |= edge[-1]
@@ -158,8 +158,8 @@ def png_of(pixels: npt.NDArray[np.uint8]) -> bytes:
         pixels: (rows, cols) grey, or (rows, cols, 3) red first.
 
     Source:
-        ISO/IEC 15948: chunks IHDR, IDAT, IEND; each row is stored as its difference from the
-        row above (filter type 2), which deflates well.
+        ISO/IEC 15948: chunks IHDR, IDAT, IEND; each row is stored as its difference from
+        the row above (filter type 2), which deflates well.
     """
     rows, cols = pixels.shape[:2]
     colours = PNG_COLOUR if pixels.ndim == 3 else PNG_GREY

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from flexdt.twin.geometry.cone_vec import ConeVec
     from flexdt.twin.projection import Volume
 
-MOST_PICTURES: Final = 24
+MAX_PICTURES: Final = 24
 """Pictures behind a slider; of more, so many are taken, evenly spread."""
 SIDE_PX: Final = 320
 """Longest side of a picture."""
 DRAWING_PX: Final = 420
 """Side of the drawing of a geometry."""
-MARGIN: Final = 0.06
+MARGIN_SHARE: Final = 0.06
 """Free margin around a geometry, as a share of the drawing's side."""
 DOT_PX: Final = 2.5
 """Radius of the dot of a source's place."""
@@ -89,7 +89,7 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
         window: attenuation of black and of white [1/mm]; None: percentiles of the volume.
 
     Returns:
-        A page; each slider chooses among at most `MOST_PICTURES` layers and starts at the
+        A page; each slider chooses among at most `MAX_PICTURES` layers and starts at the
         middle one. The line below states the window.
 
     Raises:
@@ -118,9 +118,10 @@ def volume_page(volume: Volume, window: Sequence[float] | None = None) -> Notebo
 
 
 def data_page(data: ImageSet) -> NotebookPage:
-    """Show the projections of a data set behind a slider, and the sinogram of its middle row.
+    """Show the projections of a data set behind a slider, and the sinogram of its middle
+    row.
 
-    At most `MOST_PICTURES` of the projections that are present, evenly spread, all in one
+    At most `MAX_PICTURES` of the projections that are present, evenly spread, all in one
     grey window by percentiles. The sinogram has the rows of these, views downwards.
 
     Args:
@@ -161,7 +162,7 @@ def data_page(data: ImageSet) -> NotebookPage:
 def geometry_page(cone_vec: ConeVec) -> NotebookPage:
     """Draw source, panel and sample of each view, with one scale along all axes.
 
-    A slider chooses among at most `MOST_PICTURES` views, from the first one on. The line
+    A slider chooses among at most `MAX_PICTURES` views, from the first one on. The line
     below states the drawing's width [mm].
 
     Args:
@@ -212,9 +213,9 @@ class _Drawing:
     def of(cls, cone_vec: ConeVec) -> _Drawing:
         """Choose the scale at which sources, panels and sample fit into the drawing.
 
-        The width is the diagonal of their bounding box, the origin included, with `MARGIN`
-        at both ends. The sample's radius is half the panel's width scaled to the axis by
-        the nearest source; a panel without shape is 1 pixel wide.
+        The width is the diagonal of their bounding box, the origin included, with
+        `MARGIN_SHARE` at both ends. The sample's radius is half the panel's width scaled
+        to the axis by the nearest source; a panel without shape is 1 pixel wide.
 
         Args:
             cone_vec: all views.
@@ -230,7 +231,7 @@ class _Drawing:
         reach = float(np.linalg.norm(cone_vec.source[0] - cone_vec.detector[0]))
         return cls(
             0.5 * (low + high),
-            float(np.linalg.norm(high - low)) * (1.0 + 2.0 * MARGIN),
+            float(np.linalg.norm(high - low)) * (1.0 + 2.0 * MARGIN_SHARE),
             float(half) * panel / max(reach, 1e-9),
         )
 
@@ -248,7 +249,7 @@ class _Drawing:
         """Draw the parts that all views share, as SVG: axes, places of the source, and
         the sample as a circle at the origin, with a radius of at least 2 px.
 
-        The source is a dot in each of at most `MOST_PICTURES` views.
+        The source is a dot in each of at most `MAX_PICTURES` views.
         """
         dots = "".join(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{DOT_PX}" fill="#d33" opacity=".6"/>'
@@ -313,14 +314,14 @@ class _Drawing:
 
 
 def _slider_indices(count: int) -> list[int]:
-    """Choose at most `MOST_PICTURES` indices below `count`, evenly spread, of which a
+    """Choose at most `MAX_PICTURES` indices below `count`, evenly spread, of which a
     slider shows one.
 
     They ascend from 0 to count - 1; all if there are no more; [] for 0.
     """
     if not count:
         return []
-    spread = np.linspace(0, count - 1, min(count, MOST_PICTURES))
+    spread = np.linspace(0, count - 1, min(count, MAX_PICTURES))
     return [int(i) for i in np.unique(spread.round())]
 
 

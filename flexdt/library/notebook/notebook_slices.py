@@ -11,14 +11,15 @@ import numpy.typing as npt
 from flexdt.library.datasets.pictures import PERCENTILES
 from flexdt.twin.errors import TwinError
 
-MOST_VALUES: Final = 1_000_000
+MAX_VALUES: Final = 1_000_000
 """Of which percentiles are taken; of more, about so many are taken, evenly spread."""
 AXES: Final = (("z", 0, "xy"), ("y", 1, "xz"), ("x", 2, "yz"))
 """Name of an axis, its index in the data, and the axes of its layers (to the right, up)."""
 
 
 def layer_of(data: npt.NDArray[Any], axis: int, index: int) -> npt.NDArray[Any]:
-    """Return one layer of a volume (nz, ny, nx), the last axis to the right and the other up.
+    """Return one layer of a volume (nz, ny, nx), the last axis to the right and the other
+    up.
 
     Args:
         data: the volume's values.
@@ -40,7 +41,7 @@ def window_of(
 ) -> tuple[float, float]:
     """Return the values of black and white: those given, else percentiles.
 
-    At most about MOST_VALUES values are looked at, in even steps along each axis. Equal
+    At most about MAX_VALUES values are looked at, in even steps along each axis. Equal
     percentiles give white = black + 1.
 
     Args:
@@ -55,7 +56,7 @@ def window_of(
         TwinError: not two numbers, the first the smaller one.
     """
     if window is None:
-        step = max(1, round((values.size / MOST_VALUES) ** (1.0 / values.ndim)))
+        step = max(1, round((values.size / MAX_VALUES) ** (1.0 / values.ndim)))
         seen = values[(slice(None, None, step),) * values.ndim]
         seen = seen[np.isfinite(seen)]
         low, high = np.percentile(seen, PERCENTILES).tolist() if seen.size else (0.0, 1.0)

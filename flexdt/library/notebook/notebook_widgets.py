@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 WIDTH_PX: Final = 240
 """Width of a picture."""
-REACH: Final = 0.5
+WINDOW_REACH_WIDTHS: Final = 0.5
 """Reach of the window's slider beyond the window, on each side, as a share of its width."""
 
 
@@ -33,13 +33,14 @@ def volume_widgets(
         widgets: the package ipywidgets.
         volume: is seen from above, from the front and from the right.
         window: attenuation of black and of white at first [1/mm]; its slider reaches
-            `REACH` times the width beyond both. None: percentiles of the volume.
+            `WINDOW_REACH_WIDTHS` times the width beyond both. None: percentiles of the
+            volume.
 
     Returns:
         A box of widgets, which a notebook shows.
     """
     low, high = window_of(volume.data, window)
-    beyond = REACH * (high - low)
+    beyond = WINDOW_REACH_WIDTHS * (high - low)
     chosen = widgets.FloatRangeSlider(
         value=(low, high),
         min=low - beyond,

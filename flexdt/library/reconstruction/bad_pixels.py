@@ -18,10 +18,10 @@ from flexdt.twin.reconstruction.consistency.pixels import BadPixels, bad_pixels
 
 MIN_VIEWS: Final = 12
 """Smallest number of views in which bad pixels are separable from a turning object."""
-MOST_KEPT_BYTES: Final = 128 << 20
+MAX_KEPT_BYTES: Final = 128 << 20
 """Largest line integrals kept between the passes over them [bytes]; larger ones are
 recomputed."""
-MIN_TURN: Final = 0.2
+MIN_TURN_SHARE: Final = 0.2
 """Spread of the sources over their distance from the axis, at least, of a scan that turns."""
 
 
@@ -52,7 +52,7 @@ def _bad_pixels(
     """Find pixels that differ from their neighbours in all views.
 
     At most `MAX_FROM_DISK` views are read, evenly spread; they are kept in memory for the
-    next pass if they need at most `MOST_KEPT_BYTES`. For a panel on its side rows and
+    next pass if they need at most `MAX_KEPT_BYTES`. For a panel on its side rows and
     columns are exchanged meanwhile.
 
     Args:
@@ -62,8 +62,8 @@ def _bad_pixels(
 
     Returns:
         The pixels; None with fewer than `MIN_VIEWS` views, no open beam, a source that
-        moves by less than `MIN_TURN` of its distance, an axis that is projected nowhere,
-        or no bad pixels.
+        moves by less than `MIN_TURN_SHARE` of its distance, an axis that is projected
+        nowhere, or no bad pixels.
     """
     present = np.array(dataset.present)
     if len(present) < MIN_VIEWS or not (dataset.flat > dataset.dark).any():
@@ -71,7 +71,7 @@ def _bad_pixels(
     some = present[np.unique(np.linspace(0, len(present) - 1, MAX_FROM_DISK).astype(int))]
     views = cone_vec[some]
     spread = np.ptp(views.source[:, :2], axis=0).max()
-    if spread < MIN_TURN * np.linalg.norm(views.source, axis=1).max():
+    if spread < MIN_TURN_SHARE * np.linalg.norm(views.source, axis=1).max():
         return None
     lies = on_its_side(views)
     middle = views.project_points(np.zeros((1, 3)), dataset.shape)[:, 0, 1 if lies else 0]
@@ -80,11 +80,11 @@ def _bad_pixels(
         return None
 
     held: list[Float32Array] = []
-    keeps = 4 * len(some) * math.prod(dataset.shape) <= MOST_KEPT_BYTES
+    keeps = 4 * len(some) * math.prod(dataset.shape) <= MAX_KEPT_BYTES
 
     def images() -> Iterator[Float32Array]:
-        """Yield some line integrals, rows along the axis; kept for the next pass if they fit
-        the memory.
+        """Yield some line integrals, rows along the axis; kept for the next pass if they
+        fit the memory.
         """
         yield from held
         for index in some[len(held) :].tolist():

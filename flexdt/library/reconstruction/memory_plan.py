@@ -8,7 +8,7 @@ from typing import Final
 from flexdt.twin.errors import LimitError
 from flexdt.twin.projection import Grid
 
-PART: Final = 16
+PART_IMAGES: Final = 16
 """Number of images processed at a time."""
 WORKING_IMAGES: Final = 100
 """Largest working memory of FDK in addition to a slab, in images of four bytes a pixel

@@ -35,7 +35,7 @@ from flexdt.library.reconstruction.kept_images import (
     KeptImages,
 )
 from flexdt.library.reconstruction.memory_plan import (
-    PART,
+    PART_IMAGES,
     MemoryPlan,
     plan_memory,
     plan_whole,
@@ -185,11 +185,12 @@ class ScanFrames:
         return rows // self.binning, cols // self.binning
 
     def parts(self) -> Iterator[Float32Array]:
-        """Yield line integrals of all frames in order, corrected as in `view`, `PART` at
-        a time, (k, rows, cols); they are not kept for another pass."""
+        """Yield line integrals of all frames in order, corrected as in `view`,
+        `PART_IMAGES` at a time, (k, rows, cols); they are not kept for another pass.
+        """
         count = len(self.indices)
-        for first in range(0, count, PART):
-            numbers = range(first, min(first + PART, count))
+        for first in range(0, count, PART_IMAGES):
+            numbers = range(first, min(first + PART_IMAGES, count))
             yield np.stack([self.view(number, again=False) for number in numbers])
 
     @cached_property
@@ -393,10 +394,11 @@ def reconstruct_dataset(
     workers: AbstractContextManager[Executor] | None = None,
     memory: int | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct a data set into a file, which appears under its name only when complete.
+    """Reconstruct a data set into a file, which appears under its name only when
+    complete.
 
-    Each image is read once, but by workers. Those that are needed again are kept in memory, or
-    in a file without a name in the folder of `out`.
+    Each image is read once, but by workers. Those that are needed again are kept in
+    memory, or in a file without a name in the folder of `out`.
 
     Args:
         dataset: from `load_dataset`.
@@ -404,20 +406,20 @@ def reconstruct_dataset(
         request: the volume; None is FDK of the entire field of view.
         parameters: correction; None is the one in force during the scan, if any.
         progress: called with the work done and the total.
-        workers: make the slabs of FDK; they see the data set and `out` under the same paths. An
-            interrupted reconstruction is taken up.
+        workers: make the slabs of FDK; they see the data set and `out` under the same
+            paths. An interrupted reconstruction is taken up.
         memory: that FDK may use; None for half of the free memory [bytes].
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames,
-        missing, correction (edge units), accuracy (see `Volume.accuracy`; None but for FDK),
-        warnings, seconds.
+        missing, correction (edge units), accuracy (see `Volume.accuracy`; None but for
+        FDK), warnings, seconds.
 
     Raises:
         UnknownNameError: unknown algorithm, window or material.
         TwinError: beam hardening cannot be corrected, because the data set has none.
-        LimitError: another ending, one of the data set's own files, a volume too large for this
-            machine, or too little memory or room on disk.
+        LimitError: another ending, one of the data set's own files, a volume too large
+            for this machine, or too little memory or room on disk.
         GeometryError: a trajectory that the algorithm cannot use.
         DatasetError: a frame or the flat field cannot be read.
         OSError: the file cannot be written.
@@ -761,10 +763,12 @@ def preview(
     parameters: Offsets | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct a quick look at a scan: few views, coarse pixels and voxels, FDK, PNG slices.
+    """Reconstruct a quick look at a scan: few views, coarse pixels and voxels, FDK, PNG
+    slices.
 
     `out` is the volume's file. About PREVIEW_VOXELS voxels along the longest side, and
-    from PREVIEW_VIEWS to twice as many views (all, if there are fewer), with a Hann window.
+    from PREVIEW_VIEWS to twice as many views (all, if there are fewer), with a Hann
+    window.
 
     Args:
         dataset, out, parameters, progress: as for `reconstruct_dataset`.

@@ -14,12 +14,12 @@ from flexdt.twin.reconstruction import ring_errors
 from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
 from flexdt.twin.reconstruction.acquisition.trajectory import Circle, circle_of
 
-MOST_LEAN_PX: Final = 1.0
+MAX_LEAN_PX: Final = 1.0
 """Columns between the axis at the panel's upper and lower edge, at most: beyond, columns on
 both sides of it do not see the same rays."""
 SECTORS: Final = 8
 """Number of parts of a turn whose numbers of views are compared."""
-MOST_UNEVEN: Final = 1.3
+MAX_UNEVEN_RATIO: Final = 1.3
 """Views of the fullest sector over those of the emptiest, at most."""
 
 
@@ -55,7 +55,7 @@ def _axis_column(
 
     Returns:
         The column (of the upright image); None if the sources are on no level circle, the
-        turn is not full and even, or the axis leans by more than `MOST_LEAN_PX` over the
+        turn is not full and even, or the axis leans by more than `MAX_LEAN_PX` over the
         image.
     """
     try:
@@ -76,7 +76,7 @@ def _axis_column(
         tall = shape[1]
     lean_px = tall * np.ptp(columns) / np.ptp(rows)
     middle = float(columns.mean())
-    if np.isfinite(middle) and lean_px <= MOST_LEAN_PX:
+    if np.isfinite(middle) and lean_px <= MAX_LEAN_PX:
         return middle
     return None
 
@@ -84,4 +84,4 @@ def _axis_column(
 def _evenly_turned(circle: Circle) -> bool:
     """Check whether all directions have as many views: those of a turn and a half do not."""
     views, _ = np.histogram(circle.angle, SECTORS, (0.0, 2.0 * np.pi))
-    return bool(views.max() <= MOST_UNEVEN * views.min() + 1.0)
+    return bool(views.max() <= MAX_UNEVEN_RATIO * views.min() + 1.0)

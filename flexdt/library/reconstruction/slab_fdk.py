@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from flexdt.library.reconstruction.kept_images import KeptImages
-from flexdt.library.reconstruction.memory_plan import PART
+from flexdt.library.reconstruction.memory_plan import PART_IMAGES
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Grid, Volume
@@ -32,12 +32,12 @@ from flexdt.twin.reconstruction.acquisition.rectify import (
 )
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, narrow_overlap
 
-MARGIN: Final = 6
+MARGIN_ROWS: Final = 6
 """Rows around the shadow that a slab takes too, so that a panel of many rows never seems
 to have few (`fdk_plan.FEW_ROWS`)."""
-VOXEL = 1.0
-FILTERED_PIXEL = 25.0
-READ_PIXEL = 12.0
+VOXEL_WORK = 1.0
+FILTERED_PIXEL_WORK = 25.0
+READ_PIXEL_WORK = 12.0
 """Work of FDK a voxel and view, a pixel that is filtered and one that is read and prepared, in
 units of the first (`tests/studies/full_size.py --costs`)."""
 
@@ -119,8 +119,9 @@ class StandingImages:
         return stood
 
     def rows(self, like: Volume) -> slice:
-        """Return the rows with a slab's shadow in some view, with a margin of `MARGIN` on
-        either side; all rows if the scan rises or the panel is not upright.
+        """Return the rows with a slab's shadow in some view, with a margin of
+        `MARGIN_ROWS` on either side; all rows if the scan rises or the panel is not
+        upright.
 
         Args:
             like: grid of the slab; its values are not used.
@@ -128,7 +129,7 @@ class StandingImages:
         if self.rises or not is_upright(self.cone_vec):
             return slice(0, self.shape[0])
         first, last = rows_needed(self.cone_vec, self.shape, like)
-        return slice(max(first - MARGIN, 0), min(last + MARGIN, self.shape[0]))
+        return slice(max(first - MARGIN_ROWS, 0), min(last + MARGIN_ROWS, self.shape[0]))
 
     def part(self, rows: slice) -> tuple[ConeVec, tuple[int, int], Truncation | None]:
         """Return geometry, (rows, cols) and truncation (None if there is none) of a range
@@ -198,7 +199,7 @@ def fdk_slabs(
 
 
 def _parts(count: int) -> list[range]:
-    limits = [*range(0, count, PART), count]
+    limits = [*range(0, count, PART_IMAGES), count]
     return [range(first, last) for first, last in pairwise(limits)]
 
 
@@ -257,8 +258,10 @@ class Work:
             slab = grid.slab(first, last)
             seen = images.rows(slab.blank())
             pixels = (seen.stop - seen.start) * cols
-            work.append(count * (VOXEL * slab.bytes / 4 + FILTERED_PIXEL * pixels))
-        return cls(count, READ_PIXEL * count * rows * cols, work, tell)
+            work.append(
+                count * (VOXEL_WORK * slab.bytes / 4 + FILTERED_PIXEL_WORK * pixels)
+            )
+        return cls(count, READ_PIXEL_WORK * count * rows * cols, work, tell)
 
     def read(self) -> None:
         """Count one more image as read."""
