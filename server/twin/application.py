@@ -38,22 +38,23 @@ class TwinSession:
         self._client = Client(peer)
 
     async def handle(self, method: AnyMethod, params: Params) -> object:
-        """Answer one call: take control where the method needs it, then call its handler.
+        """Answer one call: renew the client's lease, take control where the method needs
+        it, and call the method's handler.
 
-        A programming error is raised as it is.
-
-        Methods that move by hand are refused while a job runs, and cancel the automatic
-        resume of a paused one.
+        Methods that move by hand are refused while a job runs; during such a call no
+        paused job resumes by itself.
 
         Args:
             method: of the wire.
             params: validated.
 
         Returns:
-            The handler's result.
+            The handler's result; a result that must be awaited is awaited here.
 
         Raises:
-            RpcError: the wire's form of any error that a user can cause.
+            RpcError: the wire's form of any error that a user can cause; -32003 if
+                another client is the controller or a job runs.
+            Exception: a programming error, as it is.
         """
         twin = self._twin
         client = self._client
@@ -76,9 +77,11 @@ class TwinSession:
             raise
 
     def close(self) -> None:
-        """Unsubscribe the ended connection and release its control.
+        """End the session of a closed connection: drop its subscriptions, release its
+        control, and publish the state.
 
         If it was the controller, its way around obstacles ends with the leg under way.
+        Other motion goes on.
         """
         if self._twin.control.holder == self._client.name:
             self._twin.detours.cancel()  # the controller's way ends with the present leg
@@ -87,9 +90,11 @@ class TwinSession:
         self._twin.feed.changed()
 
     def _take_control(self, what: str) -> None:
-        """Take control for the client if nobody holds it, and publish the new controller.
+        """Take control for the client if nobody holds it, and renew its lease; the state
+        is published only if the controller has changed.
 
-        The lease of its own control is renewed.
+        Args:
+            what: method, for the error.
 
         Raises:
             RpcError: -32003, another client is the controller.
@@ -112,12 +117,12 @@ def twin_pages(
 
     Args:
         twin, server, projector: whose figures they show.
-        requests: counted calls.
+        requests: counts of answered calls.
     """
 
     def health() -> dict[str, object]:
-        """Return the facts of `/healthz`: server version, projector, and the current job or
-        None.
+        """Return the facts of `/healthz`: "server" with its version, "projector"
+        ("connected" or "not connected"), "job" with id and phase, or None.
         """
         job = twin.jobs.current
         return {
@@ -137,11 +142,12 @@ def twin_pages(
 def _figures(
     twin: TwinServer, server: TcpServer, projector: ProjectorPool
 ) -> list[Metric]:
-    """List the metrics of the twin server, read now; those of requests are not among
+    """List the metrics of the twin server as read now; metrics of requests are not among
     them.
 
-    Free disk space is left out where the system does not report it; an unknown factor is
-    0.
+    They are connections, events by topic, jobs by phase, frames, safety state, clock,
+    speed, projector and its views, and free disk space [bytes]. Free space is left out
+    where the system does not report it; an unknown real-time factor is 0.
     """
     jobs = Counter(job.phase for job in twin.jobs.all())
     phases: dict[str, float] = {phase: jobs[phase] for phase in get_args(JobPhase)}

@@ -102,10 +102,15 @@ class ControlLease:
             self._heard = self._clock()
 
     def require(self, who: str, what: str) -> None:
-        """Check that `who` may move: it has control, or takes it if it is free.
+        """Check that `who` may move: it has control already, or takes it because it is
+        free.
 
-        Control is free without a holder, or after its `idle_s` without a request; the
-        lease is renewed.
+        Control is free without a holder, or after `idle_s` without a request of the
+        holder. The lease of `who` is renewed.
+
+        Args:
+            who: name of the client's connection.
+            what: method, for the error.
 
         Raises:
             RpcError: -32003, another client is the controller.
@@ -316,10 +321,12 @@ class TwinServer:
         """Awaited ends of motions."""
 
     async def start(self, sample: Sample | None = None) -> None:
-        """Put `sample` on the stage at the motors' present positions, and start the
-        services.
+        """Put `sample` on the stage at the motors' present positions, publish it, and
+        start the services.
 
-        Unless jobs were restored, files of jobs are removed first.
+        Files of earlier jobs are removed unless `recall` was called. The services are
+        jobs, live view, state feed, state store and, if there is one, the projector's
+        watch.
 
         Contacts at the start are warnings in the log.
 
@@ -350,12 +357,11 @@ class TwinServer:
         self._tasks = [asyncio.create_task(self._run_service(w)) for w in work]
 
     async def stop(self) -> None:
-        """End all services and workers, and write the state as that of a server that
-        ended.
+        """Cancel all services, end the workers, and write the state as that of a server
+        that ended.
 
-        Before `start` no state is written.
-
-        A running scan's data set is marked incomplete.
+        A running scan's data set is marked incomplete. Before `start` no state is
+        written.
         """
         for task in self._tasks:
             task.cancel()
@@ -372,8 +378,8 @@ class TwinServer:
         """Restore scanner and jobs of the previous server, before `start`; log a warning
         if it was killed.
 
-        A warning also if jobs are to be resumed. A sample that cannot be read gives the
-        empty stage.
+        There is a warning, too, if jobs are to be resumed. Jobs are restored even where
+        no state is stored. A sample that cannot be read gives the empty stage.
 
         Returns:
             The sample for the stage; None if nothing is stored, or nothing that fits this
@@ -430,7 +436,8 @@ class TwinServer:
     def _apply_last(self) -> None:
         """Put the previous server's correction in force at the start.
 
-        The stage is empty then, and no guard is made.
+        The stage is initialised empty and without a guard, also if there is no
+        correction.
 
         One that is lost or does not fit leaves none in force, with a warning in the log.
         """
@@ -451,10 +458,10 @@ class TwinServer:
             )
 
     def _readable_sample(self, sample: Sample) -> Sample:
-        """Read the stored sample, and return the empty stage, with a warning in the log,
-        if that fails.
+        """Return the stored sample if its guard can be built, else the empty stage with a
+        warning in the log.
 
-        Of uploaded voxels the material is dropped.
+        Any error of reading counts. The material of uploaded voxels is dropped first.
         """
         head = self.samples.head(sample.name)
         if head is not None and head.kind == "voxels":
@@ -472,13 +479,15 @@ class TwinServer:
         return sample
 
     async def _run_service(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run a service; after an exception log it and restart the service.
+        """Run a service until it returns; after an exception log it, pause for
+        `SERVICE_PAUSE_S`, and run it again.
 
-        Repeatedly is `MAX_FAILURES` times within `FAILURE_WINDOW_S`; a pause of
-        `SERVICE_PAUSE_S` comes before each restart. It ends when the service does.
+        After `MAX_FAILURES` failures within `FAILURE_WINDOW_S` it sets `failed`, which
+        ends all such loops and the process; the supervisor restarts that. Without the
+        service the server would answer without acting.
 
-        A service that fails repeatedly ends the process, which its supervisor restarts:
-        without the service the server would answer without acting.
+        Args:
+            work: makes the service's coroutine, once for each run.
         """
         ends: deque[float] = deque(maxlen=MAX_FAILURES)
         while not self.failed.is_set():
@@ -529,10 +538,11 @@ class TwinServer:
         )
 
     def _clearance(self, snapshot: ScannerState) -> NearestPair | None:
-        """Compute the smallest clearance at a state's positions; None for a machine
-        without components.
+        """Compute the smallest clearance [mm] and its pair at a state's motor positions,
+        in the scene of the guard in force.
 
-        Always computed anew; it needs the guard's scene.
+        Returns:
+            The pair; None without a guard, as for a machine without components.
         """
         guard = self.scanner.guard  # its scene is the one in force, and has been made
         motors = {
@@ -548,7 +558,8 @@ class TwinServer:
         """Describe the sample on the stage for the wire; the name is None for an empty
         stage.
 
-        Size, description and revision only of a sample.
+        An empty stage has no size, description or revision. The material is that in
+        force: voxels have none.
         """
         sample = self.scanner.sample
         offset = w.SamplePlacement(**asdict(sample.offset))
@@ -578,8 +589,8 @@ class TwinServer:
     # Changing -----------------------------------------------------------------------------------
 
     def changed(self) -> None:
-        """Notify state feed, live view and state store of a change, and wake who awaits a
-        motion's end.
+        """Notify state feed, live view and state store of a change, and let each
+        `motion_ended` look again at when motors rest.
         """
         self.feed.changed()
         self.live.changed()
@@ -605,7 +616,8 @@ class TwinServer:
     def _memory(self, ended: bool) -> kept.Memory:
         """Record the twin's state for the file that a restarted server reads.
 
-        Jobs that have files are not in it; only how many were made.
+        Jobs that have files are not in it, only those that could not be written and how
+        many were ever made.
 
         Args:
             ended: whether the server ends now.
@@ -649,7 +661,8 @@ class TwinServer:
         """Wait until `motors` are at rest, at any position, also after stops and further
         moves.
 
-        At once if none of them moves.
+        It returns at once if none of them moves or `motors` is empty. The time is the
+        twin's.
         """
         while True:
             now = self.clock.now()
@@ -678,13 +691,12 @@ class TwinServer:
         self._publish_log(level, message, data)
 
     def _noticed_disk(self, problem: str | None) -> None:
-        """Tell all clients, in log and state, that changes cannot be saved, or that they
-        can be saved again.
-
-        Paths are relative to the data directory; the state is published.
+        """Log for all clients that changes cannot be saved (an error) or that they can be
+        saved again (info), and publish the state.
 
         Args:
-            problem: None when it is over.
+            problem: reason of the failure; paths in it are shown relative to the data
+                directory. None when saving works again.
         """
         if problem is None:
             self.tell("info", "the state is on the disk again")
@@ -705,11 +717,10 @@ class TwinServer:
         self.hub.publish("log", entry, slot=None)
 
     def _job_changed(self, job: Job) -> None:
-        """Publish a job's status, log a change of its phase, and mark the state as
-        changed.
+        """Publish a job's status, log a new phase, and notify all watchers of the twin.
 
-        Running is not logged, nor a phase that was logged before; an ended job with an
-        error is logged as an error.
+        The phases "running" and the one logged last are not logged. A job with an error
+        is logged as an error.
         """
         status = self.jobs.status(job)
         self.hub.publish("job", status, slot=job.id)
@@ -721,11 +732,12 @@ class TwinServer:
         self.changed()
 
     def _scan_image(self, frame: Exposure, radiograph: Radiograph) -> None:
-        """Judge the scan's latest image and publish it, with its public geometry, to
-        subscribers.
+        """Judge the latest image of the running scan, and publish it with its public
+        geometry.
 
-        Only projections are judged; without subscribers nothing is published, and other
-        kinds are ignored.
+        Only a projection is judged, also without subscribers. An image of any kind is
+        published if there are subscribers. It has the sample of the running job and the
+        frame's positions, camera and tube.
 
         Args:
             frame: of the scan.

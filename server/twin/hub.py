@@ -49,10 +49,11 @@ class _Event:
         data: object | Render,
         slot: str | None,
     ) -> None:
-        """Make an event of number `seq` at twin time `time` [s].
+        """Make an event of topic `topic`, number `seq`, at twin time `time` [s].
 
-        `data` may be a function from a view to the data. A newer event of the same slot
-        replaces a pending one; without a slot every event is delivered.
+        `data` is the content or a function from a view to the content. A newer event of
+        the same slot replaces a pending one; slots of different topics are different.
+        With `slot` None every event is delivered.
         """
         self.topic = topic
         self.seq = seq
@@ -62,9 +63,10 @@ class _Event:
         self._made: dict[ImageRequest, Prepared] = {}
 
     def prepared(self, view: ImageRequest) -> Prepared:
-        """Prepare the event's message for a view of the image; made once for each view.
+        """Return the event's message for a view of the image, made at the first request
+        for that view and kept.
 
-        Data that are no function are the same for every view.
+        Without a function as `data` all views have the same content.
         """
         if view not in self._made:
             if callable(self._data):
@@ -171,8 +173,12 @@ class Hub:
 
         The listener's earlier subscriptions to the same topics do not count.
 
-        Raises:
-            RpcError: -32003, there would be more.
+        Args:
+            listener: who subscribes.
+            topics: its new subscriptions.
+            view: of all of them.
+
+        Raises: RpcError: -32003, there would be more; names the number and the limit.
         """
         views = [
             s.view
@@ -191,10 +197,10 @@ class Hub:
                 )
 
     def unsubscribe(self, listener: Peer, topics: Iterable[TopicName]) -> None:
-        """End subscriptions of `listener`; topics that were not subscribed to are
-        ignored.
+        """End subscriptions of `listener` to `topics`; topics that it is not subscribed
+        to are ignored.
 
-        Events that wait for the rate are dropped.
+        Its events that wait for the rate are dropped.
         """
         for topic in topics:
             subscription = self._listeners.get(topic, {}).pop(listener, None)
@@ -255,13 +261,15 @@ class Hub:
         data: object | Render,
         slot: str | None = "",
     ) -> None:
-        """Tell one subscriber of `topic` how things are: the last event's `seq`, out of turn.
+        """Send one subscriber of `topic` the present data, out of turn, with the number
+        of the last event.
 
-        Nothing if it is not subscribed; the history and the rate are not touched.
+        Nothing is sent if it is not subscribed. Other subscribers, the history, the
+        numbers and the rate are not touched. Before the first event the number is 0.
 
         Args:
             listener: who has just subscribed.
-            topic: which.
+            topic: of the event.
             data: as for `publish`.
             slot: as for `publish`.
         """
@@ -273,10 +281,10 @@ class Hub:
             )
 
     def _offer(self, listener: Peer, subscription: _Subscription, new: _Event) -> None:
-        """Deliver an event now, or, if it has a slot, keep it until the subscription's rate
-        allows it.
+        """Deliver an event now, or keep it until the subscription's rate allows it.
 
-        A newer event of the same slot replaces it; events without a slot never wait.
+        Only an event with a slot waits; then a newer one of the same slot replaces it. An
+        event that is delivered at once begins the next interval.
         """
         loop = asyncio.get_running_loop()
         wait = subscription.next_at - loop.time()
@@ -291,7 +299,9 @@ class Hub:
         self._deliver(listener, subscription, new)
 
     def _flush(self, listener: Peer, subscription: _Subscription) -> None:
-        """Deliver the pending event of each slot, and begin the next interval."""
+        """Deliver the pending event of each slot, forget them, and begin the next
+        interval.
+        """
         subscription.timer = None
         subscription.next_at = (
             asyncio.get_running_loop().time() + subscription.min_interval_s
@@ -307,10 +317,11 @@ class Hub:
         self._drain()
 
     def _drain(self) -> None:
-        """Post as many due events as one turn of the loop allows, and schedule the next
-        turn.
+        """Post due events, oldest first, until none is left or this turn's
+        `EVENTS_A_TURN` are used up, and schedule `_refill` for the next turn.
 
-        Events of subscriptions that have ended are dropped, and do not count.
+        Events of subscriptions that have ended are dropped and do not count. Of topics
+        with a history the last number posted to the listener is noted.
         """
         while self._due_events and self._room:
             listener, subscription, new = self._due_events.popleft()

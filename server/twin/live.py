@@ -55,10 +55,13 @@ class Shot:
 
     @classmethod
     def of(cls, scanner: ScannerTwin, now: float, revision: str | None = None) -> Shot:
-        """Read the scanner's state at `now`, with the revision of the sample on its
-        stage.
+        """Read from the scanner the state at `now` [twin s] on which an image depends.
 
-        Positions are of all motors, sorted by name; `revision` None if unknown.
+        Args:
+            scanner: its positions of all motors, sorted by name, camera, sample, tube and
+                correction are taken.
+            now: time of the positions.
+            revision: of the content of an uploaded sample; None if unknown.
         """
         return cls(
             time=now,
@@ -204,14 +207,12 @@ class LiveView:
         return Shot.of(scanner, self.clock.now(), self.revision(scanner.sample))
 
     async def run(self) -> None:
-        """Compute and publish images while the pose changes, one at a time; ends only by
-        cancellation.
+        """Compute and publish images after each change and during motion, one at a time;
+        end only by cancellation.
 
-        An image equal to the last one is not made again; at most one in
-        `FRAME_INTERVAL_S`.
-
-        Nothing is computed without subscribers or while a scan runs. A failure is logged
-        and tried again.
+        There is at most one image in `FRAME_INTERVAL_S`. An image equal to the last one
+        is not made again. Nothing is computed without subscribers or while a scan runs. A
+        failure is logged and tried again after `RETRY_S`.
         """
         loop = asyncio.get_running_loop()
         while True:
@@ -236,15 +237,15 @@ class LiveView:
     async def shoot(
         self, shot: Shot, *, predicted: bool = False
     ) -> tuple[Radiograph, ConeVec]:
-        """Compute the image of a shot and its public geometry; the image is judged in the
-        state.
+        """Compute the image of a shot without noise, and the shot's public geometry.
 
-        Without noise and hidden truth if `predicted`, else with the truth.
+        The image has the scanner's true geometry, and becomes the one that the state's
+        flags judge; not so with `predicted`.
 
         Args:
             shot: pose, tube and camera.
-            predicted: use the public geometry for the image as well, and keep it out of
-                the state.
+            predicted: compute the image with the public geometry, and leave the state's
+                flags alone.
 
         Returns:
             The radiograph without noise, and one row of cone_vec, nominal plus
@@ -294,11 +295,16 @@ class LiveView:
         await self._publish(radiograph, cone, shot)
 
     async def _publish(self, radiograph: Radiograph, cone: ConeVec, shot: Shot) -> None:
-        """Make an image in each subscribed view, in a thread, and publish it; keep it for
-        the state.
+        """Make an image in each subscribed view, in a thread, publish it, and keep it for
+        the flags in the state.
 
-        The noise depends on the number of the image alone, so all views of it agree. A
-        view subscribed meanwhile is made when it is delivered.
+        The noise depends on the number of the image alone, so all its views agree. A view
+        that is subscribed meanwhile is made when it is delivered.
+
+        Args:
+            radiograph: the image without noise.
+            cone: its public geometry, one row.
+            shot: pose, tube and camera; gives the event's time.
         """
         self._count += 1
         count = self._count
@@ -323,7 +329,9 @@ class LiveView:
             self._showing = asyncio.create_task(self._publish_newest())
 
     async def _publish_newest(self) -> None:
-        """Publish the newest image that was handed over, and again until there is none newer."""
+        """Publish the image that was handed over last, and again as long as another has
+        been handed over meanwhile; older ones are skipped.
+        """
         while self._made is not None:
             made = self._made
             self._made = None
@@ -352,10 +360,11 @@ class StateFeed:
         self._changed.set()
 
     async def run(self, settled: Callable[[], None]) -> None:
-        """Publish the state after each change and during motion; ends only by
-        cancellation.
+        """Publish the state after each change, during motion, and when X-rays become
+        ready; end only by cancellation.
 
-        During motion every `STATE_INTERVAL_S` of real time, and once more at its end.
+        During motion it is published every `STATE_INTERVAL_S` of real time, and once more
+        at its end.
 
         Args:
             settled: called when motion has ended, or X-rays have become ready.
@@ -380,13 +389,13 @@ class StateFeed:
             await self._wait_until_warm(settled)
 
     async def _wait_until_warm(self, settled: Callable[[], None]) -> None:
-        """Wait until X-rays are ready and publish the state then, if nothing else changes
-        before.
+        """Wait until X-rays are ready, then publish the state and call `settled`; another
+        change ends the wait without either.
 
-        Nothing is waited for if they are ready or off, or while a scan runs.
+        It returns at once if X-rays are ready or off, or while a scan runs.
 
         Args:
-            settled: called then.
+            settled: called when they are ready.
         """
         tube = self.scanner.tube
         if tube.ready_in_s(self.clock.now()) and not self.job_runs():
@@ -401,7 +410,9 @@ class StateFeed:
                 settled()
 
     def _publish(self) -> None:
-        """Publish the state if anybody is subscribed; a TwinError is logged, not raised."""
+        """Publish the state if anybody is subscribed to it; a TwinError is logged as a
+        warning, not raised.
+        """
         try:
             if self.hub.wanted("state"):
                 self.hub.publish("state", lambda _view: self.render())

@@ -36,8 +36,10 @@ async def run(options: TwinSettings) -> int:
     """Run the server until SIGTERM or SIGINT: lock the data directory, restore, serve,
     and end.
 
-    Without a state (or `fresh`) the default sample is put on the stage; `sample` counts
-    before the state's. Memory is a quarter of the machine's unless stated.
+    The state of the last server is restored unless `fresh`. The option `sample` counts
+    before the state's sample; without either, `DEFAULT_SAMPLE` is put on the stage. The
+    memory limit is a quarter of the machine's memory unless stated. The line `ready` is
+    printed once clients are served.
 
     Args:
         options: of the process.
@@ -150,9 +152,15 @@ async def run(options: TwinSettings) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the process until it is stopped; returns its exit code.
+    """Run the twin's process until it is stopped.
 
-    `argv` None is the command line.
+    It sets the level of the log and the interpreter's switch interval, `SWITCH_S`.
+
+    Args:
+        argv: arguments; None for those of the command line.
+
+    Returns:
+        The exit code.
     """
     options = parse(TwinSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)

@@ -55,18 +55,19 @@ class Reader:
 
 
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
-    """Decode a message or batch and validate its parameters; runs in the worker.
+    """Decode a message or a batch and validate the parameters of its calls; runs in the
+    worker.
 
-    It never raises for a malformed message: that is pickled.
+    A malformed message raises nothing: its error is pickled.
 
     Args:
-        codec: of the connection.
+        codec: of the connection; None before one is agreed on.
         most: largest number of items in a batch.
         raw: bytes of the message.
 
     Returns:
-        b"batch" or b"single", then for each item the method's name (b"" if unknown) and
-        its pickle.
+        b"batch" or b"single", then for each item two entries: the method's name (b"" if
+        unknown or no call), and the pickle of `_pickled_call`.
     """
     message = Connection(codec, max_batch=most).decode(raw)
     batch = isinstance(message, m.Batch)
@@ -84,11 +85,12 @@ def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
 
 
 def _pickled_call(message: m.Single) -> bytes:
-    """Pickle a message as a call with validated parameters; errors, and too large ones,
-    are pickled in place of parameters.
+    """Pickle a request or notification as a `Call` with validated parameters; other
+    messages are pickled as they are.
 
-    Messages that are no calls are pickled as they are; parameters above `MAX_PARAMS`
-    become an error unless the method is bulky.
+    In place of parameters the call has an RpcError if they are not valid, or if its
+    pickle is larger than `MAX_PARAMS` and the method is not bulky. A notification's call
+    has no id and is not answered.
     """
     if not isinstance(message, m.Request | m.Notification):
         return pickle.dumps(message)
@@ -106,10 +108,12 @@ def _pickled_call(message: m.Single) -> bytes:
 
 
 def _params(message: m.Request | m.Notification) -> Params | RpcError:
-    """Read a call's parameters as its method's model; returns the error if they do not
-    fit.
+    """Validate a call's parameters as the model of its method; the poses of a trajectory
+    are packed into one text.
 
-    Poses are packed to one text.
+    Returns:
+        The parameters, or (not raised) the RpcError: an unknown method, or parameters
+        that do not fit.
     """
     try:
         params = parse_params(find(message.method), message.params)

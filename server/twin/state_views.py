@@ -19,8 +19,8 @@ SAFETY_NAMES = {"ready": "ok", "blocked": "aborted", "estopped": "estop"}
 
 
 def tube_view(tube: TubeSettings, now: float) -> w.TubeState:
-    """Convert the tube to its wire form: on, kV, W, whether it is ready at `now`, else in
-    how many s.
+    """Convert the tube to its wire form: on, kV, W, and whether X-rays are ready at `now`
+    [twin s], else in how many seconds.
     """
     return w.TubeState(
         on=tube.on,
@@ -39,10 +39,12 @@ def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
 def geometry_view(readout: Readout | None) -> w.GeometryState:
     """Convert the derived geometry to its wire form.
 
-    None stands for such a pose.
+    Args:
+        readout: None for a pose whose rotation axis or detector is not in front of the
+            source.
 
     Raises:
-        GeometryError: the pose is impossible for a scanner.
+        GeometryError: `readout` is None.
     """
     if readout is None:
         raise GeometryError(
@@ -57,13 +59,13 @@ def safety_view(
 ) -> w.SafetyState:
     """Convert safety state and clearance to their wire form.
 
-    Clearance and pair are None where nothing is near; the margin's warning names the
-    pair.
+    `clearance_mm` and `pair` are None where nothing is near. A clearance below the margin
+    adds a warning that names the pair.
 
     Args:
         safety: of the scanner.
-        clearance: smallest one now; None for a machine without components.
-        margin_mm: a clearance below it is a warning.
+        clearance: smallest one now; None or infinite where there is none.
+        margin_mm: least clearance without a warning.
     """
     if clearance is None or not math.isfinite(clearance.mm):
         near = None
@@ -106,9 +108,11 @@ def clock_view(clock: TwinClock) -> w.ClockState:
 
 
 def stopped_view(state: w.State, stopping: StopMotion, now: float) -> w.Stopped:
-    """Return the wire state after a stop: path, duration and distances of the stopping motion.
+    """Add a stopping motion to the wire state: its path, duration [s] and distances by
+    motor.
 
-    If it would hit something, the pair and in how many seconds from `now` (0 if past).
+    If it would hit something, it also has the pair of bodies and in how many seconds from
+    `now`, at least 0; else None for both.
     """
     hit = stopping.would_hit
     how = w.Stopping(

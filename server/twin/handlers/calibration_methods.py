@@ -22,12 +22,14 @@ from flexdt.server.twin.handlers import handler as h
 async def apply(
     twin: TwinServer, client: h.Client, params: p.CalibrationApply
 ) -> p.CorrectionResult:
-    """Make a correction, put it in force instead of the last one, and save both.
+    """Make a correction, put it in force instead of the last one, save it and the
+    history, and log it.
 
-    A known name with the same values is put in force again. The result has the
-    correction.
+    A known name with the same values is put in force again.
 
-    The answer warns of motion that was halted because it would collide now.
+    Returns:
+        The correction, and a warning of motion that was halted because it would collide
+        now.
 
     Raises:
         RpcError: -32602, the name is taken; -32003, the client has lost control.
@@ -57,9 +59,11 @@ async def apply(
 def get(
     twin: TwinServer, client: h.Client, params: p.CalibrationGet
 ) -> p.CorrectionResult:
-    """Return the correction in force (maybe None), or the named one, which need not be in force.
+    """Return a correction: the named one, which need not be in force, or without a name
+    the one in force (None if there is none).
 
-    An unknown name raises as `Corrections.get`.
+    Raises:
+        UnknownNameError: as `Corrections.get`.
     """
     if params.name is None:
         return p.CorrectionResult(
@@ -74,9 +78,10 @@ def get(
 async def list_all(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.CorrectionListResult | Encoded:
-    """List all corrections, oldest first, and the name of that in force (or None).
+    """List all corrections, oldest first, and the name of the one in force (or None).
 
-    A long list is made in several turns of the loop.
+    The list is made in several turns of the loop. More than `ITEMS_A_TURN` are encoded in
+    a thread; then the result is the encoded answer.
     """
     current = twin.scanner.correction
     views = await h.in_turns(twin.corrections.all(), twin.correction_state)
@@ -89,10 +94,18 @@ async def list_all(
 
 @h.answers(p.CALIBRATION_REVERT)
 async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.CorrectionResult:
-    """Put the previous correction in force, or none; the answer warns of motion that was
-    halted.
+    """Put the correction in force again that was before the last one in the history, save
+    that, and log it.
 
-    Without a correction in the history none is in force, and nothing is an error.
+    Where none was before, none is in force afterwards; an empty history is no error.
+
+    Returns:
+        The correction (or None), and a warning of motion that was halted because it would
+        collide now.
+
+    Raises:
+        RpcError: -32003, the client has lost control.
+        CollisionError: bodies would be too close; nothing changes.
     """
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
@@ -108,14 +121,18 @@ async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.Correct
 async def delete(
     twin: TwinServer, client: h.Client, params: p.CalibrationDelete
 ) -> p.CorrectionDeleted:
-    """Delete a correction and its file from the list and the history of `revert`; data
-    sets keep theirs.
+    """Delete a correction, its file and its entries in the history of `revert`, and log
+    it; data sets keep their copy.
 
-    The client must be allowed to move when it is done.
+    The client must still be allowed to move when it is done.
+
+    Returns:
+        The name.
 
     Raises:
         UnknownNameError: there is no such correction.
         LimitError: it is in force.
+        RpcError: -32003, the client has lost control.
     """
     async with twin.stage_turn:
         history = twin.corrections.without(params.name)
@@ -128,7 +145,9 @@ async def delete(
             )
 
         def files(changes: Changes) -> None:
-            """Add the new history and the removal of the correction's file to the change."""
+            """Add the new history and the removal of the correction's file to the set of
+            changes on the disk.
+            """
             twin.corrections.store_history(changes, history)
             twin.corrections.remove(changes, params.name)
 
@@ -143,8 +162,8 @@ async def delete(
 
 
 def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.CorrectionResult:
-    """Log a message and its warnings for all clients, and make the answer with the
-    correction in force.
+    """Log a message and each of its warnings for all clients, and return the answer: the
+    correction in force (or None) and the warnings.
     """
     twin.tell("info", message)
     for warning in warnings:
@@ -157,10 +176,11 @@ def _in_force(twin: TwinServer, message: str, warnings: list[str]) -> p.Correcti
     DATASET_LIST, DATASET_GET, DATASET_FRAME, p.CALIBRATION_FIT, p.CALIBRATION_ALIGN
 )
 async def from_data_sets(twin: TwinServer, client: h.Client, params: Params) -> Encoded:
-    """Run a method on the data directory in a worker process and return its encoded
-    result.
+    """Run a method that reads the data directory in a worker process, and return its
+    encoded result.
 
-    The worker is told which data set a job writes.
+    The worker gets the folder name of the current job's data set ("" without a job),
+    which is still being written.
     """
     job = twin.jobs.current
     running = ""

@@ -67,13 +67,15 @@ _Handler: TypeAlias = Callable[
 
 
 def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_P, _R]]:
-    """Make a decorator that registers a function as handler of `methods`.
+    """Return a decorator that registers a function as the handler of `methods` in
+    `HANDLERS`.
 
-    The function is returned unchanged; a method may have one handler only.
+    The function is returned unchanged. A method that has a handler already raises
+    AssertionError.
     """
 
     def mark(handler: _Handler[_P, _R]) -> _Handler[_P, _R]:
-        """Register the handler for its methods, and return it unchanged.
+        """Register the handler for all the methods, and return it unchanged.
 
         A method that has one already raises AssertionError.
         """
@@ -93,14 +95,22 @@ def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], 
 def ensure_idle(
     twin: TwinServer, client: Client, method: str, what: str
 ) -> Callable[[], None]:
-    """Return a check that neither control has changed hands nor a job begun since the
-    request.
+    """Return a check, to be called later, that raises if another client has control or a
+    job would be disturbed.
 
-    It raises RpcError -32003; `method` and `what` are for its messages.
+    Args:
+        twin, client: whose control and jobs.
+        method: named in the error of control.
+        what: named in the error of the job.
+
+    Returns:
+        The check; it raises RpcError -32003.
     """
 
     def check() -> None:
-        """Raise if control has changed hands, then if a job would be disturbed."""
+        """Raise RpcError -32003 if another client has control, or else if a job would be
+        disturbed.
+        """
         twin.control.ensure_allowed(client.name, method)
         twin.jobs.require_idle(what)
 
@@ -108,10 +118,8 @@ def ensure_idle(
 
 
 async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[View]:
-    """Apply `view` to each item and return the results; other requests are handled
-    between them.
-
-    Between each `ITEMS_A_TURN` items; in order.
+    """Apply `view` to each item and return the results in order; after every
+    `ITEMS_A_TURN` items other requests have a turn.
     """
     views = []
     for at, item in enumerate(items, start=1):
@@ -132,17 +140,17 @@ async def change_settings(
     twin: TwinServer, change: Callable[[ScannerTwin], None], ready: Callable[[], None]
 ) -> None:
     """Try a change of settings on a copy of the scanner, write the state, then change the
-    scanner.
-
-    Errors of `change` and `ready` leave everything as it was.
+    scanner and notify watchers.
 
     Args:
         twin: whose scanner.
-        change: sets it; it is tried on a copy first, and its errors are raised.
-        ready: raises if the client has lost control.
+        change: sets it; it is called on a copy first, and its errors are raised before
+            anything has changed.
+        ready: raises if the client has lost control; called before the scanner is
+            changed.
 
     Raises:
-        DatasetWriteError: it cannot be written; nothing has changed.
+        DatasetWriteError: the state cannot be written; nothing has changed.
     """
 
     def after(memory: Memory) -> Memory:
@@ -152,7 +160,9 @@ async def change_settings(
         return with_scanner_state(memory, trial)
 
     def take() -> None:
-        """Change the scanner and notify watchers; raise first if the client has lost control."""
+        """Change the scanner itself and notify watchers; `ready` raises first if the
+        client has lost control.
+        """
         ready()
         change(twin.scanner)
         twin.changed()  # here: the client may be gone when this is saved
@@ -174,28 +184,28 @@ async def change_stage(
     """Put a sample on the stage and a correction in force: check, write, then change all
     at once.
 
-    A correction that cannot be applied is refused first.
-
-    Hold `stage_turn` meanwhile. The sweep runs in a thread. Motion that is not free of
-    the new stage is halted, and a running job interrupted.
+    A correction that cannot be applied is refused before anything is built. The sweep
+    runs in a thread. Motion that is not free of the new stage is halted; that also
+    interrupts a running job and ends a way around obstacles. The caller must hold
+    `stage_turn`.
 
     Args:
         twin: whose stage.
         sample, correction: the new ones; either may be the present one.
-        ready: raises if the client has lost control.
+        ready: raises if the client has lost control; called last before the change.
         history: of corrections, with this one; None leaves it.
         source: origin of a new correction.
         upload: new content under the sample's name.
         scene: settings and positions that come with it; its motion starts.
 
     Returns:
-        Warnings: motion that was halted.
+        The reason of a halt as the one warning, or [].
 
     Raises:
         UnknownNameError, LimitError, PhantomError: there is no such sample.
         GeometryError: a correction that no scanner can have.
-        CollisionError, SafetyError: what is under way, or stands, is not free of it;
-            nothing has changed (see `ScannerTwin.take_stage`).
+        CollisionError, SafetyError: present poses or motion touch the new stage; nothing
+            has changed (see `ScannerTwin.take_stage`).
         DatasetWriteError: it cannot be written; nothing has changed.
     """
     if history is None:
@@ -216,8 +226,8 @@ async def change_stage(
     change = await asyncio.to_thread(change.certified)
 
     def files(changes: Changes) -> None:
-        """Add the files of upload, correction and history to the change, as far as there are
-        any.
+        """Add to the changes on the disk: an upload's files, the correction, and the
+        history, each if there is one.
         """
         if upload is not None:
             twin.samples.store(changes, upload)
@@ -239,14 +249,14 @@ async def change_stage(
         return with_scanner_state(memory, trial, twin.corrections.in_state(names))
 
     def take() -> list[str]:
-        """Change stage, correction and settings together, and stop motion that would
-        collide.
+        """Change stage, correction, history and settings together, halt motion that would
+        collide, and notify watchers.
 
-        Raises, before anything changes, if the client has lost control. A halt also ends
-        a way around obstacles and interrupts a running job.
+        `ready` raises first if the client has lost control. A halt also cancels a way
+        around obstacles and interrupts a running job.
 
         Returns:
-            the reason for stopping as a warning, or no warning.
+            The reason of the halt as the one warning, or [].
         """
         ready()
         halted = scanner.take_stage(change, twin.clock.now())

@@ -37,18 +37,20 @@ from flexdt.twin.scanner.state import (
 async def get_projection(
     twin: TwinServer, client: Client, params: p.ProjectionGet
 ) -> Encoded:
-    """Compute an image at the present pose, or predict one for other poses or settings.
+    """Compute an image at the present pose, or predict one for other positions, tube or
+    camera settings.
 
-    Too strong a binning is an error.
-
-    A prediction has the public geometry and no noise; at the present pose the hidden
-    truth and noise are in the image.
+    The image at the present pose has the hidden truth and noise. A prediction has the
+    public geometry and no noise; one of the three parameters makes the request a
+    prediction.
 
     Returns:
-        The image, encoded for the connection, with marks of its pixels where requested.
+        The image, encoded in a thread for the connection, with marks of its pixels where
+        requested.
 
     Raises:
-        RpcError: -32008, it would be larger than an answer may be.
+        RpcError: -32602, the binning is larger than the image; -32008, the answer would
+            be too large.
         TwinError: the machine does not have a motor or a setting.
     """
     shot = twin.live.now()
@@ -66,10 +68,9 @@ async def get_projection(
     radiograph, cone = await twin.live.shoot(shot, predicted=elsewhere)
 
     def work() -> Encoded:
-        """Compute and encode the image in a thread, with marks if asked for.
+        """Make and encode the image, with marks if they are requested; runs in a thread.
 
-        An image for another place than the present (`elsewhere`) is made without random
-        noise.
+        Noise is random, not of a seed; a prediction has none.
         """
         view = ImageRequest(params.kind, params.binning)
         way = twin.radiography
@@ -90,7 +91,8 @@ def _predicted_shot(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Sh
     """Return the shot with the requested positions, tube and camera in place of the
     present ones.
 
-    X-rays switched on have no warm-up; what is not requested stays as in `shot`.
+    X-rays that are switched on need no warm-up. Settings that are not requested stay as
+    in `shot`.
 
     Raises:
         LimitError, UnknownNameError: the machine does not have a motor or a setting.
@@ -108,17 +110,18 @@ def _predicted_shot(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Sh
 
 
 def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:
-    """Check that an image fits into one answer.
+    """Check that an image fits into one answer of the connection.
 
-    Counts take 2 bytes a pixel, line integrals 4, marks one more.
+    Counts take 2 bytes a pixel, line integrals 4, marks one more; 4096 bytes are left for
+    the rest.
 
     Args:
         shape: (rows, cols) before binning.
         params: kind, binning and marks.
-        codec: of the connection; JSON needs a third more.
+        codec: of the connection; any but MessagePack needs a third more.
 
     Raises:
-        RpcError: -32008, it does not.
+        RpcError: -32008, it does not fit; names both sizes [bytes].
     """
     rows, cols = (n // params.binning for n in shape)
     size = rows * cols * ((2 if params.kind == "counts" else 4) + params.marks)
@@ -131,10 +134,11 @@ def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec)
 
 @answers(p.PROJECTION_RAY)
 async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult:
-    """Compute path lengths on the ray of a pixel, in the public geometry.
+    """Compute the path lengths [mm] by material on the ray of a pixel, in the public
+    geometry at the present pose.
 
-    The pixel may be fractional; pixel centres are whole numbers. The result has [mm] by
-    material.
+    The pixel is (column, row) and may be fractional; centres are whole numbers, so the
+    edge is half a pixel further.
 
     Raises:
         LimitError: the image has no such pixel.
@@ -154,7 +158,9 @@ async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult
 
 @answers(p.GEOMETRY_GET)
 def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryResult:
-    """Return cone_vec, detector shape and pixel [mm] now: nominal plus the applied correction."""
+    """Return the present cone_vec (12 numbers), detector shape (rows, cols) and pixel
+    [mm]: nominal plus the correction in force.
+    """
     cone = twin.scanner.cone_vec(twin.clock.now())
     return w.GeometryResult(
         cone_vec=cone.rows[0].tolist(),
@@ -165,12 +171,11 @@ def get_geometry(twin: TwinServer, client: Client, params: Empty) -> w.GeometryR
 
 @answers(p.EXPOSURE_PREDICT)
 async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -> Encoded:
-    """Predict the image quality of a circular scan at the present distances, in a worker
-    process.
+    """Predict the image quality of a circular scan, in a worker process.
 
-    A sample that is named is read, be it on the stage or not (with its own material).
-
-    Settings that the request leaves out are the present ones.
+    Settings and distances that the request leaves out are the present ones. A named
+    sample is read with its own material, be it on the stage or not; without a name it is
+    the one on the stage, with the material there.
 
     Returns:
         The forecast, encoded for the connection.

@@ -43,9 +43,14 @@ async def check(twin: TwinServer, client: h.Client, params: ScanInput) -> Encode
 
 @h.answers(*SUBMIT)
 async def submit(twin: TwinServer, client: h.Client, params: ScanInput) -> p.SubmitResult:
-    """Check a script or poses, and put the scan into the queue; returns job, data set, warnings.
+    """Check a script or poses, and put the scan into the queue; the client's control is
+    checked again when it is queued.
 
-    The client must be allowed to move, when it is asked and again when it is queued.
+    Returns:
+        The job's id, its data set's folder, and warnings.
+
+    Raises:
+        RpcError, TwinError: as `Submissions.submit`.
     """
     ready = h.ensure_allowed(twin, client, "a scan")
     job = await twin.submissions.submit(
@@ -70,15 +75,18 @@ async def pause(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSt
 
 @h.answers(p.JOB_RESUME)
 async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """Return a paused job to its pose and continue it; queue one that ended early once
-    more.
+    """Continue a paused job after its return to its pose; queue a job that ended early,
+    aborted or failed, once more.
 
-    At most `PATIENCE_S`. A done job raises as `Jobs.resume`.
+    For a paused job the answer waits until it runs or is refused, at most `PATIENCE_S`. A
+    done job raises as `Jobs.resume`.
 
-    The answer waits until the job runs or is refused.
+    Returns:
+        The job's status.
 
     Raises:
-        RpcError: -32002, a contact is ahead; the job stays paused.
+        RpcError: -32003, the client may not move.
+        CollisionError: a contact is ahead; the job stays paused.
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED_PHASES and job.phase != "done":
@@ -93,9 +101,11 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
 
 @h.answers(p.JOB_STEP)
 async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """Run one frame or command of a paused job; wait at most `PATIENCE_S`, return the status.
+    """Run one frame or command of a paused job, wait for its end at most `PATIENCE_S`,
+    and return the job's status.
 
-    -32002 as for `resume`, also if an obstacle stopped it.
+    Raises:
+        CollisionError: an obstacle stopped it; the job stays paused.
     """
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)
@@ -107,13 +117,13 @@ async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSta
 
 @h.answers(p.JOB_ABORT)
 async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.JobStatus:
-    """End the job with X-rays off; its data set stays, marked incomplete with the reason.
+    """End a job with X-rays off; its data set stays, marked incomplete with the reason.
 
-    It waits at most `PATIENCE_S` for the end. Without `job` it is the current or last
-    one.
+    Without `job` it is the current or last one. The answer waits until the state is on
+    the disk, and at most `PATIENCE_S` for the job's end.
 
-    The answer waits until the state is on the disk and the job has ended; a disk that
-    fails is a warning in it.
+    Returns:
+        The job's status; a disk that fails is a warning in it, no error.
     """
     job = twin.jobs.get(params.job)
     twin.jobs.abort(job, params.reason, client.name)
@@ -144,18 +154,20 @@ async def list_jobs(
 async def forget(
     twin: TwinServer, client: h.Client, params: p.JobForget
 ) -> p.JobForgetResult:
-    """Remove ended jobs, and their files, from the list.
+    """Remove ended jobs and their files from the list; data sets stay.
 
-    The job named (whenever it ended), or else all that ended at least `days` ago; resumed
-    ones stay. Returns the ids removed.
+    They are the job named, whenever it ended, or else all that ended at least `days` ago;
+    without `days` all ended ones. One that was resumed meanwhile stays. A scan whose data
+    set exists keeps its record, so submitting it again resumes it.
 
-    An incomplete one whose data set exists is resumed if its scan is submitted again.
+    Returns:
+        The ids of the removed jobs.
     """
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
 
     def files(changes: Changes) -> None:
-        """Remove the jobs' files, and the records of scans whose data set's folder does not
-        exist.
+        """Add to the changes on the disk: the removal of the jobs' files, and of the scan
+        record where the data set's folder does not exist.
         """
         for job in jobs:
             twin.job_files.remove(changes, job.id)
@@ -163,10 +175,10 @@ async def forget(
                 JobRecord.forget(changes, twin.directory, job.name)
 
     def take() -> list[Job]:
-        """Remove the jobs from the list, except those that were resumed meanwhile; return
-        them.
+        """Remove the jobs from the list and mark the state as changed; return the removed
+        ones.
 
-        The state is marked as changed.
+        Jobs that have been resumed meanwhile stay.
         """
         gone = [
             job for job in jobs if job.phase in ENDED_PHASES
@@ -180,8 +192,10 @@ async def forget(
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:
-    """Wait until `condition` holds, at most `PATIENCE_S`, and return the job's status either
-    way.
+    """Wait until `condition` holds, at most `PATIENCE_S` of real time, and return the
+    job's status either way.
+
+    The condition is tested every 5 ms.
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + PATIENCE_S
@@ -191,10 +205,10 @@ async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.
 
 
 def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
-    """Return the status of a job that is to continue; raise the CollisionError of one
-    that is paused by an obstacle.
+    """Return `status`, unless the job is paused by an obstacle: then raise its
+    CollisionError.
 
-    Other errors of a paused job are in the status.
+    Other errors of a paused job stay in the status.
     """
     error = None
     if job.runner is not None:
@@ -205,12 +219,15 @@ def _unless_obstructed(job: Job, status: w.JobStatus) -> w.JobStatus:
 
 
 def _source(params: ScanInput) -> ScanSource:
-    """Make the requested scan from a script's text or bytes, or from poses.
+    """Make the requested scan from a script's text or its bytes in base64, or from a list
+    of poses.
 
-    Exposure and flats are those of the request, for poses only; moments and seed for both.
+    Exposure and flat frames are taken from the request for poses only; motion samples and
+    seed for both.
 
     Raises:
-        RpcError: -32602, no base64; -32008, the script is too large.
+        RpcError: -32602, `data_base64` is not base64; -32008, the script has more than
+            `MAX_SCRIPT_BYTES`.
     """
     if isinstance(params, p.TrajectoryInput):
         return ScanSource.of_poses(

@@ -27,12 +27,16 @@ from flexdt.twin.scanner.state import CameraChange
 
 @answers(p.AXES_MOVE)
 async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
-    """Start a move; the answer is sent at once, or with `wait` when the motors rest.
+    """Start a move of motors; with `plan` find and start a way around obstacles instead
+    (see `_move_around_obstacles`).
 
-    Warnings are targets limited to the travel and, with `wait`, motors that stopped
-    short; `arrived` is None without `wait`.
+    A way that is under way is cancelled. The answer is sent at once, or with `wait` when
+    the motors rest.
 
-    A way around obstacles that is under way is cancelled. With `plan` a new one is found.
+    Returns:
+        The longest duration [s]; warnings of targets limited to the travel and, with
+        `wait`, of motors that rest elsewhere; `moves` None; `arrived`, None without
+        `wait`.
     """
     if params.plan:
         return await _move_around_obstacles(twin, client, params)
@@ -56,9 +60,8 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
 
 
 async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> list[str]:
-    """Wait until the motors rest, and list a warning for each that rests elsewhere.
-
-    Positions must agree exactly.
+    """Wait until the motors rest, and list a warning for each that does not rest exactly
+    at its target.
 
     Args:
         twin: whose motors.
@@ -75,11 +78,10 @@ async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> l
 
 @contextmanager
 def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
-    """Cancel a way around obstacles if the command is accepted or halts the motors.
+    """Run a command of motion, then cancel a way around obstacles and publish the change.
 
-    The change is published in any case.
-
-    A refused command leaves the way running.
+    The way is cancelled if the command succeeds or has changed the motors' programmes.
+    After a command that raises without a change it goes on.
     """
     before = twin.scanner.programmes
     refused = True
@@ -98,14 +100,16 @@ async def _move_around_obstacles(
     """Find free moves to the targets and start them one by one; an earlier way ends with
     its present leg.
 
-    The result has the moves; `arrived` is None without `wait`.
+    With `wait` the answer comes at the end of the way. Later a failure is a warning in
+    the log in either case.
 
-    With `wait` the answer comes at the end of the way; else its failure is told in the
-    log.
+    Returns:
+        Duration of the way [s]; warnings; the moves, each motor -> target; `arrived`,
+        None without `wait`.
 
     Raises:
         CollisionError: no free way was found.
-        RpcError: the client has lost control meanwhile.
+        RpcError: -32003, the client has lost control meanwhile.
     """
     twin.detours.cancel()
     now = twin.clock.now()
@@ -139,10 +143,13 @@ async def _move_around_obstacles(
 
 @answers(p.AXES_JOG)
 def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
-    """Run an axis until the lease ends (`twin.motion.drives.plan_jog`), or as far as it
-    is free; a way around obstacles is cancelled.
+    """Run an axis at a velocity until the lease ends or as far as it is free (see
+    `twin.motion.drives.plan_jog`).
 
-    The result has the duration [s] and a warning if the jog is cut short; no moves.
+    A way around obstacles is cancelled.
+
+    Returns:
+        The duration [s], a warning if the jog is cut short, and `moves` None.
     """
     with _cancelling_detour(twin):
         jogged = twin.scanner.jog(
@@ -157,10 +164,13 @@ def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
 async def set_axis(
     twin: TwinServer, client: Client, params: p.AxisSet
 ) -> p.AxisSetResult:
-    """Set speed and acceleration of an axis's future motions; the answer has those in
-    force.
+    """Set speed and acceleration of an axis's future motions, and save them; those left
+    out stay.
 
-    Omitted ones stay; it needs an idle twin. Motion under way is not changed.
+    It needs control and an idle twin. Motion under way is not changed.
+
+    Returns:
+        The axis with the speed and acceleration that are in force.
     """
 
     def change(scanner: ScannerTwin) -> None:
@@ -178,10 +188,13 @@ async def set_axis(
 
 @answers(p.AXES_STOP)
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Bring the motors to rest; a running scan pauses, a way around obstacles is
+    """Bring the motors to rest; a running scan pauses, and a way around obstacles is
     cancelled.
 
-    Also if nothing moves: it counts as a stop. X-rays stay as they are.
+    It counts as a stop even if nothing moves. X-rays stay as they are.
+
+    Returns:
+        The state with the stopping motion.
     """
     twin.detours.cancel()
     twin.interrupt("stop")
@@ -192,11 +205,14 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
 
 @answers(p.SAFETY_ESTOP)
 def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Stop as the machine's E-stop does, X-rays off, and save that it is in force; a
-    running scan pauses.
+    """Stop as the machine's E-stop does with X-rays off, log it, and save that it is in
+    force.
 
-    Also if it is in force already; then the state is not written at once. A way around
-    obstacles ends.
+    A running scan pauses, and a way around obstacles ends. While it is in force already
+    it stops again, but the state is not written at once.
+
+    Returns:
+        The state with the stopping motion.
     """
     twin.detours.cancel()
     twin.interrupt("E-stop")
@@ -226,14 +242,16 @@ def set_clock(twin: TwinServer, client: Client, params: p.ClockSet) -> w.ClockSt
 
 @answers(p.TUBE_SET)
 async def set_tube(twin: TwinServer, client: Client, params: p.TubeSet) -> w.TubeState:
-    """Change the tube: voltage, power, X-rays; omitted settings stay. Voltage and power
-    are saved.
+    """Change the tube's voltage, power and X-rays; omitted settings stay.
 
-    Voltage and power need an idle twin; X-rays alone are switched at once, also during a
-    job.
+    A change of voltage or power needs control and an idle twin, and is saved. X-rays
+    alone are switched at once, also during a job.
+
+    Returns:
+        The tube's state afterwards.
 
     Raises:
-        SafetyError: X-rays on after motion was stopped meanwhile.
+        SafetyError: X-rays were to go on and motion was stopped after the request came.
     """
 
     stops = twin.scanner.stops

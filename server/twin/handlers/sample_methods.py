@@ -24,11 +24,17 @@ MAX_NAMED_UPLOADS = 50
 async def set_sample(
     twin: TwinServer, client: h.Client, params: p.SampleSet
 ) -> p.SampleResult:
-    """Put a shipped phantom or an upload on the stage; without an offset it is centred.
+    """Put a shipped phantom, an upload or nothing on the stage; without an offset it is
+    centred.
 
-    It needs an idle twin; an unknown upload or phantom is an error.
+    It needs control and an idle twin, after the reading and when it is done. The sample
+    is read first, in a thread.
 
-    The sample is read first, in a thread; the answer warns of motion that was halted.
+    Returns:
+        The sample on the stage, and a warning of motion that was halted.
+
+    Raises:
+        UnknownNameError: an upload given as `file`, or a sample, that does not exist.
     """
     if params.name is None:
         name = params.file
@@ -59,10 +65,12 @@ async def set_sample(
 async def list_samples(
     twin: TwinServer, client: h.Client, params: Empty
 ) -> p.SampleListResult | Encoded:
-    """List the empty stage, shipped phantoms and uploads, with their sizes, and all
+    """List the empty stage, shipped phantoms and uploads, in that order, and all
     materials.
 
-    In that order; a long list is made in several turns of the loop.
+    Phantoms have their size [mm], uploads a text with format and bytes. The list is made
+    in several turns of the loop; more than `ITEMS_A_TURN` entries are encoded in a
+    thread.
     """
     empty = p.SampleInfo(
         name=EMPTY_STAGE, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
@@ -85,11 +93,11 @@ async def list_samples(
 async def mesh(
     twin: TwinServer, client: h.Client, params: p.SampleMesh
 ) -> p.SampleMeshResult:
-    """Send a part of the mesh (binary STL) of the sample on the stage, for drawing.
+    """Return `count` bytes from `start` of the mesh (binary STL) of the sample on the
+    stage, for drawing.
 
-    A part beyond the end is empty; `total` is the mesh's size [bytes].
-
-    The mesh is made once for each sample, in a thread.
+    A part beyond the end is shorter or empty; `total` is the mesh's size [bytes]. The
+    mesh of a sample is made once, in a thread.
 
     Raises:
         LimitError: the stage is empty.
@@ -123,12 +131,15 @@ async def mesh(
 async def upload(
     twin: TwinServer, client: h.Client, params: p.SampleUpload
 ) -> p.UploadResult:
-    """Write one chunk of an upload; after the last one parse and store the sample.
+    """Store one chunk of an upload; after the last one parse the sample, store it, and
+    log it.
 
-    A sample in use needs an idle twin at each chunk. Until complete the result has only
-    the bytes received; then sample and warnings, too.
+    A complete upload under the name of the sample on the stage replaces that one there. A
+    sample on the stage needs control and an idle twin at each chunk.
 
-    A complete upload under the name of the sample on the stage replaces that one there.
+    Returns:
+        The bytes received and `complete`; for a complete upload also the sample, and
+        warnings of assumed values and of motion that was halted.
     """
     head = UploadHead.of(params)
     _ensure_idle_if_used(twin, client, head.name)
@@ -174,14 +185,17 @@ async def upload(
 async def delete(
     twin: TwinServer, client: h.Client, params: p.SampleDelete
 ) -> p.SampleDeleteResult:
-    """Delete an upload and its files, unless it is on the stage or in a scan that has not
-    ended.
+    """Delete an upload and its files, and log it.
 
-    Returns the name and its size [bytes]; use is checked again when it is done.
+    That it is not in use is checked at the request and again when it is done.
+
+    Returns:
+        The name and the upload's size [bytes].
 
     Raises:
-        UnknownNameError: no such upload.
-        LimitError, RpcError: it is in use.
+        UnknownNameError: there is no such upload.
+        LimitError: it is on the stage.
+        RpcError: -32003, a scan of it has not ended, or the client has lost control.
     """
     name = params.name
     ready = h.ensure_allowed(twin, client, "sample.delete")
@@ -206,9 +220,8 @@ async def delete(
 
 
 def _ensure_unused(twin: TwinServer, name: str) -> None:
-    """Check that no scan and no stage needs a sample.
-
-    In that order.
+    """Check that an upload is not on the stage, and then that no scan that has not ended
+    shows it.
 
     Raises:
         LimitError: it is on the stage.
@@ -241,10 +254,14 @@ def _ensure_idle_if_used(twin: TwinServer, client: h.Client, name: str) -> None:
 def _sample_info(
     name: str, phantom: Phantom, head: UploadHead | None = None
 ) -> p.SampleInfo:
-    """Describe a sample for the list; `head` is the description of an upload, None for a
-    phantom.
+    """Describe a sample for the list: name, kind, description, size [mm], and whether it
+    was uploaded.
 
-    Size [mm] and description are the phantom's.
+    Args:
+        name: of the sample.
+        phantom: gives description and size.
+        head: description of an upload, which gives the kind; None for a shipped phantom,
+            of kind "phantom".
     """
     return p.SampleInfo(
         name=name,
@@ -262,10 +279,10 @@ def _upload_info(head: UploadHead) -> p.SampleInfo:
 
 
 def _unknown_upload(twin: TwinServer, name: str) -> UnknownNameError:
-    """Make the error for an upload that does not exist, with the last names; returned,
-    not raised.
+    """Make, not raise, the error for an upload that does not exist.
 
-    At most `MAX_NAMED_UPLOADS` names and the number of older ones.
+    It names the last `MAX_NAMED_UPLOADS` uploads and the number of older ones, or that
+    there are none.
     """
     uploads = list(twin.samples.uploads)[-MAX_NAMED_UPLOADS:]
     older = len(twin.samples.uploads) - len(uploads)

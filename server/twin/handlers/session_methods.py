@@ -26,12 +26,15 @@ document = cache(openrpc_document)
 
 @answers(p.SESSION_HELLO)
 def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
-    """Answer a client's greeting; `network.shell_parts.TokenCheck` has checked its token.
+    """Check the protocol's version, note the client's program name, and return the facts
+    of the server.
 
-    A later hello does not change the program. The result has protocol, server, machine,
-    profile, session, physics and instance.
+    A later hello does not change the program, by which control goes. The token has been
+    checked before, by `network.shell_parts.TokenCheck`.
 
-    The client's program is noted, as control goes by its name.
+    Returns:
+        Protocol, server's version, machine, profile, session (the client's name),
+        physics, and instance of this run.
 
     Raises:
         RpcError: another version of the protocol.
@@ -51,16 +54,18 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
 
 @answers(p.SESSION_CONTROL)
 def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlResult:
-    """Take, release or force control; there is one controller at a time.
+    """Acquire, release or force control, and publish the state; there is one controller
+    at a time.
 
-    Release by another than the controller changes nothing; acquire renews the lease. The
-    result has the controller (None: nobody) and whether it is the client.
+    Acquire renews the controller's own lease. Release by another than the controller
+    changes nothing. Force takes control from a controller and logs that. When a
+    controller loses or releases control, its way around obstacles is cancelled.
 
-    A new controller cancels the last one's way around obstacles, and force is told in the
-    log.
+    Returns:
+        The controller (None: nobody), and whether it is the client.
 
     Raises:
-        RpcError: -32003, another client is the controller.
+        RpcError: -32003, acquire while another client is the controller.
     """
     before = twin.control.holder
     match params.action:
@@ -93,10 +98,11 @@ def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
 
 @answers(p.STATE_SUBSCRIBE)
 def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
-    """Subscribe to events; state, image and jobs are sent at once where they are among the
-    topics.
+    """Subscribe the client to topics, and send at once the state, an image and jobs,
+    where they are among the topics.
 
-    Of the jobs, those that have not ended and the current or last one.
+    Of the jobs those are sent that have not ended, and the current or last one. A second
+    call changes rate and view.
     """
     view = ImageRequest(params.projection_kind, params.projection_binning)
     twin.hub.subscribe(client.peer, params.topics, params.max_rate_hz, view)
@@ -120,7 +126,9 @@ def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Noth
 
 @answers(d.SCENE_SAVE)
 def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult:
-    """Return a scene: motors' targets, settings, sample and correction. Nothing is stored here."""
+    """Return a scene of the present: motors' targets, settings, sample and correction;
+    the server stores nothing.
+    """
     scene = save_scene(
         twin.scanner,
         twin.clock.now(),
@@ -133,17 +141,18 @@ def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult
 
 @answers(d.SCENE_LOAD)
 async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State:
-    """Load a scene: check all of it, the motion included, then change stage and settings
-    and start the motors.
+    """Load a scene: check all of it, the motion included, then change stage, correction
+    and settings and start the motors.
 
-    A scene without a correction ends the one in force. It needs an idle twin, before and
-    after the reading.
+    A scene without a correction ends the one in force. It needs control and an idle twin,
+    after the sample is read and when it is done. Halted motion is a warning in the log.
 
     Returns:
-        The complete state afterwards; halted motion is told in the log.
+        The complete state afterwards.
 
     Raises:
-        RpcError: -32602, another machine's; -32003, a job runs.
+        RpcError: -32602, another machine's; -32003, a job runs or the client has no
+            control.
         SafetyError: motion was stopped meanwhile.
     """
     scene = params.document
@@ -155,10 +164,8 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
             await asyncio.to_thread(twin.samples.load, sample.name, sample.material)
 
     def ready() -> None:
-        """Raise if motion was stopped meanwhile, a job runs, or the client has lost
-        control.
-
-        In that order: stop, control, job.
+        """Raise if motion was stopped since the request, another client has control, or a
+        job runs; in that order.
         """
         if twin.scanner.stops != stops:
             raise SafetyError(
