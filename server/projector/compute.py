@@ -93,7 +93,8 @@ class ComputeJob:
     async def run(self, compute: ComputeThread, step: Step) -> object:
         """Compute a step in its turn on the compute thread and return its value.
 
-        A job that has been given up raises its error at once.
+        A job that has been given up raises its error at once, and one that is given up
+        meanwhile as soon as that happens.
 
         Args:
             compute: the thread.
@@ -115,8 +116,8 @@ class ComputeJob:
     async def _in_turn(self, compute: ComputeThread, step: Step) -> object:
         """Wait for the lane, put the step into the thread's queue, and return its value.
 
-        The job enters the lane's number of jobs in hand at its first step, and stays in
-        it.
+        At its first step the job also waits until fewer than `MAX_IN_HAND` jobs of the
+        lane are in hand; it stays in hand afterwards.
         """
         if not self._in_hand:
             self._in_hand = await self.lane.in_hand.acquire()
@@ -160,9 +161,10 @@ class ComputeThread:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        """Compute queued steps in order until `close`; results and errors go to their futures.
+        """Compute queued steps in order until `close` is called; results and errors go to
+        the steps' futures.
 
-        Steps cancelled before are skipped.
+        A step whose future was cancelled before it begins is skipped.
         """
         while (put := self._steps.get()) is not None:
             future, step = put
@@ -184,7 +186,7 @@ def projection_steps(
         shape: detector (rows, cols).
         block: views of a step.
 
-    Returns:
+    Yields:
         Steps whose values are float32 (views, rows, cols).
     """
 
@@ -202,11 +204,14 @@ def views_a_block(shape: tuple[int, int]) -> int:
 
 
 def begin(threads: int) -> None:
-    """Set the thread count of this thread's kernels, and load or compile
-    the projection kernels.
+    """Set the thread count of this thread's kernels, and load or compile the projection
+    kernels; start the compilation of back projection.
 
-    Those of back projection, which few clients need, are compiled later in a thread of
-    low priority.
+    The kernels of back projection, which few clients need, are compiled later from a
+    thread of their own.
+
+    Args:
+        threads: of the kernels.
 
     Raises:
         ValueError: more threads than numba was started with.
@@ -220,9 +225,8 @@ def begin(threads: int) -> None:
 
 
 def _compile_back() -> None:
-    """Wait `COMPILE_BACK_AFTER_S`, then compile the back projection in another process.
-
-    At low priority, and only unless it is compiled already.
+    """Wait `COMPILE_BACK_AFTER_S`, then compile the back projection in another process at
+    low priority, unless it is compiled already.
     """
     time.sleep(COMPILE_BACK_AFTER_S)
     os.nice(10)  # Linux: of this thread, and of the process that it starts

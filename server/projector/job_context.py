@@ -40,8 +40,12 @@ class JobClient:
     """One connection, its jobs and its requests under way."""
 
     def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
-        """Make the state of a connected client, with two lanes; admitted already if no token
-        is needed.
+        """Make the state of a connected client, with two lanes and no jobs.
+
+        Args:
+            link: its connection.
+            token: that it must show; None admits it at once.
+            lines: of the log about refused tokens.
         """
         self.link = link
         self.let_in = token is None
@@ -109,7 +113,11 @@ class Context:
         return await client.begin(id).run(self.compute, step)
 
     def supersede(self, client: JobClient, key: str) -> None:
-        """End this client's jobs of that key that still wait, with an error; count them."""
+        """End this client's jobs of that key that still wait, with an error, and count
+        them in `superseded`.
+
+        Jobs that are being computed go on.
+        """
         for job in client.jobs.values():
             if job.key == key and job.waits:
                 job.end(superseded(key))

@@ -19,13 +19,20 @@ from flexdt.runtime.settings import parse
 
 
 async def run(options: ProjectorSettings) -> int:
-    """Serve until SIGTERM or SIGINT; return the exit code.
+    """Serve until SIGTERM or SIGINT, then close the server.
 
-    It uses all threads, and half of the memory, unless options say otherwise. The port is
-    announced when bound, all addresses when ready.
+    It uses all threads and half of the memory unless options say otherwise. The port is
+    announced when it is bound, the addresses, threads and memory limit [bytes] when it is
+    ready.
 
     Args:
         options: of the process.
+
+    Returns:
+        The exit code, always OK.
+
+    Raises:
+        AccessError, OSError: the address, the token or the TLS files cannot be used.
     """
     from flexdt.runtime.http_pages import Requests, served_pages
     from flexdt.server.projector.compute import backend, begin

@@ -41,7 +41,7 @@ Answer = Callable[[Context, JobClient, Id, Any], Awaitable[object]]
 
 
 async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object:
-    """Check the token, admit the client and end its hello timeout.
+    """Check the token, admit the client, and cancel the time limit for its hello.
 
     The protocol version is not checked here.
 
@@ -55,7 +55,7 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
         A dict with the keys protocol, server, machine (empty), instance and evicts.
 
     Raises:
-        RpcError: not authorised, a wrong token.
+        RpcError: not authorised: a wrong or missing token.
     """
     await client.token_check.check(p.token, client.link.peer)
     client.let_in = True
@@ -72,23 +72,26 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
 async def volume_put(
     context: Context, client: JobClient, id: Id, p: wire.VolumePut
 ) -> object:
-    """Store a scene, or a chunk of voxels or of a mesh; prepare and store a complete
-    volume.
+    """Store a scene, or a chunk of voxels or of a mesh; the last chunk has the whole
+    prepared and stored.
 
-    A scene is stored at once (received 0). An incomplete one is only kept.
+    A scene comes whole (received 0). The chunks come in order and belong to the
+    connection.
 
     Args:
         context: of the server.
         client: that sends it.
         id: of the request.
-        p: parameters.
+        p: name, and a scene, or the sizes of grid or mesh with a chunk.
 
     Returns:
-        A dict with the keys name, received [bytes], total [bytes], complete and, where its
-        values are doubtful, warnings.
+        A dict with the keys name, received [bytes], total [bytes], complete and, where
+        its values are doubtful, warnings.
 
     Raises:
-        RpcError: -32008 above the memory limit; -32602, chunks that do not fit together.
+        RpcError: -32008, above the memory limit; -32602, chunks that do not fit together
+            or values that are not finite.
+        GeometryError: values that are no attenuation.
     """
     if p.scene is not None:
         context.store.put(p.name, scene_from_dict(p.scene), evictable=p.evictable)
@@ -143,10 +146,10 @@ async def volume_get(
 
 
 async def volume_list(context: Context, client: JobClient, id: Id, p: Params) -> object:
-    """List the volumes and their memory as a dict: volumes, memory_used and memory_limit
-    [bytes].
+    """List the volumes and their memory, as a dict with the keys volumes, memory_used and
+    memory_limit [bytes].
 
-    Each has name, kind, bytes and its sizes. The arguments are ignored.
+    Each volume has its name, kind, bytes and sizes. Nothing but `context` is used.
     """
     return {
         "volumes": context.store.describe(),
@@ -163,23 +166,23 @@ async def volume_remove(
 
 
 async def project(context: Context, client: JobClient, id: Id, p: wire.Project) -> object:
-    """Compute line integrals, block of views by block; replace a waiting request of
-    the same key.
+    """Compute line integrals, one block of views after the other, and send them.
 
-    Warnings about the geometry are in the result. The parts are sent before it.
+    A request with a key first ends the client's waiting requests of the same key. The
+    geometry is examined before anything is computed.
 
     Args:
         context: of the server.
         client: that calls.
         id: of the request.
-        p: parameters.
+        p: name of the volume, cone_vec (n, 12), detector (rows, cols), key.
 
     Returns:
-        The image value; type, shape and number of parts where the views were sent in
-        parts.
+        The image value if all views fit into one frame; else dtype, shape and the number
+        of parts, sent before. With warnings about the geometry if there are any.
 
     Raises:
-        RpcError: no such volume, or a view that is too large.
+        RpcError: no such volume, or a view of more than `MAX_VIEW_BYTES`.
         GeometryError: a geometry that no scanner has.
     """
     volume = context.store.get(p.volume)
@@ -213,11 +216,10 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 async def backproject(
     context: Context, client: JobClient, id: Id, p: wire.Backproject
 ) -> object:
-    """Compute the adjoint of projections, and answer it or store it, added to a named
-    volume.
+    """Compute the adjoint of projections on a grid, and send it, or with `into` add it to
+    a named volume.
 
-    A named volume that does not exist begins at zero; the sum replaces it, with parts 0
-    in the answer.
+    A named volume that does not exist begins at zero; the sum replaces it.
 
     Args:
         context: of the server.
@@ -226,12 +228,11 @@ async def backproject(
         p: projections, cone_vec, grid, and perhaps the name of the volume.
 
     Returns:
-        The image value; type, shape and number of parts where it was sent in parts or
-        added.
+        As `Context.send_array`; with `into` dtype, shape and parts 0.
 
     Raises:
-        RpcError: other numbers of projections and views, another grid than that of the
-            named volume, or no memory.
+        RpcError: -32602, other numbers of projections and views, or a named volume of
+            another shape; -32008, no memory.
     """
     if len(p.projections) != len(p.cone_vec):
         raise invalid_params(
@@ -251,7 +252,7 @@ async def backproject(
 async def health(context: Context, client: JobClient, id: Id, p: Params) -> object:
     """Return figures about the server as a dict, by the names of the wire.
 
-    Instance, version, backend and threads, uptime [s], clients, waiting, views,
+    They are instance, version, backend and threads, uptime [s], clients, waiting, views,
     superseded, volumes, and memory used, allowed and evictable [bytes]. `client`, `id`
     and `p` are ignored.
 
@@ -278,10 +279,10 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
 
 
 async def cancel(context: Context, client: JobClient, id: Id, p: wire.Cancel) -> object:
-    """Cancel a request of this client; the answer, a dict with the key cancelled, says
-    whether there was one.
+    """Cancel a request of this client, which is then answered with an error.
 
-    The cancelled request is answered with an error.
+    Returns:
+        A dict with the key cancelled: whether that request was under way.
     """
     job = client.jobs.get(p.request)
     if job is not None:
@@ -303,13 +304,15 @@ def _document() -> object:
 def _accumulator(
     context: Context, name: str | None, grid: wire.VoxelGrid
 ) -> Volume | None:
-    """Return the volume called `name`, to which a back projection is added; None if there
-    is none, or no name.
+    """Look up the volume called `name`, to which a back projection is to be added.
 
     Only the shape is compared, not voxel size and place.
 
+    Returns:
+        The volume; None without a name or if there is no such volume.
+
     Raises:
-        RpcError: it is not a volume of this grid.
+        RpcError: -32602, it is a mesh or a scene, or has another shape than `grid`.
     """
     if name is None or name not in context.store:
         return None
@@ -325,16 +328,19 @@ def _warnings(doubts: list[str]) -> dict[str, list[str]]:
 
 
 def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | TriangleMesh:
-    """Check a volume's values, make its projection layout, and return the volume; blocks.
+    """Check a volume's values and make its projection layout; blocks.
 
-    Meshes are returned as they are.
+    Meshes are not checked.
 
     Args:
         volume: complete.
-        doubts: gets warnings about its values.
+        doubts: gets warnings about the values.
+
+    Returns:
+        `volume` itself.
 
     Raises:
-        RpcError: numbers that are not finite.
+        RpcError: -32602, values that are not finite.
         GeometryError: values that are no attenuation.
     """
     if isinstance(volume, Volume):
@@ -347,13 +353,15 @@ def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | Tria
 
 
 def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
-    """Compute a back projection on a grid; blocks.
-
-    float32, without filter or weights; `old` must be of the same grid.
+    """Compute a back projection on a grid, float32, without filter or weights; blocks.
 
     Args:
         p: projections, cone_vec and grid.
-        old: volume of that grid to which it is added, in a copy; None for none.
+        old: volume of that shape; the result is their sum, and `old` is not changed. None
+            for none.
+
+    Returns:
+        A new volume.
     """
     blank = np.broadcast_to(np.float32(0), p.grid.shape)
     volume = back(

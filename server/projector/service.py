@@ -67,10 +67,8 @@ class ProjectorServer(ListeningServer):
         self.seated: set[JobClient] = set()
 
     async def close(self) -> None:
-        """Stop listening, abort all connections, cancel their work, and end the compute
-        thread.
-
-        It waits for the cancelled work.
+        """Stop listening, abort all connections, cancel their requests and wait for them,
+        and end the compute thread.
         """
         if self.server is not None:
             self.server.close()
@@ -86,10 +84,10 @@ class ProjectorServer(ListeningServer):
     # -- connections -------------------------------------------------------------------------
 
     def made(self, link: FrameLink) -> None:
-        """Register a new connection in the waiting room; without a token its frames and
-        time are limited.
+        """Register a new connection in the waiting room, which may displace another one.
 
-        The waiting room may displace another connection.
+        If a token is needed, frames are limited to `MAX_STRANGER_FRAME_BYTES` until it is
+        shown, and it must be shown within `hello_timeout_s`.
         """
         client = JobClient(link, self.context.token, self.context.lines)
         self.context.clients[link] = client
@@ -99,9 +97,8 @@ class ProjectorServer(ListeningServer):
             link.deadlines.start("hello", self.limits.hello_timeout_s)
 
     def lost(self, link: FrameLink) -> None:
-        """Forget an ended connection: its place and its unfinished uploads; cancel its requests.
-
-        Volumes that are complete stay.
+        """Forget an ended connection, its place and its unfinished uploads, and cancel
+        its requests; complete volumes stay.
         """
         client = self.context.clients.pop(link)
         self.waiting.leave(client)
@@ -111,12 +108,12 @@ class ProjectorServer(ListeningServer):
             task.cancel()
 
     def _seat(self, client: JobClient) -> None:
-        """Give a client a place; one that has been admitted may send full frames.
-
-        Nothing for one that has a place; a refused client is disconnected.
+        """Move a client from the waiting room to a place, and let it send frames of full
+        size; nothing for one that has a place.
 
         Raises:
-            RpcError: -32003, all places are taken.
+            RpcError: -32003, all `max_clients` places are taken; the client is
+                disconnected soon.
         """
         if client in self.seated:
             return
@@ -133,18 +130,24 @@ class ProjectorServer(ListeningServer):
         return min(MAX_FRAME, self.limits.max_message)
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
-        """Log an error as a warning, send it without an id, and end the connection."""
+        """Log an error as a warning, send it without an id, and end the connection.
+
+        Args:
+            link: connection of the client.
+            error: why it is refused.
+        """
         self.context.lines.log(
             "refused", logging.WARNING, client=link.peer, reason=error.message
         )
         link.dismiss(m.Failure(None, error))
 
     def frame(self, link: FrameLink, body: memoryview) -> None:
-        """Serve a client's frame in a task; refuse it from one with too many, or
-        without a token.
+        """Serve a client's frame in a task of its own, or refuse and disconnect the
+        client.
 
-        Refused clients are disconnected. Reading pauses for a client without a token or
-        with more than `MAX_PENDING_BYTES` pending.
+        It is refused with `max_waiting` requests under way, or before the token after
+        `MAX_STRANGE_MESSAGES`. Reading pauses for a client without a token, and with more
+        than `MAX_PENDING_BYTES` pending.
 
         Args:
             link: connection of the client.
@@ -168,13 +171,13 @@ class ProjectorServer(ListeningServer):
     # -- requests ----------------------------------------------------------------------------
 
     async def _serve(self, client: JobClient, body: memoryview) -> None:
-        """Decode a frame, answer its request, and release the client's lane and memory.
+        """Decode a frame, send the answer of its request, then release the request's lane
+        and memory.
 
-        Batches and ids in use are refused. A failure to answer aborts the connection,
-        with a log line.
-
-        Reading resumes once little is pending. A violation of the protocol ends the
-        connection.
+        A batch and an id in use are answered with an error. A notification other than
+        `cancel` is ignored. A violation of the protocol refuses the client; any other
+        failure is logged and aborts the connection. Reading resumes once at most
+        `MAX_PENDING_BYTES` are pending.
 
         Args:
             client: that sent it.
@@ -222,7 +225,9 @@ class ProjectorServer(ListeningServer):
     async def _call(
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
-        """Serve a call, log it and observe its duration; an error becomes a `Failure`."""
+        """Serve a call with `_handle`, log it, observe its duration, and return its
+        answer or failure.
+        """
         return await answered(
             self._handle(client, id, name, given),
             name,
@@ -235,19 +240,22 @@ class ProjectorServer(ListeningServer):
     async def _handle(
         self, client: JobClient, id: m.Id, name: str, given: Given
     ) -> m.Response | m.Failure:
-        """Check token, parameters and place of a call, and answer it.
+        """Check token, parameters and place of a call, and run its method.
 
-        Before the token only hello is served. Unknown errors are logged and answered as
-        internal; only ConnectionError is raised.
+        Before the token only hello is served. An unexpected error is logged and answered
+        as internal, lack of memory as too large.
 
         Args:
             client: that calls.
             id: of the request; None for a notification.
             name: of the method.
-            given: parameters, or the error in them.
+            given: parameters as they were sent.
 
         Returns:
             The result, or any failure as an answer.
+
+        Raises:
+            ConnectionError: the connection has ended; no other error is raised.
         """
         try:
             if not client.let_in and name != HELLO:
@@ -357,11 +365,12 @@ async def serve_projector(
 def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
     """Make the monitoring pages of a running projector.
 
-    They are /healthz, with the version, and /metrics.
+    They are /healthz, with the server's version, and /metrics, with its figures and those
+    of requests.
 
     Args:
         server: whose figures they show.
-        requests: counted calls.
+        requests: counts of answered calls.
     """
     context = server.context
 
@@ -370,8 +379,8 @@ def projector_pages(server: ProjectorServer, requests: Requests) -> Pages:
         return {"server": f"flexdt projector {version('flexdt')}"}
 
     def figures() -> list[Metric]:
-        """List the figures of `/metrics`: clients, views, requests superseded and waiting,
-        volumes.
+        """List the figures of `/metrics`: connections, views, requests superseded and
+        waiting, volumes, their memory and its limit [bytes].
         """
         store = context.store
         return [

@@ -39,7 +39,7 @@ class _Upload:
     def whole(self) -> Volume | TriangleMesh:
         """Make the volume or mesh of the complete bytes.
 
-        Values are not copied; faces become int64.
+        Voxels and vertices are views of the bytes, not copies; faces become int64.
 
         Raises:
             GeometryError: a mesh that does not close.
@@ -91,13 +91,12 @@ class VolumeStore:
     def get(self, name: str) -> Body:
         """Look up the volume called `name`, which becomes the most recently used.
 
-        At most `MAX_LISTED_NAMES` names, and how many others.
-
         Returns:
             The volume, mesh or scene itself, not a copy.
 
         Raises:
-            RpcError: -32602, listing the names.
+            RpcError: -32602, there is none; lists the last `MAX_LISTED_NAMES` names and
+                how many others there are.
         """
         if name not in self._held:
             last = list(self._held)[-MAX_LISTED_NAMES:]
@@ -112,12 +111,14 @@ class VolumeStore:
         return value
 
     def put(self, name: str, value: Body, *, evictable: bool = False) -> None:
-        """Store a complete volume, mesh or scene under `name`, replacing its namesake.
+        """Store a complete volume, mesh or scene under `name`, in place of its namesake.
 
-        It becomes the most recently used; evictable ones may be removed for it.
+        It becomes the most recently used. Evictable volumes are removed for it where
+        memory is needed.
 
         Args:
-            name, value: what.
+            name: of the volume.
+            value: volume, mesh or scene; not copied.
             evictable: whether it may be forgotten where memory is needed.
 
         Raises:
@@ -139,26 +140,25 @@ class VolumeStore:
         start: int,
         data: memoryview,
     ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
-        """Receive a chunk of voxels or of a mesh.
+        """Receive a chunk of voxels or of a mesh; the complete volume is not stored,
+        `put` does that.
 
-        A chunk at 0 begins anew; room for the whole is reserved then. An empty chunk is
-        refused unless the whole is empty.
-
-        Chunks come in order. The complete volume is not stored: `put` does that.
+        Chunks come in order. A chunk at 0 begins anew and reserves room for the whole,
+        beside a namesake. An empty chunk is refused unless the whole is empty.
 
         Args:
-            owner: client that sends it.
+            owner: client that sends it; each has uploads of its own.
             name: of the volume.
-            what: size of the complete volume or mesh.
+            what: size of the complete volume or mesh, equal in all chunks.
             start: place of the chunk [bytes].
             data: the chunk.
 
         Returns:
-            Bytes received so far and, once all have come, the function that makes the
-            volume or mesh.
+            Bytes received so far, and None, or once all have come the function that makes
+            the volume or mesh.
 
         Raises:
-            RpcError: -32008 above the memory limit; -32602, chunks that do not fit
+            RpcError: -32008, above the memory limit; -32602, chunks that do not fit
                 together.
         """
         total = what.nbytes
@@ -183,10 +183,11 @@ class VolumeStore:
         return end, upload.whole
 
     def remove(self, name: str) -> bool:
-        """Remove a volume, evictable or not, with its memory count; return whether there was
-        one.
+        """Remove a volume, evictable or not, and its share of the memory count; an upload
+        of that name goes on.
 
-        An upload of that name goes on.
+        Returns:
+            Whether there was one.
         """
         value = self._held.pop(name, None)
         if value is None:
@@ -207,17 +208,19 @@ class VolumeStore:
         return [_info(name, self._held[name]) for name in sorted(self._held)]
 
     def reserve(self, what: str, needed: int, replaced: str | None = None) -> None:
-        """Make room for a volume by removing evictable ones, the least recently used first.
+        """Make room for a volume by removing evictable ones, the least recently used
+        first, until it fits.
 
-        Uploads count as used; the one replaced is not removed here.
+        Uploads count as used memory. The volume that is replaced counts as free, but is
+        not removed here.
 
         Args:
             what: the volume, for the message.
             needed: its memory [bytes].
-            replaced: name of the volume whose place it takes.
+            replaced: name of the volume whose place it takes; None for none.
 
         Raises:
-            RpcError: -32008, above the memory limit; nothing is removed.
+            RpcError: -32008, it would not fit even then; nothing is removed.
         """
         old = None
         if replaced is not None:
@@ -262,7 +265,9 @@ def _needed(what: wire.VoxelGrid | wire.MeshSize) -> int:
 
 
 def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
-    """Make the error for a chunk at byte `asked` where `allowed` is expected; returned."""
+    """Make, not raise, the error -32602 for a chunk at or up to byte `asked` where byte
+    `allowed` is expected.
+    """
     return invalid_params(
         f"volume {name!r}: a chunk at or up to byte {asked} does not fit; expected {allowed}",
         [problem("start", "chunks must come in order", asked)],

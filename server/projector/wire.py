@@ -109,9 +109,11 @@ class FrameLink(asyncio.BufferedProtocol):
         self.on_made(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Return the memory for the next bytes: rest of the length, or of the frame's body.
+        """Return the memory for the next bytes: the rest of the four length bytes, or of
+        the frame's body.
 
-        After the end of the stream it is memory to be ignored. `sizehint` is ignored.
+        Once nothing more is to be read it is memory of its own, to be ignored. `sizehint`
+        is ignored.
         """
         if self._over:
             return memoryview(bytearray(SLICE_BYTES))
@@ -147,8 +149,8 @@ class FrameLink(asyncio.BufferedProtocol):
             self.on_frame(self, body)
 
     def _begin(self, size: int) -> None:
-        """Reserve memory for a frame; an empty one goes to `on_frame`, one that is too
-        large to `on_broken`.
+        """Reserve memory for a frame whose length has come; pass an empty frame to
+        `on_frame`, and the error of one above `max_frame` to `on_broken`.
 
         After one that is too large, nothing more is read.
 
@@ -167,10 +169,11 @@ class FrameLink(asyncio.BufferedProtocol):
             self._body = np.empty(size, np.uint8).data
 
     def eof_received(self) -> bool:
-        """Close the connection when the peer has closed its side; inside a frame call
+        """Let the transport close when the peer has closed its side; inside a frame call
         `on_broken` first.
 
-        Returns False: the transport closes.
+        Returns:
+            False: the transport closes.
         """
         if self.mid_frame and not self._over:
             self._over = True
@@ -178,7 +181,8 @@ class FrameLink(asyncio.BufferedProtocol):
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Record that the connection has ended, wake who waits to write, and call `on_lost`.
+        """Note the end of the connection, cancel its deadlines, wake whoever waits to
+        write, and call `on_lost`.
 
         `exc` is ignored.
         """
@@ -223,12 +227,12 @@ class FrameLink(asyncio.BufferedProtocol):
             await self._writable.wait()
 
     def dismiss(self, message: m.Message) -> None:
-        """Send a last message and end the connection; discard what still arrives.
+        """Send a last message and end the connection; bytes that still arrive are
+        discarded.
 
-        The connection is cut `MAX_LAST_WORD_S` later at the latest; with TLS it is closed
-        at once. Nothing if it has ended.
-
-        Closing at once with bytes unread would reset the connection and lose the message.
+        The sending side is closed at once, the connection at most `MAX_LAST_WORD_S`
+        later: closing it with bytes unread would reset it and lose the message. With TLS
+        it is closed at once. Nothing happens if the connection has ended.
         """
         self._over = True
         if self.lost or self.transport.is_closing():
@@ -242,9 +246,9 @@ class FrameLink(asyncio.BufferedProtocol):
             self.transport.close()
 
     async def _send_payload(self, payload: memoryview) -> None:
-        """Send a payload in slices, each once the transport takes it.
+        """Send a payload in slices of `SLICE_BYTES`, each once the transport takes it.
 
-        If it is cancelled, the connection is aborted: half a frame has gone out.
+        If it is cancelled, the connection is aborted, as half a frame has gone out.
         """
         try:
             for start in range(0, len(payload), SLICE_BYTES):
@@ -274,9 +278,10 @@ class _Pending:
     parts: npt.NDArray[np.float32] | None = None
 
     def part(self, params: Mapping[str, object]) -> None:
-        """Copy a part (float32, from index `start`) into the result's flat array.
+        """Copy a part (float32, from index `start`) into the result's flat array, which
+        the first part makes.
 
-        Ignored before the shape is known, or without a whole `start`.
+        The part is ignored if no array was requested or `start` is no whole number.
         """
         start = params.get("start")
         data = params.get("data")
@@ -304,9 +309,11 @@ class ProjectorLink:
     async def connect(
         cls, host: str, port: int, ssl: tls.SSLContext | None = None
     ) -> Self:
-        """Connect to a server.
+        """Connect to a server; nothing is sent yet.
 
-        Nothing is sent yet.
+        Args:
+            host, port: its address.
+            ssl: TLS context of a client; None for a plain connection.
 
         Raises:
             OSError: no server answers.
@@ -341,8 +348,6 @@ class ProjectorLink:
     ) -> npt.NDArray[np.float32]:
         """Request a float32 array, which comes in one piece or in parts.
 
-        Another type or shape counts as no such array: -32603.
-
         Args:
             method: its name on the wire.
             params: its parameters.
@@ -352,7 +357,8 @@ class ProjectorLink:
             The array, read-only.
 
         Raises:
-            RpcError: the answer is an error, or no such array.
+            RpcError: the answer is an error; -32603, it is no float32 array of that
+                shape.
             LinkLost: the connection has ended.
         """
         answer, parts = await self._request(method, params, shape)
@@ -407,11 +413,11 @@ class ProjectorLink:
             self._calls.abandon(request, sent=sent)
 
     async def _until_answered(self, answer: asyncio.Future[Any]) -> None:
-        """Wait as long as the projector is alive; close the connection to one that is
-        silent for `SILENT_S`.
+        """Wait until `answer` is done, and close the connection if nothing at all comes
+        for `SILENT_S`.
 
-        Its health is asked every `ASK_AGAIN_S`, one request at a time; closing fails the
-        answer.
+        Every `ASK_AGAIN_S` the projector's health is requested, one request at a time, so
+        a busy projector is not silent. Closing fails the answer.
         """
         loop = asyncio.get_running_loop()
         asked_at = loop.time()
@@ -433,8 +439,8 @@ class ProjectorLink:
             note.exception()  # a connection that has ended needs no cancellation
 
     def _frame(self, link: FrameLink, body: memoryview) -> None:
-        """Pass the answers and parts of a frame to their requests; close on a violation
-        of the protocol.
+        """Pass the answers and parts of a frame to their requests; close the connection
+        on a violation of the protocol.
 
         Answers to abandoned requests and parts of unknown ones are ignored.
         """
@@ -456,10 +462,11 @@ class ProjectorLink:
         link.transport.abort()
 
     def _lost(self, link: FrameLink) -> None:
-        """Fail all open requests with `LinkLost`; log a violation of the protocol.
+        """Fail all open requests with `LinkLost`; a violation of the protocol is logged
+        and named in the error.
 
-        An end inside a frame is a violation, logged as a warning only, unless the link
-        was closed here.
+        An end inside a frame is a violation too, unless the link was closed here; it is
+        logged as a warning, others as errors.
         """
         if link.mid_frame and not self._closed:
             self._calls.violate(ProtocolError("the stream ended inside a frame"))

@@ -67,10 +67,10 @@ class Acquisition:
     _charge_lock: asyncio.Lock = field(default_factory=asyncio.Lock, init=False)
 
     async def produce(self, batch: Sequence[Exposure]) -> None:
-        """Project, expose and store a batch of frames, and show the last one.
+        """Project, expose and store a batch of frames, and pass the last one to `shown`.
 
-        Files are written in a worker thread. A batch with X-rays on passes its last image
-        to `shown`.
+        Files are written in a worker thread. A batch with X-rays off is dark, and not
+        shown.
 
         Args:
             batch: frames with files that share camera settings and X-rays on or off.
@@ -91,10 +91,8 @@ class Acquisition:
             self.shown(batch[-1], images[-1])
 
     async def _radiographs(self, batch: Sequence[Exposure]) -> list[Radiograph]:
-        """Project a batch of frames; remember the last `KEPT_IMAGES` where the panel has
-        lag or traps.
-
-        The images of a panel without memory are not kept.
+        """Project a batch of frames; the last `KEPT_IMAGES` are remembered for a panel
+        with lag or traps.
 
         Args:
             batch: frames that share camera settings; with `moments` above 1 each is
@@ -115,10 +113,11 @@ class Acquisition:
         return images
 
     async def _earlier_images(self, frame: Exposure) -> Before:
-        """Collect the earlier frames whose afterglow is still on the panel.
+        """Collect the images of earlier frames whose afterglow is still on the panel.
 
-        Missing ones are projected again, so that a frame does not depend on which were
-        made before it.
+        These are among the last `MEMORY_FRAMES`, with X-rays on and the same camera
+        settings, less than `MAX_MEMORY_S` before. Missing images are projected again, so
+        that a frame does not depend on which were made before it.
 
         Args:
             frame: that is being made.
@@ -138,27 +137,27 @@ class Acquisition:
         return found
 
     async def _image(self, frame: Exposure) -> Radiograph:
-        """Return the image of a frame with X-rays on: a recent one, else it is projected again."""
+        """Return the image of a frame with X-rays on: the remembered one, else project it
+        again.
+        """
         image = self._recent.get(frame.index)
         if image is None:
             return (await self._radiographs([frame]))[0]
         return image
 
     async def _trapped_charge(self, frame: Exposure) -> Float32Array | None:
-        """Compute the charge in the panel's traps at a frame's start, from the first
-        frame on.
+        """Compute the charge in the panel's traps at a frame's start, from all frames
+        before it in the plan.
 
-        Between frames charge decays by the plan's times, not the real ones.
-
-        It is the same wherever a scan was interrupted, and empty after a change of the
-        camera's settings. Charges of the last `KEPT_IMAGES` frames are remembered;
-        missing images are projected again.
+        Between frames charge decays by the plan's times. It is the same wherever a scan
+        was interrupted, and zero after a change of the camera's settings. Charges of the
+        last `KEPT_IMAGES` frames are remembered; missing images are projected again.
 
         Args:
             frame: that is being made.
 
         Returns:
-            Charge (rows, cols); None for a panel without traps.
+            Charge (rows, cols), float32; None for a panel without traps.
         """
         if not self.radiography.traps:
             return None
@@ -236,16 +235,16 @@ class Acquisition:
         before: Sequence[Before],
         trapped: Sequence[Float32Array | None],
     ) -> None:
-        """Convert images to counts, with noise by the frame's number, and write each
-        frame's file.
+        """Convert images to counts and write each frame's file.
 
-        Without a seed there is no noise.
+        Noise depends on the seed and the frame's number; without a seed there is none.
 
         Args:
             batch: frames with files.
             images: one for each frame.
             before: earlier frames on the panel, for each frame.
-            trapped: charge in the panel's traps (rows, cols), for each frame.
+            trapped: charge in the panel's traps (rows, cols), for each frame; None
+                without traps.
 
         Raises:
             DatasetWriteError: as `put`; the files before are there.

@@ -97,13 +97,14 @@ class CheckInput:
         return len(self.source.poses.text) <= LIGHT_BYTES
 
     def report(self, bytes_at_most: int | None = None, swept: bool = True) -> CheckReport:
-        """Parse, plan and check the scan, collisions included where the machine has
-        bodies; blocks.
+        """Parse, plan and check the scan, with a sweep for collisions where the machine
+        has components; blocks.
 
-        For poses the moves between them go around obstacles, unless nothing is swept.
+        Moves between poses go around obstacles if collisions are swept.
 
         Args:
-            bytes_at_most: largest size of the report; None for no limit.
+            bytes_at_most: largest size of the report; None for no limit. It holds for a
+                swept report only.
             swept: whether collisions are looked for.
 
         Returns:
@@ -210,13 +211,13 @@ class Checks:
         return await self._workers.ask(_encoded, _bare(check_input), codec, seen)
 
     async def probes(self, check_input: CheckInput) -> tuple[SampleProbe, ...]:
-        """Choose rays of a scan's projections from which its counts are predicted.
+        """Choose the rays of a scan's projections behind which its counts are predicted.
 
-        A light check is planned in a thread here, others in a worker; collisions are not
-        looked for.
+        The scan is planned, without a sweep for collisions: a light one in a thread of
+        this process, others in a worker.
 
         Raises:
-            RpcError: -32008, planning takes too long.
+            RpcError: -32008, planning takes too long or too much memory.
         """
         if self._runs_here(check_input):
             return await self._threaded(lambda: probes_of(check_input))
@@ -225,12 +226,12 @@ class Checks:
         return found
 
     async def runnable(self, check_input: CheckInput) -> Checked:
-        """Parse, plan and sweep a scan, here or in a worker process, and return it if it
-        may run.
+        """Parse, plan and sweep a scan, in a thread here or in a worker process, and
+        return its plan if it may run.
 
-        The last result is kept until it is requested again: if a job begins with the
-        position, sample and correction that it was submitted with, the plan is the one
-        checked then.
+        The last result is kept for one more request with an equal input: a job that
+        begins with the position, sample and correction that it was submitted with has the
+        plan checked then.
 
         Args:
             check_input: the scan, with everything that its check depends on.
@@ -276,9 +277,10 @@ class Checks:
 
 
 def planned(check_input: CheckInput) -> tuple[ScanPlan, list[str]]:
-    """Return the plan of a scan and its warnings in words; blocks.
+    """Check a scan and return its plan and its warnings in words; blocks.
 
-    At most `MAX_PROBLEMS` warnings, then how many more.
+    There are at most `MAX_PROBLEMS` warnings, and then one with the number of those left
+    out.
 
     Raises:
         RpcError: -32005 or -32002, it may not run.
@@ -297,7 +299,9 @@ def in_pieces(check_input: CheckInput) -> list[bytes]:
 
 
 def _bare(check_input: CheckInput) -> CheckInput:
-    """Return the input without the listing of poses, which only people read; scripts unchanged."""
+    """Return the input without the text that lists its poses, which only people read; the
+    input of a script is returned unchanged.
+    """
     source = check_input.source
     if source.poses is None:
         return check_input
@@ -321,15 +325,17 @@ def packed_probes(check_input: CheckInput) -> list[bytes]:
 def _encoded(
     check_input: CheckInput, codec: Codec, seen: SampleForecast | None = None
 ) -> list[bytes]:
-    """Compute a dry-run report and encode it in pieces of `ANSWER_PIECE` bytes; runs in a
-    worker.
-
-    A report with errors gets no problems of the sample.
+    """Compute a dry-run report and encode it, in pieces of `ANSWER_PIECE` bytes; runs in
+    a worker.
 
     Args:
         check_input: the scan to be checked.
         codec: of the connection that asked.
-        seen: the prediction behind the sample, whose problems join the report; None without.
+        seen: the prediction behind the sample, whose problems join a report without
+            errors; None without.
+
+    Returns:
+        The pieces, in order.
 
     Raises:
         RpcError: -32008, the report is larger than an answer may be.
@@ -352,7 +358,8 @@ def _encoded(
 def _refusing_large(
     sweep: dry_run.CollisionCheck, most: int | None
 ) -> dry_run.CollisionCheck:
-    """Wrap a sweep so that it refuses plans whose report would be too large.
+    """Wrap a sweep so that it refuses a plan, before the sweep, whose report would be too
+    large.
 
     Without a limit the sweep is only called.
 
@@ -367,9 +374,8 @@ def _refusing_large(
     def bounded(
         plan: ScanPlan, machine: Machine, profile: Profile, size: SampleSize | None
     ) -> Clearance:
-        """Sweep a plan, unless its report would be too large: then raise the error TOO_LARGE.
-
-        The size is estimated from the steps before the sweep.
+        """Sweep a plan; raise RpcError -32008 instead if the size of its report,
+        estimated from the steps, is above the limit.
         """
         size_of = sum(STEP_BYTES + len(s.what) + len(s.assumed_from) for s in plan.steps)
         if most is not None and size_of > most:
@@ -380,16 +386,16 @@ def _refusing_large(
 
 
 def require_runnable(report: CheckReport) -> None:
-    """Raise an error with the report's problems unless the plan may run.
+    """Return if the plan may run, else raise an error with the report's problems.
 
-    At most as many problems as `_worst` keeps are sent, and `MAX_PROBLEMS` collisions
-    with their number in all.
+    The error has the problems that `_worst` selects, and of collisions the first
+    `MAX_PROBLEMS` and their number.
 
     Args:
         report: of the scan.
 
     Raises:
-        RpcError: -32005 with its problems; -32002 where collisions are all that is wrong.
+        RpcError: -32005, errors other than collisions; -32002, collisions alone.
     """
     if report.ok:
         return
@@ -439,14 +445,13 @@ def _pickled_pieces(plan: ScanPlan) -> list[bytes]:
     """Pickle a plan, without machine and profile, in pieces small enough to be read at
     once.
 
-    At most `PARTS_A_PIECE` parts in each; an empty tuple has one piece.
-
     Args:
         plan: of a scan.
 
     Returns:
-        First the pickled dict of its short fields, then pickled pairs (field or axis,
-        some of its parts); the files of each group are apart from the group.
+        First the pickled dict of its short fields, then pickled pairs (field, "axis NAME"
+        or "files N"; at most `PARTS_A_PIECE` of its parts), in order; an empty field has
+        one piece.
     """
     rest = {f.name: getattr(plan, f.name) for f in fields(plan)}
     for name in ("machine", "profile"):
@@ -469,10 +474,10 @@ def _pickled_pieces(plan: ScanPlan) -> list[bytes]:
 
 
 def _rebuilt_plan(pieces: list[bytes], machine: Machine, profile: Profile) -> ScanPlan:
-    """Rebuild the plan that `_pickled_pieces` pickled; in a thread, so that others run between
-    pieces.
+    """Rebuild the plan that `_pickled_pieces` pickled.
 
-    Garbage collection is off meanwhile.
+    Garbage collection is off meanwhile. It runs in a thread, so that other work runs
+    between pieces.
 
     Args:
         pieces: of `_pickled_pieces`, all and in order.
@@ -500,9 +505,8 @@ def _rebuilt_plan(pieces: list[bytes], machine: Machine, profile: Profile) -> Sc
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Disable the collector of cyclic garbage within the context.
-
-    It goes on at the end only if it was on.
+    """Disable the collector of cyclic garbage within the context; it is enabled again
+    only if it was before.
 
     A million new objects would start it repeatedly, and each pass holds the interpreter.
     """

@@ -85,10 +85,11 @@ class FramePipeline(Generic[T]):
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _process_batches(self) -> None:
-        """Take batches of waiting frames and produce each until it succeeds; ends only by
+        """Take batches of waiting frames and produce each until it succeeds; end only by
         cancellation.
 
-        Several such tasks may run; each wakes who waits for room or for the end.
+        Several such tasks run at a time. Each wakes whoever waits for room or for the
+        end.
         """
         while True:
             async with self._changed:
@@ -118,10 +119,8 @@ class FramePipeline(Generic[T]):
         return batch
 
     async def _produce_until_done(self, batch: Sequence[T]) -> None:
-        """Produce a batch; after a failure call `failed`, wait for `retry`, and try
-        again.
-
-        The batch is tried again whole.
+        """Produce a batch; after any exception call `failed`, wait for `retry`, and
+        produce the whole batch again.
         """
         while True:
             try:

@@ -51,8 +51,9 @@ class Retry:
         return max(0.0, self._at - asyncio.get_running_loop().time())
 
     def schedule(self, error: Exception, go: Callable[[], None]) -> None:
-        """Schedule a call of `go` after a pause that doubles with each attempt; a pending
-        call is kept.
+        """Schedule a call of `go` after a pause; nothing changes if a call is pending.
+
+        The pause is `first_s`, doubles with each attempt, and is at most `longest_s`.
 
         Args:
             error: for which it waits: after a full disk `go` is called only once there is
@@ -71,10 +72,8 @@ class Retry:
             self._attempts = 0
 
     def cancel(self) -> None:
-        """Cancel the next attempt and reset the pause: a user takes over, or the job has
-        ended.
-
-        Nothing to cancel is no error.
+        """Cancel the next attempt, if there is one, and reset the pause: a user takes
+        over, or the job has ended.
         """
         if self._task is not None:
             self._task.cancel()
@@ -82,14 +81,12 @@ class Retry:
         self._attempts = 0
 
     async def _wait(self, error: Exception, go: Callable[[], None], pause: float) -> None:
-        """Pause, again and again while the disk is full, then call `go`.
-
-        Before another error than a full disk it pauses once.
+        """Pause, then call `go`; after a full disk pause again as long as it has no room.
 
         Args:
             error: for which it waits.
             go: resumes the job.
-            pause: between attempts [real s].
+            pause: before each attempt [real s].
         """
         while True:
             await asyncio.sleep(pause)
@@ -101,9 +98,10 @@ class Retry:
 
 
 def _has_room(error: DiskFullError) -> bool:
-    """Return whether the data of a full-disk error would fit now.
+    """Return whether the data that a full disk refused would fit now.
 
-    True also if the error has no path and size, or the system does not report free space.
+    It is True, too, if the error has no path or size, or the system does not report free
+    space.
     """
     data = error.data if isinstance(error.data, Mapping) else {}
     path = data.get("path")

@@ -64,7 +64,7 @@ class Jobs:
         max_age: timedelta = timedelta(days=365),
         today: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
-        """Make an empty queue of scans; nothing runs before `run`.
+        """Make an empty queue of scans; nothing runs before `work`.
 
         `changed` is called after each change of a job; `max_waiting` jobs may wait,
         `max_ended` ended ones are kept for `max_age`; `projectors` scales how many frames
@@ -107,7 +107,8 @@ class Jobs:
         An ended job is returned, too, while it is kept.
 
         Raises:
-            UnknownNameError: lists the existing jobs, at most `MAX_NAMED_JOBS`.
+            UnknownNameError: no such job, or no job at all; lists the last
+                `MAX_NAMED_JOBS` jobs and the number of older ones.
         """
         if job is None and self.current is not None:
             return self.current
@@ -133,9 +134,11 @@ class Jobs:
 
     @property
     def busy(self) -> bool:
-        """True while the running job makes frames or is being opened, or runs at speed "max".
+        """True while the current job runs and makes frames or opens, or runs at speed
+        "max".
 
-        False for a paused one, and for one that waits between frames.
+        False for a paused or waiting job, and for one that waits between frames at
+        another speed.
         """
         job = self.current
         if job is None or job.phase != "running":
@@ -144,12 +147,10 @@ class Jobs:
         return runner is None or not runner.idle or self._clock.speed_up == "max"
 
     def require_idle(self, what: str) -> None:
-        """Refuse a command that would disturb a job that runs, opens or is being resumed.
+        """Refuse a command that would disturb the current job.
 
-        Without a current job nothing is refused.
-
-        A paused job disturbs nothing, and neither does one that was aborted while it
-        opened.
+        A job is disturbed while it runs, is being opened, or is being resumed. A paused
+        job is not, nor one that was aborted while it was opened.
 
         Args:
             what: command, for the message.
@@ -173,12 +174,11 @@ class Jobs:
 
     @contextmanager
     def manual_control(self) -> Iterator[None]:
-        """Cancel the automatic resume of a paused job for the manual command inside the
-        context.
+        """Run a manual command inside the context, and cancel the automatic resume of a
+        paused job.
 
-        After a success, or a motion, only `resume` continues the job.
-
-        If the command fails before anything has moved, the automatic resume is restored.
+        Afterwards only `resume` continues that job. If the command fails before anything
+        has moved, the automatic resume is scheduled again.
         """
         by_hand = self._manual
         programmes = self._scanner.programmes
@@ -221,8 +221,8 @@ class Jobs:
         """Make the wire form of a job: its phase, progress, times [s], error and
         warnings.
 
-        An ended job remains 0 s; speed-up is the job's, else the clock's; `retry_s` is
-        only of the current job.
+        An ended job has 0 s left and no present command. The speed-up is the job's, else
+        the clock's; `retry_s` is None but for the current job.
         """
         p = job.where
         step = None if p is None else p.step
@@ -263,22 +263,22 @@ class Jobs:
         job: Job | None = None,
         sample: Sample | None = None,
     ) -> Job:
-        """Make a queued job, new or as the next state of one that has ended; nothing
-        knows it yet.
+        """Make a queued job, new or as the next state of an ended one; neither list nor
+        queue knows it before `enqueue`.
 
-        The job's number is the next one, a continued job keeps its own.
-
-        `enqueue` puts it in the list and in the queue.
+        A new job gets the next number, a continued one keeps its own and loses its error
+        and end.
 
         Args:
             name, folder: of the data set.
             plan, prepare, speed_up, warnings: of the scan; `prepare` makes the job's
                 inputs at its turn.
-            job: ended job to continue; None for a new one.
+            job: ended job to continue, whose name and folder it keeps; None for a new
+                one.
             sample: sample of the scan.
 
         Raises:
-            RpcError: -32003, too many jobs wait, or the job has not ended.
+            RpcError: -32003, `max_waiting` jobs wait, or the job has not ended.
         """
         waiting = sum(each.phase == "queued" for each in self._all.values())
         if waiting >= self.max_waiting:
@@ -301,10 +301,12 @@ class Jobs:
         )
 
     def enqueue(self, draft: Job) -> Job:
-        """Put a drafted job at the end of the queue; a continued job stays the same
-        object.
+        """Put a drafted job into the list and at the end of the queue, and publish it;
+        old ended jobs are forgotten.
 
-        It is counted if new; old ended jobs are forgotten, and the change is published.
+        Returns:
+            The job of the list: for a continued job the same object as before, with the
+            draft's fields.
         """
         self._count += draft.id not in self._all
         job = self._all.setdefault(draft.id, draft)
@@ -315,12 +317,12 @@ class Jobs:
         return job
 
     def pause(self, job: Job) -> None:
-        """Pause a running job; nothing to do for one that is paused.
+        """Pause a running job; one that is paused stays so.
 
-        A planned retry is cancelled, and only `resume` continues it.
+        A planned retry is cancelled: only `resume` continues the job.
 
         Raises:
-            RpcError: -32003, it does not run.
+            RpcError: -32003, it neither runs nor is paused.
         """
         runner = self._runner(job, "pause", ("running", "paused"))
         self._take_over()
@@ -328,9 +330,11 @@ class Jobs:
         self._tell(job)
 
     def resume(self, job: Job) -> None:
-        """Let a paused job go on; nothing to do for one that runs.
+        """Let a paused job go on; nothing changes for one that runs but that a planned
+        retry is cancelled.
 
-        A planned retry is cancelled. Raises as `_runner` for a job in another state.
+        Raises:
+            RpcError: -32003, it neither runs nor is paused.
         """
         runner = self._runner(job, "resume", ("running", "paused"))
         self.retry.cancel()
@@ -350,10 +354,8 @@ class Jobs:
     def abort(self, job: Job, reason: str | None = None, by: str | None = None) -> None:
         """End a job in any phase; its data set stays, incomplete, with the reason.
 
-        A waiting job ends at once; a running one at its next wait; the first requester
-        stays `ended_by`.
-
-        X-rays go off with a job that has begun.
+        A waiting job ends at once, a running one at its next wait, with X-rays off; one
+        that is being opened, before it runs. The first requester stays `ended_by`.
 
         Args:
             job: to end; one that has ended stays as it is.
@@ -372,11 +374,14 @@ class Jobs:
             self._tell(job)
 
     def interrupt(self, reason: Exception) -> None:
-        """Pause the job that runs or is about to, after a stop from outside (stop,
-        E-stop).
+        """Pause the current job after a stop from outside (stop, E-stop), also one that
+        is being opened or resumed.
 
-        A retry that was planned is cancelled; the job goes on only when it is resumed by
-        hand. Nothing more if none runs.
+        A planned retry is cancelled; only `resume` continues the job. A paused job stays
+        paused, with its reason.
+
+        Args:
+            reason: shown as the job's error.
         """
         self._take_over()
         self._interrupted = reason
@@ -400,9 +405,10 @@ class Jobs:
         return self._count
 
     def changed(self) -> dict[str, JobMemory | None]:
-        """Return name -> job as it is now, for jobs changed since the last call, in their order.
+        """Return the jobs changed since the last call, as name -> record, by number, and
+        empty the list of changes.
 
-        None for a forgotten one; the list of changes is emptied.
+        The record is None for a forgotten job.
         """
         names = self._changed
         self._changed = set()
@@ -448,15 +454,15 @@ class Jobs:
         return left
 
     def ended(self, job: str | None, min_age: timedelta) -> list[Job]:
-        """Select the ended jobs to be forgotten.
+        """Select the ended jobs to be forgotten; nothing is removed here.
 
         Args:
-            job: its name; None for all that ended long enough ago.
+            job: its id; None for all that ended long enough ago.
             min_age: least time since their end; not used for a named job.
 
         Raises:
             UnknownNameError: there is no such job.
-            RpcError: -32003, it has not ended.
+            RpcError: -32003, the named one has not ended.
         """
         if job is None:
             return self._ended_before(self._today() - min_age)
@@ -510,12 +516,11 @@ class Jobs:
     # Running ------------------------------------------------------------------------------------
 
     async def work(self) -> None:
-        """Run queued jobs one after the other; ends only by cancellation.
+        """Run queued jobs one after the other; end only by cancellation.
 
-        Jobs aborted while they waited are skipped.
-
-        Each job runs at its own speed of the clock; the speed from before is restored
-        after it, unless somebody changed it meanwhile. A job's error ends that job alone.
+        Jobs aborted while they waited are skipped. Each job runs at its own speed of the
+        clock; afterwards the speed from before is restored, unless somebody changed it
+        meanwhile. A job's error ends that job alone.
         """
         while True:
             job = await self._queue.get()
@@ -548,18 +553,21 @@ class Jobs:
                 self._tell(job)
 
     async def _run(self, job: Job) -> JobPhase:
-        """Prepare one job at rest, run it, and finish or mark its data set.
+        """Wait for the motors' rest, prepare one job, run it, and finish its data set or
+        mark it incomplete.
 
-        A stop from outside that came since its turn pauses it at once. The data set is
-        closed in any case, incomplete unless it was finished.
-
-        An aborted job switches X-rays off. Errors of the job are logged and stored in it.
+        A stop from outside that came since its turn pauses it at once. An aborted job
+        that has begun switches X-rays off. Errors are stored in the job, and logged
+        unless a user caused them. The data set's writer is closed in any case.
 
         Args:
             job: at its turn.
 
         Returns:
             The job's last phase: done, aborted or failed.
+
+        Raises:
+            CancelledError: the server ends; the data set is marked incomplete first.
         """
         self._interrupted = None
         self._manual = False
@@ -639,7 +647,7 @@ class Jobs:
         """Mark the data set of a job as incomplete, with the reason and the time reached;
         log a failure.
 
-        Without a runner the time is 0 s. Only TwinErrors are caught.
+        Without a runner the time is 0 s. Errors other than TwinError are raised.
         """
         elapsed = 0.0
         if job.runner is not None:
@@ -692,14 +700,12 @@ class Jobs:
         )
 
     def _copy_progress(self, job: Job) -> None:
-        """Copy the runner's progress and error into the job, count frames, and publish if
-        due.
-
-        The phase changes between running and paused only.
+        """Copy the runner's phase, frames and error into the job, and publish it if due.
 
         A change of phase or error is published at once, progress every
-        `PUBLISH_INTERVAL_S`. New frames reset the delay of automatic retries, and a job
-        that a passing error stopped is scheduled to resume.
+        `PUBLISH_INTERVAL_S`. New frames are counted and reset the delay of automatic
+        retries. A job that a passing error has paused is scheduled to resume. The phase
+        is copied only between running and paused.
         """
         assert job.runner is not None
         p = job.runner.progress
@@ -722,10 +728,10 @@ class Jobs:
             self._tell(job)
 
     def _schedule_resume(self) -> None:
-        """Schedule a retry after a pause by a full disk or a projector, unless a user
-        took over.
+        """Schedule a retry if the current job is paused by an error that may pass, such
+        as a full disk or a lost projector, and no user took over.
 
-        Only while it is paused by a passing error; once until it has run.
+        A retry that is planned stays as it is.
         """
         job = self.current
         if job is None or job.runner is None or self._manual:

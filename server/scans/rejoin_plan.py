@@ -40,14 +40,14 @@ class Rejoin:
 
     def programme(self) -> dict[str, tuple[Trajectory, ...]]:
         """Compute the motion of all axes from rest at `start`: a run-up, then the rest of
-        the plan.
+        the plan from `tau` on.
 
-        The run-up has constant acceleration and ends with the plan's position and
-        velocity.
+        Each run-up has constant acceleration and ends, at `run_up_s`, with the plan's
+        position and velocity; a faster axis begins later.
 
         Returns:
-            Axis -> trajectories, on a clock that is 0 when the motion begins [s]; the
-            plan is joined at `run_up_s`. Axes that stay are left out.
+            Axis -> trajectories, on a clock that is 0 when the motion begins [s]; axes
+            that stay are left out.
         """
         join = self.run_up_s
         out = {}
@@ -71,8 +71,8 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
     """Compute from which pose at rest, and with which run-up, a scanner joins `plan` at
     time `tau`.
 
-    An axis starts behind where it is by its braking distance; the run-up lasts as long as
-    that of the slowest.
+    An axis starts behind its position at `tau` by its braking distance. The run-up lasts
+    as long as that of the slowest axis.
 
     Args:
         plan: the scan.
@@ -94,10 +94,15 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
 def _remaining(
     trajectories: tuple[tuple[float, Trajectory], ...], tau: float
 ) -> tuple[Trajectory, ...]:
-    """Select the part of an axis's motion from plan time `tau` on; the current trajectory
-    is cut there.
+    """Select an axis's motion from plan time `tau` on; a trajectory under way is cut
+    there.
 
-    Times stay the plan's; () once all has ended.
+    Args:
+        trajectories: pairs of start [s] and trajectory, by time.
+        tau: on the plan's clock [s].
+
+    Returns:
+        Trajectories on the plan's clock; () once all have ended.
     """
     begun = [t for time, t in trajectories if time <= tau]
     later = tuple(t for time, t in trajectories if time > tau)

@@ -40,13 +40,11 @@ Phase = Literal["running", "paused", "done"]
 
 
 def apply_command(scanner: ScannerTwin, command: c.Command, now: float) -> None:
-    """Set tube, camera or an axis's rates as `command` has them; motion and images are not
-    commands here.
+    """Set tube, camera or an axis's rates as `command` has them; other commands, such as
+    motion and images, do nothing.
 
-    X-rays come on without the warm-up after a long rest.
-
-    Rates are limited to those that the axis allows now. Commands for components of other
-    packages do nothing.
+    X-rays come on without the warm-up after a long rest. Rates are limited to those that
+    the axis allows now. Rates of axes that the machine does not have are skipped.
 
     Args:
         scanner: to set.
@@ -170,13 +168,15 @@ class ScanRunner:
     # Control ------------------------------------------------------------------------------------
 
     def pause(self, error: Exception | None = None) -> None:
-        """Stop motion as soon as the run obeys, keep the settings in force, and wait for
-        `resume`.
+        """Request a pause: the run stops motion at its next wait, and waits for `resume`,
+        `step` or `abort`.
 
-        A second pause keeps the settings saved first; a single step is given up.
+        The settings in force are saved, to be restored then; a second pause keeps those
+        saved first. A single step is given up.
 
         Args:
-            error: reason, shown in `progress`; None if a user requested the pause.
+            error: reason, shown in `progress` at once; None if a user requested the
+                pause.
         """
         if error is not None:
             self._set_progress(error=error)
@@ -195,10 +195,11 @@ class ScanRunner:
         self._wake()
 
     def step(self) -> None:
-        """Run one frame, or one command that takes none, and pause again; clears a shown error.
+        """Request one frame, or one command that lasts, after which the run pauses again;
+        a shown error is cleared.
 
-        A step requested while a frame waits for room is for the next frame; others before
-        the run obeys are one.
+        Requests before the run obeys are one step. A request while a frame waits for room
+        counts for the next frame.
         """
         self._pause = False
         self._single_step = True
@@ -207,10 +208,10 @@ class ScanRunner:
         self._wake()
 
     def abort(self, reason: str | None = None) -> None:
-        """Request the end of the run: it raises `JobAborted`, with the reason, at its
-        next wait.
+        """Request the end of the run: it raises `JobAborted` at its next wait.
 
-        Without a reason an earlier one stays.
+        Args:
+            reason: for the error; None keeps an earlier one.
         """
         if reason is not None:
             self._end = JobAborted(reason)
@@ -235,13 +236,13 @@ class ScanRunner:
     # Running ------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run the complete plan on the clock: settings, motion and frames, with pauses
-        and steps.
+        """Run the plan on the clock: settings, motion and frames, with pauses, steps and
+        retries.
 
-        After a single step it pauses again.
-
-        Existing frames are skipped without waiting for their time. Motors are stopped if
-        the run ends by an error.
+        It begins at the first frame that is missing, after all settings from before it,
+        and frames that exist are skipped. A frame that a pause falls into is exposed
+        again. After a single step it pauses. Motors are stopped if the run ends by an
+        error.
 
         Raises:
             JobAborted: it was ended before the end.
@@ -292,9 +293,10 @@ class ScanRunner:
             await self._pipeline.close()
 
     def _first_moment(self) -> float:
-        """Plan time at which to begin [s]: 0, or the event of the first frame that is missing.
+        """Return the plan time at which to begin [s]: 0 without existing frames, else the
+        start of the first missing frame.
 
-        With no frame missing, the plan's end.
+        With no frame missing it is the plan's end.
         """
         if not self.done:
             return 0.0
@@ -304,10 +306,8 @@ class ScanRunner:
         return self.plan.duration_s
 
     def _not_made(self, error: Exception) -> None:
-        """Pause after an error that may pass; end the run if the same frames would fail
-        again.
-
-        It then ends with that error.
+        """Handle a batch that failed: pause with an error that may pass, or end the run
+        with one that the same frames would meet again.
         """
         if hopeless(error):
             self._end = error
@@ -322,13 +322,11 @@ class ScanRunner:
         self._set_progress(frames_done=self.progress.frames_done + made)
 
     async def _apply_step(self, step: PlanStep) -> None:
-        """Apply a command of the plan and show it in `progress`; after an error pause,
+        """Apply a command of the plan and show it in `progress`; after a TwinError pause,
         and try again on resume.
 
-        Only TwinErrors pause it.
-
         Raises:
-            Exception: the run is to end (`JobAborted`).
+            JobAborted: the run was ended while it was paused.
         """
         self._set_progress(step=step, what=step.what)
         while True:
@@ -347,7 +345,7 @@ class ScanRunner:
     ) -> None:
         """Wait until plan time `moment`, obeying pause and abort; set the progress to it.
 
-        At once if it has passed; requests are obeyed before that.
+        It returns at once if that has passed, but obeys requests first.
 
         Args:
             moment: on the plan's clock [s].
@@ -385,13 +383,12 @@ class ScanRunner:
             self._waiting.set_result(None)
 
     async def _obey_requests(self, tau: float) -> None:
-        """Obey requests: raise if the run is to end; else stop, wait for `resume`, and
-        rejoin the plan.
+        """Obey waiting requests: raise if the run is to end, else stop, wait for
+        `resume`, and rejoin the plan.
 
-        At once without a request.
-
-        After `resume` the settings of before the pause are restored. An error on the way
-        back pauses again.
+        Without a request it returns at once. After `resume` the settings of before the
+        pause are restored and failed frames are tried again. A TwinError on the way back
+        pauses again.
 
         Args:
             tau: plan time at which the run goes on [s].
@@ -427,10 +424,13 @@ class ScanRunner:
             self.scanner.stop(self.clock.now())
 
     async def _begin(self) -> None:
-        """Wait where a stop came before the run has begun: nothing is set before it may go
-        on.
+        """Wait out a pause that was requested before the run began; nothing is set before
+        it may go on.
 
-        Settings saved by such a stop are dropped.
+        Settings saved by that pause are dropped.
+
+        Raises:
+            Exception: the run is to end (`JobAborted`).
         """
         while self._has_request():
             await self._wait_for_request(0.0)
@@ -440,7 +440,7 @@ class ScanRunner:
     async def _wait_for_request(self, tau: float) -> None:
         """Show the run as paused and wait for resume, step or abort.
 
-        At once if it is no longer paused.
+        It returns at once if it is no longer paused.
 
         Args:
             tau: plan time at which it pauses [s].
@@ -458,10 +458,13 @@ class ScanRunner:
             raise self._end
 
     async def _rejoin_or_pause(self, tau: float) -> None:
-        """Move to where the plan stands at `tau` [s]; an error pauses the run with it.
+        """Move to where the plan is at `tau` [s], then obey requests; a TwinError of the
+        motion pauses the run.
 
-        With a request waiting (pause, abort) it does not move. Requests are obeyed at the
-        end.
+        With a request waiting (pause, abort) it does not move before that is obeyed.
+
+        Raises:
+            Exception: the run is to end (`JobAborted`).
         """
         if not self._has_request():
             try:
@@ -472,20 +475,19 @@ class ScanRunner:
             await self._obey_requests(tau)
 
     async def _rejoin(self, tau: float) -> None:
-        """Move to the plan's pose at `tau` and start the swept motion from there; ends
+        """Move to the plan's pose at `tau` and start the swept motion from there; return
         early on a pause or an abort.
 
-        After `MAX_SWEEPS` the last certificate is tried, and refused by the scanner if
-        outdated.
-
-        A certificate that the stage or the motors have outdated is made again, up to
-        `MAX_SWEEPS` times. The plan's zero on the twin's clock is set anew.
+        A certificate that a change of stage or motors has outdated is made again, up to
+        `MAX_SWEEPS` times; the last one is tried in any case. The plan's zero on the
+        twin's clock is set anew.
 
         Args:
             tau: time on the plan's clock [s].
 
         Raises:
             CollisionError: on the way there, or in the rest of the plan.
+            SafetyError: the last certificate is outdated.
         """
         paces = {axis: pace[1] for axis, pace in self.scanner.paces.items()}
         way = rejoin(self.plan, tau, paces)
@@ -514,16 +516,16 @@ class ScanRunner:
         self._set_progress(tau=tau)
 
     async def _return_to(self, start: Mapping[str, float]) -> None:
-        """Move the motors to where a programme begins and wait for rest; ends early on a
-        pause or an abort.
+        """Move the motors to where a programme begins and wait for their rest; return
+        early on a pause or an abort.
 
-        Nothing if they rest there already.
+        Nothing moves if they rest there already. The move is shown in `progress`.
 
         Args:
             start: axis -> position [mm, deg].
 
         Raises:
-            CollisionError: the way there.
+            CollisionError: on the way there.
         """
         now = self.clock.now()
         if self.scanner.positions(now) == start and not self.scanner.moving(now):
@@ -543,7 +545,9 @@ class ScanRunner:
     # Frames -------------------------------------------------------------------------------------
 
     async def _put(self, frame: Exposure) -> None:
-        """Hand a frame to the pipeline; while that is full the twin's clock is held."""
+        """Hand a frame to the pipeline; while that is full the twin's clock is held, and
+        requests are obeyed.
+        """
         if not self._pipeline.full:
             await self._pipeline.put(frame)
             return
@@ -558,9 +562,9 @@ class ScanRunner:
             await self._await_clock_held(self._pipeline.drained(), self.plan.duration_s)
 
     async def _await_clock_held(self, work: Awaitable[None], moment: float) -> None:
-        """Await `work` with the clock held, obeying pause and abort meanwhile.
+        """Await `work` with the twin's clock held, and obey pause and abort meanwhile.
 
-        While paused the work goes on, with the clock running.
+        While the run is paused the work goes on, with the clock running.
 
         Args:
             work: that takes real but no twin time; cancelled if the run ends.
@@ -607,9 +611,8 @@ class _Settings:
         return cls(scanner.tube, scanner.camera, scanner.paces)
 
     def restore(self, scanner: ScannerTwin) -> None:
-        """Put them back.
-
-        Rates, camera, tube, in that order; those set before an error stay set.
+        """Restore rates, camera and tube, in that order; those set before an error stay
+        set.
 
         Raises:
             SafetyError: X-rays were on, and an E-stop is in force.
@@ -623,10 +626,11 @@ class _Settings:
 def _events(
     steps: Sequence[PlanStep], frames: Sequence[Exposure]
 ) -> list[tuple[float, PlanStep | Exposure]]:
-    """Sort commands and frames by time; at equal times a command is before its own
-    frames.
+    """Sort commands and frames by time; at equal times by their place in the plan, a
+    command before its own frames.
 
-    Of commands at one time the earlier in the plan comes first.
+    Returns:
+        Pairs of plan time [s] and command or frame.
     """
     keyed: list[tuple[tuple[float, int, int], PlanStep | Exposure]] = []
     keyed += [((s.start_s, s.index, 0), s) for s in steps]

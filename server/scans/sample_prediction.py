@@ -44,14 +44,18 @@ class Prediction:
 async def predict_counts(
     radiography: Radiography, begin: StartConditions, plan: ScanPlan
 ) -> Prediction:
-    """Predict the counts of a scan's projections.
+    """Predict the counts of a scan's projections, with the physics and sample of its
+    start.
 
-    Without a sample only the open beam is judged. The result has exposures and problems.
+    Without a sample only the open beam is judged.
 
     Args:
-        radiography: how images are made.
-        begin: conditions of the scan; its physics and its sample are used.
+        radiography: how images are made; physics and scatter are those of `begin`.
+        begin: conditions of the scan.
         plan: of the scan.
+
+    Returns:
+        Predicted exposures, and problems of the sample beyond those of the open beam.
     """
     chosen = replace(radiography, physics=begin.physics, scatter=begin.scatter)
     forecast = await forecast_sample(chosen, begin.sample, sample_probes(plan))
@@ -70,9 +74,9 @@ async def predict_counts(
 async def forecast_sample(
     radiography: Radiography, sample: Sample, probes: tuple[SampleProbe, ...]
 ) -> SampleForecast:
-    """Predict the pixels behind a sample; wait while the projector works.
+    """Predict the pixels behind a sample for each probe; wait while the projector works.
 
-    A failed prediction ends no submission: errors of the sample are reported by the scan
+    A failure is in the result, not raised: errors of the sample are reported by the scan
     itself.
 
     Args:
@@ -81,7 +85,8 @@ async def forecast_sample(
         probes: rays to project.
 
     Returns:
-        The shares of each probe's pixels, or the reason why they are not predicted.
+        The shares of each probe's pixels; None for all of them, with the reason, if one
+        fails.
     """
     try:
         shares = [await radiography.predicted_shares(sample, one) for one in probes]

@@ -95,12 +95,10 @@ class Job:
 
 
 def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
-    """Restore a job of an earlier server from its record.
+    """Restore a job of an earlier server from its record; nothing starts by itself.
 
-    The ended phases are kept as they were. Nothing starts by itself.
-
-    One that had not ended is done if its data set is complete, else incomplete with an
-    error with the way to go on.
+    A job that had ended keeps its phase. Another one is done if its data set is complete,
+    else incomplete, with an error that counts the images and names the way to go on.
 
     Args:
         memory: its record.

@@ -96,9 +96,15 @@ class ScanSource:
         seed: int | None = None,
         flat: bool | Mapping[str, float] = True,
     ) -> ScanSource:
-        """Make a scan from a trajectory; its script is one comment for each pose.
+        """Make a scan from a trajectory; its script is a comment on exposure and flats,
+        then one for each pose.
 
-        `exposure_ms` None is the camera's; `flat` is whether flats are taken, or where.
+        Args:
+            poses: axis -> value [mm, deg] of each pose, or a list made before.
+            exposure_ms: of each image; None for the camera's.
+            moments: poses averaged within an exposure in motion.
+            seed: of the noise; None for a fresh one.
+            flat: whether flats are taken, or the pose of them.
         """
         if not isinstance(poses, PoseList):
             poses = PoseList.of(poses)
@@ -157,8 +163,8 @@ class JobRecord:
         """Add the record, as JSON for the data set `name`, to changes that are written
         together.
 
-        The file is in `FOLDER`, named after the data set; the listing of poses is not in
-        it.
+        The file is in `FOLDER`, named after the data set; the text that lists poses is
+        not in it.
 
         Args:
             changes: files written as one.
@@ -184,12 +190,10 @@ class JobRecord:
 
     @staticmethod
     def remove(root: Directory, name: str) -> None:
-        """Delete the record of a complete data set, which is not resumed; errors are
-        logged
+        """Delete the record of a complete data set, which is not resumed.
 
-        One that is not there is no error.
-
-        A file that stays is harmless.
+        A missing record is no error. A failure is logged as a warning, as a file that
+        stays is harmless.
         """
         try:
             root.folder(FOLDER).discard(f"{file_stem(name)}.json")
@@ -211,12 +215,11 @@ class JobRecord:
 
     @classmethod
     def read(cls, root: Directory, name: str) -> JobRecord:
-        """Read the record of the data set `name`; a damaged one is set aside.
-
-        Set aside means renamed and logged.
+        """Read the record of the data set `name`; a damaged one is renamed and logged.
 
         Raises:
-            FileNotFoundError: there is no record, or no valid one.
+            FileNotFoundError: there is no record, or a damaged one.
+            OSError: it cannot be read.
         """
         file = f"{file_stem(name)}.json"
         without = "what a scan started from cannot be read; it cannot be resumed"
@@ -229,7 +232,7 @@ class JobRecord:
     def _of(cls, data: bytes) -> JobRecord:
         """Decode a record from the bytes of its file, also of earlier servers.
 
-        Records without `flat` have none taken.
+        A record without `flat` has no flats.
 
         Raises:
             ValueError, KeyError, TypeError: another schema, or fields that are missing or

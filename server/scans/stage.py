@@ -89,16 +89,15 @@ class Stage:
         """Compute convex pieces that contain the sample, object frame [mm]; may take a
         second.
 
-        Pieces of a file that was replaced meanwhile are returned, not remembered.
-
-        The pieces of the last `MAX_CACHED_SCENES` samples are remembered.
+        The pieces of the last `MAX_CACHED_SCENES` samples are remembered, but not those
+        of a file that was replaced meanwhile.
 
         Args:
             sample: on the stage.
             upload: next upload under the sample's name; None for the present one.
 
         Returns:
-            The pieces; empty for an empty stage.
+            The pieces; empty for an empty stage or a sample without matter.
         """
         before = self._content(sample, upload)
         pieces = self._pieces.get(before)
@@ -121,8 +120,12 @@ class Stage:
         return pieces
 
     def size(self, sample: Sample) -> SampleSize | None:
-        """Compute what contains the sample at every angle, from its shape where it stands;
-        None for an empty stage. May take a second, as `pieces`.
+        """Compute the cylinder that contains the sample at every angle, from its shape
+        where it is placed; may take a second, as `pieces`.
+
+        Returns:
+            The size; None for an empty stage. A sample without matter has the size that
+            its phantom states.
         """
         phantom = self.phantom(sample)
         if phantom is None:
@@ -139,10 +142,10 @@ class Stage:
         parameters: Offsets = NOMINAL,
         upload: ReceivedSample | None = None,
     ) -> CollisionScene | None:
-        """Build the scene of bodies that may collide; the last `MAX_CACHED_SCENES` scenes are
-        remembered.
+        """Build the scene of bodies that may collide, or return a remembered one.
 
-        Scenes are known by content and placement of the sample, and by parameters.
+        The last `MAX_CACHED_SCENES` scenes are remembered, by content and placement of
+        the sample and by parameters.
 
         Args:
             sample: on the stage.
@@ -221,12 +224,13 @@ class Shapes:
         return kept if same else None
 
     def of(self, name: str, revision: str | None, phantom: Phantom) -> Shape:
-        """Compute the shape of `phantom`, or return it from the cache; may take a second.
+        """Make the mesh of `phantom` as binary STL, or return the remembered one of that
+        name and revision; may take a second.
 
-        Only the last one is kept; its file is binary STL.
+        Only the last one is remembered.
 
         Raises:
-            RpcError: -32008, it has more triangles than may be sent.
+            RpcError: -32008, the file would be larger than the limit.
         """
         if (kept := self.known(name, revision)) is not None:
             return kept
@@ -281,8 +285,12 @@ class ObstacleMoves:
     ) -> Way:
         """Plan a free way from where the motors will rest.
 
-        With a warning if it goes around something. `shortest` lets rotations turn the
-        shorter way.
+        Nothing moves. The way has a warning if it goes around something.
+
+        Args:
+            targets: axis -> target [mm, deg].
+            relative: whether targets are distances from where the motors will rest.
+            shortest: whether a rotation may take the shorter way.
 
         Raises:
             UnknownNameError, LimitError, SafetyError: as a move.
@@ -304,8 +312,8 @@ class ObstacleMoves:
         """Resolve targets and find moves to them that touch nothing; the search runs in a
         thread.
 
-        Without bodies the direct move is the way. The order is one of single moves or
-        moves together.
+        Without components, or if it is free, the direct move is the way; else it has
+        several legs, each of one or several axes.
 
         Args:
             targets: axis -> target [mm, deg].
@@ -364,13 +372,15 @@ class ObstacleMoves:
         return self._task
 
     async def _follow_legs(self, way: Way) -> None:
-        """Move along the legs of a way one by one, each after the motors' rest; call
-        `changed` at each start.
+        """Wait for the motors' rest, move along the legs of a way one after the other,
+        and wait for the rest after the last.
 
-        It first waits for the motors' rest, and ends when the last leg has ended.
+        `changed` is called when a leg has started.
 
         Raises:
-            SafetyError: other motion has begun or motion was stopped.
+            SafetyError: after the first leg other motion has begun or motion was stopped;
+                no further leg starts.
+            TwinError: a leg is refused, as a move.
         """
         scanner = self.scanner
         clock = self.clock
@@ -417,12 +427,12 @@ class ObstacleMoves:
 
 
 async def wait_for_way(task: asyncio.Task[None]) -> list[str]:
-    """Wait for the end of the task that moves along a way.
+    """Wait for the end of the task that moves along a way, and list what ended it early.
 
     The task is not cancelled if this wait is.
 
     Returns:
-        Warnings if it was cancelled or refused a leg; empty if it arrived.
+        One warning if it was cancelled or refused a leg; [] if it arrived.
 
     Raises:
         Exception: any error of the task but a TwinError.

@@ -90,7 +90,15 @@ class Submissions:
     """Day, and number of the last scan named on it."""
 
     async def check(self, source: ScanSource, codec: Codec) -> Encoded:
-        """Compute the dry-run report from the scanner's present state; nothing moves.
+        """Compute the dry-run report of a scan from the scanner's present state, with a
+        prediction behind the sample; nothing moves.
+
+        Args:
+            source: script or poses.
+            codec: of the connection.
+
+        Returns:
+            The encoded report.
 
         Raises:
             RpcError: -32008, it takes too long, too much memory, or is too large for an
@@ -104,9 +112,8 @@ class Submissions:
     async def _sample_seen(
         self, check_input: CheckInput, sample: Sample
     ) -> SampleForecast | None:
-        """Predict the pixels behind the sample on the stage; None without a sample.
-
-        The rays are those of the checked scan.
+        """Predict the pixels behind `sample` on rays of the checked scan; None for an
+        empty stage.
         """
         if not sample.name:
             return None
@@ -127,9 +134,10 @@ class Submissions:
     ) -> Job:
         """Check a scan completely, write its record, and put it in the queue as a job.
 
-        The seed is the script's, else drawn (or that of the resumed scan).
+        The seed is the request's, else drawn.
 
-        A name of an interrupted data set resumes that scan with its start conditions.
+        The name of an interrupted data set of the same script resumes that scan with its
+        start conditions and seed.
 
         Args:
             source: script or poses.
@@ -142,9 +150,12 @@ class Submissions:
             The queued job, with warnings.
 
         Raises:
-            RpcError: -32005 script invalid, -32002 collisions, -32602 the name is taken,
-                -32003 the sample of the resumed scan has changed.
-            LimitError, DiskFullError, DatasetNameError.
+            RpcError: -32005, the script is invalid; -32002, collisions; -32602, the name
+                is taken; -32003, the sample of the resumed scan has changed; -32008, the
+                sample does not fit into memory.
+            LimitError: the name is too long.
+            DiskFullError: the images do not fit on the disk.
+            DatasetNameError: the name is not a plain one.
         """
         resumed = None
         if name is not None:
@@ -187,15 +198,16 @@ class Submissions:
     ) -> None:
         """Put a job that ended early into the queue again; only missing images are made.
 
-        What the scan began from is its record; where the data set exists, that one's
-        start, sample and correction count.
+        The scan is read from its record. Where its data set exists, it goes on under the
+        conditions that it began with.
 
         Args:
             job: that has ended.
             ensure_allowed: raises if the requester has lost control.
 
         Raises:
-            RpcError: as `submit`; -32602 if there is nothing to continue.
+            RpcError: as `submit`; -32602, its record cannot be read or a job writes the
+                data set.
         """
         name = job.name
         refused = partial(name_conflict, job.name)
@@ -241,7 +253,7 @@ class Submissions:
         """Write the scan's and the job's records as one change, then put the job into the
         queue.
 
-        The requester must be allowed at that moment, too; else -32003 and no job.
+        If the requester has lost control by then, nothing is queued.
 
         Args:
             job_record: record of the scan.
@@ -250,8 +262,9 @@ class Submissions:
             make: drafts the job.
 
         Raises:
-            DatasetWriteError: the record cannot be written; the job is not made.
-            RpcError: -32602, another job has taken the name.
+            DatasetWriteError: the records cannot be written; nothing is queued.
+            RpcError: -32602, another job has taken the name; -32003, too many jobs wait,
+                or control is lost.
         """
         drafts: list[Job] = []
 
@@ -267,10 +280,11 @@ class Submissions:
             self.job_files.put(changes, drafts[0].memory())
 
         def take() -> Job:
-            """Put the drafted job into the queue; raise if its name has been taken
-            meanwhile.
+            """Put the drafted job into the queue and return it.
 
-            It also raises if the requester has lost control.
+            Raises:
+                RpcError: the requester has lost control, or a job writes the data set of
+                    that name.
             """
             ensure_allowed()
             [draft] = drafts
@@ -290,8 +304,9 @@ class Submissions:
         """Check a scan completely (text, plan, collisions, disk, memory, counts) and
         prepare its start.
 
-        Warnings are those of the check, of the predicted counts, and (resumed) how many
-        images exist and that the sample on the stage is another.
+        Warnings are those of the check and of the predicted counts. For a resumed scan
+        the first ones say how many images exist, and whether another sample is on the
+        stage.
 
         Args:
             job_record: record of the scan.
@@ -330,15 +345,15 @@ class Submissions:
         ensure_allowed()
 
         async def prepare() -> JobInputs:
-            """Check the scan again at its turn, and open its data set; return the inputs
+            """Check the scan again at its turn, open its data set, and return the inputs
             of the job.
 
             A scan that is not resumed begins from the motors and the sample of now.
-            Counts are predicted again only if check or sample differ.
+            Counts are predicted again only if plan or sample have changed.
 
             Raises:
-                RpcError: it may not run any more; DatasetWriteError: the data set cannot
-                    be opened.
+                RpcError: it may not run any more.
+                DatasetWriteError: the data set cannot be opened.
             """
             begun = job_record
             if (
@@ -374,13 +389,13 @@ class Submissions:
     ) -> CheckInput:
         """Collect the input of a scan's check; shapes are computed in a thread.
 
-        The correction in force and the physics of now are in it.
+        Correction, collision pieces of the sample on the stage, and physics are those of
+        now.
 
         Args:
             source: script or poses.
             start: scanner before the scan.
-            shown: sample through which the beam passes; collisions are those of the
-                sample on the stage.
+            shown: sample through which the beam passes, of which the size is taken.
         """
         scanner = self.scanner
         stage = self.stage
@@ -435,10 +450,10 @@ class Submissions:
         resume: bool,
         predicted: tuple[PredictedExposure, ...],
     ) -> JobInputs:
-        """Write the scan's record and create (or resume) its data set; in a worker
-        thread.
+        """Write the scan's record, create its data set or go on with it, and make the
+        producer of its frames; in a worker thread.
 
-        Physics, scatter and seed are those of the start conditions; the geometry is
+        Physics, scatter and seed are those of the start conditions. The geometry is
         checked before anything is written.
 
         Args:
@@ -453,8 +468,8 @@ class Submissions:
             the end.
 
         Raises:
-            DatasetWriteError, GeometryError: the folder cannot be written; the geometry
-                is not usable.
+            DatasetWriteError: the folder cannot be written.
+            GeometryError: the geometry is not usable.
         """
         begin = job_record.begin
         radiography = replace(
@@ -499,12 +514,12 @@ class Submissions:
         return JobInputs(plan, writer, acquisition.produce, finished)
 
     def _ensure_same(self, begin: StartConditions) -> None:
-        """Check that a scan's sample, once read, has not changed since the scan began.
+        """Check that the file of a scan's sample is the one with which the scan began.
 
         Nothing is checked while the scan's revision is not known.
 
         Raises:
-            RpcError: -32003, another file has come under its name.
+            RpcError: -32003, another file has come under the sample's name.
         """
         now = self.stage.revision(begin.sample)
         name = begin.sample.name
@@ -517,9 +532,10 @@ class Submissions:
             )
 
     def _resumable(self, name: str, source: ScanSource) -> StartConditions | None:
-        """Read the start conditions of the interrupted data set called `name`.
+        """Read the start conditions of the interrupted data set called `name`, after a
+        check that the scan may continue it.
 
-        Compared are script, poses and, for poses, exposure.
+        Script and poses must be equal, and for poses the exposure.
 
         Args:
             name: of the data set.
@@ -577,9 +593,10 @@ class Submissions:
         return kept.begin
 
     def _free_name(self) -> str:
-        """Choose the first name of today (date and number) that no job and no folder has.
+        """Choose the first name of today (date and number) that no job has and that is
+        not in the data directory.
 
-        The next search begins at that number.
+        The next search of the day begins at that number.
         """
         used = {job.name for job in self.jobs.all()}
         now = self.now()
@@ -598,14 +615,14 @@ class Submissions:
     def _require_room(self, size: int, name: str) -> None:
         """Check that the images of a scan that are not there yet fit on the disk.
 
-        Images that are there count by their size, complete or not.
+        Image files of the data set that are there count by their present size.
 
         Args:
             size: of all images [bytes].
             name: of the data set.
 
         Raises:
-            DiskFullError: they do not.
+            DiskFullError: they do not fit.
         """
         there = 0
         with suppress(FileNotFoundError), self.root.folder(name).entries() as entries:

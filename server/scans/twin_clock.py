@@ -106,9 +106,8 @@ class TwinClock:
 
     @property
     def real_time_factor(self) -> float | None:
-        """Measured twin seconds a real second over the samples kept (the last few seconds).
-
-        None until they span more than `SAMPLE_S`.
+        """Measured twin seconds a real second over the last few seconds; None until
+        samples span more than `SAMPLE_S`.
         """
         wall = self._wall()
         now = self._time()
@@ -121,9 +120,9 @@ class TwinClock:
     def at(self, moment: float) -> asyncio.Future[None]:
         """Return a future that is done once the clock has reached `moment` [s].
 
-        At once for a moment that has passed; equal moments in the order of the calls.
-
-        Its owner may finish or cancel it early; the clock then drops it.
+        It is done at once for a moment that has passed. Futures of equal moments end in
+        the order of the calls. Its owner may finish or cancel it early; the clock then
+        drops it.
         """
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         if self._time() >= moment:
@@ -157,10 +156,10 @@ class TwinClock:
             self._set_timer()
 
     def _time(self) -> float:
-        """Compute the twin's time now [s]; it stands while held, and between events at speed
-        "max".
+        """Compute the twin's time now [s].
 
-        From twin time `LATE_S` on it runs at real time at most.
+        It does not change while held, and at speed "max" only by jumps to awaited
+        moments. From twin time `LATE_S` on it runs at most at real time.
         """
         if self._hold_count or self._speed_up == "max":
             return self._base
@@ -184,11 +183,12 @@ class TwinClock:
             self._samples.popleft()
 
     def _set_timer(self) -> None:
-        """Schedule the wake-up of the first future that waits, in place of the one
+        """Schedule the wake-up for the first future that waits, in place of the one
         scheduled before.
 
-        None while time is held or nobody waits; at speed "max" after some rounds of the
-        loop; at most an hour ahead.
+        Nothing is scheduled while time is held or nobody waits. At speed "max" it comes
+        after `WAKE_ROUNDS` rounds of the loop, else after at most an hour of real time.
+        Futures that are done are dropped.
         """
         if self._timer is not None:
             self._timer.cancel()
@@ -210,10 +210,11 @@ class TwinClock:
             self._timer = loop.call_later(min(wait, 3600.0), self._wake_due)
 
     def _jump_to_next(self, patience: int) -> None:
-        """Set the time to the first awaited moment, and wake its task alone; for speed
+        """Set the time to the first awaited moment and finish that one future; for speed
         "max".
 
-        Cancelled waits are skipped; time never goes back.
+        Futures that are done are skipped; time never goes back. Then the next wake-up is
+        scheduled.
 
         Args:
             patience: number of loop rounds to wait first, in which tasks that are ready
@@ -234,9 +235,10 @@ class TwinClock:
         self._set_timer()
 
     def _wake_due(self) -> None:
-        """Wake the tasks due within a microsecond of real time, and schedule the next wake-up.
+        """Finish the futures that are due within a microsecond of real time, and schedule
+        the next wake-up.
 
-        Time is set forward to a woken task's moment if the timer was early.
+        Time is set forward to the moment of a future that the timer woke early.
         """
         self._timer = None
         now = self._time()

@@ -178,7 +178,8 @@ class Hub:
             topics: its new subscriptions.
             view: of all of them.
 
-        Raises: RpcError: -32003, there would be more; names the number and the limit.
+        Raises:
+            RpcError: -32003, there would be more; names the number and the limit.
         """
         views = [
             s.view
