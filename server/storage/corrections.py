@@ -145,24 +145,24 @@ class Corrections:
         *,
         sides_known: bool = False,
     ) -> NamedCorrection:
-        """Make a correction from edge values [mm, deg]; nothing is stored yet.
+        """Make a correction from edge values [mm, deg], or return the known one; nothing
+        is stored yet.
 
-        Values that are left out are nominal; the note of a known one stays, and whether
-        its sides are known.
+        Parameters that are left out are nominal. A known name with the same values
+        returns the known correction with its own note and date, and
+        its `sides_known`.
 
         Args:
             values: parameter -> value [mm, deg].
-            name: of the correction; None: one that follows from its date.
+            name: of the correction; None: "correction-DATE-N".
             note: for people.
             when: its date; None: now.
             sides_known: see `NamedCorrection`.
 
-        Returns:
-            The new correction, or the known one of this name with the same values.
-
         Raises:
             UnknownNameError: a name that is not a parameter.
-            RpcError: -32602, the name is taken; corrections are never edited.
+            RpcError: -32602, the name is taken by other values; corrections are never
+                edited.
             LimitError: there are as many as may be.
         """
         date = (when or datetime.now(UTC)).isoformat(timespec="milliseconds")
@@ -188,10 +188,11 @@ class Corrections:
         )
 
     def after(self, correction: NamedCorrection | None) -> History:
-        """Return the history once `correction` (None: none) is in force instead of the last.
+        """Return the history once `correction` (None: none) is in force instead of the
+        last; nothing is changed here.
 
-        Unchanged if none is in force before and after; the oldest beyond `MAX_HISTORY`
-        are dropped.
+        It is the same list if none is in force before and after. Names beyond the last
+        `MAX_HISTORY` are dropped.
         """
         name = None
         if correction is not None:
@@ -203,9 +204,15 @@ class Corrections:
     def store(
         self, changes: documents.Changes, correction: NamedCorrection, source: str | None
     ) -> None:
-        """Write a new correction; a known one stays as it is.
+        """Add the file of a new correction to `changes`; nothing is added for a known
+        name.
 
-        It is added to `changes`; nothing is known of it until `know`.
+        `get` and `all` do not have it before `know`.
+
+        Args:
+            changes: written together.
+            correction: to be stored.
+            source: data set or file that it came from, or None.
 
         Raises:
             DatasetWriteError: the system cannot write.
@@ -241,10 +248,8 @@ class Corrections:
             self._written = history
 
     def without(self, name: str) -> History:
-        """Return the history as it is once the correction called `name` is deleted;
-        changes nothing.
-
-        All its places in the history are left out.
+        """Return the history without any entry of the correction called `name`; nothing
+        is changed here.
 
         Raises:
             UnknownNameError: there is no such correction.
@@ -266,8 +271,12 @@ class Corrections:
         changes.remove(self._folder, self._files.get(name) or _file(self._all[name]))
 
     def forget(self, name: str, history: History) -> None:
-        """Remove a correction from memory (its file is removed elsewhere); `history` is
-        the one without it.
+        """Remove a correction from memory and set the history; its file is removed by
+        `remove`.
+
+        Args:
+            name: of the correction; it must be known.
+            history: the one without it.
         """
         del self._all[name]
         self._sources.pop(name, None)
@@ -275,7 +284,11 @@ class Corrections:
         self.history = history
 
     def _free_name(self, date: str) -> str:
-        """Find an unused name for a correction of this date (only its day counts)."""
+        """Find an unused name "correction-YYYY-MM-DD-N" for a correction of this date
+        (ISO 8601).
+
+        N begins after the number of corrections of that day.
+        """
         base = f"correction-{date[:10]}"
         taken = sum(name.startswith(base) for name in self._all)
         while (name := f"{base}-{taken + 1}") in self._all:
@@ -290,9 +303,10 @@ def _file(correction: NamedCorrection) -> str:
 
 
 def _joined(before: History, in_force: History) -> History:
-    """Join the history of the file and that of the state, whose last name is in force.
+    """Join the history of the file with that of the state, whose last name is in force.
 
-    One name cuts the file's history after its last place, or is appended.
+    A history of none or several names in the state replaces the file's. A single name
+    cuts the file's history after its last place there, or is appended.
 
     Args:
         before: of the file.
@@ -315,9 +329,8 @@ def _read_history(data: bytes) -> History:
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
-    """Parse a correction and its origin (or None), and check that it is plausible.
-
-    Shifts may be of any finite length here.
+    """Parse a correction and its origin (or None), and check that it is plausible,
+    whatever the length of its shifts.
 
     Raises:
         ValueError, TwinError: no correction, or an implausible one.

@@ -25,16 +25,16 @@ PHANTOM_SUFFIXES: Final = (".toml", ".json")
 def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFitResult:
     """Calibrate from data sets for `calibration.fit`; blocks, for a worker process.
 
-    Without a fit, residuals and steps are left out; a bead that was not used has None.
-
     Args:
         root: the data directory, against which names of data sets and phantom files are
             resolved.
-        asked: parameters of `calibration.fit`.
+        asked: parameters of `calibration.fit`. The phantom is a shipped name, a file with
+            one of `PHANTOM_SUFFIXES`, or `UNKNOWN`.
 
     Returns:
-        The calibration's document, with residuals [px], covariances by step and bead
-        tracks where requested; paths are relative to the data directory.
+        The calibration's document; with a fit also the covariance by step and, where
+        requested, residuals [px] (None for a bead that was not used); bead tracks where
+        requested. Paths are relative to the data directory.
 
     Raises:
         TwinError: there is no such data set or phantom, or nothing can be fitted.
@@ -104,9 +104,11 @@ def align(
 
 
 def _dataset_path(root: Directory, name: str) -> Path:
-    """Return the folder of a data set, or raise DatasetMissingError if there is none.
+    """Return the path of a data set's folder.
 
-    A name that is no plain file name raises DatasetNameError.
+    Raises:
+        DatasetMissingError: there is no such folder.
+        DatasetNameError: the name is no plain file name.
     """
     if not root.is_directory(plain_name(name, "data set")):
         raise DatasetMissingError(
@@ -116,12 +118,11 @@ def _dataset_path(root: Directory, name: str) -> Path:
 
 
 def _text(root: Directory, name: str) -> str:
-    """Read a phantom file of the data directory, which may name no other files.
-
-    A name that is no plain file name raises DatasetNameError.
+    """Read the text of a phantom file of the data directory.
 
     Raises:
-        DatasetMissingError: no such file.
+        DatasetMissingError: there is no such file.
+        DatasetNameError: the name is no plain file name.
     """
     if plain_name(name, "phantom") not in root.names():
         raise DatasetMissingError(

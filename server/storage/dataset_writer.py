@@ -59,11 +59,22 @@ class DatasetWriter:
         sync: bool = True,
         write: Write = write_some,
     ) -> None:
-        """Make the data set's folder, or (`resume`) go on in it, and write script and texts.
+        """Make the data set's folder, or (`resume`) go on in it, and write script and
+        texts.
 
-        The record is written as incomplete. The folder stays locked until `close`; at an
-        error it is released. Raises: DatasetError if a name is bad, the folder has files
-        (or another scan's), or the disk is full.
+        The data set is marked incomplete. The folder's descriptor is held until `close`;
+        after an error it is released.
+
+        Args:
+            root: the data directory.
+            record: the scan; its name names the folder.
+            script: byte for byte; None for none.
+            resume: allow a folder that holds files of the same scan.
+            sync, write: see `Directory`.
+
+        Raises:
+            DatasetError: a name that is not plain, files in the folder (or of another
+                scan), or a full disk.
         """
         for file in record.files:
             plain_name(file)
@@ -132,10 +143,10 @@ class DatasetWriter:
             self._present.add(name)
 
     def finish(self, *, duration_s: float | None = None) -> None:
-        """Mark the data set complete: write its texts anew, after the images are safe on
-        the disk.
+        """Check that all images are there, and mark the data set complete: write its
+        texts anew, after the images are safe on the disk.
 
-        The folder stays locked until `close`.
+        The folder is held until `close`.
 
         Args:
             duration_s: of the scan as it ran [s]; None keeps the planned one.
@@ -166,7 +177,8 @@ class DatasetWriter:
         """Check that the folder is empty or holds this scan, and remove unfinished files
         from it.
 
-        Only headers of the images are read. `record` adopts what the document states.
+        Of an image only the header is read. With a document, `record` takes over its
+        start and correction.
 
         Args:
             resume: whether the folder may have files.
@@ -192,11 +204,10 @@ class DatasetWriter:
         return {name for name in found if self._is_complete_image(name)}
 
     def _is_complete_image(self, name: str) -> bool:
-        """Return whether the file holds an image of the right format (only its
-        header is read).
+        """Return whether the file holds an image of 16-bit pixels, of the planned shape,
+        and with all bytes that its header claims.
 
-        The file must have 16-bit pixels, the planned shape, and all bytes that the header
-        claims. False if it cannot be read.
+        Only the header is read. False if it cannot be read.
         """
         try:
             with self._files.open(name) as file, tifffile.TiffFile(file) as tiff:
@@ -212,13 +223,14 @@ class DatasetWriter:
             return False
 
     def _check_same(self) -> None:
-        """Check that the folder holds this scan, and adopt its start and its correction
-        in `record`.
+        """Check that the folder holds this scan, and take over its start and its
+        correction in `record`.
 
-        Frames, machine, profile and noise must agree.
+        Frames, machine, profile and noise must be equal.
 
         Raises:
-            DatasetExistsError: it cannot be read, or holds another scan.
+            DatasetExistsError: its document cannot be read, or is of another scan; names
+                the first difference.
         """
         path = self.folder / DOCUMENT
         try:
@@ -247,12 +259,13 @@ class DatasetWriter:
         )
 
     def _check_room(self) -> None:
-        """Check that the missing images fit on the disk.
+        """Check that the missing images (2 bytes a pixel) and `RESERVE_BYTES` fit on the
+        disk.
 
-        With `RESERVE_BYTES` to spare; nothing is checked where free space is unknown.
+        Nothing is checked where free space is unknown.
 
         Raises:
-            DiskFullError: they do not.
+            DiskFullError: they do not fit.
         """
         missing = self.missing
         need = (

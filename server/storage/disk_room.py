@@ -52,9 +52,10 @@ class UsedBytes:
         """Sum up the bytes of all files in the directory and its folders; links are not
         followed.
 
-        0 if the directory cannot be read.
+        Folders that have not changed since the last call are not listed again.
 
-        Folders that have not changed since the last call are not read again.
+        Returns:
+            The sum; 0 if the directory cannot be read.
         """
         with suppress(OSError):
             changed_ns = os.stat(self._root.fileno() or self._root.path).st_mtime_ns
@@ -67,16 +68,17 @@ class UsedBytes:
     def _count(
         self, folder: Directory, name: str, changed_ns: int, there: dict[str, _Seen]
     ) -> int:
-        """Sum up a folder, reusing what is known of unchanged ones; record them in `there`.
+        """Sum up a folder and those in it, and record each in `there`; unchanged folders
+        are not listed again.
 
-        A folder is unchanged if its time of modification is, and is not young; contents
-        that cannot be read count 0.
+        A folder is unchanged if its time of modification is, and is more than
+        `MIN_SETTLED_NS` ago. Folders that have gone or cannot be read count 0.
 
         Args:
-            folder: that contains it.
-            name: of the folder.
+            folder: to be summed up.
+            name: of the folder, relative to the directory, for `there`.
             changed_ns: its time of modification [ns].
-            there: folder -> what was counted; changed.
+            there: folder -> its listing; changed.
 
         Returns:
             Bytes.
@@ -139,9 +141,9 @@ class DiskRoom:
         return UsedBytes(self.root)
 
     def require(self, what: str, size: int, there: int = 0) -> None:
-        """Check that the disk and the quota have room for `size` and the reserve.
+        """Check that the disk and the quota have room for `size` and `RESERVE_BYTES`.
 
-        Unknown free space without a quota is no error.
+        Nothing is checked without a quota where free space is unknown.
 
         Args:
             what: that is about to begin, for the message.
@@ -149,7 +151,7 @@ class DiskRoom:
             there: of these, bytes that are there already.
 
         Raises:
-            DiskFullError: with the needed and the free room.
+            DiskFullError: they have not; names the needed and the free room.
         """
         need = size + RESERVE_BYTES - there
         free = free_bytes(self.root.path)
@@ -177,7 +179,7 @@ def require_last(folder: Path, what: str, size: int) -> None:
         size: its bytes.
 
     Raises:
-        DiskFullError: as if the disk was full.
+        DiskFullError: it does not.
     """
     free = free_bytes(folder)
     need = size + LAST_BYTES

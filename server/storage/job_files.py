@@ -81,7 +81,9 @@ class JobFiles:
         self._folder = self._records.folder(FOLDER)
 
     def read(self) -> list[JobMemory]:
-        """Read every job in the order made; files that cannot be read are set aside and logged."""
+        """Read every job, ordered by number; files that cannot be read are renamed and
+        logged.
+        """
         found = []
         for file in documents.ours(self._folder):
             without = "a job cannot be read; without it (its data set stays)"

@@ -92,10 +92,11 @@ def remember(
     unfiled: Sequence[JobMemory] = (),
     ended: bool = False,
 ) -> Memory:
-    """Record the scanner at twin time `now`: where its motors are, not where they are bound.
+    """Make the document of the scanner at twin time `now`, with the motors' present
+    positions, not their targets.
 
-    Rates, tube, camera, sample and correction are in the scene, and whether an E-stop is
-    in force.
+    It has rates, tube, camera, sample and correction, whether an E-stop is in force, the
+    time of writing, and the arguments.
 
     Args:
         scanner: as it is.
@@ -123,12 +124,13 @@ def remember(
 def with_scanner_state(
     memory: Memory, scanner: ScannerTwin, corrections: list[str | None] | None = None
 ) -> Memory:
-    """Replace the settings, sample and correction of the document by those of `scanner`.
+    """Replace settings, rates, sample and correction of the document by those of
+    `scanner`.
 
-    Rates are the scanner's, too; jobs and E-stop stay.
+    Positions, jobs and E-stop stay.
 
     Args:
-        memory: as it is; its positions stay.
+        memory: the document; not changed.
         scanner: as it will be.
         corrections: as `Memory` has them; None leaves them.
     """
@@ -143,10 +145,10 @@ def with_scanner_state(
 
 
 def read_memory(root: Directory) -> Memory | None:
-    """Read the state of data directory `root`; None if there is none; a damaged file is
-    set aside.
+    """Read the state of data directory `root`.
 
-    That is logged.
+    Returns:
+        The state; None if there is none, or a damaged file, which is renamed and logged.
     """
     return documents.read_or_set_aside(
         root,
@@ -160,7 +162,7 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     """Set the scanner to the state in `memory`, X-rays off; an E-stop stays in force.
 
     A voltage outside the tube's range is replaced by the present one, with a warning in
-    the log. The correction is not restored here.
+    the log. Positions are limited to the travel. The correction is not restored here.
 
     Args:
         memory: the state.
@@ -253,13 +255,12 @@ class StateStore:
             self._at_once.set()
 
     async def run(self, moving: Callable[[], bool]) -> None:
-        """Write the state after each change, and while motors move; ends only by
+        """Write the state after each change, and while motors move; end only by
         cancellation.
 
-        At most once in `MIN_INTERVAL_S`, unless a write is asked for at once. Failed jobs
-        alone are tried again later.
-
-        A failure is logged and tried again after `FAR_S`.
+        It is written at most once in `MIN_INTERVAL_S`, unless a write at once is
+        requested. A failure is logged and tried again after `FAR_S`; if only jobs failed,
+        further changes are written meanwhile.
 
         Args:
             moving: returns whether positions are changing.
@@ -285,15 +286,14 @@ class StateStore:
                     await self._at_once.wait()
 
     async def flush(self) -> None:
-        """Write state and changed jobs now, so that everything answered later survives a
-        kill.
+        """Write the state and up to `MAX_JOBS_PER_TURN` changed jobs now, so that
+        everything answered later survives a kill.
 
-        If some jobs are left to be written, another write is asked for.
-
-        The outcome is kept in `problem`, and passed to `noticed`.
+        If more jobs are left, another write is scheduled. The outcome is kept in
+        `problem`, and passed to `noticed` if it is new.
 
         Raises:
-            DatasetWriteError: the system cannot write.
+            DatasetWriteError, OSError: the system cannot write.
         """
         async with self._writing:
             try:
@@ -337,10 +337,10 @@ class StateStore:
     ) -> T:
         """Write a change to the disk, then apply it; restore the disk if either fails.
 
-        One change at a time, before any other write.
+        No other write comes in between.
 
         Args:
-            take: applies the change in memory; may raise.
+            take: applies the change in memory; may raise before it does.
             after: makes the state's document with the change from the present one; None
                 leaves the document.
             files: adds further files to the change.
@@ -376,9 +376,10 @@ class StateStore:
             self.noticed(problem)
 
     def end(self) -> None:
-        """Write state and all changed jobs for the last time; an error is logged, not raised.
+        """Write the state as that of an ended server, and all changed jobs; an error is
+        logged, not raised.
 
-        Writes still under way can not undo it.
+        Later writes, as of threads still under way, are skipped.
         """
         try:
             self._put(self._make(True), self._unwritten_jobs(most=sys.maxsize))
@@ -403,9 +404,17 @@ class StateStore:
         return now | dict(islice(self._unwritten.items(), max(0, most - len(now))))
 
     def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
-        """Write the document and jobs to the disk, one write at a time; blocks.
+        """Write the document and then the jobs to the disk, one write at a time; blocks.
 
-        After the last write (of an ended server), others are skipped.
+        Nothing is written after the document of an ended server has been.
+
+        Args:
+            memory: the document.
+            jobs: id -> job; None deletes its file.
+
+        Raises:
+            DatasetWriteError: the document cannot be written.
+            JobsNotWrittenError: a job cannot be written.
         """
         # Ending cancels the task that waits for a worker thread, but not the thread.
         with self._file:
@@ -417,9 +426,8 @@ class StateStore:
                 self._put_job(name, job)
 
     def _put_job(self, name: str, job: JobMemory | None) -> None:
-        """Write a job, and remove it from the unwritten ones unless it has changed again.
-
-        None deletes its file.
+        """Write a job (None deletes its file), and remove it from the unwritten ones
+        unless it has changed again meanwhile.
 
         Raises:
             JobsNotWrittenError: the disk does not take it.
@@ -437,9 +445,13 @@ class StateStore:
         document: Memory | None,
         files: Callable[[documents.Changes], None] | None,
     ) -> None:
-        """Write files and the document as undoable changes.
+        """Write files, then the document, as changes that the caller confirms or undoes;
+        blocks.
 
-        Blocks; the document after the files. The caller confirms or undoes `changes`.
+        Args:
+            changes: gets all that is written.
+            document: of the state; None leaves it.
+            files: adds files; None for none.
 
         Raises:
             DatasetWriteError: the disk does not take them, or the server is ending.
@@ -465,7 +477,16 @@ def _text(memory: Memory) -> bytes:
 
 
 def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:
-    """Move positions into the travel of their motors: rounding may have brought them out."""
+    """Limit positions to the travel of their motors, as rounding may have brought them
+    out.
+
+    Args:
+        machine: must have all the axes.
+        positions: axis -> position [mm, deg].
+
+    Returns:
+        Axis -> position [mm, deg].
+    """
     axes = machine.axes
     return {
         name: min(max(x, axes[name].lower), axes[name].upper)

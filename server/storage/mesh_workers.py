@@ -46,13 +46,14 @@ def scene_apart(raw: bytes, *, name: str) -> Phantom:
 
 
 def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
-    """Read a mesh or scene from bytes in a worker process with limits; blocks.
+    """Read a mesh or scene from bytes in a worker process of its own, with limits;
+    blocks.
 
-    The process ends in any case.
+    The limits are `TIMEOUT_S` and `MEMORY_BYTES`; the process is ended in any case.
 
     Args:
         read: function of the worker.
-        how: its keyword arguments.
+        how: its keyword arguments; "name" is that of the sample.
         raw: bytes of the file.
 
     Returns:

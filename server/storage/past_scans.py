@@ -100,19 +100,20 @@ class PastScans:
         )
 
     async def ask(self, params: Params, running: str, codec: Codec) -> Encoded:
-        """Answer a request in a worker process.
+        """Answer a request in a worker process; calibration and alignment have a worker
+        of their own with longer limits.
 
         Args:
             params: of the method.
             running: name of the data set that is being written; "" for none.
             codec: of the answer.
 
+        Returns:
+            The encoded answer.
+
         Raises:
             RpcError: -32602, there is no such data set or image, or it is damaged;
                 -32008, it is larger, or takes longer to read, than is allowed.
-
-        Returns:
-            The encoded answer.
         """
         context = TwinContext(running, self._machine, self._profile)
         slow = isinstance(params, CalibrationFit | CalibrationAlign)
@@ -126,12 +127,21 @@ class PastScans:
 
 
 def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[bytes]:
-    """Answer a request in the worker; return the encoded answer.
+    """Answer a request in the worker and encode the answer; only files below `root` are
+    read.
 
-    Only files below `root` are read; other errors are raised as they are.
+    Args:
+        root: data directory.
+        asked: parameters; their type chooses the method.
+        context: facts about the twin.
+        codec: of the answer.
+
+    Returns:
+        The pieces of the encoded answer.
 
     Raises:
         DatasetMissingError: a file that cannot be read.
+        TwinError, RpcError: of the method.
     """
     try:
         directory = Directory(root)
@@ -156,9 +166,9 @@ class _LruCache:
         return key in self._made
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the value of `key`, made now if it is not known; it becomes the latest used.
+        """Return the value of `key`, or make and keep it; it becomes the latest used.
 
-        The least recently used one is dropped beyond the limit.
+        Beyond the limit the least recently used value is dropped.
         """
         value = self._made[key] = self._made.pop(key) if key in self._made else make()
         if len(self._made) > self._most:
@@ -231,8 +241,8 @@ class _Scan:
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     """Find a data set's folder.
 
-    The key is made of inode, time and size of the folder and of its document, if there is
-    one.
+    The key is made of the name, and of inode, time and size of the folder and of its
+    document, if there is one.
 
     Args:
         root: data directory.
@@ -258,18 +268,18 @@ def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
 
 
 def _scan(folder: files.Folder, most: int) -> _Scan:
-    """Read a folder: its document of at most `most` bytes, else the scanner's texts.
+    """Read a folder's document, or without a usable one the scanner's texts, or without
+    those the list of images.
 
-    Without either, only files, kinds and whether X-rays were on are known. `problem`
-    states why the document was not used.
+    `problem` of the result says why the document was not used. Of a bare list only files,
+    kinds and that darks are without X-rays are known.
 
     Args:
         folder: of a data set.
         most: largest size of the document [bytes].
 
     Raises:
-        DatasetError: neither document nor projections, or a document that cannot be read
-            and no projections.
+        DatasetError: there is no usable document and no projection.
     """
     try:
         if folder.document is None:
@@ -315,9 +325,10 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
 
 
 def _texts(folder: files.Folder) -> Any:
-    """Read the scanner's own texts of a folder without a document.
+    """Read the scanner's own texts of a folder without a document, as a `DataSet`.
 
-    None if it has a document, or no texts that can be read.
+    Returns:
+        The data set; None if the folder has a document, or no texts that can be read.
     """
     from flexdt.library.reading.folders import load_dataset  # heavy: only workers need it
 
@@ -343,8 +354,8 @@ def _kept_scan(path: Path, key: tuple[object, ...]) -> _Scan:
 def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
     """Summarise a data set as a row of the list; nothing is read here.
 
-    Complete only with all files there; without a document, values come from the scanner's
-    texts, or are unknown. The problem is cut to 500 characters.
+    With a document it is complete only if all its files are there. Without one, values
+    come from the scanner's texts, or are unknown; the problem is cut to 500 characters.
 
     Args:
         path: of the data set.
@@ -412,21 +423,23 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
 def _list(
     root: Directory, asked: p.DatasetList, context: TwinContext, codec: Codec
 ) -> p.DatasetListResult:
-    """Answer dataset.list: the data sets that match the search, newest first, within the
-    time limit.
+    """Answer dataset.list: the data sets that match the search, newest first, from
+    `start` on and at most `count`.
 
     All words of the search must be in name, state, sample, operator, machine, mode, start
-    or settings. At most `MAX_SETS` folders; `left_out` counts the others and those with
-    bad names.
-
-    Summaries and thumbnails are cached. Data sets for which the time was too short are
-    listed as not read yet.
+    or settings, whatever the case. Of at most `MAX_SETS` folders summaries are read or
+    taken from the cache; those for which `LIST_S` was too short are listed as not read
+    yet. Folders that hold no data set are skipped.
 
     Args:
         root: data directory.
-        asked: search, range and thumbnails.
-        context: jobs and machine of the twin.
+        asked: search, range and largest side of thumbnails.
+        context: name of the running data set.
         codec: of the connection, not used.
+
+    Returns:
+        The rows, the number that match, that of unread ones, and `left_out`: folders
+        beyond `MAX_SETS` or with a bad name.
     """
     folders = []
     left_out = 0
@@ -484,9 +497,8 @@ def _list(
 
 
 def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
-    """Set state "running", without a reason, for the data set that the twin writes now.
-
-    Others are returned unchanged.
+    """Return a summary with state "running" and no reason if the twin writes that data
+    set now, else unchanged.
     """
     running = info.name == context.running
     if running:
@@ -495,10 +507,10 @@ def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
 
 
 def _list_row(path: Path, modified: float) -> p.DatasetInfo | str:
-    """Read and summarise a data set; a damaged one has its problem in the summary.
+    """Read and summarise a data set; what cannot be read is the problem in the summary.
 
-    Paths in the problem are relative to the data directory; a document that is too large
-    is a problem.
+    Documents above `MAX_LISTED_DOCUMENT_BYTES` are not read. Paths in the problem are
+    relative to the data directory.
 
     Args:
         path: of its folder.
@@ -521,9 +533,9 @@ def _list_row(path: Path, modified: float) -> p.DatasetInfo | str:
 def _with_thumbnail(
     root: Directory, info: p.DatasetInfo, side: int, until: float
 ) -> p.DatasetInfo:
-    """Add a thumbnail to a summary, unless the time is over.
+    """Add a thumbnail of the middle projection to a summary, made now or cached.
 
-    Thumbnails made before are used even after the time; without one, None.
+    After `until` only cached ones are added.
 
     Args:
         root: data directory.
@@ -536,11 +548,14 @@ def _with_thumbnail(
     """
 
     def make() -> ImageValue | str:
-        """Read the middle projection and make its thumbnail, 8-bit, at most `side` pixels a
-        side.
+        """Read the middle projection and shrink it to an 8-bit image of at most `side`
+        pixels a side.
 
-        Binned (a narrow image: sampled); grey from its 0.5 % to its 99.5 % value. "" if
-        there is no projection or it cannot be read.
+        It is binned, or sampled if one side has fewer pixels than the factor. Grey values
+        run from the 0.5 % to the 99.5 % quantile.
+
+        Returns:
+            The image; "" if there is no projection or it cannot be read.
         """
         folder = files.list_folder(path)
         images = list(folder.projections.values())
@@ -577,16 +592,21 @@ def _with_thumbnail(
 def _get(
     root: Directory, asked: p.DatasetGet, context: TwinContext, codec: Codec
 ) -> p.DatasetResult:
-    """Answer dataset.get: settings, poses over time, and the other requested parts.
+    """Answer dataset.get: summary, poses over time at chosen images, warnings, and the
+    other requested parts.
 
-    At most `points` images, evenly spread; times are None unless all of them have one.
-    Script and measurements only if asked for.
+    The images are at most `points`, evenly spread. Script and measurements are read only
+    if requested.
 
     Args:
         root: data directory.
         asked: name and parts.
         context: jobs and machine of the twin.
         codec: of the connection, not used.
+
+    Returns:
+        Per chosen image index, file, kind, whether it is there, time [s] (None for all
+        unless all have one) and positions (None where unknown).
 
     Raises:
         DatasetError: no such data set, or one that cannot be read.
@@ -623,10 +643,11 @@ def _get(
 
 
 def _doubts(scan: _Scan, shape: tuple[int, int] | None) -> list[str]:
-    """List contradictions of a data set's files and its geometry.
+    """List the warnings of a data set's texts, or else contradictions in the geometry of
+    its projections.
 
-    From the texts their warnings; else those of the projections' geometry above a note;
-    none if no projection has a geometry.
+    Notes are left out. The list is empty if no projection has a geometry; a geometry that
+    cannot be examined gives its error.
 
     Args:
         scan: the data set.
@@ -674,8 +695,8 @@ def _script(folder: files.Folder) -> str:
     Bytes that are not UTF-8 become replacement characters.
 
     Raises:
-        DatasetMissingError: there is none.
-        RpcError: -32008, it is too large.
+        DatasetMissingError: there is none in the listing.
+        RpcError: -32008, it is larger than `MAX_SCRIPT_BYTES`.
     """
     if SCRIPT not in folder.names:
         raise ds.DatasetMissingError(
@@ -688,18 +709,19 @@ def _script(folder: files.Folder) -> str:
 
 
 def _measure(scan: _Scan, at: tuple[int, ...]) -> dict[str, Any]:
-    """Compute mean counts and clearances of images; late ones come with the next request.
+    """Compute mean counts and, with a document, clearances of images.
 
-    Late is after `MEASURE_S`. Without a document there are only counts; if the scene
-    cannot be built `clearance_of` has the reason.
+    Means not begun within `MEASURE_S` are None; they come with the next request, as those
+    computed are cached.
 
     Args:
         scan: the data set.
         at: indices of images.
 
     Returns:
-        counts, clearance_mm and clearance_of of the result; None for what is late or
-        missing.
+        "counts", and with a document "clearance_mm" [mm] and "clearance_of". A value is
+        None where it is late or missing; if the scene cannot be built, all clearances are
+        None and "clearance_of" has the reason.
     """
     until = time.monotonic() + MEASURE_S
     counts: list[float | None] = []
@@ -774,7 +796,8 @@ def _frame(
 ) -> p.DatasetFrameResult:
     """Answer dataset.frame: one image, normalised and binned as requested.
 
-    Counts are rounded after binning; a document's frame must have its shape.
+    Line integrals are of projections only. Counts are rounded after binning. With a
+    document the image must have its shape.
 
     Args:
         root: data directory.
@@ -846,12 +869,10 @@ def _frame(
 
 
 def _existing_file(folder: files.Folder, file: str) -> str:
-    """Check that a file exists, and return its name.
-
-    By the listing of the folder, not by the disk.
+    """Check that the folder's listing has a file, and return its name.
 
     Raises:
-        DatasetMissingError: it does not.
+        DatasetMissingError: it has not.
     """
     if file not in folder.names:
         raise ds.DatasetMissingError(
@@ -862,8 +883,8 @@ def _existing_file(folder: files.Folder, file: str) -> str:
 
 @lru_cache(4)
 def _line_integrals_of(scan: _Scan, shape: tuple[int, int]) -> LineIntegrals:
-    """Make the conversion of a data set's counts to line integrals; the last four are
-    cached.
+    """Make the conversion of a data set's counts to line integrals, from its mean dark
+    and flat images; the last four are cached.
 
     Without dark images the dark is 0.
 

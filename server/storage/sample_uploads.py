@@ -45,8 +45,8 @@ class UploadHead(SampleUpload):
 
     @classmethod
     def of(cls, chunk: SampleUpload) -> UploadHead:
-        """Make the description of the upload that a chunk belongs to; a missing unit is the
-        format's.
+        """Make the description of the upload that a chunk belongs to; a missing unit
+        becomes the default of the format.
         """
         given = chunk.model_dump(exclude={"start", "data"})
         return cls.model_validate(
@@ -83,14 +83,12 @@ class Incoming:
         self._lock = threading.Lock()
 
     def receive(self, head: UploadHead, start: int, data: bytes) -> int:
-        """Write a chunk of an upload to a nameless file.
+        """Append a chunk to an upload's nameless file.
 
-        A chunk that overlaps what has come is cut; one that reaches beyond the total is
-        checked by the caller.
-
-        A chunk that has come before is passed over, so a client may send it again; a
-        chunk at 0 of another file under the same name begins a new upload. The oldest
-        uploads give way to new ones.
+        Bytes that have come before are skipped, so a client may send a chunk again. A
+        chunk at 0 of another file, or after a complete one, begins a new upload of that
+        name. Uploads beyond `MAX_UPLOADS` or the byte limit drop the oldest. That a chunk
+        stays within the total is checked by the caller.
 
         Args:
             head: description of the upload.
@@ -133,9 +131,8 @@ class Incoming:
             return known.received
 
     def take(self, name: str) -> tuple[UploadHead, bytes]:
-        """Read a complete upload and remove it from those under way.
-
-        Its file is closed, and so deleted, in any case once it is complete.
+        """Read a complete upload, and remove it and its file; it is removed, too, if
+        reading fails.
 
         Args:
             name: of the sample.
@@ -144,7 +141,7 @@ class Incoming:
             Its description and its bytes.
 
         Raises:
-            LimitError: it is not complete, because another one was begun under its name.
+            LimitError: it is not complete, as when another one was begun under its name.
             DatasetWriteError: its file cannot be read.
         """
         with self._lock:
@@ -159,10 +156,8 @@ class Incoming:
                 self._close(name)
 
     def _begin(self, head: UploadHead) -> _Open:
-        """Begin an upload, in place of its namesake and of the oldest beyond
-        `MAX_UPLOADS`.
-
-        The file has no name.
+        """Begin an upload with a nameless file; its namesake, and the oldest uploads from
+        `MAX_UPLOADS` on, are dropped.
 
         Raises:
             DiskFullError: no room for twice its size.
@@ -180,14 +175,20 @@ class Incoming:
         return upload
 
     def _make_room(self, name: str, more: int) -> None:
-        """Drop the oldest other uploads until `more` bytes fit; one that is alone always fits."""
+        """Drop the oldest uploads but `name` until `more` bytes fit into the limit or no
+        other is left.
+        """
         while sum(o.received for o in self._open.values()) + more > self._limit:
             if all(other == name for other in self._open):
                 break  # the largest upload alone always fits
             self._drop(but=name)
 
     def _drop(self, but: str | None = None) -> None:
-        """Drop the oldest upload other than `but`, and log a warning; there must be one."""
+        """Drop the oldest upload other than `but`, and log a warning.
+
+        Raises:
+            StopIteration: there is no such upload.
+        """
         oldest = next(name for name in self._open if name != but)
         log(
             "an unfinished upload was dropped for newer ones",
@@ -206,10 +207,8 @@ class Incoming:
             known.file.close()
 
     def _gap(self, name: str, start: int, received: int) -> LimitError:
-        """Make the error for a chunk that does not follow the last one; returned, not
-        raised.
-
-        It has the expected start and the limits of unfinished uploads.
+        """Make, not raise, the error for a chunk at `start` where `received` is expected;
+        it names the limits of unfinished uploads.
         """
         return LimitError(
             f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "

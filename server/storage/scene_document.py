@@ -24,10 +24,8 @@ def save_scene(
     saved: str = "",
     version: str = "",
 ) -> p.Scene:
-    """Convert the scanner to a document; a motor under way is saved at its target.
-
-    It has rates of all axes, tube, camera, sample with offset, and the correction or
-    None.
+    """Convert the scanner to a scene: motors' targets, rates of all axes, tube, camera,
+    sample with offset, correction (or None).
 
     Args:
         scanner: whose state is saved.
@@ -89,13 +87,14 @@ def correction_of(part: p.CorrectionPart) -> NamedCorrection:
 
 
 def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Check that all of a scene fits this scanner; the scanner itself is not changed.
+    """Check that a scene is of this machine, then its positions, settings and correction;
+    the scanner is not changed.
 
-    In that order; motors left out stay, collisions are not looked for.
+    Settings are tried on a new scanner of that machine. Collisions are not looked for.
 
     Args:
         scene: document.
-        scanner: on a copy of which the settings are tried.
+        scanner: that is to have it.
 
     Raises:
         RpcError: -32602, another machine's.
@@ -117,10 +116,8 @@ def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
 
 
 def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, float]]:
-    """Return motor -> (speed, acceleration): the scene's where it has them,
-    else the scanner's.
-
-    [mm/s, mm/s2 or deg]; axes that only the scene has are left out.
+    """Return each axis of the scanner -> (speed, acceleration) [mm/s, mm/s^2; deg/s,
+    deg/s^2]: the scene's where it has them, else the scanner's.
     """
     return {
         axis: (scene.speeds.get(axis, speed), scene.accelerations.get(axis, acceleration))
@@ -129,10 +126,10 @@ def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, flo
 
 
 def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Set tube, camera and rates of the axes as in the scene; X-rays and motors stay as
-    they are.
+    """Set rates of the axes, then tube voltage and power, then camera as in the scene;
+    X-rays and motors stay as they are.
 
-    In the order rates, tube, camera; those set before an error stay set.
+    Settings made before an error stay.
 
     Raises:
         LimitError, UnknownNameError: a setting or an axis that this scanner does not

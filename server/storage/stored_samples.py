@@ -85,11 +85,18 @@ class SampleStore:
         room: DiskRoom | None = None,
         memory_limit: int | None = None,
     ) -> None:
-        """List the stored uploads of a folder; those that cannot be read are set aside.
+        """List the uploads stored in a folder, and delete files that belong to none of
+        them.
 
-        `limit` is for one upload [bytes], `most` for their number, `memory_limit` for
-        loaded phantoms [bytes] (None: no limit). Phantoms are loaded when used; replaced
-        files are deleted.
+        Descriptions that cannot be read are renamed and logged. Names of shipped phantoms
+        and of the empty stage are skipped. Phantoms are loaded when used.
+
+        Args:
+            folder: of the uploads.
+            limit: of one upload [bytes].
+            most: number of uploads.
+            room: on the disk; None for any.
+            memory_limit: of loaded phantoms [bytes]; None for no limit.
         """
         if memory_limit is None:
             self._memory_limit = math.inf
@@ -138,10 +145,9 @@ class SampleStore:
         return self._heads.get(name)
 
     def revision(self, name: str) -> str | None:
-        """Return an identifier of the appearance of an upload that has been read; None
-        for a shipped phantom.
+        """Return a text that names an upload's content and material.
 
-        None also for one that has not been read yet.
+        None for a shipped phantom, and for an upload that has not been read yet.
         """
         with self._lock:
             revision = self._revisions.get(name)
@@ -151,7 +157,8 @@ class SampleStore:
         return _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
-        """Load the phantom called `name`; parsed once and cached. Blocks.
+        """Return the phantom called `name` from the cache, or parse it and cache it;
+        blocks.
 
         Two threads may parse the same one at once; the last result is kept.
 
@@ -165,7 +172,8 @@ class SampleStore:
         Raises:
             UnknownNameError: no such sample or material.
             LimitError: a material for a sample that has its own.
-            PhantomError: an upload that cannot be read any more; it is set aside.
+            PhantomError: an upload that cannot be read any more; if its bytes are damaged
+                it is removed from the list.
         """
         key = (name, material)
         with self._lock:
@@ -185,9 +193,11 @@ class SampleStore:
     def _keep(
         self, key: tuple[str, str | None], phantom: Phantom, revision: str | None
     ) -> None:
-        """Cache a phantom, and its revision if given; drop the oldest ones beyond the limits.
+        """Cache a phantom, and its revision if given; drop the oldest ones beyond the
+        limits.
 
-        The limits are number and memory; the new one and that on the stage always stay.
+        The limits are `MAX_CACHED_PHANTOMS` and the memory limit. The new one and that on
+        the stage always stay.
         """
         self._loaded[key] = phantom
         if revision is not None:
@@ -202,7 +212,7 @@ class SampleStore:
         """Check an upload's size and name, and write one chunk of it, see
         `Incoming.receive`.
 
-        A name in use may be replaced beyond the number allowed.
+        A stored name may be replaced even if no further upload is allowed.
 
         Args:
             head: description of the upload.
@@ -214,8 +224,8 @@ class SampleStore:
 
         Raises:
             RpcError: -32008, larger than allowed.
-            LimitError: a gap before this chunk, too many uploads, or a name with another
-                meaning.
+            LimitError: a gap before this chunk, too many uploads, a name that is too
+                long, or that of a shipped phantom or the empty stage.
             DatasetWriteError: the disk does not take it.
         """
         if head.total > self._limit:
@@ -241,11 +251,12 @@ class SampleStore:
     def parse(self, name: str, material: str | None = None) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
 
-        It is taken from the uploads under way, so a second call fails.
+        It is removed from the uploads under way, so a second call fails.
 
         Args:
             name: the upload's.
-            material: to be on the stage, if not its own.
+            material: also parse it of this material, in which it is on the stage; None:
+                not.
 
         Raises:
             PhantomError, UnknownNameError: its content does not hold.
@@ -258,9 +269,8 @@ class SampleStore:
         return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
     def store(self, changes: documents.Changes, upload: ReceivedSample) -> None:
-        """Write an upload; the previous one of that name stays beside it until `know`.
-
-        It is added to `changes`: bytes first, then the description.
+        """Add an upload's bytes, then its description, to `changes`; the files of the
+        previous upload of that name stay until `tidy`.
 
         Raises:
             DatasetWriteError: the system cannot write.
@@ -319,7 +329,9 @@ class SampleStore:
             del self._loaded[key]
 
     def tidy(self) -> None:
-        """Delete the files that an upload or `forget` has replaced; errors leave the file."""
+        """Delete the files of uploads that were replaced or forgotten; a file that cannot
+        be deleted stays.
+        """
         with self._lock:
             files = self._replaced
             self._replaced = set()
@@ -328,10 +340,11 @@ class SampleStore:
                 self._folder.unlink(file)
 
     def _settle(self) -> None:
-        """Clean the folder at the start: delete the files of interrupted writers, and bytes
-        without an upload unless its damaged description is kept.
+        """Delete temporary files of interrupted writers, and bytes of no known upload,
+        from the folder.
 
-        Other files stay; errors leave a file.
+        Bytes beside a damaged description that was renamed stay, as do other files, and
+        those that cannot be deleted.
         """
         self._folder.sweep([TEMPORARY])
         known = {_bytes_file(name, head.revision) for name, head in self._heads.items()}
@@ -377,11 +390,10 @@ class SampleStore:
         return phantom, _revision(head, raw)
 
     def _read_bytes(self, head: UploadHead) -> bytes:
-        """Read the bytes of an upload and compare them with its size and revision.
+        """Read the bytes of an upload and compare them with its size and, if it has one,
+        its revision.
 
-        Without a stored revision only the size is compared.
-
-        A damaged upload is removed from the list and its files are set aside.
+        A damaged upload is removed from the list, and its files are renamed.
 
         Args:
             head: description of the upload.
@@ -414,7 +426,9 @@ class SampleStore:
 
 
 def _bytes_of(phantom: Phantom) -> int:
-    """Return the memory that voxels and surfaces of a phantom take [bytes]; labels not counted."""
+    """Return the memory of a phantom's attenuation voxels and surface meshes [bytes];
+    material labels are not counted.
+    """
     voxels = 0
     if phantom.voxels is not None:
         voxels = phantom.voxels.data.nbytes
@@ -428,27 +442,27 @@ def _revision(head: UploadHead, raw: bytes) -> str:
 
 
 def _shown(head: UploadHead, revision: str) -> str:
-    """Return an identifier of an upload's appearance: the same content may come
-    in another material."""
+    """Return the content's revision, followed by the material if the upload has one: the
+    same content may come in another material.
+    """
     if head.material is None:
         return revision
     return f"{revision} {head.material}"
 
 
 def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
-    """Parse the bytes of an upload: mesh or scene in a worker, voxels here.
-
-    The material of a scene is its own; `material` is not used for it.
+    """Parse the bytes of an upload: mesh or scene in a worker process, voxels here.
 
     Args:
         head: description of the upload.
         raw: its bytes.
-        material: of a mesh, or that fills voxels; None: the default of a mesh, or
-            attenuation as uploaded.
+        material: of a mesh (None: `DEFAULT_MATERIAL`), or that fills voxels (None:
+            attenuation as uploaded); not used for a scene.
 
     Raises:
-        PhantomError: voxels of another size, or not finite; a mesh or scene that cannot be
-            read.
+        PhantomError: voxels of another size, or not finite; a mesh or scene that cannot
+            be read.
+        UnknownNameError: no such material.
     """
     if head.kind == "mesh":
         return mesh_apart(
@@ -486,10 +500,10 @@ def _bytes_file(name: str, revision: str | None) -> str:
 
 
 def _head_of(file: str) -> Callable[[bytes], UploadHead]:
-    """Make the reader of an upload's description, which validates it as if it
-    was uploaded now.
+    """Make the parser of an upload's description, for a file of this name.
 
-    It raises ValueError for one that is invalid or about another sample than its file's.
+    It raises ValueError for a description that would be refused today, or is about
+    another sample than the file's name.
     """
 
     def read(data: bytes) -> UploadHead:
@@ -503,14 +517,15 @@ def _head_of(file: str) -> Callable[[bytes], UploadHead]:
 
 
 def sample_material(head: UploadHead | None, material: str | None) -> str | None:
-    """Choose the material that a mesh is filled with.
+    """Choose the material that an uploaded mesh is filled with: the requested one, else
+    that of its description, else `DEFAULT_MATERIAL`.
 
     Args:
         head: description of the upload; None for a shipped phantom.
         material: requested with the sample, if any.
 
     Returns:
-        Name of the material; None for a sample that has its own.
+        Name of the material; None for a sample that is no mesh.
     """
     if head is None or head.kind != "mesh":
         return None
