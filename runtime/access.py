@@ -107,21 +107,18 @@ _L = TypeVar("_L", ConnectionLimits, TwinLimits, ViewerLimits)
 
 
 def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ()) -> _L:
-    """Set limits from `NAME=VALUE` words.
+    """Return `default` with the limits that `NAME=VALUE` words set.
 
-    Of a limit given twice the last counts; limits that are whole are cut to whole
+    Of a limit given twice the last counts. Values of whole limits are cut to whole
     numbers.
 
     Args:
         words: as on the command line.
-        default: limits to change; not changed itself.
-        others: names that are not its own and are passed over.
-
-    Returns:
-        `default` with the values of those words that are its own.
+        default: limits to start from; not changed itself.
+        others: names of other limits, which are skipped unchecked.
 
     Raises:
-        AccessError: no such limit, or not a number above zero; lists the limits.
+        AccessError: no such limit (lists the limits), or not a finite number above 0.
     """
     names: tuple[str, ...] = limit_names(default)
     out: _L = default
@@ -152,7 +149,7 @@ def limit_names(limits: ConnectionLimits | TwinLimits | ViewerLimits) -> tuple[s
 def is_loopback(host: str) -> bool:
     """Return whether an address to listen on can be reached from this machine only.
 
-    "localhost" is; other names, which are not looked up, are not.
+    True for "localhost" and loopback addresses. Other names are not looked up, and False.
     """
     if host == "localhost":
         return True
@@ -180,16 +177,15 @@ def is_rebound(host: str) -> bool:
 
 
 def check_bind(host: str, token: str | None) -> None:
-    """Check that an address that others can reach is protected by a token.
-
-    A token needs 16 characters, also on the loopback.
+    """Check that a token has at least 16 characters, and that an address that others can
+    reach has one.
 
     Args:
         host: where a server is to listen.
         token: that clients must bring; None for none.
 
     Raises:
-        AccessError: no token for a non-loopback address, or a token too short to be one.
+        AccessError: no token for a non-loopback address, or one too short.
     """
     if token is not None and len(token) < 16:
         raise AccessError(
@@ -210,16 +206,16 @@ def token_matches(given: str | None, token: str) -> bool:
 def read_token(file: Path | None) -> str | None:
     """Read the token that a server requires or a client brings.
 
-    Spaces around it are removed; an empty variable counts as none.
+    Spaces around it are removed.
 
     Args:
         file: whose first line it is; None: the environment's FLEXDT_TOKEN.
 
     Returns:
-        The token; None without a file and without the variable.
+        The token; None without a file if the variable is empty or missing.
 
     Raises:
-        AccessError: the file cannot be read or holds no token.
+        AccessFileError: the file cannot be read or its first line is empty.
     """
     if file is None:
         return os.environ.get("FLEXDT_TOKEN") or None
@@ -239,17 +235,17 @@ def read_token(file: Path | None) -> str | None:
 def client_tls(
     authority: Path | None, *, any_name: bool = False
 ) -> ssl.SSLContext | None:
-    """Make a client's TLS context that trusts the certificates of a PEM file alone;
-    None without one.
+    """Make a client's TLS context that trusts the certificates of a PEM file alone; None
+    without one.
 
     TLS 1.2 or newer; the system's own authorities are not trusted.
 
     Args:
         authority: the file.
-        any_name: the certificate is the server's own, by whatever name it is reached.
+        any_name: do not compare the server's name with that in its certificate.
 
     Raises:
-        AccessError: the file is missing or holds no certificates.
+        AccessFileError: the file is missing or holds no certificates.
     """
     if authority is None:
         return None
@@ -266,7 +262,7 @@ def client_tls(
 def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
     """Make a server's TLS context from PEM files.
 
-    TLS 1.2 or newer; certificates of clients are not asked for.
+    TLS 1.2 or newer; clients need no certificate.
 
     Args:
         certificate, key: the files; both or none.

@@ -20,11 +20,11 @@ STOP_GRACE_S = 15.0
 
 
 def main() -> None:
-    """Run the module named on the command line as `__main__`; a thread ends the process
-    with its parent.
+    """Run the module named on the command line as `__main__`, with the arguments after
+    it, and watch standard input in a thread.
 
-    Without a module it exits with a usage line. Arguments after the module are the
-    module's.
+    When standard input closes, as at the end of the parent, the process ends. Without a
+    module it exits with a usage line.
     """
     if len(sys.argv) < 2:
         sys.exit("usage: python -m flexdt.runtime.child MODULE [ARGUMENT...]")
@@ -35,10 +35,8 @@ def main() -> None:
 
 
 def _watch() -> None:
-    """Wait until standard input closes, then send SIGTERM to this process.
-
-    `STOP_GRACE_S` later it ends at once with code 1. What arrives on standard input is
-    ignored.
+    """Read and drop standard input until it closes, then send SIGTERM to this process;
+    `STOP_GRACE_S` later exit at once with code 1.
     """
     while os.read(0, 4096):
         pass

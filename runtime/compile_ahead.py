@@ -85,8 +85,8 @@ def _fit() -> None:
 
 
 def _reconstruction() -> None:
-    """Compile the kernels of FDK by reconstructing eight tiny views, and those of
-    truncation, part layout and warping by a call each.
+    """Compile the kernels of FDK by reconstructing eight tiny views, and those of part
+    layout, truncation and warping by a call each.
     """
     from flexdt.twin.projection.kernels import layout_kernels
     from flexdt.twin.reconstruction import fdk
@@ -119,9 +119,8 @@ ANALYSIS: Final = ("calibration", "bead detection", "FDK")
 
 
 def is_compiled(group: str) -> bool:
-    """Return whether numba's disk cache has a group's last kernel for this processor.
-
-    The cache is only read; nothing is compiled.
+    """Return whether numba's disk cache has the last kernel of a group, an entry of
+    `GROUPS`, for this processor; nothing is compiled.
     """
     from importlib import import_module
 
@@ -133,13 +132,14 @@ def is_compiled(group: str) -> bool:
 
 def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
     """Compile the missing groups, each in a process of its own, as many at a time as
-    there are cores; block until done.
+    there are cores; block until all have ended.
 
-    Nothing is noted if none is missing; a group that fails is not an error here.
+    Nothing is noted if none is missing. A group that fails is not an error here.
 
     Args:
         groups: names, of `GROUPS`.
-        note: called with a line about the groups, when one is done, and every `SILENT_S`.
+        note: called with a line at the beginning, when groups are done, and after each
+            `SILENT_S` without one.
     """
     missing = [group for group in groups if not is_compiled(group)]
     if not missing:
@@ -173,9 +173,10 @@ def start(words: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
 
 
 def main() -> None:
-    """Compile the groups named on the command line, or all, each in another process.
+    """Compile the groups named on the command line, or all, each in another process, and
+    print the progress.
 
-    After `--here` one group is compiled in this process, without output.
+    With `--here GROUP` that group is compiled in this process, without output.
     """
     match sys.argv[1:]:
         case ["--here", group]:

@@ -63,14 +63,14 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 def _figure(
     kind: str, name: str, help: str, values: float | Mapping[str, float], label: str = ""
 ) -> Metric:
-    """Make a figure of the metrics page.
+    """Make a figure of the metrics page, with one value or one for each value of a label.
 
     Args:
         kind: gauge or counter.
-        name: of the figure.
+        name: of the figure; a counter's ends with `_total`.
         help: one sentence.
         values: its value, or label value -> value.
-        label: name of the label.
+        label: name of the label; "" without one.
     """
     metric = Metric(name.removesuffix("_total"), help, kind)
     for what, value in values.items() if isinstance(values, Mapping) else [("", values)]:
@@ -162,8 +162,8 @@ class _Server(ThreadingWSGIServer):
         super().__init__(*given, **more)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Register a connection as not admitted, which may end the oldest such, and start
-        its thread.
+        """Register a connection as not admitted, which may end another one of the crowded
+        list, and serve it in a thread of its own.
 
         Connections are grouped by address, see `WaitingList`.
         """
@@ -211,7 +211,9 @@ class _Handler(WSGIRequestHandler):
 
 
 def _foreign(host: str) -> bool:
-    """Return whether a request's Host is that of another site, or cannot be parsed."""
+    """Return whether a request's Host names another site than this machine; True also if
+    it cannot be parsed.
+    """
     try:
         return is_rebound(host)
     except ValueError:
@@ -221,33 +223,34 @@ def _foreign(host: str) -> bool:
 def _application(
     pages: Pages, token: str | None, *, loopback: bool
 ) -> Callable[..., list[bytes]]:
-    """Make the pages a WSGI application, whose pages are made in turns of the running
-    event loop.
+    """Make a WSGI application of the pages, which are made in turns of the event loop
+    that runs now.
 
     Only GET and HEAD are answered, HEAD without a body.
 
     Args:
         pages: path -> function that makes the page.
-        token: required beyond `OPEN_PAGES`; None: of no client.
-        loopback: whether requests of other sites' pages are rejected by their Host.
+        token: required of clients for all but `OPEN_PAGES`; None: never.
+        loopback: whether requests whose Host is another site are rejected.
 
     Returns:
-        The application; errors are empty pages with a status: 401, 403, 404, 405, and 503
-        if the loop is held.
+        The application, for threads; an error is the page "{}" with status 401, 403, 404,
+        405, or 503 if the loop is held.
     """
     loop = asyncio.get_running_loop()
 
     def response(asked: Mapping[str, Any]) -> HttpResponse:
-        """Check a request and have the loop make its page.
+        """Check a request, admit its connection, and have the loop make its page.
 
-        In order: 403 another site's Host (on loopback), 405 method, 404 path, 401 token,
-        503 no turn of the loop within `MAX_HELD_S`. An exception of a page is raised.
+        The checks are, in order: 403 another site's Host (on loopback), 405 method, 404
+        path, 401 token. No turn of the loop within `MAX_HELD_S`, or a closed loop, is
+        503. An exception of a page is raised.
 
         Args:
             asked: the request as WSGI has it.
 
         Returns:
-            The page, or an empty one with the status of the error.
+            The page, or "{}" with the status of the error.
         """
         path = asked["PATH_INFO"]
         given = asked.get("HTTP_AUTHORIZATION", "")
@@ -281,10 +284,10 @@ def _application(
             return HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE)
 
     def application(asked: dict[str, Any], start: Callable[..., object]) -> list[bytes]:
-        """Answer a request, as WSGI has it: begin the response by `start`, and return its
-        body.
+        """Answer a request, as WSGI has it: call `start` with status and headers, and
+        return the body, [] for HEAD.
 
-        It also has type and length, and forbids caches.
+        The headers are type, length, and one that forbids caches.
         """
         page = response(asked)
         body = page.text.encode()
@@ -305,18 +308,17 @@ def _application(
 async def served_pages(
     pages: Pages, settings: ServerSettings
 ) -> AsyncIterator[dict[str, object]]:
-    """Serve `pages`, in daemon threads, as long as the context lasts.
+    """Serve `pages` in a daemon thread as long as the context lasts.
 
-    On the loopback no token is asked for. The server stops at the end.
-
-    Without a port for them in the settings nothing is served.
+    Without a port in the settings nothing is served, and {} is yielded. On the loopback
+    no token is required.
 
     Args:
         pages: path -> function that makes the page, called in the loop that runs now.
         settings: host and port; beyond the loopback only with a token.
 
     Yields:
-        Facts for the process's `ready` line.
+        Facts for the process's `ready` line: `http_port`, the port in use.
 
     Raises:
         AccessError: the address can be reached by others and there is no token.
@@ -361,7 +363,7 @@ def watching_pages(
     Args:
         health: content of `/healthz` in addition to its status.
         figures: of `/metrics`, in addition to those that every process has.
-        requests: answered so far; None where there are none to count.
+        requests: counts of answered requests, for `/metrics`; None where there are none.
         failed: whether a part of the server has died; then `/healthz` answers 503.
     """
 
@@ -379,10 +381,10 @@ def watching_pages(
         return HttpResponse(json.dumps(document) + "\n", status)
 
     def metrics() -> HttpResponse:
-        """Make `/metrics`: requests, the server's figures, dropped log lines, turns of the loop.
+        """Make `/metrics`: counts of requests, the server's figures, dropped log lines
+        and, on a `ServerLoop`, durations of its turns.
 
-        The longest turn is that since the last scrape; on another loop turns are left
-        out.
+        The longest turn is that since the last call.
         """
         page = [*(requests or Requests()).figures(), *figures()]
         page.append(

@@ -34,10 +34,8 @@ def current() -> str:
 
 @contextmanager
 def traced(name: str) -> Iterator[None]:
-    """Give all log lines within the context, and in tasks started in it, the trace
-    `name`.
-
-    The earlier trace is restored at the end.
+    """Add the trace `name` to all log lines within the context, and in tasks started in
+    it; afterwards the earlier trace is in force.
     """
     token = _CURRENT.set(name)
     try:
@@ -64,10 +62,11 @@ class JsonLines(logging.Formatter):
     traceback if any."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Format a record as one line of JSON: time (UTC, ms), level, event, facts, traceback.
+        """Format a record as one line of JSON: time (UTC, ms), level, event, facts,
+        traceback if any.
 
-        A fact may replace time, level or event; values that JSON has not are written as
-        text.
+        A fact named time, level or event replaces that. Values that JSON does not have
+        are written as text.
         """
         stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         line: dict[str, object] = {
@@ -94,9 +93,10 @@ class Apart(QueueHandler):
     """
 
     def __init__(self, target: logging.Handler, room: int = 10_000) -> None:
-        """Write records to `target` from a thread of its own, by a queue of `room` records.
+        """Write records to `target` from a thread of its own, through a queue of `room`
+        records.
 
-        The thread starts now and is closed when the process exits.
+        The thread starts now. It is stopped when the process exits.
         """
         super().__init__(queue.Queue(room))
         self.dropped = 0
@@ -129,7 +129,8 @@ class _Listener(QueueListener):
     _thread: threading.Thread | None
 
     def stop(self) -> None:
-        """End the thread after what is queued, waiting at most 1 s for room and 2 s for its end.
+        """End the thread after the queued records, waiting at most 1 s for room in the
+        queue and 2 s for its end.
 
         A second call does nothing.
         """
@@ -193,18 +194,16 @@ class Sparing:
         error: bool = False,
         **facts: object,
     ) -> None:
-        """Write a line like `log`, or count it if there were too many of its kind; its
-        kind is the event unless given.
+        """Write a line like `log`, or only count it if there were too many of its kind.
 
-        A kind has a burst of lines, and one more each `EVERY_S`. Kinds that have been
-        quiet are forgotten.
+        A kind may have `burst` lines at once, and one more each `EVERY_S`.
 
-        The next line of the kind states the number left out.
+        The next line that is written has the number left out as `left_out`.
 
         Args:
             event: name of the event.
             level: of `logging`.
-            kind: that the line counts for.
+            kind: that the line counts for; the event if left out.
             error: add the traceback of the error that is handled.
             facts: further members of the line.
         """
@@ -228,16 +227,14 @@ class Sparing:
 def set_up(
     stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False
 ) -> None:
-    """Send this program's log to `stream` as JSON lines, in place of earlier targets (for
-    a process's main).
-
-    Lines go nowhere else afterwards.
+    """Send this program's log to `stream` as JSON lines, in place of its earlier handlers
+    (for a process's main).
 
     Args:
-        stream: where to.
+        stream: target.
         level: least level that is written.
-        apart: write from a thread; warnings of libraries go to the log too (a server's
-            main).
+        apart: write from a thread of its own, and send warnings and lines of `LIBRARIES`
+            there, too (a server's main).
     """
     handler: logging.Handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonLines())

@@ -54,9 +54,10 @@ BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 
 def durations(name: str, help: str, labels: Sequence[str] = ()) -> Histogram:
-    """Make a histogram of durations [s] for the metrics page, in `BUCKETS_S`, not registered.
+    """Make a histogram of durations [s] with the limits `BUCKETS_S`, which is not
+    registered.
 
-    Also switches off "created" series of all metrics of the process.
+    The "created" series of all metrics of the process are switched off.
     """
     from prometheus_client import Histogram, disable_created_metrics
 
@@ -72,16 +73,17 @@ class Holds:
         self.begin()
 
     def begin(self) -> None:
-        """Reset the counts; the turn that is under way is not counted."""
+        """Reset histogram and longest turn; the turn that is under way will not be
+        counted.
+        """
         what = "How long each turn held the event loop."
         self.turns = durations("flexdt_loop_hold_seconds", what)
         self._worst = 0.0
         self._begun = False
 
     def observe(self, seconds: float) -> None:
-        """Count a turn of `seconds` that has ended, and note the longest.
-
-        The first after `begin` is not counted.
+        """Count a turn of `seconds` that has ended, and note the longest; the first turn
+        after `begin` is not counted.
         """
         if not self._begun:
             self._begun = True
@@ -106,8 +108,10 @@ class _Watched(selectors.DefaultSelector):
         self._woke: float | None = None
 
     def select(self, timeout: float | None = None) -> Any:
-        """Poll as the base class does, and report the time since the last poll returned as a
-        turn.
+        """Poll as the base class does, after counting the time since the last poll
+        returned as a turn of the loop.
+
+        After a poll that does not wait the turn begins before the poll.
         """
         now = perf_counter()
         if self._woke is not None:
@@ -129,19 +133,19 @@ class ServerLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(self) -> None:
-        """Make a loop that measures its turns, and logs what asyncio reports instead of
-        printing it.
+        """Make a loop that measures its turns, and writes errors that asyncio reports to
+        the log at a limited rate.
         """
         self.holds = Holds()
         super().__init__(_Watched(self.holds))
         lines = Sparing(burst=1)
 
         def complain(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-            """Log what asyncio reports: once in a while of each kind, errors of the
-            system without a traceback.
+            """Log what asyncio reports, at most one line of each kind and then one at
+            intervals.
 
-            Errors of the system, and reports without an error, are warnings; others
-            errors with traceback.
+            A report without an error, or of an OSError, is a warning; others are errors
+            with traceback.
             """
             what = str(context.get("message"))
             error = context.get("exception")
@@ -191,8 +195,8 @@ class ListeningServer:
 
         Args:
             made: makes the protocol of a connection.
-            host, port: where; port 0 is any free one.
-            ssl: for TLS.
+            host, port: address to take; port 0 is any free one.
+            ssl: for TLS, whose handshake may take `TLS_HANDSHAKE_S`; None: none.
             serving: False lets connections wait until `serve`.
 
         Raises:
@@ -234,14 +238,15 @@ KEEP_ALIVE_AFTER_S: Final = 30
 
 
 def tune(sock: socket.socket | None) -> None:
-    """Disable Nagle's delay; send keep-alive probes after 30 s of silence, three at most.
+    """Disable Nagle's delay, and send keep-alive probes after `KEEP_ALIVE_AFTER_S` of
+    silence.
 
     A peer whose machine or network has died is thus gone after a minute instead of two
     hours, and with it whatever it held (control of the twin, memory of an upload).
-    Harmless on sockets that are not TCP, and where the platform lacks an option.
+    Options that the platform lacks are skipped.
 
     Args:
-        sock: of a connection; None has no effect.
+        sock: of a connection; None or another one than TCP has no effect.
     """
     if sock is None or sock.family not in (socket.AF_INET, socket.AF_INET6):
         return
@@ -274,13 +279,12 @@ T = TypeVar("T")
 
 
 def stop_signal() -> asyncio.Event:
-    """Make an event that SIGTERM or SIGINT sets; a second signal does not
-    interrupt the stopping.
+    """Return an event that SIGTERM or SIGINT sets from now on, in place of earlier
+    handlers; it needs a running loop.
 
-    It needs a running loop, and takes the place of earlier handlers.
-
-    A console script that watches for signals learns from it that an orderly end has begun,
-    which it ends where that gets stuck.
+    Further signals do not interrupt the stopping. A console script that watches for
+    signals by the wake-up descriptor is notified, so that it can end a stopping that gets
+    stuck.
     """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -312,7 +316,7 @@ def leave(*_: object) -> None:
 
 
 async def first_of(*events: asyncio.Event) -> None:
-    """Wait until one of the events is set; at once if one is."""
+    """Wait until one of the events is set; return at once if one is."""
     waits = [asyncio.create_task(event.wait()) for event in events]
     try:
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
@@ -322,17 +326,15 @@ async def first_of(*events: asyncio.Event) -> None:
 
 
 def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
-    """Print the JSON line of a ready server, with its process id; freeze garbage
-    collection.
+    """Print the JSON line of a ready server: `ready`, `facts`, and the process id.
 
-    On another kind of loop only the line is printed.
-
-    The measure of how long the loop is held begins here.
+    In a `ServerLoop` garbage is collected and the remaining objects are frozen first, and
+    the measurement of the loop's turns begins anew.
 
     Args:
         server: its kind, the value of `ready`.
         facts: further members of the line.
-        out: where to; None: standard output.
+        out: file; None: standard output.
     """
     loop = asyncio.get_running_loop()
     if isinstance(loop, ServerLoop):
@@ -352,13 +354,12 @@ def announce_bound(server: str, host: str, port: int) -> None:
 
 
 def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> int:
-    """Run the work of a process to its end in an event loop of its own; print an error on
-    standard error.
+    """Raise the limit on open descriptors, run the work of a process to its end in an
+    event loop of its own, and print an error on standard error.
 
-    USAGE after an AccessError (INVALID for one of its files), INVALID after a TwinError,
-    ValueError or an OSError of a file, REFUSED after another OSError.
-
-    The limit on open descriptors is raised first.
+    Of an error it returns USAGE after an AccessError (INVALID for one of its files),
+    INVALID after a TwinError, ValueError or an OSError of a file, REFUSED after another
+    OSError. Other errors are raised.
 
     SIGINT ends the process at once until the work calls `stop_signal`: nobody has been
     promised anything yet, and an exception within asyncio's loop can lose the turn of a
@@ -400,7 +401,8 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
 
 
 def _allow_descriptors() -> None:
-    """Raise the process's limit on open descriptors towards `MAX_DESCRIPTORS`; never lowers it.
+    """Raise the process's limit on open descriptors to `MAX_DESCRIPTORS` or the hard
+    limit; it is never lowered.
 
     Nothing happens on Windows, or if the system refuses.
     """
@@ -439,14 +441,13 @@ def process_seconds(pid: int) -> float | None:
 
 
 def session_seconds(session: int) -> float | None:
-    """Sum up the processor time of the processes of a session so far [s];
-    None as `process_seconds`.
-
-    Processes that have ended are not counted; None where the system has no /proc or no
-    such session.
+    """Sum up the processor time of the running processes of a session so far [s].
 
     Args:
         session: its number, which is the process id of its first process.
+
+    Returns:
+        The sum; None where the system has no /proc or no process of that session runs.
     """
     try:
         names = [name for name in os.listdir("/proc") if name.isdigit()]
@@ -459,7 +460,9 @@ def session_seconds(session: int) -> float | None:
 
 
 def _words(pid: str) -> list[str]:
-    """Return the fields of a process's `stat` line after its name; [] for one that has ended."""
+    """Return the fields of a process's `stat` line from the state on; [] for one that has
+    ended.
+    """
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:
             return file.read().rpartition(")")[2].split()

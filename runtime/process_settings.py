@@ -48,10 +48,11 @@ class Address:
 def address(text: str) -> Address:
     """Parse HOST:PORT or [IPv6]:PORT.
 
-    The host is not looked up; brackets are removed. Ports are 1 to `MAX_PORT`.
+    The host is not looked up and may be any text; brackets around it are removed.
 
     Raises:
-        typer.BadParameter: the text has another form, or the port is none.
+        typer.BadParameter: the text has another form, or the port is not from 1 to
+            `MAX_PORT`.
     """
     host, _, port = text.strip().rpartition(":")
     closed = host.startswith("[") == host.endswith("]")
@@ -84,13 +85,14 @@ def several(text: str) -> str:
 
 
 def memory_size(text: str) -> int:
-    """Parse "4GiB", "512M" or "1000000" [bytes].
+    """Parse a size such as "4GiB", "512M" or "1000000", and return it rounded down to
+    whole bytes.
 
-    Units are powers of 1024 whatever their spelling (K, KB, KiB; case does not count);
-    the result is rounded down and above 0.
+    Units are powers of 1024 whatever their spelling (K, KB, KiB, up to T; case does not
+    count).
 
     Raises:
-        typer.BadParameter: not a size.
+        typer.BadParameter: not a size of at least one byte.
     """
     match = re.fullmatch(r"(\d+\.?\d*)\s*([kmgt]?)i?b?", text.strip().lower())
     size = 0
@@ -102,9 +104,9 @@ def memory_size(text: str) -> int:
 
 
 def speed_up(text: str | float) -> float | Literal["max"]:
-    """Parse the speed-up of the twin's time: a positive number, or max.
+    """Parse the speed-up of the twin's time: a finite number above 0, or "max".
 
-    Case and surrounding spaces do not count. The upper limit is not checked here.
+    Case and surrounding spaces do not count. The twin's upper limit is not checked here.
 
     Raises:
         typer.BadParameter: neither.
@@ -122,13 +124,10 @@ def speed_up(text: str | float) -> float | Literal["max"]:
 
 
 def scatter_method(text: str) -> str:
-    """Parse a method of simulating scatter: off or mc.
-
-    The text is returned unchanged; "first", which has been removed, has a message of its
-    own.
+    """Check a method of simulating scatter, "off" or "mc", and return it.
 
     Raises:
-        typer.BadParameter: another one.
+        typer.BadParameter: another one; "first", which has been removed, has a hint.
     """
     if text not in get_args(Scatter):
         removed = ""
@@ -270,9 +269,10 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
 
     @property
     def places(self) -> tuple[Address, ...]:
-        """Addresses of the projectors, each once; `projector` (or else its port) comes first.
+        """Addresses of the projectors, each once: first `projector`, or else
+        `projector_port` on this machine, then `projectors`.
 
-        Without any, the standard port on this machine.
+        Without any it is `PROJECTOR_PORT` on this machine.
         """
         port = None
         if self.projector_port is not None:

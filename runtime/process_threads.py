@@ -31,16 +31,15 @@ DEVICE: Final = "flexdt.twin.projection.gpu"
 
 
 def load_sleeping() -> str:
-    """Load OpenMP with threads that sleep while they wait, unless the user chose or
-    it is loaded.
+    """Load OpenMP so that its threads sleep while they wait, unless the user's
+    environment chose otherwise or it is loaded already.
 
-    Where OpenMP cannot be loaded, the kernels' own state is returned.
-
-    The environment is then as it was: other libraries and child processes keep their
-    defaults.
+    The environment is unchanged afterwards: other libraries and child processes keep
+    their defaults.
 
     Returns:
-        How its threads wait.
+        How its threads wait, as a phrase; that of the kernels' own threads where OpenMP
+        cannot be loaded.
     """
     chosen = [f"{name}={os.environ[name]}" for name in CHOSEN_BY if name in os.environ]
     if chosen:
@@ -60,8 +59,8 @@ def load_sleeping() -> str:
 
 
 def _in_child() -> None:
-    """Restrict a forked child to one thread if the parent had kernel threads, and
-    to no device.
+    """Restrict a forked child: no GPU, and one thread if the parent had started kernel
+    threads.
 
     Modules that were not loaded are left alone.
     """
@@ -74,10 +73,8 @@ def _in_child() -> None:
 
 
 def watch() -> None:
-    """Let kernel threads sleep while they wait in this process (Linux), and have forked
-    children compute in one thread.
-
-    Elsewhere kernel threads are left as they are.
+    """Let kernel threads of this process sleep while they wait (Linux only), and restrict
+    forked children from now on, see `_in_child`.
     """
     if sys.platform == "linux":
         kernel_threads.waiting = load_sleeping()

@@ -33,10 +33,8 @@ class Shown(Protocol):
 
 
 def shown_on(log: logging.Logger) -> Shown:
-    """Choose where work is shown: the handlers of a log, a notebook, a terminal, standard
-    error.
-
-    In that order; on a standard error that is no terminal, lines.
+    """Choose how work is shown: as log lines if the log has handlers, else as a bar in a
+    notebook or a terminal, else as lines.
 
     Args:
         log: whose handlers a program may have set.
@@ -108,7 +106,8 @@ class TerminalBar:
     ) -> None:
         """Draw the bar over the one drawn before.
 
-        Cut to the terminal's width, unless that is unknown or tiny.
+        It is cut to the terminal's width, unless that is unknown or at most
+        `NARROWEST_CHARS`.
 
         Args:
             what: name of the work.
@@ -153,9 +152,13 @@ class NotebookBar:
     def show(
         self, what: str, done: float | None, seconds: float, left_s: float | None
     ) -> None:
-        """Replace the bar shown before by its text and fraction.
+        """Draw the bar and its text in place of those drawn before.
 
-        `done` None is a bar without a value; seconds so far and left are in the text.
+        Args:
+            what: name of the work.
+            done: fraction, 0 to 1; None gives a bar without a value.
+            seconds: since the work began.
+            left_s: time left [s]; None if unknown.
         """
         value = ""
         if done is not None:

@@ -62,9 +62,8 @@ class _Work:
     covered: Callable[[], bool] = lambda: False
 
     def advance(self, done: float) -> None:
-        """Set the fraction that is done; 0 or less changes nothing.
-
-        The first fraction begins the measurement of the rate.
+        """Set the fraction that is done; 0 or less is ignored. The first one begins the
+        measurement of the rate.
         """
         if self.done is None and done > 0.0:
             self.rated_from = done, time.monotonic()
@@ -80,7 +79,8 @@ class _Work:
             now: time [s].
 
         Returns:
-            None before `RATED_FRACTION` has been done at that pace, and at the end.
+            Seconds; None before `RATED_FRACTION` has been done at that pace, and at the
+            end.
         """
         if self.done is None or self.done >= 1.0:
             return None
@@ -91,10 +91,11 @@ class _Work:
         return (now - since) * (1.0 - self.done) / paced
 
     def tell(self) -> None:
-        """Show the work's name and fraction as they are now, unless it has ended, and set
-        when to show it next.
+        """Draw the work's name, fraction and times, and set when to show it next, after
+        `DRAWN_S` for a bar, else `SILENT_S`.
 
-        Also nothing while another work covers it, or if the log takes no warnings.
+        Nothing is shown if it has ended, while another work covers it, or if the log
+        takes no warnings.
         """
         with self.lock:
             if self.ended or self.covered() or not LOG.isEnabledFor(logging.WARNING):
@@ -151,7 +152,8 @@ class _ProgressThread:
         """Show each work when it is due, again and again; runs in a thread until the
         process ends.
 
-        Works are shown without the lock held.
+        Works are shown without the lock held. An idle thread sleeps until a work is
+        added.
         """
         while True:
             with self._changed:
@@ -232,15 +234,15 @@ os.register_at_fork(after_in_child=_forget)
 
 @contextmanager
 def shown_work(what: str, progress: Progress = None) -> Iterator[Advance]:
-    """Show the work that goes on inside the context, from when it takes seconds.
+    """Show the work that goes on inside the context, from when it has taken `SILENT_S`.
 
-    Within other work it is shown under that one's bar by name, without a fraction.
+    Within other work only its name is shown, with that one's bar.
 
     Args:
         what: its name, such as "calibrating". Work of the same name within it is the same
             work.
-        progress: the caller's choice: a function that takes the fraction done; False
-            shows nothing.
+        progress: a function that gets the fraction done instead, with the end in any case
+            unless there is an error; False shows nothing; None shows it.
 
     Yields:
         The function that takes the fraction done, 0 to 1.
@@ -266,12 +268,10 @@ def shown_work(what: str, progress: Progress = None) -> Iterator[Advance]:
 
 @contextmanager
 def _show_until_end(what: str) -> Iterator[_Work]:
-    """Show a work until the context ends, and log the time it took.
+    """Show a work from `SILENT_S` on until the context ends, and log the time it took.
 
-    That is only of kinds in `FOLLOWED`, within `SILENT_S`; nothing is shown before
-    `SILENT_S`.
-
-    Work of the same kind shortly after is shown as one that goes on.
+    Work of a kind in `FOLLOWED` that begins within `SILENT_S` of the last one's end is
+    shown as one with it.
 
     Args:
         what: name; its first word is its kind.
@@ -307,10 +307,8 @@ def _entered(works: list[_Entered], one: _Entered) -> Iterator[None]:
 
 @contextmanager
 def _renamed(outer: _Work | None, what: str) -> Iterator[None]:
-    """Show a work under the name of one within it until the context ends; None shows
-    nothing.
-
-    The earlier name comes back at the end, also after an error.
+    """Show a work with the name of one within it until the context ends, also after an
+    error; nothing for None.
     """
     if outer is None:
         yield
@@ -325,17 +323,16 @@ def _renamed(outer: _Work | None, what: str) -> Iterator[None]:
 
 @contextmanager
 def silence_shown(what: str) -> Iterator[Callable[[], None]]:
-    """Show that a program works, from two seconds on until it has said something.
+    """Show that a program works, from `SILENT_S` on until its first output or the end of
+    the context.
 
-    The end of the context ends it, too.
-
-    Work that this thread shows meanwhile is shown in its place.
+    While this thread shows other work, that is shown instead.
 
     Args:
-        what: name of what the program does.
+        what: name of the program's work.
 
     Yields:
-        A function that ends this, for the program's first words.
+        A function that ends this, to be called before the first output.
     """
     works, now = _threads.works, time.monotonic()
     work = _Work(what, now, now + SILENT_S, covered=lambda: bool(works))

@@ -48,9 +48,11 @@ def option(default: object, *flags: str, public: bool = True, **details: Any) ->
 
 
 def parameters(settings: type[Settings]) -> dict[str, inspect.Parameter]:
-    """Convert a table's keys to options: parameters of a function that typer reads.
+    """Convert the fields of a settings class to keyword-only parameters that typer reads
+    as options.
 
-    A field without own flags is --its-name; a tuple becomes a list option.
+    A field without own flags is --its-name; a tuple becomes a list option. Help texts are
+    those of the class's docstring and its bases'.
 
     Args:
         settings: class of the table.
@@ -83,9 +85,12 @@ def _is_read(declared: Field[Any]) -> bool:
 
 
 def described(thing: object) -> tuple[str, dict[str, str]]:
-    """Split a docstring into its text and its arguments or attributes by name.
+    """Split a docstring into its text and its arguments or attributes.
 
-    Sections of results and errors belong to neither.
+    Sections of results and errors are left out.
+
+    Returns:
+        The text before the sections, and name -> description on one line.
     """
     whole = inspect.getdoc(thing) or ""
     whole = re.sub(r"\n\n(?:Yields|Returns|Raises):\n(?: +\S.*\n?)+", "", whole)
@@ -110,7 +115,7 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
 
     Args:
         settings: class of the process or command.
-        words: of the command line, `sys.argv`'s where left out.
+        words: of the command line; None: `sys.argv`'s.
 
     Returns:
         The settings; None after the help.
@@ -134,10 +139,10 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
 
 
 def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
-    """Read like `read`, in a process of its own: exit with code 2 for wrong words, 0
-    after the help.
+    """Read settings like `read`; after wrong words print the reason on standard error and
+    exit with code 2, after the help with 0.
 
-    Reasons go to standard error; errors that are not of the words are raised.
+    Errors that are not of the words are raised.
     """
     try:
         found = read(settings, words)
@@ -152,13 +157,14 @@ def parse(settings: type[S], words: Sequence[str] | None = None) -> S:
 
 
 def words(given: Mapping[str, object]) -> list[str]:
-    """Convert options to words of a command line; the inverse of `read`.
+    """Convert options to words of a command line, of which `read` makes the same
+    settings.
 
-    Underscores become dashes; values are texts by `str`.
+    Underscores of a name become dashes.
 
     Args:
         given: name -> value; None and False are left out, True is a bare flag, a list or
-            tuple is given once for each item.
+            tuple is repeated for each item, others are texts by `str`.
     """
     out = []
     for name, value in given.items():

@@ -123,10 +123,10 @@ class Supervisor:
     _running: dict[str, Process] = field(default_factory=dict)
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Start everything, restart services that end until `stop` is set, then stop
-        everything.
+        """Start all services, restart those that end until `stop` is set, then stop all
+        in reverse order.
 
-        Stopping, in reverse order, happens after errors and cancellation, too.
+        They are stopped after errors and cancellation, too.
 
         Args:
             stop: set from outside.
@@ -148,10 +148,14 @@ class Supervisor:
             await self._stop_all()
 
     async def _look_after(self) -> None:
-        """Start the services one after the other, each once the one before has its address.
+        """Start the services one after the other, each once the one before has its
+        address; announce all addresses when all are ready.
 
-        When all are ready their addresses are announced; then they are kept alive until
-        one is given up, whose error is raised. At the end all keepers are cancelled.
+        Then they are kept alive until one is given up or this is cancelled; their
+        processes go on.
+
+        Raises:
+            ServiceError: a service left by itself at its first start.
         """
         keepers: list[asyncio.Task[None]] = []
         try:
@@ -169,17 +173,18 @@ class Supervisor:
             await asyncio.gather(*keepers, return_exceptions=True)
 
     async def _keep_alive(self, start: _Start) -> None:
-        """Start a service whenever it ends, after a growing pause, and note each end;
-        ends only by cancellation.
+        """Start a service, and again whenever it ends, after a growing pause; end only by
+        cancellation or at a failed first start.
 
-        Only an exit with a code >= 0 at the first start gives up; a signal's death is
-        restarted. Ends are noted in words as long as they are worth reporting.
+        What is left of its processes is killed before each new start. Ends are noted in
+        words as `Ends.reported` allows. A first start that a signal ends is tried again.
 
         Args:
             start: the service and the events of its start.
 
         Raises:
-            ServiceError: it left by itself at its first start.
+            ServiceError: it exited with a code of 0 or more before it was ready for the
+                first time.
         """
         clock = asyncio.get_running_loop().time
         ends = Ends()
@@ -215,13 +220,14 @@ class Supervisor:
     async def _spawn(self, service: Service) -> Process:
         """Start and record a service's process, which ends with its parent.
 
-        It runs in a session of its own, with pipes for input and output.
+        It runs `flexdt.runtime.child` in a session of its own, with pipes for input and
+        output.
 
         Args:
             service: with its command.
 
         Raises:
-            _Ended: the system has no room for a process.
+            _Ended: the system cannot start a process.
         """
         try:
             process = await asyncio.create_subprocess_exec(
@@ -241,17 +247,17 @@ class Supervisor:
         return process
 
     async def _wait_until_ready(self, process: Process, start: _Start) -> None:
-        """Wait until a service is ready; report the wait and the progress.
+        """Wait until a service is ready; note the wait every `SILENT_S`.
 
-        A note comes after `SILENT_S`, then again; it is given up after `STALLED_S`
-        without CPU work (not where the work cannot be measured).
+        It is given up after `STALLED_S` without processor time; where that cannot be
+        measured it is never given up.
 
         Args:
             process: of the service.
             start: the service and the events of its start.
 
         Raises:
-            _Ended: before it was ready, or it no longer does anything.
+            _Ended: it ended before it was ready, or it no longer does anything.
         """
         clock = asyncio.get_running_loop().time
         service = start.service
@@ -292,8 +298,8 @@ class Supervisor:
         """Read a service's output up to `ready`: record the address of `bound` and
         `ready` lines, skip others.
 
-        At the end of the output it waits for ever: the caller sees that the process has
-        ended.
+        It returns after `ready`. At the end of the output it waits for ever: the caller
+        sees that the process has ended.
 
         Args:
             process: of the service.
@@ -320,9 +326,10 @@ class Supervisor:
                         return
 
     def _forget(self, service: Service) -> None:
-        """Kill what is left of a service's process group, and forget its process.
+        """Kill what is left of a service's process group, whose children may hold its
+        port or its files, and forget its process.
 
-        Its children may hold its port or its files. Nothing to do if it does not run.
+        Nothing happens if none is recorded.
         """
         process = self._running.pop(service.name, None)
         if process is not None:
@@ -330,10 +337,10 @@ class Supervisor:
                 os.killpg(process.pid, signal.SIGKILL)
 
     async def _stop_all(self) -> None:
-        """Stop all services in reverse order, one by one; kill one that takes over
-        `STOP_GRACE_S`.
+        """Stop all services in reverse order, one by one, and kill what is left of their
+        process groups.
 
-        The rest of each service's processes is killed, too.
+        One that takes over `STOP_GRACE_S` is killed, which is noted.
         """
         for service in reversed(self.services):
             process = self._running.get(service.name)
@@ -375,7 +382,11 @@ class _Start:
 async def _unless_one_ends(
     event: asyncio.Event, keepers: Sequence[asyncio.Task[None]]
 ) -> None:
-    """Wait for an event, or until a keeper ends; the error of one that has ended is raised."""
+    """Wait until an event is set or a keeper ends.
+
+    Raises:
+        Exception: the error of the keeper that has ended.
+    """
     waiting = asyncio.create_task(event.wait())
     await asyncio.wait({waiting, *keepers}, return_when=FIRST_COMPLETED)
     waiting.cancel()
@@ -385,10 +396,8 @@ async def _unless_one_ends(
 
 
 async def _drained(process: Process) -> int:
-    """Read the pipe until the process ends, so that printing never blocks; return
-    its exit code.
-
-    What it prints is dropped.
+    """Read and drop a process's output until it ends, so that its printing never blocks;
+    return its exit code.
     """
     drain = asyncio.create_task(_drain(process))
     try:
@@ -406,10 +415,10 @@ async def _drain(process: Process) -> None:
 
 
 async def _ended(process: Process) -> int:
-    """Wait for the end of a process alone, not of its children with the same pipes; return
-    its exit code.
+    """Wait for the end of a process, whatever its children do with the same pipes, and
+    return its exit code.
 
-    It looks every `CHECK_INTERVAL_S`.
+    It is looked at every `CHECK_INTERVAL_S`.
     """
     end = asyncio.create_task(process.wait())
     try:
@@ -421,7 +430,9 @@ async def _ended(process: Process) -> int:
 
 
 def _how(code: int) -> str:
-    """Describe an exit code; a negative one as the signal that killed the process."""
+    """Describe an exit code as "exit code N", a negative one as the signal that killed
+    the process.
+    """
     if code >= 0:
         return f"exit code {code}"
     try:

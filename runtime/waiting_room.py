@@ -48,10 +48,8 @@ class WaitingList(Generic[_G]):
         self.guests: dict[_G, None] = {}
 
     def enter(self, guest: _G) -> None:
-        """Admit a connection; if the room is then too full, displace another.
-
-        That is the oldest one of the address with the most connections; it may be the new
-        one.
+        """Admit a connection; above `most` displace the oldest one of the address that
+        has most, which may be this one.
         """
         self.guests[guest] = None
         if len(self.guests) > self._most:
@@ -66,11 +64,11 @@ class WaitingList(Generic[_G]):
 
 
 def neighbourhood(host: str) -> str:
-    """Return the address for a share: an IPv4 address, or the 64 bits of an IPv6
-    network (one owner's).
+    """Return the address by which connections are counted: an IPv4 address itself, or the
+    first 64 bits of an IPv6 address (one owner's) as a network.
 
-    An IPv4 address written as IPv6 counts as IPv4; a zone is cut off; what is no address
-    is returned unchanged.
+    An IPv4 address written as IPv6 counts as IPv4. A zone is cut off. A text that is no
+    address is returned unchanged.
     """
     try:
         address = ipaddress.ip_address(host.partition("%")[0])

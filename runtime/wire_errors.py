@@ -34,18 +34,17 @@ CODES: Sequence[tuple[type[e.TwinError], Code]] = (
 
 
 def explain(error: Exception, root: Path | None = None) -> RpcError:
-    """Convert `error` to the wire's error; paths below `root`, the data directory, become
-    relative to it.
+    """Convert `error` to the wire's error.
 
-    Wire errors stay; a script's has its problems as data; TwinErrors get the code of
-    their class.
+    An RpcError is returned as it is. A script's error has its problems as data. Other
+    TwinErrors get the code of their class in `CODES`.
 
     Args:
         error: any exception.
-        root: data directory; None: paths stay as they are.
+        root: data directory, to which paths below it become relative; None: they stay.
 
     Returns:
-        The error; an internal one where `error` is none that users can cause.
+        The error; an internal one, without details, for an error that no user can cause.
     """
     if root is not None:
         known = explain(error)
@@ -76,17 +75,15 @@ def is_user_error(error: Exception) -> bool:
 
 
 def from_root(said: object, root: Path) -> object:
-    """Replace paths below the folder `root` in nested values by relative ones.
+    """Return `said` with paths below the folder `root` replaced by relative ones, in
+    nested values, too.
 
-    The folder itself becomes "the data directory"; lists and tuples become lists; keys
+    The folder itself becomes "the data directory". Lists and tuples become lists; keys
     stay.
 
     Args:
-        said: text, mapping or list; other values stay.
+        said: text, mapping or list; other values are returned as they are.
         root: the data directory.
-
-    Returns:
-        A new value of the same form.
     """
     match said:
         case str():

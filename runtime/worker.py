@@ -50,7 +50,11 @@ def receive_parts(channel: socket.socket) -> list[bytes]:
 
 
 def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
-    """Read exactly `size` bytes from a socket; raise EOFError if the other end closes before."""
+    """Read exactly `size` bytes from a socket, in pieces of at most 1 MiB.
+
+    Raises:
+        EOFError: the other end closes before.
+    """
     data = bytearray(size)
     view = memoryview(data)
     at = 0
@@ -63,9 +67,8 @@ def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
 
 
 def limit(what: str, most: int) -> None:
-    """Limit one resource of this process to `most`, or to the system's hard limit.
-
-    Only the soft limit is set; the hard one stays.
+    """Set the soft limit of one resource of this process to `most`, or to the hard limit
+    if that is lower.
 
     Args:
         what: name of the resource, such as RLIMIT_CPU.
@@ -82,9 +85,8 @@ def limit(what: str, most: int) -> None:
 def peak_bytes() -> int:
     """Return the largest memory this process has taken so far [bytes].
 
-    Elsewhere that is what it returns.
-
-    By Linux's own figure: `ru_maxrss` begins with the memory of the parent.
+    It is Linux's figure of this process alone; elsewhere `ru_maxrss`, which begins with
+    the memory of the parent.
     """
     try:
         with open("/proc/self/status", encoding="ascii") as status:
@@ -96,17 +98,19 @@ def peak_bytes() -> int:
 
 
 def answer(request: Sequence[bytes]) -> list[bytes]:
-    """Do one piece of work within its processor time; errors are returned, not raised.
+    """Do one piece of work and return its result or its error as parts; nothing is
+    raised.
 
-    The processor limit is set anew before the call, with 2 s to spare; beyond it the
-    system ends the process.
+    It may take the allowed processor time and 2 s more; beyond that the system ends the
+    process.
 
     Args:
-        request: seconds allowed, the pickled call, and its binary arguments.
+        request: processor seconds allowed, the pickled pair of function and arguments,
+            and its binary arguments.
 
     Returns:
-        b"done" with the parts; b"refused" with code, message and data; b"memory";
-        b"failed" with the traceback.
+        b"done" with the function's parts; b"refused" with JSON of code, message and data
+        of an error that users can cause; b"memory"; or b"failed" with the traceback.
     """
     seconds, call, *raw = request
     # Before the call is unpickled, which imports modules.
@@ -139,11 +143,14 @@ def document(read: Callable[..., Any], how: Mapping[str, str], raw: bytes) -> li
 
 
 def main() -> int:
-    """Limit this process's memory, then answer requests until the parent is gone; return
-    the exit code.
+    """Limit this process's memory and priority, then answer requests until the parent is
+    gone.
 
-    Arguments: descriptor of the socket, memory limit [bytes]. It runs at low priority;
-    each answer has the peak memory in its second part.
+    The command line has the descriptor of the socket and the memory limit [bytes]. Each
+    answer has the peak memory [bytes] as its second part.
+
+    Returns:
+        The exit code, 0.
     """
     channel = socket.socket(fileno=int(sys.argv[1]))
     limit("RLIMIT_AS", int(sys.argv[2]))
@@ -161,9 +168,13 @@ def main() -> int:
 
 
 def _end_with_parent(number: int) -> None:
-    """Wait until the parent closes its end of the socket, then exit at once with code 0.
+    """Wait until the parent closes its end of the socket, then exit the process at once
+    with code 0.
 
-    On systems that cannot poll for that, return at once.
+    On systems that cannot poll for that it returns at once.
+
+    Args:
+        number: descriptor of the socket.
     """
     if not hasattr(select, "POLLRDHUP"):
         return

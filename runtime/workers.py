@@ -48,7 +48,11 @@ class Worker:
     def __init__(self, memory_bytes: int) -> None:
         """Start a worker process with a memory limit [bytes], connected by a socket pair.
 
-        It inherits the environment without the token; its standard streams go nowhere.
+        It inherits the environment without the token and with one thread for each
+        library; its standard streams go nowhere.
+
+        Raises:
+            OSError: the system cannot start a process.
         """
         self._memory = memory_bytes
         ours, theirs = socket.socketpair()
@@ -86,13 +90,13 @@ class Worker:
     def ask(
         self, work: Work, arguments: Sequence[object], raw: Parts, seconds: float
     ) -> list[bytes]:
-        """Have one piece of work done; a failure, or much memory, ends the process.
+        """Have one piece of work done by the process, and return its parts; blocks.
 
-        It is kept after an answer or a refusal unless its peak memory is above
-        `MAX_KEPT_BYTES`.
+        Any failure but a refusal kills the process, and so does a peak memory above
+        `MAX_KEPT_BYTES`, after the answer.
 
         Args:
-            work: called there.
+            work: function called there.
             arguments: that it takes first, pickled.
             raw: that it takes after them, sent as they are.
             seconds: of processor time that it may take; doing nothing for so long ends
@@ -133,9 +137,9 @@ class Worker:
         raise RuntimeError(answer[0].decode("utf-8", "replace"))
 
     def _wait(self, seconds: float) -> None:
-        """Wait for the first byte of an answer.
+        """Wait until an answer begins, without reading it.
 
-        Where processor time cannot be read, only the time without change counts.
+        Where processor time cannot be read, real time counts.
 
         Args:
             seconds: of processor time that the work may take; doing nothing for so long
@@ -161,8 +165,8 @@ class Worker:
                     raise TimeoutError
 
     def _end_error(self, work: Work, seconds: float) -> RpcError:
-        """Kill the process and make the error -32008 that its work ended it; returned, not
-        raised.
+        """Kill the process, and make, not raise, the error -32008 that it ended during
+        its work.
 
         It has the exit code and the allowed seconds and memory.
         """
@@ -182,7 +186,7 @@ class Worker:
         self._process.kill()
 
     def kill(self) -> None:
-        """End the process, wait for its end, and close the channel; it may have ended already."""
+        """Kill the process unless it has ended, wait for its end, and close the channel."""
         with suppress(OSError):
             self.stop()
         self._process.wait()
@@ -216,11 +220,11 @@ class Workers:
         return bool(self._idle)
 
     async def ask(self, work: Work, *arguments: object, raw: Parts = ()) -> list[bytes]:
-        """Have one piece of work done by an idle or a new worker; it is stopped if this
-        is cancelled.
+        """Have one piece of work done by an idle or a new worker, once there is a free
+        place.
 
-        It waits for a free place first; the worker is kept idle afterwards if it may have
-        further work.
+        If this is cancelled, the worker is stopped. Afterwards a worker that may have
+        further work becomes idle.
 
         Args:
             work: function that a worker calls.
@@ -231,7 +235,8 @@ class Workers:
             The parts that the function returns.
 
         Raises:
-            RpcError, RuntimeError: as `Worker.ask`.
+            RpcError: as `Worker.ask`; -32003, no process could be started.
+            RuntimeError: as `Worker.ask`.
         """
         async with self._turn:
             loop = asyncio.get_running_loop()
@@ -253,12 +258,10 @@ class Workers:
                 self._keep(worker)
 
     def _new(self) -> Worker:
-        """Start a process.
-
-        The error is -32003; the caller may try again.
+        """Start a worker process.
 
         Raises:
-            RpcError: no process could be started.
+            RpcError: -32003, no process could be started; the caller may try again.
         """
         try:
             return Worker(self.memory_bytes)
@@ -267,10 +270,8 @@ class Workers:
             raise busy(f"no process could be started: {error.strerror}", data) from None
 
     def _keep(self, worker: Worker) -> None:
-        """Return a process to the idle ones if it may work again, and end them all after
-        `MAX_IDLE_S` without work.
-
-        The time counts anew from each end of work.
+        """Make a worker idle if it may have further work, and begin anew the `MAX_IDLE_S`
+        after which all idle ones are ended.
         """
         if worker.kept:
             self._idle.append(worker)

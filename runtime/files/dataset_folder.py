@@ -117,8 +117,8 @@ class Folder:
         return self.projections.get(index, f"scan_{index:06d}.tif")
 
     def frames(self, files: Sequence[str], shapes: Sequence[Shape]) -> tuple[Frame, ...]:
-        """Make frames with these names and (rows, cols), numbered from 0; each says if its
-        file is here.
+        """Make frames of these names and shapes (rows, cols), numbered from 0; each has
+        its path, and whether the listing has its file.
         """
         return tuple(
             Frame(i, name, self.path / name, name in self.names, shape)
@@ -156,10 +156,10 @@ class Folder:
 
     @cached_property
     def _numbered(self) -> dict[str, tuple[dict[int, str], tuple[str, str] | None]]:
-        """Sort image names by prefix (di, io, scan) and number; other names are ignored.
+        """Image names by prefix ("di", "io", "scan") and number; other names are ignored.
 
-        Prefix -> (number -> first name of that number, ascending; two names with one
-        number, or None).
+        Prefix -> (number -> first name of that number, ascending; and the first pair of
+        names with one number, or None).
         """
         found: dict[str, dict[int, str]] = {prefix: {} for prefix in ("di", "io", "scan")}
         twice: dict[str, tuple[str, str]] = {}
@@ -183,9 +183,8 @@ _confined: Directory | None = None
 
 @contextmanager
 def confined(root: Directory) -> Iterator[None]:
-    """Ensure that, inside, this process reads nothing below `root` through a link.
-
-    It is for the whole process, threads included; contexts nest.
+    """Let this process, all threads included, read nothing through a link below `root`
+    within the context; contexts nest.
 
     A user's own folders may well have links in them; paths that strangers request of a
     server may not.
@@ -200,10 +199,11 @@ def confined(root: Directory) -> Iterator[None]:
 
 
 def _within(path: Path) -> Directory | None:
-    """Return the directory at a path below the one that reading is confined to; None if
-    it is not.
+    """Return the directory at a path that is below the one that reading is `confined` to;
+    nothing is looked up on the disk.
 
-    None also if reading is not confined. Nothing is looked up on the disk.
+    Returns:
+        The directory; None if reading is not confined or the path is elsewhere.
     """
     if _confined is None or not path.is_relative_to(_confined.path):
         return None
@@ -214,10 +214,11 @@ def _within(path: Path) -> Directory | None:
 
 
 def opened(path: Path) -> BinaryIO:
-    """Open a file of a data set for reading.
+    """Open a file of a data set for reading; where reading is `confined`, links are not
+    followed.
 
     Raises:
-        OSError: there is none, or where reading is `confined`, it is no regular file.
+        OSError: there is none, or (confined) it is no regular file.
     """
     folder = _within(path.parent)
     if folder is None:
@@ -226,10 +227,8 @@ def opened(path: Path) -> BinaryIO:
 
 
 def list_folder(path: Path) -> Folder:
-    """List the files of a folder; where reading is `confined`, links to files are left
-    out.
-
-    Not confined, links to files are in it. Folders are not.
+    """List the files of a folder, without its folders; where reading is `confined`, links
+    are left out, too.
 
     Args:
         path: of the folder.
@@ -318,21 +317,21 @@ def read_image(
 def read_values(
     path: Path, shape: tuple[int, int] | None = None, kinds: str = "uf"
 ) -> npt.NDArray[np.uint16 | np.float32]:
-    """Read one TIFF image: counts as uint16 or, where `kinds` has an f, float32.
-
-    Any failure to decode becomes a DatasetFormatError with path and reason.
+    """Read the first image of a TIFF file: counts as uint16 or, where `kinds` has an f,
+    other values as float32.
 
     Args:
         path: of the file.
         shape: (rows, cols) that the image must have; None: any.
-        kinds: of values that are allowed: u, f.
+        kinds: of values that are allowed: u (counts), f (other numbers).
 
     Returns:
         uint16 or float32 (rows, cols).
 
     Raises:
         DatasetMissingError: it is not there.
-        DatasetFormatError: it is no such image.
+        DatasetFormatError: it is no such image, or cannot be decoded; names path and
+            reason.
     """
     try:
         image = _decoded(path, kinds)
@@ -362,13 +361,11 @@ def read_values(
 
 
 def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
-    """Decode the pixels of a TIFF, once its head is known to be that of such an image.
+    """Decode the first image of a TIFF file, after a check of its kind and size.
 
-    Signed counts are allowed if none is negative. LZW and the like are decoded by another
-    library; only the first image of the file is read.
-
-    A file of a few bytes may claim any size, and inflate to any: both are looked at
-    before memory is taken.
+    A file of a few bytes may claim any size, and inflate to any: both are checked before
+    memory is taken. Signed counts are allowed if none is negative. Compression other than
+    deflate is decoded by OpenCV.
 
     Args:
         path: of the file.
@@ -378,7 +375,7 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
         uint16 or float32 (rows, cols).
 
     Raises:
-        DatasetFormatError: another kind of image, or larger than allowed.
+        DatasetFormatError: another kind of image, or more than `MAX_IMAGE_BYTES`.
         ValueError: pixels that cannot be decoded.
     """
     import tifffile
@@ -439,8 +436,8 @@ def _check_kind(
         kinds: that are allowed: u, f.
 
     Raises:
-        DatasetFormatError: says what is allowed, and how several images in one file are
-            read.
+        DatasetFormatError: another type or number of dimensions; names what is allowed,
+            and how several images in one file are read.
     """
     allowed = [np.dtype(k) for k in (*COUNTS, "f4", "f8") if k[0] in kinds or k in COUNTS]
     if len(shape) == 2 and kind.newbyteorder("=") in allowed:
@@ -459,9 +456,8 @@ def _check_kind(
 
 
 def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
-    """Check that every strip inflates to no more than the image's `size` [bytes].
-
-    No more than `size` + 1 bytes of a strip are inflated.
+    """Check that no strip of a deflated page inflates to more than the image's `size`
+    [bytes]; at most one byte more is inflated.
 
     Raises:
         DatasetFormatError: a strip inflates to more.
@@ -480,7 +476,8 @@ def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
 
 
 def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
-    """List those of the images that are all zeros; none if the last one is not.
+    """List those of the images that are there and all zeros, in order; () if the last one
+    that is there is not.
 
     A stopped scan leaves such images if the files were made in advance.
     """
@@ -493,7 +490,8 @@ def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
 def _blank(path: Path) -> bool:
     """Return whether all pixels of an image are zero; False if it cannot be read.
 
-    A sample from the middle of a large file decides if it has any other byte.
+    For a large file a sample of `BLANK_SAMPLE_BYTES` from its middle decides if it has a
+    byte other than 0.
     """
     try:
         with opened(path) as file:
@@ -561,9 +559,8 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
 
 
 def free_name(root: Directory, wanted: str) -> str:
-    """Find the first of `wanted`, `wanted-2`, `wanted-3`... that `root` does not have.
-
-    A name is taken by any file, folder or link. It is not reserved.
+    """Find the first of `wanted`, `wanted-2`, `wanted-3`... that is no entry of `root`;
+    it is not reserved.
 
     Raises:
         DatasetNameError: `wanted` is not plain.

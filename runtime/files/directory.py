@@ -58,10 +58,11 @@ Write = Callable[[int, memoryview], int]
 
 @contextmanager
 def writing(path: Path, refused: str) -> Iterator[None]:
-    """Convert the system's errors inside to `DatasetWriteError`, for a full
-    disk to `DiskFullError`.
+    """Convert an OSError within the context to `DatasetWriteError`, of a full disk to
+    `DiskFullError`.
 
-    The errors have path and number of the system's error; others pass.
+    The error has the path and the system's error number. Other errors are raised as they
+    are.
 
     Args:
         path: of the written file.
@@ -104,10 +105,11 @@ class Directory:
         write: Write = write_some,
         above: Directory | None = None,
     ) -> None:
-        """Name a folder; the topmost one (`above` None) is opened now where the system can.
+        """Name a folder; the topmost one (`above` None) is opened now where the system
+        can.
 
-        `sync` waits for the disk at each write, `write` is the function that writes some
-        bytes.
+        `sync` waits for the disk at each file, `write` is the function that writes some
+        bytes. A folder below another (`above`) is opened at each call, until `held`.
 
         Raises:
             DatasetError: it cannot be opened.
@@ -138,13 +140,14 @@ class Directory:
         return self._fd
 
     def held(self) -> Directory:
-        """Hold it open: whatever its name refers to later, it stays this directory.
+        """Hold a folder below another open until `close`: whatever its name refers to
+        later, it stays this directory.
 
-        Returns itself; it must be below another.
+        Returns:
+            Itself.
 
         Raises:
-            DatasetWriteError: there is no such directory, or there is a link in its
-                place.
+            DatasetWriteError: there is no such directory, or a link is in its place.
         """
         assert self._above is not None
         with writing(self.path, f"cannot use folder {self.path}"):
@@ -153,12 +156,11 @@ class Directory:
         return self
 
     def make(self) -> None:
-        """Make the directory if it is missing; safe from a power cut when this returns.
-
-        Nothing for the topmost folder, which must exist, or if it is there.
+        """Make a folder below another if it is missing, and wait for the disk; nothing
+        for the topmost folder.
 
         Raises:
-            DatasetNameError: there is a link or a file in its place.
+            DatasetNameError: a link or a file is in its place.
             DatasetWriteError: the system refuses.
         """
         if self._above is None:
@@ -179,10 +181,10 @@ class Directory:
             self._above.sync()
 
     def put(self, name: str, data: bytes | memoryview) -> None:
-        """Write a file; one of that name, or a link, is replaced as a whole.
+        """Write a file; a file or a link of that name is replaced as a whole.
 
         Args:
-            name: plain file name.
+            name: plain file name, or one that begins with `BEFORE`.
             data: its content.
 
         Raises:
@@ -205,10 +207,10 @@ class Directory:
         self.sync()
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write a file in place from its beginning, and flush it to the disk; its size
-        stays, or grows.
+        """Write the first bytes of an existing file in place, and flush it to the disk;
+        links are not followed.
 
-        Links are not followed.
+        The file keeps its further bytes, or grows to the data.
 
         Args:
             name: of a file that exists.
@@ -232,11 +234,10 @@ class Directory:
             os.close(file)
 
     def allocate(self, name: str, size: int) -> None:
-        """Make a file of `size` bytes whose blocks are reserved on the disk, in
-        place of its namesake.
+        """Make a file of `size` bytes whose blocks are reserved on the disk, in place of
+        its namesake.
 
-        The namesake is deleted first, also if this fails. The content is unspecified or
-        zero.
+        The namesake is deleted first, also if this fails. The bytes are zeros.
 
         Args:
             name: of the file.
@@ -261,9 +262,11 @@ class Directory:
                 raise
 
     def nameless(self) -> BinaryIO:
-        """Make an open file without a name, for reading and writing, unbuffered.
+        """Make an open file without a name, for reading and writing, unbuffered; it is
+        gone when it is closed or its process ends.
 
-        It is gone when it is closed or its process ends.
+        Raises:
+            OSError: the system refuses.
         """
         with self._opened() as fd:
             name, file = self._temporary(fd, 0o600, getattr(os, "O_TEMPORARY", 0))
@@ -274,8 +277,6 @@ class Directory:
     def open(self, name: str) -> BinaryIO:
         """Open a regular file for reading; a link is not followed.
 
-        What is no regular file is closed again.
-
         Args:
             name: of the file.
 
@@ -283,7 +284,8 @@ class Directory:
             The binary file, which the caller closes.
 
         Raises:
-            OSError: there is none: a FileNotFoundError, or it is no regular file.
+            FileNotFoundError: there is none.
+            OSError: it is no regular file, or cannot be opened.
         """
         with self._opened() as fd:
             try:
@@ -302,9 +304,7 @@ class Directory:
         )  # some readers want to know a name
 
     def read(self, name: str, most: int = MAX_READ_BYTES) -> bytes:
-        """Read the content of a regular file of at most `most` bytes.
-
-        Links are not followed; no more than its size at opening is read.
+        """Read a regular file of at most `most` bytes; a link is not followed.
 
         Raises:
             OSError: as `open`, or it has more.
@@ -317,12 +317,17 @@ class Directory:
             return file.read(size)
 
     def link(self, name: str, second: str, to: Directory | None = None) -> None:
-        """Give the entry `name` a second name, here or in another directory.
+        """Give a file a second name, here or in another directory; links are not
+        followed.
 
-        A link is not followed; a file of the second name raises FileExistsError.
+        Args:
+            name: of the file.
+            second: its second name.
+            to: directory of the second name; None: this one.
 
         Raises:
-            OSError: there is nothing, or the system has no links.
+            OSError: there is no such file, the second name is taken (FileExistsError), or
+                the system has no links.
         """
         target = self if to is None else to
         with self._opened() as fd, target._opened() as other:
@@ -348,9 +353,8 @@ class Directory:
             os.unlink(self._at(name), dir_fd=fd)
 
     def discard(self, name: str) -> None:
-        """Delete an entry that is no directory, safely; none there is no error.
-
-        On the disk when it returns.
+        """Delete an entry that is no directory, and wait for the disk; a missing one is
+        no error.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -361,12 +365,13 @@ class Directory:
             self.sync()
 
     def stat(self, name: str) -> os.stat_result | None:
-        """Return the status of an entry, of a link itself; None if there is none.
+        """Return the status of an entry, of a link itself.
 
-        None also if a folder above is missing.
+        Returns:
+            The status; None if there is no such entry, or no such folder.
 
         Raises:
-            OSError: it cannot be known.
+            OSError: the system refuses for another reason.
         """
         try:
             with self._opened() as fd:
@@ -381,10 +386,8 @@ class Directory:
 
     @contextmanager
     def entries(self) -> Iterator[Iterator[os.DirEntry[str]]]:
-        """Open the listing of everything in the directory, as `os.scandir`; closed with
-        the context.
-
-        Hidden and temporary names are in it, too.
+        """Open the listing of everything in the directory, hidden and temporary names
+        included, as `os.scandir`; closed with the context.
 
         Raises:
             OSError: there is no such directory.
@@ -404,10 +407,11 @@ class Directory:
                 os.close(own_fd)
 
     def names(self) -> set[str]:
-        """List the names of the complete, regular files in it; none without
-        such a directory.
+        """List the names of the regular files in it but hidden (also temporary) ones;
+        links and folders are left out.
 
-        Hidden (also temporary) files, links and folders are left out.
+        Returns:
+            The names; empty if there is no such directory.
         """
         with suppress(FileNotFoundError, NotADirectoryError), self.entries() as entries:
             return {
@@ -418,9 +422,8 @@ class Directory:
         return set()
 
     def sweep(self, left: Sequence[str] = (TEMPORARY, BEFORE)) -> None:
-        """Delete what killed writers left: names that begin with one of `left`.
-
-        Errors of the system are ignored, and the file stays.
+        """Delete the files that killed writers left, whose names begin with one of
+        `left`; those that cannot be deleted stay.
         """
         with suppress(OSError), self.entries() as entries:
             stale = [e.name for e in entries if e.name.startswith(tuple(left))]
@@ -440,10 +443,8 @@ class Directory:
                 os.fsync(fd)
 
     def close(self) -> None:
-        """Wait until no call is under way, then close the descriptor; later calls raise
-        OSError.
-
-        Also for a folder below another, which has no descriptor of its own.
+        """Wait until no call is under way, then close the descriptor, if it holds one;
+        later calls raise OSError.
         """
         with self._idle:
             self._idle.wait_for(lambda: self._busy == 0)
@@ -466,14 +467,14 @@ class Directory:
 
     @contextmanager
     def _opened(self) -> Iterator[int | None]:
-        """Provide the directory's descriptor within the context, None on a system
-        without.
+        """Provide the directory's descriptor within the context, None on a system without
+        such descriptors.
 
-        One below another is opened for the call and closed again; the topmost one cannot
-        be closed meanwhile.
+        A folder below another is opened for the context alone. A held one cannot be
+        closed meanwhile.
 
         Raises:
-            OSError: the folder has been closed.
+            OSError: the folder has been closed, or cannot be opened.
         """
         if self._above is not None:
             fd = self._open_below(self._above)
@@ -495,10 +496,14 @@ class Directory:
                 self._idle.notify_all()
 
     def _open_below(self, above: Directory) -> int | None:
-        """Open the descriptor relative to the directory above, without following a link;
-        None on a system without.
+        """Open this folder's descriptor relative to the directory above, without
+        following a link; the caller closes it.
 
-        The caller closes it.
+        Returns:
+            The descriptor; None on a system without such descriptors.
+
+        Raises:
+            OSError: there is no such directory, or a link is in its place.
         """
         if not _RELATIVE:
             return None
@@ -506,13 +511,11 @@ class Directory:
             return os.open(above._at(self.path.name), _DIRECTORY | _NO_FOLLOW, dir_fd=fd)
 
     def _at(self, name: str) -> str:
-        """Check that `name` is one component; return it for a call that takes
-        the descriptor, too.
-
-        On a system without descriptors it is the whole path.
+        """Check that `name` is one component of a path, and return it for a call with a
+        descriptor, or the whole path on a system without descriptors.
 
         Raises:
-            OSError: another kind of name.
+            OSError: "", ".", "..", or a name with a slash or a zero byte.
         """
         if name in ("", ".", "..") or "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, "no name of an entry", name)
@@ -521,9 +524,19 @@ class Directory:
         return str(self.path / name)
 
     def _temporary(self, fd: int | None, mode: int, flags: int = 0) -> tuple[str, int]:
-        """Make a new file under an unused name; return the name and its open descriptor.
+        """Make a new file under an unused name that begins with `TEMPORARY`; names in use
+        are skipped.
 
-        Names in use are skipped; other errors are raised as OSError.
+        Args:
+            fd: descriptor of the folder; None where the system has none.
+            mode: permissions.
+            flags: further flags of `os.open`.
+
+        Returns:
+            The name and its open descriptor.
+
+        Raises:
+            OSError: the system refuses.
         """
         while True:
             # Processes in containers may share a number, and killed ones leave files behind.
@@ -535,10 +548,10 @@ class Directory:
                 return name, os.open(name, _NEW | flags, mode, dir_fd=fd)
 
     def _store(self, fd: int | None, name: str, data: memoryview) -> None:
-        """Write a file under a temporary name, flush it and rename it; nothing is left of
-        a failure.
+        """Write a file under a temporary name and rename it; nothing is left of a
+        failure.
 
-        The file is flushed only with `sync`; the folder not here.
+        With `sync` the file is flushed to the disk before; the folder is not.
 
         Args:
             fd: descriptor of the folder; None where the system has none.
@@ -592,9 +605,8 @@ class Directory:
 
 
 def _allocate(file: int, size: int) -> None:
-    """Reserve `size` bytes for a new file, so that later writes need no room.
-
-    By `posix_fallocate`, or, on systems without it, by writing zeros.
+    """Reserve `size` bytes for a new file, so that later writes need no room; on systems
+    without `posix_fallocate` by writing zeros.
     """
     allocate = getattr(os, "posix_fallocate", None)
     if allocate is not None:
@@ -621,7 +633,7 @@ def free_bytes(path: Path) -> int | None:
 def memory_bytes() -> int:
     """Return the machine's memory, or the container's limit if that is less [bytes].
 
-    `FALLBACK_MEMORY_BYTES` where the system does not report its memory.
+    `FALLBACK_MEMORY_BYTES` stands for a machine's memory that the system does not report.
     """
     memory = FALLBACK_MEMORY_BYTES
     with suppress(AttributeError, ValueError):
@@ -632,11 +644,11 @@ def memory_bytes() -> int:
 
 
 def free_memory_bytes() -> int:
-    """Estimate the memory that new work can have: free, or caching files [bytes].
+    """Estimate the memory that new work can have, cached files included [bytes]; in a
+    container at most what its limit leaves.
 
-    In a container at most what its limit leaves; never below 0.
-
-    Half of the memory is assumed to be free if the system does not report it (not Linux).
+    It is at least 0. Where the system does not report it (not Linux), it is half of the
+    memory.
     """
     free = memory_bytes() // 2
     with suppress(OSError, ValueError, KeyError):
@@ -661,15 +673,14 @@ def _fields(file: Path) -> dict[str, int]:
 
 
 def open_data(root: Path) -> Directory:
-    """Open a twin's data directory, made if it is missing; check that files can be
-    written into it.
+    """Open a twin's data directory, made with its parents if it is missing, and check
+    that files can be written into it.
 
-    The caller closes it.
-
-    A full disk is no hindrance: state and jobs have room of their own (`spare_files`).
+    The caller closes it. A full disk is no error: state and jobs have room of their own
+    (`spare_files`).
 
     Raises:
-        DatasetWriteError: they cannot; with the reason.
+        DatasetWriteError: it cannot be made, opened or written.
     """
     refused = f"the data directory {root} cannot be written"
     with writing(root, refused):

@@ -32,13 +32,11 @@ ASIDE = ".unreadable"
 
 
 def file_stem(name: str) -> str:
-    """Encode `name` with percent signs as the stem of a file; different names
-    give different stems.
-
-    At most `MAX_STEM` bytes.
+    """Encode `name` with percent signs as the stem of a file; different names give
+    different stems.
 
     Raises:
-        LimitError: it is too long for a file system.
+        LimitError: the stem would have more than `MAX_STEM` bytes.
     """
     stem = encoded(name)
     if len(stem) > MAX_STEM:
@@ -86,9 +84,10 @@ class _Change:
         self.folder.sync()
 
     def _is_still(self) -> bool:
-        """Return whether the file is as this change left it: absent, or with the same bytes.
+        """Return whether the file is as this change left it: absent, or with the same
+        bytes.
 
-        Spaces that a padded file has at its end do not count.
+        Spaces at the end of a file that `keep` wrote do not count.
         """
         if self.data is None:
             return self.folder.stat(self.name) is None
@@ -116,8 +115,8 @@ class Changes:
         """Write a file like `Directory.keep`, and keep the one it replaces until `done`
         or `undo`.
 
-        A full disk without room for the second name keeps the old content in memory
-        instead, only with `keep`.
+        The replaced file gets a second name. If a full disk has no room for that, its
+        content is kept in memory, but only with `keep`.
 
         Args:
             folder, name, data: directory, file name and content.
@@ -148,9 +147,9 @@ class Changes:
         self.put(folder, name, data)
 
     def remove(self, folder: Directory, name: str) -> None:
-        """Delete a file, safely; none there is no error.
+        """Delete a file and wait for the disk; a missing one is no error.
 
-        The file is only renamed, so that `undo` restores it; `done` deletes it.
+        It is only renamed, so that `undo` can restore it; `done` deletes it.
 
         Raises:
             DatasetWriteError: the system refuses.
@@ -184,8 +183,8 @@ class Changes:
             self.undo()
 
     def done(self) -> None:
-        """Confirm the changes: delete the saved earlier files (errors are ignored), forget
-        the changes.
+        """Confirm the changes: delete the replaced files, as far as the system allows,
+        and forget the changes.
         """
         for change in self._made:
             if change.before is not None:
@@ -194,10 +193,10 @@ class Changes:
         self._made.clear()
 
     def undo(self) -> None:
-        """Restore each file, in reverse order, unless somebody else has changed it since;
-        failures are logged.
+        """Restore each file, the last one first, and forget the changes.
 
-        A file that is gone is skipped. At the end all changes are forgotten.
+        A file that somebody else has changed since, or deleted, is left alone. Failures
+        are logged.
         """
         for change in reversed(self._made):
             try:
@@ -215,9 +214,7 @@ class Changes:
 
 
 def _second_name(folder: Directory, name: str, second: str) -> bool:
-    """Give a file a second name, as a link or else as a copy.
-
-    A copy only where the system refuses links.
+    """Give a file a second name, as a link, or as a copy where the system refuses links.
 
     Args:
         folder: of the file.
@@ -225,7 +222,7 @@ def _second_name(folder: Directory, name: str, second: str) -> bool:
         second: its second name; a file of that name is removed.
 
     Returns:
-        Whether there is a file of the first name.
+        Whether there is a file called `name`.
 
     Raises:
         DatasetWriteError: the system refuses.
@@ -246,9 +243,10 @@ def _second_name(folder: Directory, name: str, second: str) -> bool:
 
 
 def read_json(data: bytes) -> object:
-    """Parse a JSON document; all its numbers must be finite and its texts valid Unicode.
+    """Parse a JSON document in UTF-8; all its numbers must be finite and its texts valid
+    Unicode.
 
-    Names given twice are allowed; the last counts.
+    Of a name given twice the last value counts.
 
     Raises:
         ValueError: it is no such document.
@@ -265,10 +263,10 @@ def read_json(data: bytes) -> object:
 def read_or_set_aside(
     folder: Directory, name: str, read: Callable[[bytes], T], without: str
 ) -> T | None:
-    """Read one of our files; set it aside if it is damaged.
+    """Read one of our files with `read`; rename and log a damaged one, see `set_aside`.
 
     Args:
-        folder, name: where it is; an entry that is no regular file is damaged, too.
+        folder, name: of the file; an entry that is no regular file is damaged, too.
         read: parses its bytes; whatever it raises means damage.
         without: what the twin does without the file, for the log.
 
@@ -285,16 +283,16 @@ def read_or_set_aside(
 
 
 def set_aside(folder: Directory, name: str, error: object, without: str) -> None:
-    """Rename a damaged file, or another thing in its place, and log one line; raises
-    nothing.
+    """Rename a damaged file, or another entry of its name, to STEM.unreadable.SUFFIX, and
+    log an error; raises nothing.
 
-    An earlier one set aside under that name is replaced; if renaming fails the line says
+    An earlier one under that name is replaced. If it cannot be renamed, the log line says
     so.
 
     Args:
         folder: of the file.
         name: of the file.
-        error: why it is set aside.
+        error: why it is set aside; the log has its first 500 characters.
         without: event of the log line.
     """
     file = folder.path / name
@@ -308,10 +306,13 @@ def set_aside(folder: Directory, name: str, error: object, without: str) -> None
 
 
 def settle(root: Directory, folders: Sequence[str]) -> None:
-    """Clean a data directory and our folders at the start: delete what killed writers left.
+    """Clean a data directory and its folders at the start: delete files of killed
+    writers, and set aside entries named like a folder that are no directory, such as
+    links.
 
-    An entry in the place of one of our folders that is no directory, such as a link, is
-    set aside.
+    Args:
+        root: data directory.
+        folders: names of the folders in it.
     """
     for folder in (root, *map(root.folder, folders)):
         folder.sweep()
@@ -321,10 +322,8 @@ def settle(root: Directory, folders: Sequence[str]) -> None:
 
 
 def ours(folder: Directory) -> list[str]:
-    """List the names of JSON documents in a folder, links among them, except
-    those set aside.
-
-    Sorted by name; [] if there is no such folder.
+    """List the names of JSON files and links in a folder, sorted, except those set aside;
+    [] if there is no such folder.
     """
     with suppress(FileNotFoundError), folder.entries() as entries:
         names = sorted(e.name for e in entries if e.name.endswith(".json"))

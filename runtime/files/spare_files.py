@@ -40,13 +40,14 @@ class SpareFiles:
         self._refill()
 
     def keep(self, name: str, data: bytes) -> None:
-        """Write a document, safe when this returns, into a spare file if the disk is full.
+        """Write a document and wait for the disk; on a full disk write it into a spare
+        file, padded with spaces.
 
-        Only a document of at most `SPARE_BYTES` fits, padded with spaces. Missing spare
-        files are then made, as far as there is room.
+        Into a spare file fits a document of at most `SPARE_BYTES`. Missing spare files
+        are then made, as far as there is room.
 
         Raises:
-            DatasetWriteError: the system refuses, and there is no spare file.
+            DatasetWriteError: the system refuses, and no spare file can be used.
         """
         try:
             self._folder.keep(name, data)
@@ -59,21 +60,21 @@ class SpareFiles:
             self._refill()
 
     def _keep_in_spare(self, name: str, data: bytes) -> bool:
-        """Write a document into a spare file and rename that to the document's name.
+        """Write a document over a spare file and rename that to the document's name, and
+        wait for the disk.
 
-        Spare files that are not usable are deleted.
-
-        The document that it replaces becomes a spare where it has the size of one.
+        The replaced document becomes a spare file if it has the size of one. Spare files
+        that are not usable are deleted.
 
         Args:
             name: of the document.
-            data: its content.
+            data: its content, of `SPARE_BYTES`.
 
         Returns:
             False if there is no usable spare file.
 
         Raises:
-            DatasetWriteError: the system cannot write.
+            DatasetWriteError, OSError: the system cannot write.
         """
         for spare in sorted(self._there):
             self._there.discard(spare)
@@ -96,7 +97,7 @@ class SpareFiles:
     def _save(self, name: str) -> None:
         """Keep a document that is about to be replaced as a spare file, by a second name.
 
-        Only if it is `SPARE_BYTES` long and a spare file is missing; one is made at most.
+        Nothing happens unless it has `SPARE_BYTES` and a spare file is missing.
         """
         about = self._folder.stat(name)
         free = [spare for spare in NAMES if spare not in self._there]

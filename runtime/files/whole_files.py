@@ -20,16 +20,15 @@ OF_LIBRARIES: Final = re.compile(r"No space left|errno = (\d+)|requested and \d+
 
 
 def require_bytes(path: Path, needed: int) -> None:
-    """Refuse a file that its disk cannot hold, before anything of it is written.
-
-    Room for other files is not kept.
+    """Check that a disk has room for a file, before anything of it is written.
 
     Args:
         path: of the file.
         needed: its size [bytes].
 
     Raises:
-        OSError: names `path`, and says what it takes and what is free.
+        OSError: ENOSPC, the file is larger than the free space; names `path` and both
+            sizes.
     """
     free = free_bytes(path)
     if needed > free:
@@ -41,17 +40,19 @@ def require_bytes(path: Path, needed: int) -> None:
 
 @contextmanager
 def room_named(path: Path) -> Iterator[None]:
-    """Have every library say alike that the disk is full, and name the file that was asked for.
+    """Convert errors of a full disk, of any library, within the context to one OSError
+    that names the requested file.
 
-    An error without a number counts as a full disk if less than `FULL_BYTES` are free. An
-    error that names another file is raised as it is.
+    An error of a known library text, or without a number while less than `FULL_BYTES` are
+    free, counts as a full disk. An error that names another file is raised as it is.
 
     Args:
-        path: what shall be written; the file that is written may be a temporary one beside it.
+        path: requested file; the written one may be a temporary one beside it.
 
     Raises:
-        OSError: names `path`, with the system's number and the bytes that are free; of another
-            kind, with the system's own words.
+        OSError: of a full disk, with the system's number, `path` and the free bytes;
+            another one with `path` and the system's own words.
+        RuntimeError: of a library, for another reason.
     """
     try:
         yield
@@ -76,9 +77,8 @@ def room_named(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a path to write; the file replaces `path` as a whole, and a failure leaves nothing.
-
-    It is a hidden file beside it.
+    """Yield the path of a hidden file beside `path` to write; at the end it replaces
+    `path`, after a failure it is deleted.
 
     Raises:
         OSError: see `room_named`.
@@ -99,7 +99,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def nearest_there(path: Path) -> Path:
-    """Return `path`, made absolute, if it exists, else the nearest folder above it that does."""
+    """Return `path`, made absolute, or the nearest folder above it that exists."""
     place = path.absolute()
     while not place.exists():
         place = place.parent

@@ -7,16 +7,14 @@ from pathlib import Path
 
 
 def require_writable(path: Path | None) -> None:
-    """Check that an output path can be written.
+    """Check that a file can be made in the folder of an output path, or in the nearest
+    one above it that exists.
 
-    Nothing is made at `path` itself, and whether an existing file may be replaced is not
-    checked.
-
-    A file without a name is made in the folder, or in the nearest one above it that
-    exists, and is gone at once.
+    A file without a name is made there and is gone at once. Whether an existing file may
+    be replaced is not checked.
 
     Args:
-        path: of a file or a folder that need not exist; None is no output.
+        path: of a file or a folder that need not exist; None is not checked.
 
     Raises:
         OSError: names `path`, and the system's reason.
