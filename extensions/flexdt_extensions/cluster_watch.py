@@ -44,11 +44,11 @@ class ClusterWatch(threading.Thread):
         self.join()
 
     def run(self) -> None:
-        """Tend the jobs every `EVERY_S` with the present workers, and print what there is to
-        say.
+        """Call `tend` every `EVERY_S` with the present workers and print its lines, until
+        closed or the scheduler is lost.
 
-        A CommandError is kept in `error`, and the client closed, which ends the waiting for
-        results.
+        A CommandError ends it: it is kept in `error`, and the client is closed, which
+        ends the waiting for results.
         """
         while not self._over.wait(EVERY_S):
             try:

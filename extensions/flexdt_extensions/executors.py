@@ -38,10 +38,10 @@ from flexdt_extensions.slurm_jobs import REFUSED, SlurmJobs, Tend, lifetime_s
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read the content of a TOML file.
+    """Read and parse a TOML file in UTF-8.
 
     Raises:
-        CommandError: no TOML.
+        CommandError: it is no TOML; names the file.
         OSError: the file cannot be read.
     """
     try:
@@ -77,10 +77,13 @@ SCHEDULER_S = 10.0
 def executor(
     jobs: int | None, scheduler: str | None
 ) -> AbstractContextManager[Executor | None]:
-    """Choose an executor to map tasks with: a dask scheduler, own processes, or None
-    for this process.
+    """Choose an executor to map tasks with.
 
-    At most one job and no scheduler: None. A scheduler comes before `jobs`.
+    A scheduler comes before `jobs`. `jobs` None is the number of cores.
+
+    Returns:
+        A context that yields the executor of a dask scheduler or of own processes; None
+        for at most one job.
     """
     if scheduler is not None:
         return dask_executor(scheduler)
@@ -95,9 +98,12 @@ def _count(jobs: int | None) -> int:
 
 @contextmanager
 def processes(jobs: int | None) -> Iterator[Executor]:
-    """Start spawned processes of one thread each, which end with this one, however it ends.
+    """Start `jobs` spawned processes of one thread each, which end with this one, however
+    it ends.
 
-    Afresh, because a fork of a process whose kernels run in threads (OpenMP) is ended by them.
+    They are spawned, as the kernels' threads (OpenMP) would end a fork. Meanwhile the
+    environment limits libraries to one thread; it is restored at the end, where waiting
+    tasks are cancelled.
     """
     before = {name: os.environ[name] for name in SINGLE if name in os.environ}
     pool = ProcessPoolExecutor(
@@ -114,9 +120,11 @@ def processes(jobs: int | None) -> Iterator[Executor]:
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent has ended; by itself it would wait for work for ever.
+    """Ignore SIGINT in this worker and exit it at once with code 1 when its parent has
+    ended.
 
-    Ctrl-C in a terminal reaches every process; it is the parent that decides.
+    Ctrl-C in a terminal reaches every process; the parent decides. Without a parent
+    process nothing is watched.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
@@ -133,10 +141,10 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
-    """Connect to the workers of a dask scheduler.
+    """Connect to the workers of a dask scheduler, and watch them while the context lasts.
 
     Silences the log of dask and its connections for the whole process. An error in the
-    body that is none of the cluster is raised as it is.
+    context that is not the cluster's is raised as it is.
 
     Args:
         address: of a scheduler, or a cluster object of dask.
@@ -184,9 +192,8 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
 def _readable_error(
     error: Exception, address: Any, killed: type[Exception]
 ) -> CommandError | None:
-    """Convert an error of dask's into one for people.
-
-    A lost scheduler, or workers that died of one task.
+    """Convert an error of dask, a lost scheduler or workers that died of one task, to one
+    for people.
 
     Args:
         error: of any kind.
@@ -194,7 +201,7 @@ def _readable_error(
         killed: dask's error on workers that died.
 
     Returns:
-        The error; None if it is not one of dask's.
+        The error; None for any other error.
     """
     if isinstance(error, CancelledError):
         return CommandError(
@@ -269,7 +276,7 @@ def job_script(wanted: Slurm) -> str:
 def slurm_executor(wanted: Slurm) -> Iterator[Executor]:
     """Submit SLURM jobs and connect to their workers; cancel the jobs at the end.
 
-    The error for a missing `sbatch` comes first.
+    Jobs that end early are replaced while the context lasts.
 
     Args:
         wanted: number, size and queue of the jobs.
@@ -307,10 +314,10 @@ def slurm_workers(path: Path) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def _same_signals() -> Iterator[None]:
-    """Leave this process's signal handlers as they were.
+    """Restore this process's signal handlers at the end of the context.
 
-    dask-jobqueue sets one when it is imported, with which Ctrl-C ends a program as if all were
-    done.
+    dask-jobqueue sets one when it is imported, with which Ctrl-C would end a program as
+    if all were done.
     """
     before = {number: signal.getsignal(number) for number in signal.valid_signals()}
     try:

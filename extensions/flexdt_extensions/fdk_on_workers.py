@@ -69,8 +69,12 @@ def move(made: Path, path: Path) -> None:
 
 
 def slabs(grid: Grid) -> list[tuple[int, int]]:
-    """List the layers (first, last) of each slab: a power of two, so that slabs can be
-    halved."""
+    """List the layers (first, end) of each slab of a volume; a slab has a power of two of
+    layers, the last one perhaps fewer.
+
+    There are at most CHUNK layers in one, and half as many until it has at most
+    SLAB_BYTES or a SLABS-th of the volume.
+    """
     each = CHUNK
     (nz, ny, nx) = grid.shape
     while each > 1 and 4 * each * ny * nx > max(SLAB_BYTES, grid.bytes // SLABS):
@@ -95,7 +99,8 @@ def levels(grid: Grid) -> list[tuple[int, int, int]]:
 def create(path: Path, grid: Grid) -> Any:
     """Create the group with its empty arrays, one for each resolution.
 
-    An existing group is overwritten; all voxels are nan until written.
+    An existing group is overwritten; all voxels are nan until written. Its metadata are
+    OME-Zarr 0.5, with places in mm.
 
     Args:
         path: of the group.
@@ -154,8 +159,8 @@ def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
 
 
 def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
-    """Write a slab as `put`, from another process: files appear when complete, that of `mark`
-    last.
+    """Write a slab as `put`, from another process: into a temporary folder first, whose
+    flushed files are then moved to the store, that of `mark` last.
 
     Args:
         path: of the store.
@@ -164,7 +169,8 @@ def put_whole(path: Path, grid: Grid, slab: int, values: Float32Array) -> None:
         values: (layers, ny, nx).
 
     Raises:
-        OSError: it cannot be written; FileNotFoundError where the store is no longer there.
+        OSError: it cannot be written; FileNotFoundError where the store is no longer
+            there.
     """
     with TemporaryDirectory(
         prefix="slab-", dir=path.parent, ignore_cleanup_errors=True
@@ -208,7 +214,7 @@ class VolumeFormat:
         """Yield a function that takes the layers in order; at the end `part` is complete
         and becomes `path`.
 
-        After an error `part` does not become `path`.
+        After an error `part` stays as it is.
 
         Args:
             part: temporary path.
@@ -238,8 +244,12 @@ class VolumeFormat:
 
     @staticmethod
     def read(path: Path) -> tuple[Float32Array, float, Sequence[float], bool]:
-        """Read values, voxel [mm] and the centre (x, y, z) [mm] of the first voxel,
-        marked by True."""
+        """Read a volume from its store.
+
+        Returns:
+            Values (z, y, x), voxel [mm], centre (x, y, z) of the first voxel [mm], and
+            True, which marks that place.
+        """
         group = opened(path)
         (scale,) = group.attrs["ome"]["multiscales"]
         size, place = scale["datasets"][0]["coordinateTransformations"]
@@ -272,8 +282,8 @@ class SlabWork:
 
 
 def make_slab(work: SlabWork, slab: int, store: Path, made_by: str) -> bool:
-    """Make and write one slab; a plain function, so that it can be sent to another
-    process.
+    """Reconstruct one slab by FDK and write it; a plain function, so that it can be sent
+    to another process.
 
     Args:
         work: the volume.
@@ -317,10 +327,10 @@ def fdk_on_workers(
     pool: Executor,
     tell: Callable[[float, float], None],
 ) -> list[str]:
-    """Make the missing slabs, then the file.
+    """Make the missing slabs of a volume on workers, then the file, and delete the slabs'
+    folder.
 
-    Slabs that exist already, of the same data and request, are kept; the only doubt is a
-    mixture of devices and processors.
+    Slabs that exist already, of the same data, request and version, are kept.
 
     Args:
         views: the frames, of a data set in a folder.
@@ -331,7 +341,7 @@ def fdk_on_workers(
         tell: called with slabs done and slabs to do.
 
     Returns:
-        Doubts about the volume.
+        A warning if devices made some of the slabs and processors others; else [].
 
     Raises:
         LimitError: another algorithm, or a data set in memory.
@@ -384,11 +394,9 @@ def fdk_on_workers(
 
 
 def as_made(running: Sequence[Future[_T]]) -> Generator[_T, None, None]:
-    """Yield results in the order in which they come; an error of one task cancels the
-    others.
+    """Yield results in the order in which they come.
 
-    A caller that may fail between two results closes it, so that this cancels the others,
-    too.
+    An error of one task, or closing the generator, cancels those that have not begun.
     """
     try:
         for future in as_completed(running):
@@ -399,11 +407,13 @@ def as_made(running: Sequence[Future[_T]]) -> Generator[_T, None, None]:
 
 
 def folder_of(out: Path, identity: object) -> tuple[Path, str]:
-    """Name the folder next to `out` for the unfinished volume; returns flexdt's
-    version as well.
+    """Name the hidden folder next to `out` for the unfinished volume; nothing is made.
 
-    Its name has a hash of that version and `identity`, so other requests have other
+    The name has a hash of flexdt's version and `identity`, so other requests have other
     folders.
+
+    Returns:
+        The path, and the version.
     """
     made_by = version("flexdt")
     text = json.dumps([made_by, identity], sort_keys=True, default=str)
@@ -412,8 +422,10 @@ def folder_of(out: Path, identity: object) -> tuple[Path, str]:
 
 
 def same_version(made_by: str) -> None:
-    """Check, on a worker, that it has the same version of flexdt as the requesting
-    process.
+    """Check, on a worker, that it has the version of flexdt of the requesting process.
+
+    Args:
+        made_by: version of that process.
 
     Raises:
         TwinError: it has another.
@@ -425,8 +437,8 @@ def same_version(made_by: str) -> None:
 
 
 def _finish(store: Path, out: Path, grid: Grid) -> None:
-    """Move a complete store to `out` if that is .zarr; else write its finest volume into
-    a file of the other format, and leave the store.
+    """Move a complete store to `out` if that is .zarr; else copy its finest volume into a
+    file of the other format, slab by slab.
     """
     if out.suffix.lower() == ".zarr":
         move(store, out)

@@ -89,7 +89,8 @@ class Online:
 
 
 def require_estimated(free: Sequence[str], tolerance: Mapping[str, float]) -> None:
-    """Check that there are tolerances, all for estimated parameters.
+    """Check that there is at least one tolerance, and that each is for an estimated
+    parameter.
 
     Args:
         free: names of the estimated parameters.
@@ -146,13 +147,14 @@ def begin(
 
 
 def feed(state: Online, pose: Poses, detections: Detections) -> Online:
-    """Add one more frame.
+    """Add one more frame, and renew the fit if the beads are known.
 
-    Until the geometry is known, attempts to distinguish all beads are repeated; then the
-    spots are assigned to the beads that the fit predicts, and the fit renewed.
+    Until there is an identifiable fit, all frames are searched for a distinction of the
+    beads. Then spots are assigned to the beads where the fit predicts them, within
+    GATE_PX and GATE_SIGMAS sigmas of the prediction.
 
     Args:
-        state: before the frame.
+        state: before the frame; not changed.
         pose: nominal pose of the frame (one).
         detections: spots found in it.
 
@@ -189,12 +191,13 @@ def feed(state: Online, pose: Poses, detections: Detections) -> Online:
 
 
 def _first(state: Online) -> Online:
-    """Attempt to distinguish the beads from all frames so far; on success return the
-    state with tracks and a first fit.
+    """Search all frames so far for a distinction of the beads, and make the first fit
+    from it.
 
-    Returns the state unchanged with fewer than `FIRST_FRAMES` frames or 6 spots, and if
-    nothing is found or it is ambiguous, explains less than 60 % of the spots, or has more
-    than 1 px rms.
+    Returns:
+        The state with tracks and fit; unchanged with fewer than `FIRST_FRAMES` frames or
+        6 spots, and if the result is ambiguous, explains less than 60 % of the spots, or
+        has more than 1 px rms.
     """
     assert state.poses is not None
     if len(state.detections) < FIRST_FRAMES or sum(len(d) for d in state.detections) < 6:
@@ -281,7 +284,7 @@ class NextAngle:
 def next_angle(
     state: Online, pose: Poses, candidates: npt.ArrayLike, tolerance: Mapping[str, float]
 ) -> NextAngle:
-    """Choose the angle after which the worst sigma, in units of its tolerance, is
+    """Choose the angle whose frame would make the worst sigma, in units of its tolerance,
     smallest.
 
     Args:
@@ -323,10 +326,10 @@ def next_angle(
 
 
 def _noise_px(fit: FitResult) -> float:
-    """Estimate the typical standard deviation of a used position [px], with residuals
-    and enlargement.
+    """Estimate the typical standard deviation of a used position [px], at least 1e-4.
 
-    At least 1e-4 px; where the fit's noise is not finite, it counts as 1.
+    It is the median of the stated ones, times the fit's noise factor (1 if that is not
+    finite) and the root of its enlargement.
     """
     whiten = fit.problem.whiten[fit.certificate.used]
     stated = float(np.median(1.0 / np.sqrt(whiten[:, 0] * whiten[:, 2])))

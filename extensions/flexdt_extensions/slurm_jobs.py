@@ -66,9 +66,10 @@ class SlurmJobs:
         self._made = self._barren = 0
 
     def submit(self) -> None:
-        """Start the missing jobs with sbatch.
+        """Submit the missing jobs with sbatch, each with a name of its own for its
+        workers.
 
-        Jobs are named and kept; those submitted before an error stay.
+        Jobs submitted before an error stay.
 
         Raises:
             CommandError: sbatch refuses, in its own words.
@@ -86,10 +87,10 @@ class SlurmJobs:
             self.jobs.append(Job(found[0], name))
 
     def tend(self, workers: Collection[str]) -> list[str]:
-        """Replace jobs that have left the queue.
+        """Note which jobs have workers, and replace jobs that have left the queue.
 
-        Jobs are replaced only if the queue could be read; where no worker is connected, a
-        line says what is waited for.
+        Nothing is replaced if the queue cannot be read. Without a connected worker, a
+        line names the jobs that are waited for.
 
         Args:
             workers: names of those that are connected.
@@ -98,7 +99,7 @@ class SlurmJobs:
             Lines of progress: states of the queue, ended jobs and errors.
 
         Raises:
-            CommandError: jobs end before a worker of theirs has come.
+            CommandError: `MAX_BARREN` jobs in a row ended before a worker of theirs came.
         """
         for job in self.jobs:
             job.seen = job.seen or any(map(job.has, workers))
@@ -116,8 +117,10 @@ class SlurmJobs:
         self.jobs = []
 
     def _queue(self) -> tuple[dict[str, str] | None, list[str]]:
-        """Read job id -> its state and reason from squeue, with no messages; (None, [its
-        message]) where it fails.
+        """Read this user's jobs from squeue.
+
+        Returns:
+            Job id -> state and reason, and []; if squeue fails None, and its message.
         """
         said = _run("squeue", "--noheader", "--me", "--format=%i %T (%r)")
         if said.returncode:

@@ -62,13 +62,14 @@ def watch(
     priors: Mapping[str, float] | None = None,
     tell: Callable[[Online], object] = lambda state: None,
 ) -> Watched:
-    """End a job once a calibration from its frames is accurate enough.
+    """Follow a job's frames, and end the job once the server's calibration from them is
+    accurate enough.
 
     Args:
         client: of the twin that runs it; it need not be in control.
         phantom: the scanned one; one that ships.
         tolerance: parameter -> sufficient sigma, edge units.
-        job: its name; the current one if left out.
+        job: its id; None for the current one.
         free: parameters to estimate.
         priors: as of `flexdt calibrate`; None: the machine's, or the assumed ones of a
             machine that does not ship.
@@ -117,7 +118,8 @@ def watch(
 
 
 def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the projections of a job as they are complete, until it ends.
+    """Yield the projections of a job as they are complete, until it ends; look every
+    `POLL_S`.
 
     Of a scan of more than 2000 images, the wire has as many that are spread evenly.
 
@@ -126,7 +128,7 @@ def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
         job: its name.
 
     Yields:
-        Data set, line integrals and nominal cone_vec.
+        Name of the data set, line integrals (rows, cols) and nominal cone_vec (12).
     """
     seen = set[int]()
     while True:
@@ -147,8 +149,8 @@ def _frames(client: TwinClient, job: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _machine_priors(client: TwinClient) -> dict[str, float]:
-    """Return the prior widths of the twin's machine with its default profile; the general
-    ones if this package lacks it.
+    """Return the prior widths of the twin's machine with its default profile, or the
+    assumed general ones for a machine that does not ship.
     """
     try:
         machine = builtin_machine(client.server.machine)

@@ -91,8 +91,8 @@ def batch(
     last = 0.0
 
     def tell(done: int, items: int, rate: float) -> None:
-        """Print items done, their rate and the estimated time left [s], at most every
-        PROGRESS_S and at the end.
+        """Note items done, their rate and the estimated time left [s]; at most every
+        PROGRESS_S, and at the end.
         """
         nonlocal last
         if time.monotonic() - last >= PROGRESS_S or done == items:

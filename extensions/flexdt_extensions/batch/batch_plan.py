@@ -94,7 +94,7 @@ KINDS: Final = tuple(k for k in _SAMPLERS if k != "fixed")
 
 
 def _number(value: object) -> bool:
-    """Check whether a value is a finite number, not a bool."""
+    """Return whether a value is a finite number, not a bool."""
     return (
         isinstance(value, int | float)
         and not isinstance(value, bool)
@@ -105,8 +105,8 @@ def _number(value: object) -> bool:
 def parse(value: object) -> Draw:
     """Parse a draw from a value of TOML.
 
-    A `Draw` is returned as it is. A list must fit its kind: two numbers, the lower first,
-    for all but "choice" and "normal" (mean and standard deviation).
+    A `Draw` is returned as it is. "choice" takes texts or numbers; every other kind takes
+    two numbers: "normal" mean and standard deviation, the others the lower one first.
 
     Args:
         value: a number, a text, or a table of one kind and its list.
@@ -152,12 +152,10 @@ def parse(value: object) -> Draw:
 
 
 def _numbers(value: object) -> Draw:
-    """Read a number or a distribution of numbers.
+    """Parse a number or a distribution of numbers.
 
     Raises:
-        ValueError: it is none.
-
-    ValueError also for a distribution that draws texts.
+        ValueError: it is neither, or draws texts.
     """
     draw = parse(value)
     if any(isinstance(v, str) for v in draw.values):
@@ -166,7 +164,7 @@ def _numbers(value: object) -> Draw:
 
 
 def _positive(value: object) -> Draw:
-    """Read a number above 0, or a distribution of such.
+    """Parse a number above 0, or a distribution of such; a normal one is never of such.
 
     Raises:
         ValueError: it is none.
@@ -182,9 +180,7 @@ def _positive(value: object) -> Draw:
 
 
 def _counts(value: object) -> Draw:
-    """Read a whole number above 0, or a choice of such.
-
-    Returns the draw.
+    """Parse a whole number above 0, or a choice or interval of such.
 
     Raises:
         ValueError: it is none.
@@ -198,10 +194,10 @@ def _counts(value: object) -> Draw:
 
 
 def _names(value: object) -> Draw:
-    """Read a name, or a choice of names.
+    """Parse a text, or a choice of texts.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is neither.
     """
     draw = parse(value)
     if not all(isinstance(v, str) for v in draw.values):
@@ -279,7 +275,8 @@ class PhantomTable(_Table):
 
     @model_validator(mode="after")
     def _one(self) -> PhantomTable:
-        """Check that one of name, cuboid and spheres is given.
+        """Check that exactly one of name, cuboid and spheres is given, and return the
+        table.
 
         Raises:
             ValueError: none or several.
@@ -327,7 +324,8 @@ class Camera(_Table):
 
     @model_validator(mode="after")
     def _either(self) -> Camera:
-        """Check that mode and roi are given, or shape and pixel_mm, or neither.
+        """Check that shape and pixel_mm are given together, without mode and roi, or not
+        at all; return the table.
 
         Raises:
             ValueError: a mixture.
@@ -384,12 +382,11 @@ class Calibrate(_Table):
 
     @model_validator(mode="after")
     def _known(self) -> Calibrate:
-        """Check the names of free parameters, and the priors.
-
-        Returns the table itself.
+        """Check the names of free parameters, and the priors; return the table.
 
         Raises:
-            ValueError: an unknown name, or priors that do not fit.
+            ValueError: an unknown name (lists the allowed ones), or priors that do not
+                fit.
         """
         wrong = [n for n in self.free if n not in NAMES]
         if wrong:
@@ -427,13 +424,13 @@ class Plan(_Table):
 
     @model_validator(mode="after")
     def _fits(self) -> Plan:
-        """Check tables against each other: errors' names, kind, phantom, images and
-        camera.
+        """Check tables against each other, and return the plan.
 
-        Returns the plan itself.
+        Errors must be of known parameters; calibrations have beads and no volumes;
+        physics other than ideal needs the machine's panel; volumes need line integrals.
 
         Raises:
-            ValueError: two of them do not go together.
+            ValueError: the first that does not hold.
         """
         wrong = [n for n in self.errors if n not in NAMES]
         if wrong:
@@ -472,8 +469,12 @@ class Plan(_Table):
 def parse_plan(document: dict[str, Any], name: str = "plan") -> Plan:
     """Validate a document and return its plan.
 
+    Args:
+        document: content of the TOML file.
+        name: of the file, for messages.
+
     Raises:
-        CommandError: every problem with its key path.
+        CommandError: lists every problem with its key path.
     """
     try:
         return Plan.model_validate(document)

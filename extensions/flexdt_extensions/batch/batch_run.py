@@ -55,15 +55,16 @@ class Store:
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
-        """Open the results of a batch in a folder, which is made if it is not there, and take
-        up an interrupted one.
+        """Open the results of a batch in a folder, which is made if it is missing, or go
+        on with an interrupted one.
 
         Args:
             folder: of the results.
             plan: of the batch.
 
         Raises:
-            CommandError: the folder holds another batch.
+            CommandError: the folder holds another batch or other files.
+            TwinError: zarr is not installed.
         """
         self.folder = folder
         self.plan = plan
@@ -91,8 +92,10 @@ class Store:
         return (i for i in range(self.plan.batch.items) if i not in self.records)
 
     def put(self, outcome: ItemOutcome) -> None:
-        """Keep an item; once its shard is complete, write that: arrays first (blank for
-        failed items), then log lines.
+        """Keep an item; once all items of its shard are kept, write the shard's arrays,
+        then its log lines.
+
+        Arrays of failed items are filled with the blank value.
         """
         self._waiting[outcome.index] = outcome
         shard = self._shard(outcome.index)
@@ -113,12 +116,14 @@ class Store:
         return range(start, min(start + size, self.plan.batch.items))
 
     def finish(self) -> dict[str, Any]:
-        """Write tables and manifest, after all items are done.
-
-        The log is sorted by item.
+        """Write tables and manifest, after all items are done, and sort the log by item.
 
         Returns:
-            The manifest: plan, arrays, counts, figures, items and their checksum.
+            The manifest: format, version, plan with checksum, arrays, counts, figures,
+            items and their checksum.
+
+        Raises:
+            KeyError: an item is missing.
         """
         items = [self.records[i] for i in range(self.plan.batch.items)]
         self._tables(items)
@@ -142,8 +147,8 @@ class Store:
     # -- helpers -------------------------------------------------------------------------------
 
     def _sort_log(self, items: list[dict[str, Any]]) -> None:
-        """Rewrite the log in the order of `items`, independent of their completion, and
-        open it again for appending.
+        """Rewrite the log, head first, in the order of `items`, and open it again for
+        appending.
         """
         self._log.close()
         lines = [_canonical(record) + "\n" for record in (self._head, *items)]
@@ -158,8 +163,8 @@ class Store:
     def _read(self) -> bool:
         """Read the log of finished items; a line that a crash cut off is dropped.
 
-        Fills `records`; items of a shard whose lines are incomplete are dropped, to be
-        computed again.
+        Fills `records`, but not with items of a shard whose lines are incomplete: they
+        are computed again.
 
         Returns:
             Whether there was a log of this plan.
@@ -203,8 +208,8 @@ class Store:
     def _open(self, known: bool) -> dict[str, Any]:
         """Open the arrays of the batch, or create them.
 
-        Arrays that are incomplete are created anew; empty items are nan (0 in uint16).
-        Files that a crash left are removed.
+        With a log, files that a crash left are removed; if an array is missing, or
+        without a log, all are created anew. Empty items are nan (0 in uint16).
 
         Args:
             known: whether the folder has a log of this plan.
@@ -280,12 +285,13 @@ def open_arrays(folder: Path) -> Any:
 
 
 def figures(items: list[dict[str, Any]]) -> dict[str, Any]:
-    """Sum up the identifiable calibrations; empty for images.
+    """Sum up the identifiable calibrations.
 
     Returns:
-        Counts, and for each parameter the mean absolute error, the root mean square of error
-        over stated sigma, and the share within 1.96 sigma (0.95 if errors are Gaussian and
-        sigmas true).
+        {} without calibrations; else the numbers "judged" and "identifiable", and
+        "parameters": name -> mean absolute error ("mae"), root mean square of error over
+        stated sigma ("rms_pull"), and share within 1.96 sigma ("within_95"; 0.95 if
+        errors are Gaussian and sigmas true).
     """
     judged = [i for i in items if "identifiable" in i]
     used = [i for i in judged if i["identifiable"]]
@@ -342,7 +348,7 @@ def run_batch(
     *,
     tell: Tell | None = None,
 ) -> dict[str, Any]:
-    """Compute the missing items of a batch.
+    """Compute the missing items of a batch, write its tables, and return a summary.
 
     The summary is also written to `run.json`; `items_per_s` is None if nothing was
     missing.
@@ -354,7 +360,8 @@ def run_batch(
         tell: called with items done, items in all and items a second after each.
 
     Returns:
-        Summary: counts, time, throughput and paths.
+        Summary: name, kind, folder, checksums, figures, counts, time [s] and items a
+        second.
 
     Raises:
         CommandError: another plan's folder; or a worker died (completed items stay).
@@ -391,8 +398,8 @@ def run_batch(
 def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> None:
     """Compute the missing items on the pool and store each outcome as it comes.
 
-    Results that run out of order are stored as they come; few are in flight, by their
-    size. Calls that have not begun are cancelled at an error.
+    At least 4 items are in flight, at most `MAX_IN_FLIGHT`, and of `MAX_WAITING_BYTES` in
+    all. At an error the calls that have not begun are cancelled.
 
     Args:
         store: of the batch.

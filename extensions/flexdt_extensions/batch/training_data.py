@@ -63,8 +63,9 @@ class Augment:
     def apply(self, sample: Sample, rng: np.random.Generator) -> None:
         """Change a sample's projections, and the geometry they were truly made with.
 
-        Images are shifted by normal amounts [px], and get Poisson noise of a random
-        number of photons.
+        All images are shifted by one normal amount along columns and rows [px], which
+        `cone_vec_true` follows, and get Poisson noise of one random number of photons;
+        each only if it is set.
 
         Args:
             sample: arrays by name; `projections` and `cone_vec_true` are replaced.
@@ -170,8 +171,8 @@ class TrainingData:
         return np.asarray(rng.permutation(shards)[rank::ranks])
 
     def shuffled(self, rank: int = 0, ranks: int = 1) -> Iterator[Sample]:
-        """Yield this epoch's samples of a process: shards in `order`, each read once, shuffled
-        inside.
+        """Yield this epoch's samples of a process: shards in `order`, each read once and
+        shuffled inside; failed items are left out.
 
         Args:
             rank: number of the process.
@@ -194,8 +195,8 @@ class TrainingData:
                 )
 
     def _finish(self, index: int, sample: Sample) -> Sample:
-        """Augment a sample in place, with a generator seeded by seed, epoch and index,
-        and return it with its index.
+        """Augment a sample in place, by draws that depend on seed, epoch and index, and
+        return a copy with its index.
         """
         if self.augment is not None:
             rng = np.random.default_rng((self.seed, self.epoch, index, 1))

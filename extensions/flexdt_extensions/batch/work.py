@@ -95,9 +95,10 @@ class Item:
 
 
 def draw_item(plan: Plan, index: int) -> Item:
-    """Draw item `index` of a plan.
+    """Draw all values of item `index` of a plan, its phantom and its poses.
 
-    Projections are also checked for place, tube and distances of the machine.
+    Of projections the phantom's placement and the tube are checked, and with a machine's
+    camera the distances.
 
     Args:
         plan: of the batch.
@@ -172,17 +173,16 @@ def _camera(
 ) -> tuple[CameraSettings | None, tuple[int, int], float, tuple[float, float]]:
     """Determine the camera of a plan.
 
-    A made-up detector has a shape and a pixel size; else mode and region of the machine's
-    are replaced by the plan's, if given.
+    With shape and pixel size in the plan it is a made-up detector; else the machine's
+    camera with the plan's mode and ROI, if given.
 
     Args:
         plan: its camera table and averages.
         machine: of the plan.
 
     Returns:
-        Camera (None for a made-up detector), shape (rows, cols), pixel [mm], shift of the
-        ROI
-        from the panel's centre (columns, rows) [mm].
+        Camera (None for a made-up detector), shape (rows, cols), pixel [mm], and shift of
+        the ROI from the panel's centre along columns and rows [mm].
 
     Raises:
         TwinError: the ROI is not on the sensor.
@@ -220,9 +220,13 @@ def _camera(
 def _phantom(
     plan: Plan, index: int, rng: np.random.Generator
 ) -> tuple[Phantom, dict[str, Any]]:
-    """Draw an item's phantom as the plan says.
+    """Draw an item's phantom as the plan says: one by name, a cuboid with beads, or
+    spheres.
 
-    One by name, a cuboid with beads, or spheres (these with a generator of their own).
+    Args:
+        plan: of the batch.
+        index: number of the item; seeds the spheres' parts.
+        rng: of the other values.
 
     Returns:
         The phantom, and the drawn values by name for the manifest.
@@ -259,9 +263,7 @@ def _draw_cuboid(
 def _spheres(
     table: Spheres, rng: np.random.Generator, parts: np.random.Generator
 ) -> tuple[Phantom, dict[str, Any]]:
-    """Draw random spheres that do not touch, in a cylinder.
-
-    None touches another; the size is that of the cylinder.
+    """Draw random spheres that do not touch, in a cylinder, whose size is the phantom's.
 
     Args:
         table: numbers, radii, materials and the cylinder.
@@ -302,10 +304,7 @@ def _spheres(
 def _draw_place(
     radius: float, wide: float, high: float, others: list[Any], rng: np.random.Generator
 ) -> tuple[float, float, float] | None:
-    """Draw a place for a ball in a cylinder, clear of other balls.
-
-    None as well for a ball that does not fit the cylinder. Places are uniform in the
-    cylinder.
+    """Draw a place for a ball, uniform in a cylinder and clear of other balls.
 
     Args:
         radius: of the ball [mm].
@@ -315,7 +314,8 @@ def _draw_place(
         rng: generator.
 
     Returns:
-        The centre [mm]; None if none was found in MAX_TRIES.
+        The centre [mm]; None for a ball that does not fit into the cylinder, or if none
+        was found in MAX_TRIES.
     """
     if radius > wide or radius > high:
         return None
@@ -392,14 +392,17 @@ def _plan(text: str) -> Plan:
 
 
 def run_item(text: str, index: int) -> ItemOutcome:
-    """Compute one item.
-
-    A TwinError makes an outcome "failed" with its text and without arrays; else it has
-    the arrays, their SHA-256, figures and warnings of the exposure.
+    """Draw and compute one item; a TwinError becomes an outcome with status "failed" and
+    its text, without arrays.
 
     Args:
         text: the plan, as `Plan.text`.
-        index: which item.
+        index: number of the item.
+
+    Returns:
+        The outcome. Its record has seed, drawn parameters, status, figures, warnings of
+        the exposure and the SHA-256 of each array; an "error" among the figures is
+        "failed", too, with arrays.
     """
     plan = _plan(text)
     record: dict[str, Any] = {
@@ -438,7 +441,7 @@ def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
     """List warnings where the open beam's counts saturate or starve the panel, in the
     first view.
 
-    Empty unless the batch makes projections with counts or noise.
+    [] unless the batch makes projections with counts or noise by a machine's camera.
     """
     counted = plan.images.values == "counts" or plan.images.noise
     if plan.batch.kind != "projections" or item.camera is None or not counted:
@@ -455,7 +458,8 @@ def _open_beam_doubts(plan: Plan, item: Item) -> list[str]:
 def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
     """Compute an item's projections and, if the plan has it, their reconstruction.
 
-    FDK uses the true or the nominal geometry, as the plan says.
+    FDK uses the true or the nominal geometry, as the plan says, without estimating
+    errors.
 
     Args:
         plan: of the batch.
@@ -493,7 +497,7 @@ def _rng(plan: Plan, item: Item, frame: int) -> np.random.Generator | None:
 def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
     """Simulate an item's images by the ideal response, with noise if the plan has it.
 
-    Line integrals without noise do not pass the detector; noisy ones are taken from
+    Line integrals without noise do not pass the detector; noisy ones are the logarithm of
     counts.
 
     Args:
@@ -578,7 +582,8 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
 def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
     """Calibrate an item, from noisy bead points or from rendered images.
 
-    Points get noise from the item's own seed; images are rendered with noise.
+    Noise depends on the item's seed. Images are rendered with noise, and their beads
+    detected.
 
     Args:
         plan: of the batch.

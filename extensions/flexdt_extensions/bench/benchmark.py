@@ -267,16 +267,18 @@ def interleaved(
     once: frozenset[str] = frozenset(),
     budget_s: float = BUDGET_S,
 ) -> dict[str, CallTime]:
-    """Run contestants turn by turn and time them.
-
-    Returns name -> least and median time [s] and number of timed calls.
+    """Run contestants turn by turn and time their calls, each until `_enough`.
 
     Args:
         contestants: name to call; the first call of each is not counted (but for those in
-            `once`, which are called one time in all). A call that returns a float (seconds) has
-            been timed by itself, in its own process.
+            `once`, which are called one time in all). A call that returns a float
+            (seconds) has been timed by itself, in its own process.
         once: too slow for more.
-        budget_s: seconds a contestant may use before it drops out, after the least number.
+        budget_s: seconds a contestant may use before it drops out, after the least
+            number.
+
+    Returns:
+        Name -> least and median time [s] and number of timed calls.
     """
     times: dict[str, list[float]] = {name: [] for name in contestants}
     for name, call in contestants.items():
@@ -301,8 +303,16 @@ def interleaved(
 
 
 def _enough(rounds: int, spent_s: float, budget_s: float) -> bool:
-    """Check whether a contestant has run often enough: MIN_ROUNDS at least, and then until its
-    time or its rounds are spent.
+    """Return whether a contestant has run often enough: at least MIN_ROUNDS, and until
+    its time or its rounds are spent.
+
+    The most rounds are MAX_SHORT_ROUNDS as long as all together took less than SHORT_S,
+    else MAX_ROUNDS.
+
+    Args:
+        rounds: timed so far.
+        spent_s: by them [s].
+        budget_s: that they may take [s].
     """
     if rounds < MIN_ROUNDS:
         return False
@@ -429,9 +439,8 @@ def timed(
 
 
 def plain(name: str, ms: float, what: str) -> Entry:
-    """Make an entry of one time, without errors or peers.
-
-    All its errors are None, its peers empty; it has one view and the number of threads.
+    """Make an entry of one time of one view, with the number of threads; its errors are
+    None, its peers empty.
 
     Args:
         name: of the case.
@@ -472,7 +481,7 @@ def listing() -> list[str]:
 def run_bench(
     *, only: Sequence[str] = (), with_peers: bool = True, tell: Tell = lambda line: None
 ) -> Document:
-    """Measure and return the benchmark document.
+    """Run the cases on this machine and return the benchmark document.
 
     Args:
         only: names of cases to run, see `case_names`; all if empty.
@@ -481,10 +490,9 @@ def run_bench(
 
     Returns:
         {machine, cases: [{name, views, ms_per_view, median_ms_per_view, mean_error,
-        worst_error,
-        peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}], growth: {}};
-        errors are shares of the maximum against double-precision exact lengths, ratios are
-        peer / flexdt.
+        worst_error, peers: {name: {ms_per_view, mean_error}}, ratio: {name: x}, ...}],
+        growth: {}}. Errors are shares of the maximum against double-precision exact
+        lengths, ratios are peer / flexdt.
     """
     warm_up()
     found = peers() if with_peers else []
@@ -555,9 +563,8 @@ def _some_pixels(exact: np.ndarray[Any, np.dtype[np.float32]]) -> np.ndarray[Any
 
 
 def machine(missing: Mapping[str, str | None]) -> Document:
-    """Describe the machine of the figures: time, processor, load, versions, peers.
-
-    Returns them as one document, with the GPU and the load at the start.
+    """Describe the machine of the figures: time of the measurement (UTC), processor,
+    cores, threads, load, GPU, versions, and which peers took part.
 
     Args:
         missing: peer -> why it takes no part, or None.

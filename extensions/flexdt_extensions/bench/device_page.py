@@ -80,14 +80,13 @@ def by_events(work: Callable[[], object]) -> float:
 def _best(
     work: Callable[[], object], rounds: int, apart: Callable[[Any, Any], float]
 ) -> float:
-    """Measure the best of several calls; the first is not counted.
-
-    In the unit of `apart`.
+    """Call `work` `rounds` + 1 times and return the least time of all calls but the
+    first, in the unit of `apart`.
 
     Args:
         work: call to measure.
         rounds: counted calls.
-        apart: time between two pairs (clock [s], event), before and after a call.
+        apart: time between two pairs (clock [s], device event), before and after a call.
     """
     from numba import cuda
 
@@ -109,29 +108,28 @@ def _best(
 
 
 def run_device_bench(tell: Callable[[str], None]) -> Document:
-    """Measure all targets on the device.
+    """Measure all targets on the device, with ASTRA beside it where it loads.
 
     Args:
         tell: called with a line of text for each result.
 
     Returns:
         {device, cases, targets}: name, case -> views -> times, and lines of {target,
-        accepted,
-        wanted, measured, met}.
+        accepted, wanted, measured, met}.
     """
     lines: list[Document] = []
 
     def line(
         what: str, value: float | None, accepted: float, wanted: float, sign: int = 1
     ) -> None:
-        """Add a target's line: what was measured, and whether that is wanted, accepted, missed
-        or not measured; print it.
+        """Add a target's line: its limits, the measured value, and whether that is
+        wanted, accepted, missed or not measured; print it.
 
         Args:
             what: name of the target.
-            value: measured; None if it could not be.
-            accepted: limit.
-            wanted: limit.
+            value: measured; None if it could not be, with the reason in the line.
+            accepted: limit of "accepted".
+            wanted: limit of "wanted".
             sign: 1 where less is better, -1 where more is.
         """
         met = "not measured" if value is None else "missed"
@@ -196,8 +194,10 @@ def run_device_bench(tell: Callable[[str], None]) -> Document:
 def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
     """Measure one volume for each number of views a call.
 
-    On the device without copies: "kernel_ms", "adjoint_ms"; calls with copies: "call_ms",
-    "back_there_ms"; bound, ASTRA and, for some numbers of views, the processor.
+    "kernel_ms" and "adjoint_ms" are kernels alone, "call_ms" a call from host to host,
+    "back_there_ms" one on the device. "bound_ms" and "astra_ms" may be None. Back
+    projection with choice and by the processor is measured for all numbers of views but
+    the largest, errors and the processor's projection for the first.
 
     Args:
         name: of `SIZES`.
@@ -252,10 +252,11 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
 
 
 def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) -> None:
-    """Measure FDK and SIRT onto the second volume's grid.
+    """Measure FDK and SIRT onto the second volume's grid, and add their targets.
 
-    Ratios to ASTRA's and the kernels' times, None without ASTRA, and FDK's time from host
-    to host [s], with and without errors.
+    They are FDK's back projection over ASTRA's (None without it); for each kind of object
+    FDK's time from host to host [s], its ratio to the first kind, and that with errors to
+    without; and SIRT's iteration over its kernels.
 
     Args:
         line: adds a target: name, measured, accepted and wanted value.
@@ -332,8 +333,8 @@ def _quietly(call: Callable[[], object]) -> Callable[[], object]:
 
 
 def why_no_astra() -> str | None:
-    """Explain why ASTRA cannot take part: not installed, or fails to load; None where it
-    can.
+    """Return the reason why ASTRA cannot take part, not installed or fails to load; None
+    where it can.
     """
     if missing := absent(ASTRA):
         return missing
@@ -362,12 +363,14 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
     """Compute the least possible time [ms]; None where the device's speed is unknown
     (simulator).
 
-    The larger of the time to read the volume at measured speed, and of the instructions
-    for all voxels passed.
+    It is the larger of the time to read the volume once, by a measured copy on the
+    device, and of `INSTRUCTIONS_A_VOXEL` for each voxel that a ray passes, at the
+    device's nominal clock.
 
     Args:
         volume: to read once.
-        scan: views; the voxels passed by a ray are counted for the first.
+        scan: views onto `PANEL`; passed voxels are counted on rays of the first, 16
+            pixels apart.
     """
     from numba import config, cuda
 
@@ -397,7 +400,7 @@ def bound(volume: Volume, scan: ConeVec) -> float | None:
 
 def row(line: Document) -> str:
     """Format a target's line as a row of the page's Markdown table: target, accepted and
-    wanted limit, measured ("-" if None), whether met, and why.
+    wanted limit, measured ("-" if None), whether met, and why it was not measured.
     """
     if line["measured"] is None:
         value = "-"
@@ -409,8 +412,8 @@ def row(line: Document) -> str:
 
 
 def page(document: Document) -> str:
-    """Format the document as one page of Markdown: device, table of targets, and for each
-    case the times by views a call [ms].
+    """Format the document of `run_device_bench` as one page of Markdown: device, table of
+    targets, and for each case the times by views a call [ms].
     """
     head = "| target | to be accepted | wanted | measured | met |\n|---|---|---|---|---|"
     lines = [f"# {document['device']}", "", head, *map(row, document["targets"]), ""]

@@ -71,7 +71,7 @@ _PREPARED: list[Work] = []
 
 
 def _prepare(build: Callable[..., Work], arguments: tuple[object, ...]) -> None:
-    """Build the work in this process and keep it for `_PREPARED`; the process will end without
+    """Build the work and append it to `_PREPARED` of this process, which will end without
     ITK's own teardown.
 
     Warnings of the build are suppressed.
@@ -164,8 +164,8 @@ def rtk_volume(
     voxel_mm: tuple[float, float, float],
     center_mm: tuple[float, float, float],
 ) -> Any:
-    """Convert a volume (z, y, x) to an ITK image in RTK's axes, with spacing and origin
-    [mm].
+    """Convert a volume (z, y, x) to an ITK image in RTK's axes, whose y is flexdt's z and
+    z its -y, with spacing and origin [mm].
     """
     import itk
 
@@ -179,7 +179,8 @@ def rtk_volume(
 
 
 def rtk_stack(images: Float32Array, rows: FloatArray) -> Any:
-    """Convert projections to an ITK image in RTK's axes, pixel (0, 0) first.
+    """Convert projections to an ITK image with the panel's centre at the origin [mm],
+    pixel (0, 0) first.
 
     Args:
         images: (n, rows, cols).

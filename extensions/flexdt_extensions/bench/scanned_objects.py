@@ -29,7 +29,9 @@ NOISE_COUNT: Final = 32
 
 
 def field_mm(scan: ConeVec, shape: tuple[int, int]) -> float:
-    """Compute the radius about the z axis that the first view of a circle sees [mm]."""
+    """Compute the radius about the z axis that the first view of a circle sees on both
+    sides [mm], to the centres of the outer columns.
+    """
     ends = (np.array([0.0, shape[1] - 1.0]) - (shape[1] - 1) / 2)[:, None]
     ray = (scan.detector[0] + ends * scan.u[0] - scan.source[0])[:, :2]
     source = scan.source[0, :2]
@@ -87,10 +89,8 @@ def cut_off(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
 
 
 def holder(scan: ConeVec, shape: tuple[int, int]) -> Float32Array:
-    """Compute the images of a complete object and a rod that the panel's edge cuts in
-    some views.
-
-    (views, rows, cols); the complete object is a cylinder on the axis.
+    """Compute the images (views, rows, cols) of a cylinder on the axis, seen whole, and a
+    rod that the panel's edge cuts off in some views.
     """
     field = field_mm(scan, shape)
     return cylinders(

@@ -70,11 +70,10 @@ class Announcements(StreamResourceDataProvider):
     _last: StreamDatum | None = None
 
     def count(self) -> int:
-        """Count the events whose images the emitted documents name; dropped ones are
-        due again.
+        """Return the number of events whose images the emitted documents name.
 
-        The last announcement counts as dropped if the RunEngine has not filled in its
-        descriptor: the count goes back to its first event.
+        If the RunEngine has dropped the last announcement, which shows by a descriptor
+        that is not filled in, the count goes back to its first event and stays there.
         """
         if self._last is not None and not self._last["descriptor"]:
             self.last_emitted = self._last["indices"]["start"]
@@ -84,8 +83,8 @@ class Announcements(StreamResourceDataProvider):
     async def make_stream_docs(
         self, collections_written: int, collections_per_event: int
     ) -> AsyncIterator[StreamAsset]:
-        """Yield the documents of the images since the last call; keeps the last stream
-        datum.
+        """Yield the documents of the images since the last call, after going back to a
+        dropped announcement; the last stream datum is kept for `count`.
         """
         self.count()
         async for asset in super().make_stream_docs(
@@ -221,10 +220,10 @@ class _Files(DetectorDataLogic):
         self.announcements: Announcements | None = None
 
     async def prepare_unbounded(self, datakey_name: str) -> StreamableDataProvider:
-        """Choose folder and names of the next images; return the provider of their
-        documents.
+        """Choose folder and names of the next images, begin a series there, and return
+        the provider of their documents.
 
-        Loads the roll and takes the images' shape from the camera's fresh state.
+        The images' shape is that of the camera's present region.
         """
         info = self.where(datakey_name)
         self.roll.load(info.directory_path, info.filename)
@@ -320,9 +319,9 @@ class TwinCamera(ReadBeforeDescribed, StandardDetector):
 
     @AsyncStatus.wrap
     async def trigger(self) -> None:  # type: ignore[override]
-        """Take an image; images that no document names yet are overwritten.
+        """Take an image, once a staging or trigger that was interrupted has ended.
 
-        Waits first for a staging or trigger that was interrupted.
+        Images that no document names are overwritten.
         """
         if self._staging is not None:
             await (

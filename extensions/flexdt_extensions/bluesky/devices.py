@@ -68,14 +68,14 @@ class AxisLogic(MovableLogic[float]):
     async def check_move(self, new_position: float) -> None:
         """Check a move from the current position to a target; nothing moves.
 
-        Collisions are checked by the twin only if this axis wants it and the move is not
-        tiny.
+        The twin checks collisions if `collisions` is set and the move is larger than
+        `ARRIVAL_TOLERANCE`.
 
         Args:
             new_position: target [mm, deg].
 
         Raises:
-            LimitsExceeded: names the limit, or the two parts that would touch.
+            LimitsExceeded: beyond a limit, or two parts would touch; names them.
         """
         state = await self.link.fresh()
         axis = state.axes[self.axis]
@@ -104,11 +104,17 @@ class AxisLogic(MovableLogic[float]):
             )
 
     async def move(self, new_position: float, timeout: TimeoutCalculator) -> None:
-        """Move there.
+        """Move the axis and wait until it rests at the target; nothing if it has been
+        stopped.
+
+        Args:
+            new_position: target [mm, deg].
+            timeout: gives the longest wait [s].
 
         Raises:
             RpcError: a limit, a collision, a running job, or another controller.
             RuntimeError: another client stopped the axis on its way.
+            TimeoutError: it took too long.
         """
         if self.stopped:
             return
@@ -121,7 +127,7 @@ class AxisLogic(MovableLogic[float]):
                     return
 
     def _check_arrival(self, axis: AxisState, target: float, state: State) -> None:
-        """Check that an axis at rest is at its target.
+        """Check that an axis at rest is within `ARRIVAL_TOLERANCE` of its target.
 
         Raises:
             RuntimeError: it stopped before, perhaps by the emergency stop.
@@ -244,7 +250,7 @@ class TwinTube(ReadBeforeDescribed, StandardReadable):
         async def switch(on: bool) -> None:
             """Switch X-rays, and wait until they are ready or off.
 
-            It is over at once when they are off.
+            It returns at once when they are off.
 
             Raises:
                 RuntimeError: somebody else switched them meanwhile.
@@ -300,9 +306,9 @@ class TwinLab(Device, AsyncStageable):
         collisions: bool = True,
     ) -> None:
         """Make the devices of a machine's axes (also virtual ones), tube, camera and
-        scans, as attributes; arguments: see the class.
+        scans, as attributes; nothing connects yet.
 
-        Not connected yet.
+        Arguments: see the class.
         """
         if isinstance(machine, str):
             scanner = builtin_machine(machine)

@@ -179,7 +179,7 @@ class TwinFlyer(
 
     @AsyncStatus.wrap
     async def prepare(self, value: FlyScan) -> None:
-        """Check a complete scan; nothing moves.
+        """Check a complete scan and keep it for `kickoff`; nothing moves.
 
         A former job and its images are forgotten. A request is composed to a script for
         the machine.
@@ -212,9 +212,11 @@ class TwinFlyer(
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
         """Submit the prepared scan as a job, and announce the images of its data set;
-        does not wait for the scan.
+        return without waiting for the scan.
 
-        Raises if nothing is prepared.
+        Raises:
+            RuntimeError: nothing is prepared.
+            RpcError: the twin refuses the scan.
         """
         ready = self._ready()
         client = self._link.client
@@ -236,15 +238,14 @@ class TwinFlyer(
 
     @WatchableAsyncStatus.wrap
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
-        """Wait for the job's end.
-
-        Also raised if the scan was not started. The number of written images follows.
+        """Wait for the job's end, and count its written images.
 
         Yields:
             Progress: frames done and in all, time remaining [s].
 
         Raises:
-            RuntimeError: it did not end well; its data set is marked incomplete.
+            RuntimeError: the scan was not started, or did not end well (its data set is
+                then marked incomplete).
         """
         if self.job is None:
             raise RuntimeError(f"{self.name}: kickoff() must be called before complete()")
@@ -426,7 +427,11 @@ class TwinFlyer(
         return self.job is not None and self.job.state not in FINAL_STATES
 
     def _scanner(self) -> tuple[Machine, Profile]:
-        """Return machine and profile, those given, else those that the twin names."""
+        """Return machine and profile: those given, else those that the twin names.
+
+        Raises:
+            UnknownNameError: the twin's do not ship.
+        """
         server = self._link.client.server
         if self._machine is None:
             machine = builtin_machine(server.machine)
@@ -440,7 +445,7 @@ def _plan_scan(
 ) -> _Prepared:
     """Plan a script and check that its projections are one numbered series.
 
-    Only projections count, in the script's order.
+    Other images are not looked at.
 
     Args:
         scan: of the flyer.
@@ -579,11 +584,11 @@ def fly_scan(
 
 
 def checkpoint_before_close(plan: MsgGenerator[Any]) -> MsgGenerator[Any]:
-    """Set a checkpoint before each run's end, so that a later interruption repeats
-    nothing of it.
+    """Set a checkpoint before each run's end in a plan, so that a later interruption
+    repeats nothing of it.
 
-    For `RunEngine.preprocessors`. The RunEngine sets none itself, and would measure the
-    last point again.
+    It is for `RunEngine.preprocessors`. The RunEngine sets none itself, and would measure
+    the last point again.
     """
 
     def close(message: Msg) -> tuple[MsgGenerator[Any] | None, None]:
@@ -597,12 +602,12 @@ def checkpoint_before_close(plan: MsgGenerator[Any]) -> MsgGenerator[Any]:
 
 
 def _done(status: Any, seconds: float | None = None) -> MsgGenerator[bool]:
-    """Wait for a status, at most so long, or until an interruption.
+    """Wait for a status, at most `seconds` (None: for ever), or until an interruption.
 
     `bps.wait` cannot be repeated: its status is forgotten when it is interrupted.
 
     Returns:
-        Whether the status is done.
+        Whether the status is done; True for None, as in a simulator.
     """
     if status is None:
         return True

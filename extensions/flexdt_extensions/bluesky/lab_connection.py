@@ -90,9 +90,9 @@ class LabConnection:
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def connect(self) -> None:
-        """Connect, once.
+        """Connect, fetch the state and start to listen; nothing while it listens already.
 
-        Fetches a state and starts to listen; does nothing while it listens.
+        The connection is closed at the interpreter's end.
 
         Raises:
             ConnectionLost: no server answers.
@@ -117,7 +117,8 @@ class LabConnection:
         await self.client.close()
 
     def _end_at_exit(self) -> None:
-        """Close a connection left open, while RunEngine's loop still runs in its thread.
+        """Close a connection left open, if RunEngine's loop still runs in its thread;
+        wait at most `AT_EXIT_S`, and drop errors.
 
         Python's end would destroy its waiting tasks, each with lines on standard error.
         """
@@ -170,8 +171,8 @@ class LabConnection:
                     await self._news.wait()
 
     async def _listen(self) -> None:
-        """Take states and jobs of the twin and wake who waits; returns when the
-        connection is lost.
+        """Take the twin's states, and wake whoever waits in `states` at each event of
+        states and jobs; return when the connection is lost.
         """
         async with self.client.subscribe("state", "job", max_rate_hz=RATE_HZ) as events:
             with contextlib.suppress(ConnectionLost):
@@ -278,12 +279,11 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
         return f"flexdt://{self._link.address}/{self._path}"
 
     async def connect(self, timeout: float) -> None:
-        """Connect the laboratory, if it is not yet.
-
-        The error has the connection's error as its cause.
+        """Connect the laboratory, if it is not yet connected; `timeout` is not used.
 
         Raises:
-            NotConnectedError: no answer, or the server denies access.
+            NotConnectedError: no answer, or the server denies access; caused by the
+                connection's error.
         """
         try:
             await self._link.connect()
@@ -291,11 +291,10 @@ class TwinBackend(SignalBackend[_T], Generic[_T]):
             raise NotConnectedError(f"{self.source('', True)}: {error}") from error
 
     async def put(self, value: _T | None) -> None:
-        """Ask the twin for another value.
-
-        It then reads the state afresh.
+        """Set the value in the twin, and fetch the state.
 
         Raises:
+            RuntimeError: the value is None, or the member is read-only.
             RpcError: the twin rejects the value.
         """
         if self._put is None or value is None:

@@ -161,9 +161,9 @@ class ScenarioReader:
         )
 
     def _bins(self, rows: int, cols: int) -> tuple[int, int]:
-        """Read the numbers of pixels to bin along u and v; 1 without binning.
+        """Read the numbers of pixels to bin along u and v; 1 where not given.
 
-        Pixels that fill no binned pixel are cut off on both sides.
+        Pixels that fill no binned pixel are cut off on both sides, elsewhere.
 
         Args:
             rows: of the detector.
@@ -218,7 +218,10 @@ class ScenarioReader:
         "CW".
 
         The last frame is at `stop_angle`, or one step before it if `include_final_angle`
-        is false. Raises if start exceeds stop or the direction is neither CW nor CCW.
+        is false.
+
+        Raises:
+            ExchangeError: start exceeds stop, or the direction is neither CW nor CCW.
         """
         acquisition = self._at("acquisition")
         start = self._number(("acquisition", "start_angle"), _RAD)
@@ -245,7 +248,8 @@ class ScenarioReader:
         """Read source, detector, stage (u, w) or sample (r, t), in one of the `allowed`
         references.
 
-        Its parameters `u` and `w` need not be of unit length, but at right angles.
+        Its vectors need not be of unit length, but at right angles and in the reference
+        of the centre.
 
         Args:
             part: its object in the scenario.
@@ -306,7 +310,7 @@ class ScenarioReader:
         """Read a deviation: a translation [mm] or a rotation [rad] about a pivot.
 
         It is unknown to the reconstruction only where `known_to_reconstruction` is false.
-        Pivot is the sample's centre by default.
+        The axis is normalised; the default pivot is the part's own centre.
 
         Args:
             value: its object in the scenario.
@@ -381,8 +385,8 @@ class ScenarioReader:
     def _frames(self, value: object, where: str, units: Mapping[Any, float]) -> PerFrame:
         """Read a parameter with its drifts at every frame.
 
-        Drifts are spread over the frames; those unknown to reconstruction are in the real
-        values alone.
+        Drift values, of the document or of a file, are spread over the frames and added;
+        those unknown to reconstruction only to the real values.
 
         Args:
             value: number, or object with value, unit and drifts.
@@ -391,6 +395,9 @@ class ScenarioReader:
 
         Returns:
             Known and real values, (n,) each.
+
+        Raises:
+            ExchangeError: names file, key and the allowed values.
         """
         standard = self._value(value, where, units)
         known = np.full(self._count, standard)
@@ -419,19 +426,20 @@ class ScenarioReader:
         return PerFrame(known, real)
 
     def _numbers(self, name: object, where: str, columns: int = 1) -> FloatArray:
-        """Read at least so many columns of numbers, separated by commas or blanks, in a
-        named file.
-
-        Lines that begin with # are comments. Raises ExchangeError without files beside
-        the scenario, and for anything but finite numbers.
+        """Read the first columns of numbers of a named file, separated by commas or
+        blanks; lines that begin with # are comments.
 
         Args:
             name: of the file.
             where: its place in the scenario, for errors.
-            columns: least number.
+            columns: number to read; a line may have more.
 
         Returns:
             (lines, columns).
+
+        Raises:
+            ExchangeError: no files can be read here, or the file has a line without that
+                many finite numbers.
         """
         if not isinstance(name, str) or self._beside is None:
             raise self._error(where, "values in this file, as no other is read here")
@@ -513,7 +521,7 @@ class ScenarioReader:
         return found  # type: ignore[no-any-return]
 
     def _check_version(self) -> None:
-        """Check that the document is a scenario of a version that we read.
+        """Check that the document is a CTSimU Scenario of format 1.0 to 1.MAX_MINOR.
 
         Raises:
             ExchangeError: it is not.
@@ -577,7 +585,8 @@ def place(
 ) -> tuple[FloatArray, FloatArray]:
     """Compute centre and axes of a part in one frame.
 
-    In the world, or, for a sample on the stage, in the stage's (u, v, w).
+    They are in the world, or for a sample on the stage in the stage's (u, v, w). The part
+    is turned first, then deviated in order, then moved by its drifts.
 
     Args:
         part: centre, axes, deviations and drifts.
@@ -635,7 +644,8 @@ def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:
 
 def _fit_to_frames(values: FloatArray, count: int) -> FloatArray:
     """Fit drift values to the frames, (count,): the first at the first frame, the last at
-    the last, linearly between; a single one holds for all.
+    the last, linearly between; a single one, or the first of several for a single frame,
+    is repeated.
     """
     if len(values) == 1 or count == 1:
         return np.full(count, values[0])
@@ -661,7 +671,9 @@ def drifts_of(value: object) -> list[Any]:
 
 
 def _numeric(values: object) -> bool:
-    """Check whether values are a list of finite numbers."""
+    """Return whether `values` is a list of finite numbers, without bools; True for an
+    empty list.
+    """
     return isinstance(values, list) and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
         for v in values

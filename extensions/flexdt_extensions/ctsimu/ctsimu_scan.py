@@ -216,8 +216,10 @@ class _Watched(dict[str, Any]):
         return super().__getitem__(key)
 
     def unseen(self, where: str = "") -> Iterator[str]:
-        """Yield the paths of values that nobody has read, of nested ones too; comments
-        and empty ones are left out.
+        """Yield the paths of values that nobody has read, also in nested objects that
+        were read.
+
+        Keys in `_WORDS`, such as comments, and values that say nothing are left out.
         """
         for key, value in self.items():
             at = f"{where}.{key}".lstrip(".")
@@ -232,8 +234,8 @@ class _Watched(dict[str, Any]):
 
 
 def _says_something(value: object) -> bool:
-    """Check whether a value holds anything besides comments, None, False, zeros, and
-    empty texts and lists; of an object, any member.
+    """Return whether a value holds anything but None, False, zero, and empty texts and
+    lists; an object does if a member outside `_WORDS` does.
     """
     if isinstance(value, dict):
         return any(
@@ -244,7 +246,8 @@ def _says_something(value: object) -> bool:
 
 class _ScanReader(ScenarioReader):
     def scan(self) -> ScenarioScan:
-        """Read the scenario: samples, spectra, currents, detector and references.
+        """Read the complete scenario: geometry, samples, spectra, currents, detector and
+        references.
 
         Samples of vacuum are left out.
 
@@ -305,13 +308,11 @@ class _ScanReader(ScenarioReader):
         return replace(scan, notes=(*geometry.notes, *self._notes, *left))
 
     def _check(self, scan: ScenarioScan) -> None:
-        """Check that a scan with scattering has one spectrum, and samples that rest on the
-        stage.
+        """Check that a scan with scattering has one spectrum, and samples that rest on
+        the stage; others are not checked.
 
         Raises:
             ExchangeError: it has not.
-
-        Without scattering nothing is checked.
         """
         varies = len(scan.spectra) > 1
         if scan.scattering and (varies or any(s.on_stage is None for s in scan.samples)):
@@ -326,7 +327,8 @@ class _ScanReader(ScenarioReader):
     def _sample(self, given: object, where: str, poses: list[Pose]) -> MeshSample | None:
         """Read a sample: mesh, scale, substance and place in every frame.
 
-        Its place on the stage is None if it moves against the stage.
+        Its place on the stage is None if it moves against the stage by `_MIN_CHANGE` or
+        more.
 
         Args:
             given: its object in the scenario.
@@ -395,7 +397,8 @@ class _ScanReader(ScenarioReader):
     def _material_of(self, given: object, where: str) -> tuple[str, Substance | None]:
         """Read a material: density and mass fractions of its elements.
 
-        Fractions are normalised to 1; a density or composition of 0 is vacuum.
+        Fractions are normalised to 1. A density of 0, or a composition without an amount,
+        is vacuum.
 
         Args:
             given: its object in the scenario.
@@ -446,8 +449,11 @@ class _ScanReader(ScenarioReader):
         return self._substances[name]
 
     def _layers(self, *path: str) -> tuple[Filter, ...]:
-        """Read the list of filter layers at a path, without those of vacuum or no
-        thickness.
+        """Read the list of filter layers at a path; layers of vacuum or without thickness
+        are left out, and a missing list is ().
+
+        Raises:
+            ExchangeError: as `_layer`.
         """
         where = ".".join(path)
         found = [
@@ -481,17 +487,18 @@ class _ScanReader(ScenarioReader):
     # Tube
 
     def _spectra(self) -> tuple[tuple[FloatArray, ...], tuple[int, ...]]:
-        """Compute the spectra behind the filters.
+        """Compute the spectra of the tube behind its filters.
 
-        From files, or else of a tungsten tube by voltage [kV] (window included), or of
-        one energy. Raised too if filters let nothing through.
+        They are read from files, or else those of a tungsten tube by voltage [kV] behind
+        its window, or lines of one energy.
 
         Returns:
             Photons per cm2 and mAs at 1 m of each spectrum that occurs, and the index of
             each frame's.
 
         Raises:
-            ExchangeError: names file, key and the allowed values.
+            ExchangeError: names file, key and the allowed values, also if the filters let
+                nothing through.
         """
         at = "source.spectrum"
         single = self._flag("source", "spectrum", "monochromatic")
@@ -526,9 +533,10 @@ class _ScanReader(ScenarioReader):
         return fluence, tuple(order[key] for key in keys)
 
     def _check_target(self) -> None:
-        """Check that the target is of tungsten, and note that its angle is not heeded.
+        """Check that the target is of tungsten, and add a note that its angle is not
+        used.
 
-        No material passes as well.
+        No material is taken for tungsten.
 
         Raises:
             ExchangeError: another material.
@@ -551,8 +559,8 @@ class _ScanReader(ScenarioReader):
     def _read_spectrum(self, name: object, where: str) -> Spectrum:
         """Read the spectrum of a file into the tables' bins.
 
-        Photons below the tables' energies are left out with a note; above them they are
-        an error.
+        More than 0.1 % of photons below the tables' energies are left out with a note;
+        above them they are an error.
 
         Args:
             name: of the file: energy [keV] and photons / (s sr mA) about it.
@@ -560,6 +568,9 @@ class _ScanReader(ScenarioReader):
 
         Returns:
             Photons per cm2 and mAs at 1 m.
+
+        Raises:
+            ExchangeError: energies that do not grow or are too high, or negative photons.
         """
         energy, photons = self._numbers(name, where, 2).T
         if len(energy) < 2 or np.diff(energy).min() <= 0.0 or photons.min() < 0.0:
@@ -582,10 +593,11 @@ class _ScanReader(ScenarioReader):
     def _spot(self) -> tuple[float, float]:
         """Compute the focal spot's standard deviations along u and v [mm].
 
-        A spot of a size is replaced by a Gaussian of the same width, which is noted.
+        A spot of a size is replaced by a Gaussian of the same standard deviation, with a
+        note; one of a size of 6 sigma or more counts as complete. Without both it is 0.
 
-        Returns:
-            Those of a Gaussian that ends with the spot, or of a complete one.
+        Raises:
+            ExchangeError: a size or sigma below 0, or an intensity map.
         """
         where = ("source", "spot")
         self._nothing(*where, "intensity_map", "file")
@@ -647,8 +659,9 @@ class _ScanReader(ScenarioReader):
     def _grey(self) -> GreyValues:
         """Read the detector's grey values, noise, blur, lag and bits.
 
-        By range, factor and offset, or a file; photons of one energy need a range, unless
-        they are from a file.
+        Grey values are by a file or factor and offset, else by range. Photons of one
+        energy need a range, unless their spectrum is from a file. Missing values are no
+        noise, no blur, no lag and 16 bits.
 
         Returns:
             The conversion from energy to grey values.
@@ -763,12 +776,10 @@ class _ScanReader(ScenarioReader):
         return bool(found)
 
     def _natural(self, *path: str, default: int = 1, least: int = 1) -> int:
-        """Read a whole number from `least` at a path; `default` without one.
+        """Read a whole number from `least` to MOST at a path; `default` without one.
 
         Raises:
             ExchangeError: something else is there.
-
-        At most MOST.
         """
         found = self._given(*path)
         value = default if found is None else found
@@ -799,8 +810,11 @@ class _ScanReader(ScenarioReader):
         """Return a text for each frame (n); drifts are lists or files of texts, spread
         evenly over the frames.
 
-        Only the last drift counts. Raises if it is neither. Without drifts every frame
-        has the same text.
+        Only the last drift counts. Without drifts every frame has the same text (None
+        without one).
+
+        Raises:
+            ExchangeError: no list of texts, or something else than a text.
         """
         drifts = drifts_of(given)
         if not drifts:
@@ -826,10 +840,11 @@ class _ScanReader(ScenarioReader):
         ]
 
     def _table(self, columns: int, *path: str) -> FloatArray | None:
-        """Read the numbers, (n, columns), of the file named at a place; None without a
-        name.
+        """Read the numbers (n, columns) of the file named at a place, whose first column
+        grows; None without a name.
 
-        Raises unless the first column grows.
+        Raises:
+            ExchangeError: no such table.
         """
         where = ".".join(path)
         name = self._text(self._given(*path), where)
@@ -843,18 +858,16 @@ class _ScanReader(ScenarioReader):
     def _plain(
         self, given: object, units: Mapping[Any, float], where: str, default: D
     ) -> float | D:
-        """Read a number that does not drift.
-
-        A drift without value is an error.
+        """Read a number that is the same in all frames.
 
         Args:
             given: value or object from the document.
             units: unit -> factor.
             where: its path, for messages.
-            default: returned if there is no value.
+            default: returned if there is neither value nor drift.
 
         Raises:
-            ExchangeError: no number, or one that drifts.
+            ExchangeError: no number, drifts without a value, or a number that drifts.
         """
         if given is None or (isinstance(given, dict) and given.get("value") is None):
             if drifts_of(given):
@@ -871,7 +884,7 @@ class _ScanReader(ScenarioReader):
     def _series(
         self, units: Mapping[Any, float], *path: str, default: float | None = None
     ) -> FloatArray:
-        """Read a positive number for each frame.
+        """Read a number above 0 for each frame, as it really is.
 
         Only a missing value takes the default; without a default it is an error.
 

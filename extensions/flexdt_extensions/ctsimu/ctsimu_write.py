@@ -70,7 +70,6 @@ def scenario_of(
     """Convert a data set to a CTSimU scenario.
 
     Tube, exposure, date and machine are None where the data set does not know them.
-    Raises for frames of several shapes.
 
     Args:
         dataset: from `load_dataset`.
@@ -80,6 +79,10 @@ def scenario_of(
 
     Returns:
         The scenario's JSON object.
+
+    Raises:
+        TwinError: frames of several shapes.
+        ExchangeError: as `scenario_document`.
     """
     if parameters is None:
         if dataset.correction is None:
@@ -122,7 +125,8 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
         on.
 
     Raises:
-        ExchangeError: a panel that turns or changes during the scan.
+        ExchangeError: a panel whose steps turn by more than `SAME_MM` at its edge, or
+            that is no panel of CTSimU.
     """
     poses = scan.poses
     pitch_u, pitch_v = require_panel(poses.cone_vec(), "CTSimU")
@@ -223,13 +227,15 @@ def _stage_motion(
     Directions are as seen from above: growing angles are CW; falling ones are CCW with
     start and stop negated.
 
-    Deviations from equal steps become a drift of a turn about the stage's own axis.
+    Deviations of 1e-12 deg or more from equal steps become a drift of a turn about the
+    stage's own axis.
 
     Args:
         angles_deg: (n,) of the views.
 
     Returns:
-        Start and stop angle [deg], direction (CW or CCW), and drifts.
+        Start and stop angle [deg], direction (CW or CCW), and the drifting turn, or []
+        without one.
     """
     first = float(angles_deg[0])
     last = float(angles_deg[-1])

@@ -100,12 +100,11 @@ class ScenarioImages:
         self._thickest = found
 
     def _read_named_file(self, name: str) -> str:
-        """Read the text of a file that the scenario names.
+        """Read the text of a file that the scenario names, relative to the scenario's
+        folder.
 
         Raises:
             ExchangeError: it cannot be read.
-
-        The name is relative to the scenario's folder.
         """
         try:
             return text_of(self.path.parent / name)
@@ -117,6 +116,9 @@ class ScenarioImages:
     def _mesh(self, sample: MeshSample) -> TriangleMesh:
         """Read a sample's mesh, from the scenario's folder, centred on its bounding box
         and scaled to mm.
+
+        Raises:
+            OSError, TwinError: it cannot be read.
         """
         found = read_mesh(self.path.parent / sample.file)
         corners = np.asarray(found.vertices, dtype=np.float64)
@@ -152,10 +154,11 @@ class ScenarioImages:
         return np.asarray(np.linalg.norm(pixels, axis=2), dtype=np.float32)
 
     def _paths(self, frame: int, ray: int, samples: bool) -> Float32Array:
-        """Compute path lengths through each substance, and the rest through air if there is an
-        environment.
+        """Compute path lengths through each substance, and the rest through air if there
+        is an environment.
 
-        Air is the last layer, never below 0.
+        The environment is the last layer: what the samples leave of the distance to the
+        pixel's centre, at least 0.
 
         Args:
             frame: number of the frame.
@@ -186,7 +189,8 @@ class ScenarioImages:
         """Compute the energy in each pixel of one frame, and its variance, before the
         detector blurs.
 
-        Rays per pixel are averaged and blurred by the focal spot; scatter is added.
+        Rays per pixel (one in the open beam) are averaged and blurred by the focal spot;
+        with samples scatter is added. Both are scaled by distance and mAs.
 
         Args:
             frame: number of the frame.
@@ -287,7 +291,8 @@ class ScenarioImages:
             image: (rows, cols), unbinned.
 
         Returns:
-            The blurred image; a Gaussian leaves out the pixel's own width.
+            The blurred image. A Gaussian has the detector's resolution less the pixel's
+            own width.
         """
         grey = self.scan.grey
         view = self.scan.views[0]
@@ -320,8 +325,8 @@ class ScenarioImages:
     ) -> FloatArray:
         """Compute the grey values of the binned pixels.
 
-        By blur, grey values, noise, clipping to the detector's bits, and mean over each
-        binned pixel; no noise either without a seed.
+        In this order: blur, conversion, noise, clipping to 0 and the detector's largest
+        value, mean over each binned pixel. There is no noise without a seed.
 
         Args:
             energy, variance: (rows, cols), unbinned.
@@ -352,8 +357,12 @@ class ScenarioImages:
     def _references(
         self, asked: Reference, lit: bool, first: int
     ) -> Iterator[FloatArray]:
-        """Yield dark (or `lit` flat) images, with the noise of frames `first` on unless they
-        are ideal.
+        """Yield dark (or `lit` flat) images, (rows, cols), binned.
+
+        Args:
+            asked: their number, averages, and whether they are ideal, without noise.
+            lit: flat images instead of dark ones.
+            first: number of the first one's noise.
         """
         energy, variance = (
             self._open if lit else (np.zeros(self.scan.shape, np.float32),) * 2
@@ -383,10 +392,11 @@ class ScenarioImages:
     def projections(self) -> Iterator[Counts]:
         """Yield the projections in order.
 
-        With lag each frame keeps a part of the frame before; the first has none.
+        With lag each frame keeps a part of the frame before; the first has none. They are
+        corrected by the mean dark and flat images where the scenario says so.
 
         Yields:
-            uint16 (rows, cols); corrected by dark and flat where the scenario has it.
+            uint16 (rows, cols).
         """
         scan = self.scan
         lag = self.scan.grey.lag
@@ -456,7 +466,9 @@ class ScenarioImages:
         """Write all images as TIFF, and CTSimU's metadata, into a new folder.
 
         Returns:
-            The metadata file. The folder appears only when everything is in it.
+            Path of the metadata file.
+
+        The folder appears only when everything is in it; after an error nothing is left.
 
         Raises:
             ExchangeError: the folder exists and is not empty.
@@ -500,7 +512,8 @@ class ScenarioImages:
         return folder / f"{stem}_metadata.json"
 
     def _metadata(self, folder: Path, names: dict[str, str | None]) -> dict[str, Any]:
-        """Make CTSimU's metadata of the written images.
+        """Make the JSON object of CTSimU's metadata of the written images, with today's
+        date.
 
         Args:
             folder: of the images.

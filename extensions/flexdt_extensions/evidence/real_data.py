@@ -79,10 +79,14 @@ class Case:
 
 
 def _with_errors(make: Callable[[], Iterator[Told]], what: str) -> Iterator[Told]:
-    """Yield the figures of `make`, and an error at its end as one more.
+    """Yield the figures of `make`, and an error that ends it as one more.
 
-    An error out of flexdt is a missed figure. A reader that is not installed, and any
-    error of other packages for a file that is not of its name's format, is `NotRead`.
+    An error out of flexdt is a missed figure. A reader that is not installed, or an error
+    of other packages, is `NotRead`.
+
+    Args:
+        make: yields figures.
+        what: name of an error's figure.
     """
     try:
         yield from make()
@@ -130,8 +134,8 @@ class _Numbers(pickle.Unpickler):
 
 
 def _numbers(file: Path) -> Any:
-    """Load CaTE's form of storage: one pickled dictionary in a NumPy file; unpickling is
-    restricted by `_Numbers`.
+    """Read the pickled dictionary of a NumPy file, as CaTE stores it; only classes that
+    `_Numbers` allows are read.
     """
     with file.open("rb") as stream:
         np.lib.format.read_magic(stream)
@@ -151,7 +155,7 @@ def _fit_to_marks(
         free: names of the free offsets.
 
     Returns:
-        The report, and the markers' places (k, 3) [mm], by name.
+        The report, and the markers' positions (k, 3) [mm], in the order of their names.
     """
     marks = [
         (k, str(name), float(column), float(row), None)
@@ -186,7 +190,7 @@ def needles(files: list[Path]) -> Iterator[Told]:
     """Compare CaTE: marks in radiographs of the FleX-ray itself, of objects of unknown
     shape.
 
-    A scan whose views are not known is yielded as not read.
+    A scan whose views are not known, or that fails, is yielded as not read or missed.
 
     Args:
         files: of marks, one for each scan.
@@ -199,8 +203,8 @@ def needles(files: list[Path]) -> Iterator[Told]:
     def of_scan(file: Path) -> Iterator[Told]:
         """Calibrate one scan and compare the detector's shift and the residual.
 
-        Keeps the found marker shapes. A scan whose views are not known is yielded as not
-        read.
+        The markers' positions are kept in `shapes`. A scan whose views are not known is
+        yielded as not read.
 
         Args:
             file: of its marks.
@@ -423,7 +427,7 @@ def helsinki(files: list[Path]) -> Iterator[Told]:
     """Compare HTC 2022: fan-beam reconstructions with the images that their authors
     published.
 
-    What cannot be read is yielded as such.
+    A file that cannot be read is yielded as not read.
 
     Args:
         files: of the sinograms.
@@ -498,7 +502,9 @@ def zeiss(files: list[Path]) -> Iterator[Told]:
 
 
 def _result_text(make: Callable[[], Any]) -> str:
-    """Return flexdt's result as text, or the text of its TwinError; others are raised."""
+    """Call `make` and return its result, or the message of its TwinError, as text; other
+    errors are raised.
+    """
     try:
         return str(make())
     except fx.TwinError as error:

@@ -33,10 +33,15 @@ COUNTS: Final = ("frames", "attempts")
 
 
 def require_positive(*, or_zero: bool = False, **values: float) -> None:
-    """Check that an environment's settings are finite and positive (or zero, with
-    `or_zero`), and whole numbers for those in `COUNTS`.
+    """Check that settings are finite and above 0 (0 or more with `or_zero`), and whole
+    numbers if their name is in `COUNTS`.
 
-    Raises: LimitError: names the argument and what is allowed.
+    Args:
+        or_zero: whether 0 is allowed.
+        values: settings by name.
+
+    Raises:
+        LimitError: the first that does not hold; names it and what is allowed.
     """
     for name, value in values.items():
         counted = name in COUNTS
@@ -57,13 +62,15 @@ def require_positive(*, or_zero: bool = False, **values: float) -> None:
 
 
 def choices(action: npt.ArrayLike, sizes: Sequence[int]) -> list[int]:
-    """Check an action of integers, one for each size and below it, and return it as a
-    list.
+    """Check an action of whole numbers, each from 0 to below its size, and return it as a
+    list of ints.
+
+    Args:
+        action: (n,), or one number for a single size.
+        sizes: of each number.
 
     Raises:
-        LimitError: lists the allowed values.
-
-    One number is an action for one size.
+        LimitError: another count or value; lists the allowed ones.
     """
     values = np.atleast_1d(action).tolist()
     if len(values) != len(sizes) or any(
@@ -141,18 +148,18 @@ class Lab:
         return self.scanner.positions(self.now)[axis]
 
     def take(self, targets: dict[str, float]) -> Taken:
-        """Move the motors (rotations the shorter way), wait for rest, and expose; clock and
-        dose go on.
+        """Move the motors (rotations the shorter way), wait for rest, and expose; clock
+        and dose go on.
 
-        Time is in s; dose is the exposure time times the inverse square of the distance
-        to the axis, relative to REFERENCE_SOD_MM. Without a collision the time includes
-        the exposure.
+        The dose is the exposure time [s] times the square of REFERENCE_SOD_MM over the
+        distance to the axis. Before a contact the motors halt, and no frame is taken.
 
         Args:
             targets: axis -> [mm, deg].
 
         Returns:
-            Time and dose; after a collision that of the halt alone, without an image.
+            Time of motion and exposure [s], and dose; after a collision the time until
+            the halt, and no dose.
         """
         start = self.now
         try:

@@ -92,17 +92,15 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode: draw an object, number of views and dose; nothing
-        reconstructed.
-
-        All three figures are 0.
+        """Begin an episode: draw an object, a number of views and a dose, and make noisy
+        images; nothing is reconstructed.
 
         Args:
             seed: of the episode; None goes on with the present random numbers.
             options: not used.
 
         Returns:
-            Observation, and `quality`, `best` and `work`.
+            Observation, and `quality`, `best` and `work`, all 0.
         """
         super().reset(seed=seed)
         rng = self.np_random
@@ -129,10 +127,10 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def step(
         self, action: Action
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Run one attempt.
+        """Reconstruct once, and compare with the hidden object.
 
-        The reward is the gain over the best quality so far, less the work. The fourth
-        result (truncated) is always False.
+        The reward is 20 times the gain over the best quality so far, less `work_weight`
+        for 100 projections of all views.
 
         Args:
             action: algorithm, strength, nonnegative; an index each.
@@ -192,10 +190,10 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
     def _run(
         self, algorithm: int, strength: int, nonnegative: bool
     ) -> tuple[Volume, float]:
-        """Reconstruct by an algorithm.
+        """Reconstruct by an algorithm, from zero, onto the episode's grid.
 
-        FDK works once, SIRT and CGLS twice each iteration. FDK and CGLS are clipped after
-        the end.
+        The work of FDK is 1, that of SIRT and CGLS 2 an iteration. SIRT is clipped in
+        each iteration, the others at the end.
 
         Args:
             algorithm: index into ALGORITHMS.

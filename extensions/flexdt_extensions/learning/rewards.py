@@ -102,8 +102,8 @@ class InformationTask:
         return 0.5 * (_log_det(self._information) - before)
 
     def state(self) -> Float32Array:
-        """Return the logarithm of each sigma: -1 for a thousandth of its tolerance, +1
-        for the prior.
+        """Return the logarithm of each sigma, clipped to -1...1: -1 for a thousandth of
+        its tolerance, +1 for the prior.
 
         Sigmas belong to the hidden geometry; an estimate's would differ from them by
         little.
@@ -140,7 +140,8 @@ class InformationTask:
     def _of(self, lab: Lab, poses: Poses, at: Offsets) -> FloatArray:
         """Compute the information of each frame, (n, p, p), parameters in tolerances.
 
-        Spots that overlap or are not visible give none.
+        It is that of the beads' spots with a noise of NOISE_PX; spots that overlap or are
+        not visible give none.
 
         Args:
             lab: its detector.
@@ -206,10 +207,10 @@ class QualityTask:
         self._start(phantom.volume(SIDE_MM / GRID), phantom.scene)
 
     def add(self, lab: Lab, poses: Poses, rng: np.random.Generator) -> float:
-        """Take one frame, improve the reconstruction by SIRT and return its gain in
+        """Take one frame, go on with SIRT on all frames so far, and return the gain in
         quality.
 
-        All frames so far are used, from the present volume on; the noise is of `PHOTONS`.
+        SIRT runs ITERATIONS from the present volume on; the noise is that of `PHOTONS`.
 
         Args:
             lab: the scanner.
@@ -294,8 +295,10 @@ def random_object(rng: np.random.Generator) -> Phantom:
 
 
 def random_plates(rng: np.random.Generator) -> Phantom:
-    """Draw one or two parallel upright plates of twice water's attenuation, turned by any
-    angle about z: a few views see them edge-on.
+    """Draw one or two parallel upright plates of twice water's attenuation, within 50 mm,
+    turned by any angle about z.
+
+    A few views see them edge-on.
     """
     water = material("water").mu_per_mm
     axes = _turned_axes(rng.uniform(0.0, math.pi))
@@ -338,8 +341,9 @@ def blank() -> Volume:
 
 
 def column_information(lab: Lab, cone: ConeVec) -> FloatArray:
-    """Compute each frame's information about upright columns, (n, c, c), against a
-    prior of 1."""
+    """Compute the information of each of n frames about the object's c upright columns,
+    (n, c, c), in units of their prior's.
+    """
     rows, cols = lab.small_shape
     # An expected spread of 0.02/mm and photon noise of the line integral.
     a = column_lengths(cone, cols) * (0.02 * math.sqrt(PHOTONS * rows) / 3.0)
@@ -350,7 +354,7 @@ def column_lengths(cone: ConeVec, cols: int, samples: int = 80) -> FloatArray:
     """Sample the length of each ray of the middle row in each upright column of the
     object.
 
-    The rays' slope is not counted.
+    Lengths are horizontal.
 
     Args:
         cone: n views.

@@ -135,10 +135,15 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Draw a new hidden truth and return the scanner to its start pose (SOD 600 mm)
-        without a frame; returns observation and info.
+        """Begin an episode: draw a new hidden truth, and put the scanner at its start
+        pose (SOD 600 mm), without a frame.
 
-        `options` is ignored.
+        Args:
+            seed: of the episode; None goes on with the present random numbers.
+            options: not used.
+
+        Returns:
+            Observation and info, see `_info`.
         """
         super().reset(seed=seed)
         self.lab = self.new_lab()
@@ -152,7 +157,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     def step(
         self, action: Action
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Move, take a frame and score it.
+        """Move, take a frame, and return its worth less the costs of time and dose.
 
         After a collision, or the last frame, the episode is over; a collision costs a
         penalty and gives no frame.
@@ -162,8 +167,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
 
         Returns:
             Observation, reward, whether it collided, whether the frames are used up, and
-            the task's
-            figures with `collision`.
+            the task's figures with `collision`.
 
         Raises:
             LimitError: no action of this environment.
@@ -209,7 +213,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
     def targets(self, action: Action) -> dict[str, float]:
         """Convert an action to motor targets [deg, mm].
 
-        Values outside -1 to 1 are clipped.
+        Values outside -1 to 1 are clipped; each stands for the axis's full range. Without
+        "pose" only rot_obj is a target.
 
         Args:
             action: of the kind of this environment.
@@ -250,8 +255,8 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.array(values, np.float32)
 
     def forecast(self, candidates: list[dict[str, float]]) -> npt.NDArray[np.float64]:
-        """Compute the expected reward of each candidate, (m,), from data that an agent
-        may know.
+        """Compute the expected worth less the cost of time of each candidate, (m,), from
+        data that an agent may know.
 
         Args:
             candidates: motor positions [deg, mm], not checked for collisions.
@@ -294,8 +299,12 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.asarray(np.clip(image * (255.0 / 3.0), 0.0, 255.0), dtype=np.uint8)
 
     def _info(self, worth: float, seconds: float) -> dict[str, Any]:
-        """Return the figures of a step of `worth` and `seconds`: worth, frames, seconds,
-        clock_s, dose, collision (always False here), and those of the task.
+        """Return the figures of a step: those of the task, worth, frames so far, seconds,
+        clock_s, dose so far, and collision, always False here.
+
+        Args:
+            worth: of the frame.
+            seconds: of the step.
         """
         return {
             **self.task.info(),
@@ -361,7 +370,7 @@ class Episode:
 
 
 def play(env: ScanEnv, policy: Policy, seed: int) -> Episode:
-    """Run one episode.
+    """Run one episode of an environment by a policy.
 
     It ends by a collision or when the frames are used up.
 

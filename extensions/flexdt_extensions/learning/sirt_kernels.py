@@ -24,10 +24,10 @@ def solve(
     iterations,
     smallest,
 ):
-    """Improve volumes by SIRT, in place, all objects at once; values stay at least 0.
+    """Improve volumes by SIRT, in place, all objects in parallel; values stay at least 0.
 
     Args:
-        first: (views, rays + 1) index of the first voxel and length of each ray.
+        first: (views, rays + 1) index into `voxel` and `length` at which each ray begins.
         voxel: indices of voxels, ray after ray.
         length: of the rays in these voxels [mm].
         rows: (views, rays) sums of lengths.
@@ -37,10 +37,10 @@ def solve(
         images: (objects, frames, rays) line integrals.
         volumes: (objects, voxels) improved in place.
         iterations: number of iterations.
-        smallest: part of the largest sum below which sums are not divided by.
+        smallest: share of the largest sum; a smaller sum is not divided by.
 
     Returns:
-        (objects,) sums of squared residuals.
+        (objects,) sums of squared residuals of the results.
     """
     rays = rows.shape[1]
     squares = np.zeros(len(counts))

@@ -58,7 +58,8 @@ class Turntable:
         self._poses: dict[float, Poses] = {}
 
     def way(self, start: float, target: float) -> tuple[Taken, float]:
-        """Compute the cost of a turn of rot_obj; each turn is computed once.
+        """Compute the cost of a turn of rot_obj the shorter way; each is computed once,
+        up to whole turns.
 
         Args:
             start: angle [deg].
@@ -173,12 +174,12 @@ class Rays:
 
     def solve(self, tasks: Sequence[SharedQuality]) -> None:
         """Run SIRT with all frames of each object, as `QualityTask` does, for many
-        objects at once.
+        objects at once, and update their tasks.
 
-        Frames number differently for each object.
+        Objects may have different numbers of frames.
 
         Args:
-            tasks: with at least one frame each; their volumes and residuals are updated.
+            tasks: with at least one frame each.
         """
         from flexdt_extensions.learning import sirt_kernels
 
@@ -259,8 +260,10 @@ class _TurnEnv(ScanEnv):
     """A `ScanEnv` on a common turntable."""
 
     def __init__(self, **words: Any) -> None:
-        """Make an environment; if its task is one of quality, this is replaced by one
-        whose projections are shared.
+        """Make an environment; a task of quality is replaced by one that is solved
+        together with others, see `SharedQuality`.
+
+        `words` are those of `ScanEnv`.
         """
         super().__init__(**words)
         if isinstance(self.task, QualityTask):
@@ -345,13 +348,16 @@ class ScanVectorEnv(SyncVectorEnv):
         npt.NDArray[np.bool_],
         dict[str, Any],
     ]:
-        """Run one step of each environment.
+        """Run one step of each environment, with all frames solved together.
 
-        Frames that can be taken ahead are solved together first; environments that are
-        reset by this step have none.
+        Environments that are reset by this step take no frame.
 
         Args:
             actions: (num_envs,), one of 36 angles each.
+
+        Returns:
+            As of Gymnasium's `SyncVectorEnv`: observations, rewards, terminated and
+            truncated (num_envs,), and infos.
 
         Raises:
             ValueError: another shape.

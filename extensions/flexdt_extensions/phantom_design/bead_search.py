@@ -56,8 +56,8 @@ def share_identified(
     """Compute the share of simulated scans, each from its own start angle, whose beads
     are told apart.
 
-    A scan counts only if the identification does not fail, is not ambiguous, and gives no
-    spot to another bead.
+    A scan counts only if the identification does not fail, is not ambiguous, gives no
+    spot to another bead, and gives one to its own.
 
     Args:
         model: the beads.
@@ -94,9 +94,8 @@ def measured_spread(
     """Simulate fits to noisy points and compute the rms error of parameters and
     IN_IMAGES.
 
-    Only columns that a fit reports are compared.
-
-    The check of `design.forecast`.
+    It is the check of `forecast`. Parameters that the first fit does not report are left
+    out.
 
     Args:
         model: the beads; with a tolerance in `planned` each trial's beads are off by it,
@@ -292,10 +291,11 @@ def design(
     bounds_mm: npt.ArrayLike | None = None,
     resolution_mm: float = 0.1,
 ) -> Design:
-    """Choose `count` of the seats.
+    """Choose `count` of the seats so that a criterion is least, by exchanges from random
+    sets.
 
     Sets are tried from the best on; the first whose beads are told apart in all simulated
-    scans is returned, with the number of ambiguous ones before it.
+    scans is returned, with its forecast and the number of ambiguous sets before it.
 
     Args:
         seats: (m, 3) places a bead may take [mm, object frame].
@@ -376,12 +376,12 @@ def design(
 
 
 def turned_likeness(beads: FloatArray) -> float:
-    """Measure the distance of beads from a turned and shifted copy, at the best turn
+    """Compute the distance of beads from a copy turned about their mean, at the best turn
     [mm].
 
-    Root mean square distance between each bead and the one it would be taken for, over turns
-    about the vertical of 10 to 350 deg in steps of 5; 0 for a set that looks the same after
-    such a turn.
+    Root mean square distance between each bead and the one it would be taken for, over
+    turns about the vertical of 10 to 350 deg in steps of 5; 0 for a set that looks the
+    same after such a turn.
 
     Args:
         beads: (k, 3) [mm].
@@ -457,10 +457,11 @@ def _random_set(
 def _exchange_beads(
     table: SeatTable, rules: _Rules, chosen: npt.NDArray[np.int64], criterion: Criterion
 ) -> tuple[npt.NDArray[np.int64], float]:
-    """Replace beads one at a time by the best seat until no exchange helps.
+    """Move beads one at a time to the best of their allowed seats, until no exchange
+    helps; at most _TRIED_SEATS are tried for likeness.
 
-    An ambiguous set to begin with has an infinite score, so that any allowed one is
-    better.
+    A set to begin with that is too like its turned copy has an infinite score, so that
+    any allowed one is better.
 
     Args:
         table: of the seats.
@@ -469,7 +470,7 @@ def _exchange_beads(
         criterion: to be minimised.
 
     Returns:
-        The seats, and their score.
+        The seats, and their score; inf if no allowed set was found.
     """
     masks = table.alone(chosen)
     summed = np.einsum("kn,knf->kf", masks.astype(np.float64), table.blocks[chosen])
@@ -527,9 +528,11 @@ def _polish(
     bounds: FloatArray,
     resolution: float,
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Move beads off their seats by ever smaller steps while that helps.
+    """Move beads off their seats, one at a time, to the best of 26 neighbours on a grid,
+    while that helps and the rules allow it.
 
-    The step is halved when no bead moves.
+    The step begins at an eighth of the largest half extent, and is halved when no bead
+    moves, down to `resolution`.
 
     Args:
         beads: (k, 3) [mm].

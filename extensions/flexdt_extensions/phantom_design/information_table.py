@@ -127,8 +127,8 @@ class SeatTable:
         """Compute the table of places for beads of a radius; each frame counts `weight`
         times.
 
-        Information is in units of the tolerances; spots and their sizes are projected
-        without offsets.
+        Parameters are in units of their tolerances; spots and their sizes are projected
+        at nominal geometry.
 
         Args:
             places: (m, 3) [mm].
@@ -173,8 +173,9 @@ class SeatTable:
     def touching(
         self, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.bool_]:
-        """Compare the spots of two seats, (a, b, n): True if they touch, by
-        `identify.overlapping`."""
+        """Return whether the spots of seats `a` and `b` touch in each frame, (a, b, n),
+        with the margins of `identify.overlapping`.
+        """
         first = self.pixels[a]
         second = self.pixels[b]
         across = first[:, None, :, 0] - second[None, :, :, 0]
@@ -249,10 +250,10 @@ def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
 
 
 def _rows(problem: FitProblem) -> FloatArray:
-    """Compute the whitened Jacobian rows of each bead, (k, n, 2, q), each parameter in
-    units of its pixel shift at the image's edge.
+    """Compute the whitened Jacobian rows of each bead in edge units, (k, n, 2, q).
 
-    With free beads, q includes the bead's own three coordinates.
+    q is the number of parameters, and with free beads three more for the bead's own
+    coordinates.
     """
     n, k = problem.seen.shape
     factor = np.array([edge_factor(name) for name in problem.layout.names])
@@ -276,7 +277,8 @@ def inverse(information: FloatArray) -> FloatArray:
         information: (..., p, p) in units of tolerances.
 
     Returns:
-        Covariances (..., p, p); infinite diagonal where not determined.
+        Covariances (..., p, p); the variance of a parameter that a lost direction touches
+        is inf.
     """
     values, vectors = np.linalg.eigh(information)
     lost = values <= 1e-12 * np.maximum(values[..., -1:], 1e-300)
@@ -292,7 +294,7 @@ def score_of(covariance: FloatArray, criterion: Criterion) -> FloatArray:
     """Compute the criterion of a stack of covariances (m, q, q), (m,); less is better.
 
     "a": root of the mean variance; "d": geometric mean of the standard deviations along
-    the principal axes; else (worst) the largest standard deviation.
+    the principal axes; "worst": the largest standard deviation.
     """
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     match criterion:

@@ -108,7 +108,8 @@ def circle_poses(
         Poses of all frames, and the detector's shape (rows, cols).
 
     Raises:
-        CommandError: the phantom would not be between source and detector.
+        CommandError: a SOD that is not between 0 and the SDD, or values that are not
+            finite.
     """
     for sod, lateral in placements:
         if not (0.0 < sod < sdd_mm < math.inf and math.isfinite(lateral)):
@@ -174,7 +175,7 @@ def run_design(
     """Search a design, compare it with the spiral, check both by fits, and write `out`.
 
     `gain` is the spiral's score over the design's; None if the spiral does not determine
-    the geometry. Raises too if pictures are wanted without matplotlib.
+    the geometry. Fits are made only with two or more trials.
 
     Args:
         body: holder of the beads.
@@ -185,11 +186,11 @@ def run_design(
 
     Returns:
         The document of `--json`: request, `design`, `spiral`, `gain`, `assumed` and, if
-        written,
-        `files`.
+        written, `files`.
 
     Raises:
-        TwinError: the beads do not fit, or every set is ambiguous.
+        TwinError: the beads do not fit, every set is ambiguous, or `out` is given without
+            matplotlib.
     """
     if out is not None:
         require_plots()
@@ -294,7 +295,8 @@ def write(
     request: DesignRequest,
     document: dict[str, Any],
 ) -> list[str]:
-    """Write phantom.json, phantom.stl, build.html, one PNG per picture and design.json.
+    """Write phantom.json, phantom.stl, build.html, one PNG for each brick or level, and
+    design.json.
 
     Existing files of these names are overwritten.
 
@@ -336,9 +338,11 @@ def write(
 
 
 def _search(body: BeadHolder, scans: PlannedScans, request: DesignRequest) -> Design:
-    """Search for the best bead places in a body: seats of its bricks, or a grid in the block.
+    """Search for the best bead places in a body: seats of its bricks, or a grid in the
+    block.
 
-    In a block the grid has a step of `GRID_STEP_MM`, a bead's radius from the faces.
+    In a block the grid has a step of about `GRID_STEP_MM`, a bead's radius of material
+    stays around the beads, and they may then be moved off it.
 
     Args:
         body: bricks or block.
@@ -431,7 +435,7 @@ def _solid(phantom: Phantom, body: BeadHolder) -> trimesh.Trimesh:
 
 
 def _page(phantom: Phantom, sections: Sequence[str], document: dict[str, Any]) -> str:
-    """Make the page of the building instructions.
+    """Make the HTML page of the building instructions.
 
     With verdict, table of sigmas, drawings, bead places, criterion and assumptions.
 
@@ -509,8 +513,8 @@ def brick_drawings(
 ) -> Iterator[Drawing]:
     """Draw each brick, seen from below, lowest brick first.
 
-    Each comes with its steps: for every bead distances from the outer faces and the lower
-    edge [mm]; or that there is none.
+    The steps give for every bead its distances from the outer faces and the lower edge
+    [mm], or say that there is none.
 
     Args:
         work: the stack.
@@ -554,7 +558,8 @@ def level_drawings(
 ) -> Iterator[Drawing]:
     """Draw each height at which a block holds beads, seen from above, lowest first.
 
-    Each comes with the steps to build it.
+    The steps give each bead's place from the axis [mm], and where to interrupt the print.
+    Heights that agree in a thousandth of a millimetre are one.
 
     Args:
         size: of the block along x, y and z [mm].

@@ -42,10 +42,11 @@ class Seats:
 
 
 def stack_of(studs: tuple[int, int], bricks: int) -> Brickwork:
-    """Make a stack that can be built.
+    """Make a stack of `bricks` (1 to MOST_BRICKS) with so many `studs` along x and y (2
+    to MOST_STUDS each).
 
     Raises:
-        LimitError: too few or too many studs or bricks.
+        LimitError: too few or too many.
     """
     for what, value, low, high in (
         ("studs along x", studs[0], 2, MOST_STUDS),
@@ -65,10 +66,10 @@ def tubes_at(work: Brickwork) -> FloatArray:
 
 
 def seats_of(work: Brickwork, radius_mm: float) -> Seats:
-    """List every seat for beads of this radius.
+    """List every seat for beads of this radius, lowest brick first.
 
-    On the half-stud grid and at the walls, not in the tubes; at the walls on three
-    levels, elsewhere under the roof.
+    Seats are on the half-stud grid and at the walls, clear of the tubes; at the walls on
+    three levels, elsewhere under the roof.
 
     Args:
         work: the stack.
@@ -122,19 +123,17 @@ def stack_phantom(
     radius_mm: float,
     bead_material: str = "steel",
 ) -> Phantom:
-    """Build the stack with beads in its cavities.
-
-    All beads must be on seats of this stack.
+    """Build the phantom of a stack with beads on its seats.
 
     Args:
         work: the stack.
         name: of the phantom.
-        beads: (k, 3) centres that touch no plastic's inside: seats [mm, object frame].
+        beads: (k, 3) centres, each within 1e-6 mm of a seat [mm, object frame].
         radius_mm: of every bead.
         bead_material: of every bead.
 
     Raises:
-        PhantomError: a bead is in plastic or outside.
+        PhantomError: a bead is on no seat.
     """
     centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)
     seats = seats_of(work, radius_mm)
@@ -165,8 +164,9 @@ def stack_phantom(
 
 
 def grid_seats(size_mm: Sequence[float], radius_mm: float, step_mm: float) -> FloatArray:
-    """Make a grid of bead centres (m, 3) inside a cuboid about the origin, faces included
-    [mm].
+    """Make a grid of centres (m, 3) of beads inside a cuboid about the origin that may
+    touch its faces [mm]; its step is about `step_mm`, with at least two centres along
+    each axis.
 
     Raises:
         LimitError: the cuboid is smaller than a bead.

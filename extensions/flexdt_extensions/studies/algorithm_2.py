@@ -82,13 +82,17 @@ class Algorithm2(Iterated):
 
 
 def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
-    """Run Algorithm 2.
+    """Run Algorithm 2 of the thesis on bead tracks, from the problem's start.
 
-    Impossible geometries have infinite residuals.
+    Residuals are those of coordinates and of pair distances; impossible geometries have
+    infinite ones.
 
     Args:
         problem: tracks with known identities and the free parameters (beads fixed).
         lam: initial damping; 0 is Gauss-Newton and stays 0.
+
+    Returns:
+        The outcome of `iterate` in mm and deg, and the geometry at the end.
     """
     pairs = bead_pairs(problem.seen)
     unit = np.array([edge_factor(n) for n in problem.layout.names])
@@ -116,14 +120,16 @@ def iterate(
     steps: FloatArray,
     lam: float,
 ) -> Iterated:
-    """Run the iteration of Algorithm 2 on any residuals.
+    """Run the damped least-squares iteration of Algorithm 2 on any residuals.
 
-    Stops after `MAX_ITERATIONS`, when steps stay alike (stalled) or become small
-    (converged), or when the equations are singular. Damping falls after a better step and
-    grows after a worse, which is not taken.
+    It stops after `MAX_ITERATIONS`, when the lengths of STALL_WINDOW steps differ by less
+    than STALL_THRESHOLD (stalled), when a step is shorter than CONVERGENCE, or when the
+    equations are singular. Damping falls to a third after a better step, and grows five
+    times after a worse one, which is not taken.
 
     Args:
-        residual: parameters (p,) [mm, deg] to residuals (m,) [px]; inf where there are none.
+        residual: parameters (p,) [mm, deg] to residuals (m,) [px]; inf where there are
+            none.
         x: the start.
         steps: of central differences, (p,).
         lam: initial damping.

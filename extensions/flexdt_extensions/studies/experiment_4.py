@@ -103,8 +103,8 @@ def scan_names() -> tuple[str, ...]:
 
 
 def poses_of(name: str, angle: FloatArray) -> Poses:
-    """Make a real scan's poses as the author's code has them, for stage angles (n,)
-    [rad].
+    """Make a real scan's nominal poses as the author's code has them, for stage angles
+    (n,) [rad].
     """
     real = author()["real"]
     scan = real["scans"][name]
@@ -113,16 +113,14 @@ def poses_of(name: str, angle: FloatArray) -> Poses:
 
 
 def logged(name: str, used: int) -> tuple[FloatArray, float, int]:
-    """Read a fit of the thesis's logs.
-
-    Estimates are [mm, deg].
+    """Read a fit of the thesis's logs by scan and number of projections.
 
     Args:
         name: of the scan.
         used: number of projections.
 
     Returns:
-        The six estimates (`SIX`), rms residual [px], and iterations.
+        The six estimates (`SIX`) [mm, deg], rms residual [px], and iterations.
     """
     number = scan_names().index(name) + 1
     row = thesis()[f"table_A_{number + 4}_scan_{number}"][str(used)]
@@ -154,7 +152,7 @@ def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArr
 
     Args:
         name: of the scan.
-        truth: the six values of `SIX`.
+        truth: the six values of `GroupTruth` [mm, deg].
         used: number of projections.
         model: k beads.
 
@@ -174,9 +172,11 @@ def spots(name: str, truth: FloatArray, used: int, model: BeadModel) -> FloatArr
 def authors_fit(
     name: str, seen: FloatArray, model: BeadModel, radius_px: float | None = None
 ) -> Iterated:
-    """Fit spots as the author's code does.
+    """Fit spots as the author's code does: by `iterate` on coordinates and pair
+    distances.
 
-    Starts from zero offsets and the nominal start angle.
+    It begins at zero offsets and the nominal start angle, with views spread evenly over
+    one turn.
 
     Args:
         name: of the scan.
@@ -233,17 +233,18 @@ def binary_centroids(centres: FloatArray, radius_px: float) -> FloatArray:
 
 
 def physical_truth(group: slice, model: BeadModel) -> GroupTruth:
-    """Estimate the truth of a group of scans by fixed-point iteration.
+    """Estimate the truth of a group of scans by fixed-point iteration, four times.
 
-    Four iterations. Returns the six values and, for each SOD, the noise that the logs
-    have beyond the simulated fit.
-
-    At it the simulated estimates at N = 360 differ from the logged ones by a median of
+    With it the simulated estimates at N = 360 differ from the logged ones by a median of
     zero over the group's scans.
 
     Args:
         group: of `scan_names`.
         model: the beads.
+
+    Returns:
+        The six values and, for each SOD, the noise [px] that the logs have beyond the
+        simulated fit.
     """
     names = scan_names()[group]
     logs = [logged(name, FITTED_PROJECTIONS) for name in names]
@@ -281,7 +282,7 @@ def real_runs(
     exact: bool = False,
     used: Sequence[int] | None = None,
 ) -> tuple[list[Run], dict[str, Any]]:
-    """Fits of one scan's simulated spots at every N, the author's and ours.
+    """Fit one scan's simulated spots at every N, by the author's code and ours.
 
     Estimates are [mm, deg]; ours are None where they are not determined.
 
@@ -290,8 +291,8 @@ def real_runs(
         model: the beads.
         truth: of the scan's group.
         seed: of the noise.
-        exact: points without rounding and noise; the noise counts in the rms residual all the
-            same.
+        exact: points without rounding and noise; the noise counts in the rms residual all
+            the same.
         used: numbers of projections; None is those of the logs.
 
     Returns:
@@ -348,12 +349,13 @@ def real_runs(
 
 
 def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Compare each scan's logs with their simulation, over N from 36 up.
+    """Compare each scan's logs with their simulation, over N from ENOUGH up; scans
+    without such N are left out.
 
     Returns:
-        One row a scan: rms and largest difference of alpha [deg], largest difference of the rms
-        residual [%], numbers of fits compared and of those within 1 deg and 15 %, the
-        differences' rms of the other estimates [mm], and mean iterations of logs and
+        One row a scan: rms and largest difference of alpha [deg], largest difference of
+        the rms residual [%], numbers of fits compared and of those within 1 deg and 15 %,
+        the differences' rms of the other estimates [mm], and mean iterations of logs and
         simulation.
     """
     out = []
@@ -421,14 +423,16 @@ def hidden_phantom(scene: Scene, model: BeadModel, seed: int) -> tuple[Scene, Be
 def moved_beads(
     scene: Scene, model: BeadModel, shift: FloatArray
 ) -> tuple[Scene, BeadModel]:
-    """Move beads off their model; the solids that are beads move, too.
-
-    Every sphere counts as the nearest bead.
+    """Shift each bead of a model and its solid; every sphere of the scene is taken for
+    the nearest bead.
 
     Args:
         scene: solids of the phantom.
         model: its k beads.
         shift: (k, 3) [mm].
+
+    Returns:
+        The scene and the model with shifted beads.
     """
     solids = []
     for solid in scene.solids:
@@ -474,7 +478,8 @@ def found_beads(
 ) -> BeadModel:
     """Reconstruct a scan near the model's beads and find their centres in the volume.
 
-    Their tolerance is `TOLERANCE_MM`.
+    A centre is the mean place of voxels above half the largest value, weighted by the
+    excess. The beads' tolerance is `TOLERANCE_MM`.
 
     Args:
         images: line integrals of a full turn.
@@ -559,7 +564,8 @@ def image_runs(
 ) -> list[Run]:
     """Calibrate one scan from N of its images, with the beads as they were found.
 
-    A run that fails has its error as a note.
+    A run that fails has its error as a note, and its estimates are compared with the
+    truth in the printed reading.
 
     Args:
         name: Scan1 to Scan11.

@@ -135,8 +135,13 @@ def unity_poses(
 
 
 def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, Offsets]:
-    """Make nominal poses (the thesis's "Unity object", angles 360 n / N) and the truth of
-    a scenario.
+    """Make nominal poses (the thesis's "Unity object", angles 360 n / N) and the true
+    offsets of a scenario.
+
+    Args:
+        name: of the scenario.
+        frames: N, number of poses.
+        variant: "author" takes the author's code, others the thesis.
 
     Raises:
         UnknownNameError: lists the scenarios.
@@ -177,8 +182,8 @@ def tasks(
 ) -> list[WorkUnit]:
     """List all tasks of an experiment.
 
-    Each has a setting in a scenario; the order of "damping" lets rendered images serve
-    all dampings.
+    Each is a setting in a scenario; those of "damping" go scenario by scenario, so that
+    rendered images serve all dampings.
 
     Args:
         experiment: one of EXPERIMENTS.

@@ -70,14 +70,16 @@ def intensities(
     shape: tuple[int, int],
     fine: int = FINE,
 ) -> Float32Array:
-    """Compute the transmitted share of the open beam, integrated over pixels near beads.
+    """Compute the transmitted share of the open beam at pixel centres, near beads as a
+    mean over the pixel.
 
     Args:
         scene: to render.
         model: its beads.
         cone: n views.
         shape: (rows, cols).
-        fine: rays along each side of these pixels.
+        fine: rays along each side of a pixel near beads; 1 or less: none but the
+            centre's.
 
     Returns:
         (n, rows, cols), from 0 to 1.
@@ -179,17 +181,20 @@ def render(
 ) -> RenderedFrames:
     """Make the radiographs of a scan and detect the beads in them.
 
-    Returns images, their corners and the spots found in each. Noiseless images (no
-    counts) are line integrals cropped to what is not zero; noisy ones are whole, as
-    counts.
+    Images without noise are line integrals, cropped to the part that is not zero; noisy
+    ones are whole, as counts.
 
     Args:
-        scene: the phantom's solids; model: its beads.
+        scene: the phantom's solids.
+        model: its beads, near which pixels integrate.
         poses: nominal poses.
         truth: the hidden geometry the images are made with.
         camera: noise and blur.
         seed: key of the noise; frame i uses [*seed, i].
         shape: (rows, cols).
+
+    Returns:
+        The images with their corners, and the spots found in each.
     """
     detector = detector_for(model, poses)
     kept: list[npt.NDArray[np.generic]] = []
@@ -221,11 +226,12 @@ def exposures(
     seed: Sequence[int],
     shape: tuple[int, int] = SHAPE,
 ) -> Iterator[npt.NDArray[np.generic]]:
-    """Render the frames of a scan one after the other: uint16 counts, or integrals
-    without noise.
+    """Render the frames of a scan one after the other: uint16 counts (rows, cols), or
+    line integrals without noise.
 
     Args:
-        scene: solids; model: its beads, near which pixels integrate.
+        scene: the phantom's solids.
+        model: its beads, near which pixels integrate.
         cone: true geometry.
         camera: noise and blur.
         seed: key of the noise; frame i uses [*seed, i].
@@ -263,16 +269,16 @@ _made: dict[tuple[object, ...], tuple[RenderedFrames, ...]] = {}
 
 
 def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
-    """Calibrate rendered images with all numbers of projections of a task, identities
-    unknown.
+    """Calibrate rendered images with each number of projections of a task, identities
+    unknown; a failure is a run, too.
 
     Args:
         task: one setting in one scenario.
         model: the beads.
         scene: the phantom.
 
-    The images of the largest N are made once; smaller N take every so many of them, as far as
-    they divide it (the thesis's do), with the same noise.
+    The images of the largest N are made once; smaller N take every so many of them, as
+    far as they divide it (the thesis's do), with the same noise.
     """
     most = max(task.counts)
 
@@ -312,8 +318,8 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
 
 
 def _render(task: WorkUnit, model: BeadModel, scene: Scene) -> tuple[RenderedFrames, ...]:
-    """Make the radiographs of a task's largest number of projections, or take those of
-    the last.
+    """Render the radiographs of a task's largest number of projections, or return those
+    of the last call if it had the same.
 
     The radiographs of the last key are kept, and replaced by those of another.
 

@@ -100,9 +100,8 @@ def clean(value: float) -> float | None:
 
 
 def attempted(setting: str, scenario: str, n: int, solve: Callable[[int], Run]) -> Run:
-    """Run `solve`; an error becomes a run without a result, with the error as its note.
-
-    Any Exception counts; the run is marked as failed.
+    """Return the run that `solve` makes; any Exception becomes a failed run without a
+    result, with the error as its note.
 
     Args:
         setting, scenario: of the run.
@@ -215,7 +214,8 @@ def fitted_run(
 ) -> Run:
     """Compare a fit to n projections with the truth.
 
-    A failed run has no errors or sigmas, and a note.
+    Without an identifiable fit, or with a note, the run has no errors, sigmas or success,
+    but a note.
 
     Args:
         setting, scenario: which.
@@ -281,7 +281,7 @@ def _algorithm_2(
 ) -> Run | None:
     """Solve the same tracks by Algorithm 2.
 
-    Its success is a mean absolute error below the task's limit; sigmas are empty.
+    Its success is a mean absolute error below the task's limit; it has no sigmas.
 
     Args:
         task: setting and damping.
@@ -400,7 +400,7 @@ def summary(experiment: str, fidelity: str, runs: Sequence[Run]) -> dict[str, ob
 
 
 def grid(runs: Sequence[Run]) -> tuple[list[str], list[int], FloatArray]:
-    """Compute the mean MAE over scenarios.
+    """Compute the mean MAE over scenarios, by setting and number of projections.
 
     Runs without errors are left out.
 

@@ -93,7 +93,8 @@ def basin_runs(cell: Cell, model: BeadModel) -> list[Run]:
     """Run all methods on all draws of a cell; the start is the truth plus the error.
 
     Each draw has a shift of `cell.mm` in a random direction and a turn of +-`cell.deg`. A
-    run that fails has no errors and no success; success is a mean error below LIMIT.
+    run that fails has no errors and no success; success is a mean error (mm, deg alike)
+    below LIMIT.
 
     Args:
         cell: size of the error, draws and noise.
@@ -249,7 +250,7 @@ def run_study(
     variant: str = "printed",
     tell: Tell | None = None,
 ) -> Document:
-    """Run one of the thesis's experiments.
+    """Run one of the thesis's experiments, and write its report if `out` is given.
 
     Args:
         experiment: beads, phantoms, damping, detector, real or basin.
@@ -476,10 +477,14 @@ def lego_beam() -> EffectiveBeam:
 
 
 def real_images_task(task: tuple[str, BeadModel, int, int, Sequence[int]]) -> list[Run]:
-    """Run one scan of the Lego phantom, on images and with the model as found; the task
-    is (name, beads as found, seed, frames, numbers of images).
+    """Calibrate one real scan of the LEGO phantom on simulated images, with its beads as
+    found.
 
-    Returns one run for each number of images.
+    Args:
+        task: name of the scan, beads as found, seed, frames, and numbers of images.
+
+    Returns:
+        One run for each number of images.
     """
     name, found, seed, frames, counts = task
     phantom = load_phantom("lego")

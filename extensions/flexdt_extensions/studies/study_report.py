@@ -22,7 +22,8 @@ from flexdt_extensions.studies.runs import Run, grid
 def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
     """Write everything about a study into a folder (made if need be).
 
-    summary.json and report.html, and for errors by setting the charts as SVG.
+    These are summary.json and report.html, and the charts of errors by setting as SVG,
+    too.
 
     Args:
         out: the folder.
@@ -44,10 +45,8 @@ def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> 
 
 
 def _error_charts(document: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, str]:
-    """Plot errors by setting and number of projections, and by setting and parameter.
-
-    "mae" over setting and number of projections, "parameters" over setting and parameter;
-    good below 0.2.
+    """Plot mean errors as heat maps, "mae" by setting and number of projections,
+    "parameters" by setting and parameter [mm, deg]; below 0.2 is good.
 
     Args:
         document: of the study.
@@ -106,7 +105,8 @@ def _basin_charts(document: Mapping[str, Any]) -> list[str]:
 
 
 def _real_charts(document: Mapping[str, Any]) -> list[str]:
-    """Plot the logged fits with their simulation: alpha against N for each scan, tables.
+    """Plot the logged fits with their simulation: for each scan alpha against log N, and
+    a table.
 
     Missing values are gaps in the curve (nan).
 
@@ -114,7 +114,7 @@ def _real_charts(document: Mapping[str, Any]) -> list[str]:
         document: of the study.
 
     Returns:
-        HTML of lines, charts and tables.
+        HTML of the lines of `real_lines`, then of a chart and a table for each scan.
     """
     charts = ["".join(paragraph(f"{line}.") for line in real_lines(document))]
     for curve in document["curves"]:
@@ -143,16 +143,14 @@ def _real_charts(document: Mapping[str, Any]) -> list[str]:
 
 
 def open_directions(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]] | None:
-    """Sum up weak directions; None where no row has a weak run that was solved.
-
-    A row without sigmas has "-".
+    """Sum up weak directions of each row.
 
     Args:
         rows: of the study.
 
     Returns:
-        For each row: runs with a weak direction, and the largest mean sigma with its
-        parameter.
+        For each row "K of N" runs with a weak direction, and the largest mean sigma with
+        its parameter ("-" without sigmas); None if no row has a weak run that was solved.
     """
     if not any(row["weak"] > row["unidentifiable"] for row in rows):
         return None
@@ -236,7 +234,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def report(document: Mapping[str, Any], *charts: str) -> str:
-    """Build one HTML page.
+    """Make the HTML page of a study: table of settings, charts, source, assumptions.
 
     Columns that are empty in all rows are left out, except the first three.
 
@@ -309,9 +307,8 @@ def heat_map(
     good_below: float | None = None,
     good_from: float = 1.0,
 ) -> str:
-    """Draw a table of numbers, green where they are good and red where not.
-
-    Returns an SVG; each cell shows its number.
+    """Draw a table of numbers as SVG, green where they are good and red where not; each
+    cell shows its number.
 
     Args:
         values: (rows, columns); nan is white.
