@@ -21,6 +21,14 @@ class Acquila:
     def __init__(
         self, host: str = "127.0.0.1", out: int = 50000, into: int = 50001
     ) -> None:
+        """Connect to the gateway and wait half a second, as ZeroMQ drops messages before
+        both sides know each other.
+
+        Args:
+            host: of the gateway.
+            out: port on which the gateway publishes replies.
+            into: port on which it takes commands.
+        """
         context = zmq.Context.instance()
         self.replies = context.socket(zmq.SUB)
         self.replies.subscribe(b"")
@@ -33,7 +41,16 @@ class Acquila:
     def send(
         self, component: str, command: str, arg1: object = "", arg2: object = ""
     ) -> int:
-        """Send a command; returns its UUID."""
+        """Send a command without waiting for a reply.
+
+        Args:
+            component: such as `rot_obj` or `camera`.
+            command: to it.
+            arg1, arg2: of the command; sent as text.
+
+        Returns:
+            Its UUID, to be passed to `wait`.
+        """
         uuid = next(self.numbers)
         event = {
             "component": component, "comp_phys": "", "command": command, "arg1": str(arg1),
@@ -44,7 +61,19 @@ class Acquila:
         return uuid
 
     def wait(self, uuid: int, seconds: float = 120.0) -> str:
-        """Wait for a command's end; returns the reply of ACK."""
+        """Wait for a command's end, and print its feedback on the way.
+
+        Args:
+            uuid: of the command; replies to others are dropped.
+            seconds: longest wait.
+
+        Returns:
+            The reply of ACK.
+
+        Raises:
+            RuntimeError: the command ended with ERR; names its reason.
+            TimeoutError: there was no end in time.
+        """
         deadline = time.monotonic() + seconds
         while self.replies.poll(max(0, int(1000 * (deadline - time.monotonic())))):
             event = json.loads(self.replies.recv_string())
@@ -73,6 +102,11 @@ class Acquila:
 
 
 def main(argv: list[str]) -> None:
+    """Set tube, camera and motors, save a dark and a flat image, and scan 19 images while
+    the stage turns.
+
+    `argv` may have the host, then the gateway's two ports.
+    """
     host = argv[0] if argv else "127.0.0.1"
     scanner = Acquila(host, *(int(port) for port in argv[1:3]))
     do = scanner.do

@@ -84,7 +84,12 @@ class Outcome:
 
 
 def random_solid(rng: np.random.Generator) -> tuple[str, ConvexSolid]:
-    """Draw a solid of a random kind, off its frame's origin by up to 60 mm."""
+    """Draw a convex solid of a random kind, size and orientation, in half of the cases
+    off its frame's origin by up to 60 mm.
+
+    Returns:
+        Name of the kind, and the solid.
+    """
     name = rng.choice(["box", "hull", "wall", "long", "cylinder"])
     center = rng.uniform(-60, 60, 3) * rng.integers(0, 2)
     turn = Rotation.random(random_state=rng).as_matrix()
@@ -105,8 +110,9 @@ def random_solid(rng: np.random.Generator) -> tuple[str, ConvexSolid]:
 
 
 def random_trajectory(rng: np.random.Generator, span: float) -> Trajectory:
-    """Draw a motor's way over about `span`, begun up to 2 s late, at times retargeted on the
-    way."""
+    """Draw a motor's trajectory over about `span` [mm or deg], begun up to 2 s late, in
+    three of ten cases retargeted on the way.
+    """
     start = rng.uniform(0, 2) * rng.integers(0, 2)
     speed, acceleration = rng.uniform(0.05, 0.5) * span, rng.uniform(0.02, 1.0) * span
     first = motion.move(0.0, 0.0, span, speed, acceleration, start)
@@ -122,7 +128,13 @@ def random_trajectory(rng: np.random.Generator, span: float) -> Trajectory:
 
 
 def random_case(rng: np.random.Generator, kind: str) -> Case:
-    """Bodies aimed at each other: at a random time they overlap, graze or pass within 30 mm."""
+    """Draw two bodies that move towards each other: at a random time they overlap by up
+    to 30 mm, graze, or pass within 30 mm.
+
+    Args:
+        rng: of all draws.
+        kind: of KINDS; chooses which motors move.
+    """
     (name_a, a), (name_b, b) = random_solid(rng), random_solid(rng)
     moving = {
         "translation": ["ax"],
@@ -200,7 +212,11 @@ def _tip(solid: ConvexSolid, direction: np.ndarray) -> np.ndarray:
 
 
 def reference(case: Case, times: np.ndarray) -> np.ndarray:
-    """Clearances at `times` by fcl (0 when they overlap), straight from the trajectories."""
+    """Compute the clearances [mm] at `times` [s] by fcl, straight from the trajectories;
+    0 where the bodies overlap.
+
+    Two boxes overlap, too, where no separating axis is found.
+    """
     columns = [
         case.trajectories[n].positions(times) if n in case.trajectories else 0.0 * times
         for n in AXES
@@ -239,7 +255,12 @@ def reference(case: Case, times: np.ndarray) -> np.ndarray:
 def separated(
     vertices: Sequence[np.ndarray], poses: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """Separating axis test of two boxes (8 corners each) at many poses: (n,) bool."""
+    """Test at n poses whether a separating axis of two boxes exists, (n,).
+
+    Args:
+        vertices: (8, 3) corners of each box.
+        poses: of each box, turns (n, 3, 3) and origins (n, 3).
+    """
     corners = [
         v @ np.swapaxes(r, 1, 2) + o[:, None]
         for v, (r, o) in zip(vertices, poses, strict=True)
@@ -260,7 +281,9 @@ def separated(
 
 
 def sample_times(case: Case) -> np.ndarray:
-    """Return times at most `STEP_MM` of way apart (within 2001 to 12001 of them)."""
+    """Choose times from 0 to the end at most `STEP_MM` of the bodies' way apart, but
+    between 2001 and 12001 of them.
+    """
     fine = np.linspace(0.0, case.end, 2001)
     way = np.zeros(2000)
     for n, t in case.trajectories.items():
@@ -287,7 +310,12 @@ def swept(
 
 
 def judge(case: Case) -> Outcome | None:
-    """Sweep and compare; None where the bodies begin within 0.1 mm of the margin."""
+    """Sweep a case three times, and compare the sweep with the reference.
+
+    Returns:
+        The outcome, with the least time; None where the bodies begin within 0.1 mm of the
+        margin.
+    """
     if reference(case, np.zeros(1))[0] < MARGIN + 0.1:
         return None
     swept(
@@ -318,7 +346,13 @@ def judge(case: Case) -> Outcome | None:
 
 
 def study_pairs(sweeps: int, seed: int, progress: Callable[[int], None]) -> list[Outcome]:
-    """`sweeps` outcomes, the kinds in turn."""
+    """Draw cases until `sweeps` of them could be judged, the kinds in turn.
+
+    Args:
+        sweeps: number of outcomes.
+        seed: of the draws.
+        progress: called with the number of outcomes so far.
+    """
     out: list[Outcome] = []
     draw = 0
     while len(out) < sweeps:
@@ -332,8 +366,11 @@ def study_pairs(sweeps: int, seed: int, progress: Callable[[int], None]) -> list
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, object]:
-    """Sum up counts and times; `missed` are sweeps that let the clearance fall below the
-    margin."""
+    """Sum up counts, clearances [mm] and times [ms] of sweeps by name; `missed` are
+    sweeps that let the clearance fall below the margin.
+
+    Values of no outcome are None; there must be one outcome at least.
+    """
     ms = np.array([o.seconds for o in outcomes]) * 1e3
     stops = [o for o in outcomes if o.stopped]
     free = [o for o in outcomes if not o.stopped]
@@ -370,7 +407,13 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, object]:
 
 
 def study_machine(moves: int, seed: int) -> dict[str, object]:
-    """Measure sweeps of the whole FleX-ray with a LEGO-sized sample: 1 to 8 motors at once."""
+    """Time sweeps of the complete FleX-ray with a LEGO-sized sample, 1 to 8 motors moving
+    at once to random targets.
+
+    Returns:
+        Counts of moves, bodies, pairs and stops, and median, 95 % and worst times [ms] of
+        the sweep and of the guard.
+    """
     machine = builtin_machine()
     scene = build_scene(
         machine, builtin_profile(machine.default_profile), [box((24, 16, 49.8))]
@@ -410,7 +453,13 @@ def study_machine(moves: int, seed: int) -> dict[str, object]:
 
 
 def study_scripts() -> dict[str, object]:
-    """Measure whole checks (parse, plan, optics, collisions) without imaging, best of five."""
+    """Time complete checks (parse, plan, optics, collisions) of four sets of scripts,
+    best of five.
+
+    Returns:
+        Name of the set -> time [ms], and frames, collisions and least clearance [mm] of
+        its last script.
+    """
     machine = builtin_machine()
     profile = builtin_profile(machine.default_profile)
     lego = convex_pieces(load_phantom("lego").mesh())
@@ -452,7 +501,11 @@ def study_scripts() -> dict[str, object]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the study; exit code 1 if a contact was missed, a stop false, a clearance wrong."""
+    """Run the study, print its figures as JSON, and write them to a file if one is named.
+
+    Returns:
+        1 if a contact was missed, a stop false or a clearance wrong; else 0.
+    """
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--sweeps", type=int, default=2000)
     parser.add_argument("--moves", type=int, default=500)
@@ -461,6 +514,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def progress(done: int) -> None:
+        """Show the number of sweeps done in a terminal, every hundred."""
         if sys.stderr.isatty() and done % 100 == 0:
             print(f"\r{done}/{options.sweeps}", end="", file=sys.stderr)
 

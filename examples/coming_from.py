@@ -52,7 +52,9 @@ ON_THE_CARD = re.compile(
 
 
 def blocks(page: str) -> dict[str, str]:
-    """Caption -> code of a page, made smaller."""
+    """Return caption -> code of a page's blocks, with views, pixels and voxels made
+    smaller by `SMALLER`.
+    """
     text = (PAGES / f"{page}.md").read_text(encoding="utf-8")
     numbers = re.compile(
         r"(?<![\w.])(" + "|".join(map(re.escape, SMALLER)) + r")(?![\w.])"
@@ -64,8 +66,12 @@ def blocks(page: str) -> dict[str, str]:
 
 
 def given() -> dict[str, Any]:
-    """Return the names that the blocks presuppose: an array, a spectrum, files in the working
-    directory."""
+    """Return the names that the blocks presuppose, and write the files that they read
+    into the working directory.
+
+    The names are `array`, a volume (24, 24, 24), and `spectrum`; the files a mesh,
+    vectors and line integrals.
+    """
     array = np.zeros((24, 24, 24), np.float32)
     array[6:18, 6:18, 6:18] = 0.05
     array[8:11, 13:16, 15:18] = 0.0
@@ -79,7 +85,7 @@ def given() -> dict[str, Any]:
 
 
 def has_card() -> bool:
-    """Whether ASTRA finds a CUDA device."""
+    """Return whether ASTRA is installed and finds a CUDA device."""
     try:
         import astra
     except ImportError:
@@ -88,7 +94,18 @@ def has_card() -> bool:
 
 
 def run(code: str, names: dict[str, Any]) -> dict[str, object]:
-    """Statement by statement; the first error, and how many of them ran."""
+    """Run code statement by statement, without its output; after an error the next
+    statement is run.
+
+    Without a CUDA device statements that need one count as an error.
+
+    Args:
+        code: of a block.
+        names: global names, which the code changes.
+
+    Returns:
+        `statements` and `ran`, counts, and `error`, the first one with its line, or None.
+    """
     statements, error, ran, card = ast.parse(code).body, None, 0, has_card()
     for statement in statements:
         try:
@@ -111,7 +128,9 @@ def spread_mm(rows: np.ndarray, wanted: fx.ConeVec, upwards: bool) -> float:
 
 
 def fifth_task() -> list[fx.ConeVec]:
-    """Return the geometries of the library page's fifth task."""
+    """Return the 100 geometries of the library page's fifth task, each with its own
+    offset [mm] and roll [deg].
+    """
     rng = np.random.default_rng(1)
     scan = {"sod": 600, "sdd": 1059, "angles": 4, "shape": (48, 60), "pixel": 2.4}
     offsets, rolls = rng.normal(0, 0.5, (100, 2)), rng.normal(0, 0.3, 100)
@@ -122,7 +141,16 @@ def fifth_task() -> list[fx.ConeVec]:
 
 
 def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
-    """Compare as above, for the blocks of the five tasks."""
+    """Compare the result of a block of the five tasks with flexdt's.
+
+    Args:
+        caption: of the block.
+        theirs: names after its code.
+
+    Returns:
+        `geometry_mm` or `mean_difference_part`; {} for other blocks, or if the code did
+        not make the result.
+    """
     if caption.endswith("task 2"):
         vectors = fx.ConeVec(np.load("vectors.npy"))
         if caption.startswith("tomosipo") and "scan" in theirs:
@@ -151,7 +179,9 @@ def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
 
 
 def cil_rows(theirs: dict[str, Any]) -> np.ndarray:
-    """Return the geometry of CIL's `scan`, as CIL gives it to ASTRA."""
+    """Return the geometry (n, 12) of CIL's `scan`, as CIL gives it to ASTRA for its
+    `volume`.
+    """
     from cil.plugins.astra.utilities import convert_geometry_to_astra_vec_3D
 
     rows: np.ndarray = convert_geometry_to_astra_vec_3D(theirs["volume"], theirs["scan"])[
@@ -161,7 +191,17 @@ def cil_rows(theirs: dict[str, Any]) -> np.ndarray:
 
 
 def compared(peer: str, theirs: dict[str, Any], ours: dict[str, Any]) -> dict[str, float]:
-    """How far a peer's result is from ours; what it did not make is left out."""
+    """Compare a peer's results with flexdt's: geometry [mm], projections, images or
+    volume.
+
+    Args:
+        peer: name of the program.
+        theirs: names after the code of its block.
+        ours: names after the code of flexdt's block.
+
+    Returns:
+        Name -> difference; a result that the peer did not make is left out.
+    """
     out: dict[str, float] = {}
     turn, scan = ours.get("turn"), theirs.get("scan")
     if scan is not None and turn is not None:
@@ -202,7 +242,11 @@ def named(peer: str) -> str | None:
 
 
 def page(name: str) -> dict[str, object]:
-    """All blocks of a page, in a temporary folder."""
+    """Run all blocks of a page in a temporary folder, flexdt's first, and compare them.
+
+    Returns:
+        Caption -> lines of code, peer's version, the result of `run`, and differences.
+    """
     here = os.getcwd()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
@@ -224,6 +268,7 @@ def page(name: str) -> dict[str, object]:
 
 
 def main() -> None:
+    """Run the named pages, or all, and print the results as JSON."""
     every = sorted(path.stem for path in PAGES.glob("*.md"))
     parser = argparse.ArgumentParser(
         description="the pages for users of other programs, run"

@@ -38,7 +38,12 @@ STEADY = 0.2
 
 
 def ours() -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Transmission by this package, and the path through each material."""
+    """Compute the transmission of a bead phantom by this package, and the path through
+    each material.
+
+    Returns:
+        Share of the open beam (rows, cols), and material -> path [mm] (rows, cols).
+    """
     scan = ConeVec.from_vectors(
         (0, -SOD, 0), (0, SDD - SOD, 0), (PIXEL, 0, 0), (0, 0, -PIXEL)
     )
@@ -57,7 +62,15 @@ def ours() -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def theirs(folder: Path) -> np.ndarray:
-    """Transmission by gVirtualXRay, columns along +x, rows down."""
+    """Compute the transmission of the same phantom by gVirtualXRay, columns along +x,
+    rows down.
+
+    Args:
+        folder: for the meshes.
+
+    Returns:
+        Share of the open beam (rows, cols).
+    """
     phantom = bead_phantom("normal", 5)
     gvxr.createOpenGLContext()
     gvxr.setSourcePosition(0.0, -SOD, 0.0, "mm")
@@ -104,10 +117,20 @@ def transmission() -> np.ndarray:
 
 
 def ways(folder: Path) -> tuple[slice, slice]:
-    """How gVirtualXRay's rows and columns must be read to run down and along +x.
+    """Find out how gVirtualXRay's rows and columns must be read to run down and along +x,
+    by the shadow of a steel ball.
 
-    A steel ball stands to the right (+x) and above (+z); its shadow is where the line from the
+    The ball is to the right (+x) and above (+z); its shadow is where the line from the
     source through its centre meets the panel.
+
+    Args:
+        folder: for the ball's mesh.
+
+    Returns:
+        Slices of rows and columns, each forwards or backwards.
+
+    Raises:
+        SystemExit: the shadow is more than a pixel off either way.
     """
     at = np.array([30.0, 0.0, 20.0])
     ball = trimesh.creation.icosphere(subdivisions=4, radius=4.0)
@@ -136,6 +159,9 @@ def ways(folder: Path) -> tuple[slice, slice]:
 
 
 def main() -> None:
+    """Print the relative differences of both transmissions as JSON, in all, off the edges
+    and behind each material.
+    """
     mine, paths = ours()
     with tempfile.TemporaryDirectory() as folder:
         other = theirs(Path(folder))

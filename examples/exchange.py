@@ -24,6 +24,12 @@ from flexdt.library.reading.folders import load_dataset
 
 
 def main(argv: list[str]) -> None:
+    """Write a data set's geometry in every format and read it again, and print the
+    differences [mm, px].
+
+    `argv` has the data set's folder and, if given, the folder for the files. A format
+    that cannot carry the geometry is named with its reason.
+    """
     data = load_dataset(argv[0])
     folder = Path(argv[1] if len(argv) > 1 else "exchange")
     folder.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,15 @@ MOVES = (
 
 
 def event(axis: str, target: float, uuid: int, what: str, reply: str = "") -> str:
-    """One message of the scanner's interface."""
+    """Make one message of the scanner's interface, as JSON.
+
+    Args:
+        axis: that moves.
+        target: of the move [mm].
+        uuid: of the command.
+        what: reply type: "" for the command itself, RCV, FDB or ACK.
+        reply: text of the reply.
+    """
     return json.dumps(
         {
             "component": axis, "comp_phys": "", "command": "move absolute", "arg1": str(target),
@@ -41,7 +49,12 @@ def event(axis: str, target: float, uuid: int, what: str, reply: str = "") -> st
 
 
 def main(port: int) -> None:
-    """Publish, once somebody listens."""
+    """Wait for a subscription, then publish the moves of MOVES with their feedback, in
+    real time, and end.
+
+    Args:
+        port: of 127.0.0.1.
+    """
     socket = zmq.Context().socket(zmq.XPUB)
     socket.bind(f"tcp://127.0.0.1:{port}")
     socket.recv()  # a subscription

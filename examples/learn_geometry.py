@@ -50,7 +50,9 @@ class Task:
     truth: np.ndarray
 
     def rows(self, values: np.ndarray) -> np.ndarray:
-        """Return the geometry (n, 12) with a shift, a roll and an axis [px]."""
+        """Return the geometry (n, 12) with misalignment `values`: shift, roll (at the end
+        of a row) and axis, each [px].
+        """
         shift, roll, axis = values
         width = self.nominal.shape[2]
         source, centre, u, v = (
@@ -77,11 +79,16 @@ class Task:
         return np.asarray(self.operator(values) @ self.volume, np.float64) - self.images
 
     def jacobian(self, values: np.ndarray, free: list[int]) -> np.ndarray:
-        """(pixels, free parameters): the chain from parameters to the twelve numbers to images.
+        """Compute the derivative of the images by the free parameters, (pixels, free
+        parameters).
 
-        The mean of points NEAR_PX to both sides. The images of voxels have kinks at every
-        hundredth of a pixel; a derivative in one point, right as it is, holds for less than
-        that.
+        It is the mean of derivatives at points NEAR_PX to both sides: the images of
+        voxels have kinks at every hundredth of a pixel, so the derivative in one point
+        holds for less than that.
+
+        Args:
+            values: shift, roll and axis [px].
+            free: indices of the free ones.
         """
         columns = []
         for near in (*NEAR_PX, *(-px for px in NEAR_PX)):
@@ -96,8 +103,9 @@ class Task:
         return np.asarray(near_by.mean(axis=0).T)
 
     def reprojection(self, values: np.ndarray) -> float:
-        """Root mean square distance between images of points by this and by the true
-        geometry."""
+        """Compute the root mean square distance [px] between the images of 100 points by
+        this misalignment and by the true one.
+        """
         reach = 0.3 * self.volume.size_mm[0]
         points = np.random.default_rng(0).uniform(-reach, reach, (100, 3))
         shape = self.nominal.detector_shape
@@ -111,12 +119,17 @@ class Task:
 def render(
     ellipsoids: list[tuple], rows: np.ndarray, shape: tuple[int, int], sharp: bool
 ) -> np.ndarray:
-    """Line integrals (n, rows, cols) of ellipsoids (centre, matrix to the unit ball, value).
+    """Compute line integrals (n, rows, cols) of ellipsoids, exactly.
 
-    A sharp one has its value everywhere inside, another value * (1 - rho^2) at rho of the way
-    to
-    the surface. With rho^2 = a t^2 + 2 b t + c along a ray the chord is |t - t0| < w, and the
+    With rho^2 = a t^2 + 2 b t + c along a ray the chord is |t - t0| < w, and the
     integrals are 2 w and 4/3 a w^3.
+
+    Args:
+        ellipsoids: centre, matrix to the unit ball, and value [1/mm] of each.
+        rows: (n, 12) cone_vec.
+        shape: (rows, cols).
+        sharp: whether each has its value everywhere inside; else value * (1 - rho^2) at
+            rho of the way to the surface.
     """
     height, width = shape
     c, r = np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2
@@ -134,7 +147,9 @@ def render(
 
 
 def voxels(ellipsoids: list[tuple], grid: fx.Grid, sharp: bool) -> fx.Volume:
-    """Voxelise the ellipsoids: the mean of some points in each."""
+    """Voxelise ellipsoids, see `render`, by the mean of some points in each voxel: 4^3 if
+    `sharp`, else 2^3.
+    """
     fine = 4 if sharp else 2
     steps = ((np.arange(fine) + 0.5) / fine - 0.5) * grid.voxel_mm
     x, y, z = grid.blank().centers()
@@ -152,7 +167,9 @@ def voxels(ellipsoids: list[tuple], grid: fx.Grid, sharp: bool) -> fx.Volume:
 
 
 def make(seed: int, views: int, count: int, sharp: bool = False) -> Task:
-    """Draw a random object of about count^3 voxels, a random misalignment, and the images."""
+    """Draw twelve ellipsoids, voxelised in count^3, and a misalignment of up to 2 px
+    each, and render the images of the true geometry.
+    """
     rng = np.random.default_rng(seed)
     size = 40.0
     ellipsoids = []
@@ -179,8 +196,17 @@ def make(seed: int, views: int, count: int, sharp: bool = False) -> Task:
 
 
 def learn(task: Task, free: list[int], start: np.ndarray) -> np.ndarray:
-    """Gauss-Newton with trust region: shift, roll and axis [px], the others kept at the
-    truth."""
+    """Fit the free ones of shift, roll and axis [px] to the images by Gauss-Newton with a
+    trust region.
+
+    Args:
+        task: model and images.
+        free: indices of the free ones; the others are kept at the truth.
+        start: all three, where to begin.
+
+    Returns:
+        All three values.
+    """
 
     def all_of(values: np.ndarray) -> np.ndarray:
         full = task.truth.copy()
@@ -198,7 +224,14 @@ def learn(task: Task, free: list[int], start: np.ndarray) -> np.ndarray:
 
 
 def trial(seed: int, views: int, count: int, sharp: bool = False) -> dict[str, object]:
-    """One object, each parameter alone and all together."""
+    """Learn one object's misalignment from a start up to 3 px off, each parameter alone
+    and then all together.
+
+    Returns:
+        Error [px] of each one alone; reprojection error at start and end [px], errors and
+        seconds of all together; and the weakest direction, with its singular value over
+        the largest.
+    """
     task = make(seed, views, count, sharp)
     start = task.truth + np.random.default_rng(seed + 1000).uniform(-3.0, 3.0, 3)
     result: dict[str, object] = {}
@@ -220,7 +253,17 @@ def trial(seed: int, views: int, count: int, sharp: bool = False) -> dict[str, o
 
 
 def race(task: Task, start: np.ndarray) -> dict[str, object]:
-    """L-BFGS on half the sum of squares, with gradients of flexdt and of diffdrr."""
+    """Minimise half the sum of squares by L-BFGS with gradients of flexdt and then of
+    diffdrr.
+
+    Args:
+        task: model and images.
+        start: shift, roll and axis [px].
+
+    Returns:
+        Shape, and for each program times [s] of a gradient and of all, loss and gradient
+        at the start, evaluations and reprojection error [px].
+    """
     import torch
     from diffdrr.renderers import Siddon
 
@@ -236,6 +279,9 @@ def race(task: Task, start: np.ndarray) -> dict[str, object]:
     )
 
     def chain(values: np.ndarray, by_rows: np.ndarray) -> np.ndarray:
+        """Convert a gradient by the geometry's numbers (n, 12) to one by shift, roll and
+        axis.
+        """
         steps = 1e-4 * np.eye(3)
         return np.array([
             np.vdot(by_rows, task.rows(values + s) - task.rows(values - s)) / 2e-4 for s in steps
@@ -248,6 +294,9 @@ def race(task: Task, start: np.ndarray) -> dict[str, object]:
         )
 
     def theirs(values: np.ndarray) -> tuple[float, np.ndarray]:
+        """Compute loss and gradient at `values` by diffdrr's renderer and torch, one view
+        after the other.
+        """
         rows = torch.tensor(task.rows(values), requires_grad=True)
         total = 0.0
         for i in range(n):
@@ -285,8 +334,11 @@ def race(task: Task, start: np.ndarray) -> dict[str, object]:
 
 
 def cost(count: int, repeat: int = 3) -> dict[str, float]:
-    """Milliseconds a view for count^3 random voxels on a panel of 380 x 478: the best of some
-    runs, taken in turns.
+    """Time forward, back, gradient and change for count^3 random voxels on a panel of 380
+    x 478, in turns.
+
+    Returns:
+        Name -> least time of `repeat` runs [ms a view].
     """
     data = np.random.default_rng(0).uniform(0, 0.02, (count,) * 3).astype(np.float32)
     volume = fx.Volume(data, 76.8 / count)
@@ -313,6 +365,9 @@ def cost(count: int, repeat: int = 3) -> dict[str, float]:
 
 
 def main() -> None:
+    """Print the errors of several trials, and with `--peer` a race with diffdrr, or with
+    `--cost` times alone, as JSON.
+    """
     parser = argparse.ArgumentParser(
         description="a misalignment learnt back by gradients"
     )

@@ -13,6 +13,9 @@ import flexdt as fx
 
 
 def main(folder: str) -> None:
+    """Open a data set's folder, and print its size, the first frame's largest line
+    integral and source position.
+    """
     dataset = fx.open(folder)
     rows, cols = dataset.shape
     print(f"{len(dataset)} projections of {cols} x {rows}, complete: {dataset.complete}")

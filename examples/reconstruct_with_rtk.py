@@ -25,6 +25,12 @@ with warnings.catch_warnings():
 
 
 def main(argv: list[str]) -> None:
+    """Reconstruct a data set by RTK's FDK with the geometry of an exported file, and save
+    the volume (z, y, x) as .npy.
+
+    `argv` has the data set's folder, RTK's geometry file, the output and, if given, voxel
+    [mm] (0.5) and voxels a side (128).
+    """
     data = load_dataset(argv[0])
     pixel = float(np.linalg.norm(data.cone_vec.u[0]))
     voxel = float(argv[3]) if len(argv) > 3 else 0.5

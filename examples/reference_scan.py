@@ -42,7 +42,17 @@ SIZE_MM = (49.8, 16.0, 24.0)
 
 
 def bead_centres(volume: Volume, beads: np.ndarray, radius: float) -> np.ndarray:
-    """Centre of each bead: centroid of voxel shares, a ramp about half its brightness."""
+    """Find the centre of each bead in a volume: the centroid of voxels, weighted by a
+    ramp about half its brightness.
+
+    Args:
+        volume: reconstruction.
+        beads: (k, 3) about where they are [mm].
+        radius: of a bead [mm].
+
+    Returns:
+        (k, 3) [mm].
+    """
     data, voxel = volume.data, float(volume.voxel_xyz[0])
     low = np.array(volume.center_mm) - (np.array(data.shape[::-1]) - 1) / 2 * voxel
     out = np.empty_like(beads)
@@ -69,7 +79,9 @@ def sharpness(volume: Volume) -> float:
 
 
 def peak_gib(pid: int) -> float:
-    """Peak resident memory of a process and its children so far [GiB]."""
+    """Return the largest peak of resident memory so far among the descendants of a
+    process [GiB].
+    """
     total = 0.0
     for status in Path("/proc").glob("[0-9]*/status"):
         try:
@@ -109,7 +121,7 @@ class Together:
 
 
 def _family(pid: int) -> list[int]:
-    """List a process and its descendants."""
+    """List a process and all its descendants, the process first."""
     below: dict[int, list[int]] = {}
     for status in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -124,7 +136,7 @@ def _family(pid: int) -> list[int]:
 
 
 def _held_gib(pid: int) -> float:
-    """Proportional set size [GiB]; 0 when the process has ended."""
+    """Return the proportional set size of a process [GiB]; 0 when it has ended."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
@@ -133,6 +145,9 @@ def _held_gib(pid: int) -> float:
 
 
 def main() -> None:
+    """Scan the LEGO phantom, reconstruct it twice, and print times, memory [GiB] and bead
+    errors [mm] as JSON.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--frames", type=int, default=1434)
@@ -158,7 +173,14 @@ def main() -> None:
 def _measure(
     options: argparse.Namespace, script: str, figures: dict[str, object]
 ) -> None:
-    """Scan, reconstruct and compare; what comes out goes into `figures`."""
+    """Make the reference scan unless its folder exists, reconstruct it with its document
+    and from its texts alone, and compare the beads.
+
+    Args:
+        options: of the command line.
+        script: of the scan.
+        figures: gets times [s], memory [GiB], bead errors [mm] and sharpness.
+    """
     out: Path = options.out
     folder = out / "data" / "reference"
     if not folder.exists():

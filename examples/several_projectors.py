@@ -24,7 +24,9 @@ from flexdt.clients import TwinClient
 
 
 def start(*words: str) -> tuple[subprocess.Popen[str], int]:
-    """Start a `flexdt` process and return it with its port."""
+    """Start a `flexdt` process on a free port, wait for its ready line, and return it
+    with its port.
+    """
     command = [sys.executable, "-m", "flexdt.clients.cli", *words, "--port", "0"]
     child = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -36,7 +38,17 @@ def start(*words: str) -> tuple[subprocess.Popen[str], int]:
 def scan(
     ports: list[int], data: Path, frames: int, *how: str
 ) -> tuple[dict[str, str], float]:
-    """Digests of a scan's frames, and seconds; `how` is the command and its own options."""
+    """Scan `frames` poses by a twin that shares its views among projectors.
+
+    Args:
+        ports: of the projectors on this machine.
+        data: the twin's data directory.
+        frames: of one turn.
+        how: the command and its own options.
+
+    Returns:
+        File name -> SHA-256 of each image, and the time of the job [s].
+    """
     pool = ",".join(f"127.0.0.1:{port}" for port in ports)
     twin, port = start(
         *how, "--projectors", pool, "--data", str(data), "--speed-up", "max"
@@ -57,6 +69,12 @@ def scan(
 
 
 def main() -> int:
+    """Scan by one projector, by several, and by `flexdt up`, print the times, and compare
+    the images.
+
+    Returns:
+        0 if all images are the same bytes, else 1.
+    """
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

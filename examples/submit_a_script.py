@@ -14,6 +14,9 @@ from flexdt.clients import TwinClient
 
 
 def main(script: str, host: str = "127.0.0.1", port: int = 55000) -> None:
+    """Check a script on a twin and print its problems, then submit it and print its
+    progress until it has ended.
+    """
     text = Path(script).read_bytes()
     with TwinClient(host, port) as client:
         report = client.check_script(text)

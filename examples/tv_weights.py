@@ -30,7 +30,7 @@ SIZE_MM = 43.2
 
 
 def truth(count: int, fine: int = 3) -> np.ndarray:
-    """Voxelise the scene: the mean of fine^3 points in each."""
+    """Voxelise the scene in count^3 voxels: the mean of fine^3 points in each [1/mm]."""
     at = (np.arange(count * fine) - (count * fine - 1) / 2) * SIZE_MM / (count * fine)
     z, y, x = np.meshgrid(at, at, at, indexing="ij", sparse=True)
     full = 0.03 * ((x / 18) ** 2 + (y / 14) ** 2 + (z / 16) ** 2 < 1)
@@ -43,7 +43,16 @@ def truth(count: int, fine: int = 3) -> np.ndarray:
 
 
 def errors(views: int, noise: float, count: int) -> list[float]:
-    """Root mean square errors [1/mm] of FDK, SIRT and TV with each weight."""
+    """Reconstruct a noisy scan by FDK, SIRT and TV with each of WEIGHTS.
+
+    Args:
+        views: of the turn.
+        noise: standard deviation of the line integrals.
+        count: voxels a side.
+
+    Returns:
+        Root mean square error of each volume [1/mm].
+    """
     grid, wanted = fx.Grid((count,) * 3, SIZE_MM / count), truth(count)
     scan = fx.ConeVec.circular(
         sod=600, sdd=1059, angles=views, shape=(56 * count // 48, 60 * count // 48),
@@ -58,6 +67,7 @@ def errors(views: int, noise: float, count: int) -> list[float]:
 
 
 def main() -> None:
+    """Print the errors of all CASES, one line each."""
     parser = argparse.ArgumentParser(description="how strong total variation should be")
     parser.add_argument("--voxels", type=int, default=48)
     count = parser.parse_args().voxels

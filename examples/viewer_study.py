@@ -35,7 +35,9 @@ PAGES = 3
 
 @contextlib.contextmanager
 def servers() -> Iterator[dict[str, Any]]:
-    """`flexdt up` on free ports; its ready line."""
+    """Run `flexdt up` on free ports with a temporary data directory within the context,
+    and yield its ready line.
+    """
     with tempfile.TemporaryDirectory() as folder:
         words = [
             "--port",
@@ -68,6 +70,9 @@ class Page:
         self.socket, self.states, self.images, self.bytes = socket, 0, 0, 0
 
     async def listen(self, seconds: float) -> None:
+        """Count the states, images and bytes that come within `seconds`, and confirm each
+        as a page does.
+        """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 async for message in self.socket:
@@ -81,7 +86,12 @@ class Page:
 
 
 async def rates(viewer: str) -> list[dict[str, float]]:
-    """States and images a second to each of several pages, while the stage turns."""
+    """Measure the states, images and MB a second that each of PAGES pages gets while the
+    stage turns, for SECONDS.
+
+    Args:
+        viewer: HOST:PORT.
+    """
     async with contextlib.AsyncExitStack() as stack:
         pages = [
             Page(
@@ -133,7 +143,19 @@ LATENCY = """async (n) => {
 
 
 def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
-    """Latency, displayed rate and memory in headless Chromium with software rendering."""
+    """Measure latency, displayed rate and memory of the page in headless Chromium with
+    software rendering.
+
+    Args:
+        url: of the page.
+        view: that it shows.
+        minutes: of motion for the memory; 0 measures none.
+        pid: of the viewer's process.
+
+    Returns:
+        Latency [ms], images and states a second, the viewer's share of a core, and the
+        samples of `memory`.
+    """
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -182,8 +204,17 @@ def cpu_s(pid: int) -> float:
 
 
 def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
-    """Measure the viewer's resident memory and the page's heap in use [MB], while the stage
-    turns."""
+    """Measure the viewer's resident memory and the page's heap in use [MB] at intervals
+    of at most 30 s, while the stage turns.
+
+    Args:
+        page: of the browser.
+        minutes: to measure.
+        pid: of the viewer's process.
+
+    Returns:
+        Samples of minute, viewer_MB and page_heap_MB.
+    """
     samples, end = [], time.monotonic() + 60.0 * minutes
     session = page.context.new_cdp_session(page)
     begun = time.monotonic()
@@ -212,7 +243,11 @@ def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
 
 
 def viewer_pid(port: int) -> int:
-    """Find the process that listens on a port, among those started here."""
+    """Find the viewer's process that listens on a port of this machine.
+
+    Raises:
+        LookupError: there is none.
+    """
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             words = (entry / "cmdline").read_bytes().split(b"\0")
@@ -226,6 +261,9 @@ def viewer_pid(port: int) -> int:
 
 
 def _owns(entry: Path, port: int) -> bool:
+    """Return whether a process, by its folder in /proc, has the socket of a TCP port
+    (IPv4).
+    """
     sockets = {os.readlink(f) for f in (entry / "fd").iterdir()}
     for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
         fields = line.split()
@@ -238,7 +276,12 @@ def _owns(entry: Path, port: int) -> bool:
 
 
 def main() -> int:
-    """Print one JSON document."""
+    """Measure the viewer at its socket and, where playwright is installed, in a browser;
+    print one JSON document.
+
+    Returns:
+        0.
+    """
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument(
         "--minutes", type=float, default=0.0, help="of motion, for memory"

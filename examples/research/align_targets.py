@@ -72,7 +72,7 @@ class Hidden:
         return np.arange(self.views) * self.span / self.views
 
     def nominal(self) -> fx.ConeVec:
-        """Return the geometry that the data set states."""
+        """Return the geometry that the data set states: centred and not tilted."""
         return fx.ConeVec.circular(
             sod=self.sod,
             sdd=self.sdd,
@@ -82,7 +82,9 @@ class Hidden:
         )
 
     def steps(self) -> tuple[np.ndarray, np.ndarray]:
-        """u and v, (3,) each [mm]."""
+        """Compute the panel's pixel steps u and v, (3,) each [mm], with its roll, pitch
+        and yaw.
+        """
         roll, pitch, yaw = (math.radians(t) for t in self.tilts)
         u = np.array([math.cos(roll), 0.0, -math.sin(roll)])
         v = np.array([-math.sin(roll), 0.0, -math.cos(roll)])
@@ -93,8 +95,13 @@ class Hidden:
         return swing @ lean @ u * self.pixel, swing @ lean @ v * self.pixel
 
     def placed(self, k: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Source, panel's centre, u and v of view `k`, or one between two,
-        (3,) each, as the object sees them [mm]."""
+        """Compute source, panel's centre, u and v of a view, (3,) each, as the object
+        sees them [mm].
+
+        Args:
+            k: number of the view, or a place between two; with jitter the view's own
+                counts.
+        """
         part = k / self.views
         phi = math.radians(part * self.span)
         c, s = math.cos(phi), math.sin(phi)
@@ -111,8 +118,9 @@ class Hidden:
         return source, centre, u, v
 
     def axis_in_image(self) -> tuple[float, float]:
-        """Column where the axis crosses the middle row [px], its angle [deg]: its upper end
-        leans to the right for positive ones."""
+        """Compute the column where the axis crosses the middle row [px], and the axis's
+        angle [deg]; its upper end leans to the right for positive angles.
+        """
         u, v = self.steps()
         centre = np.array([self.panel[0], self.sdd, self.panel[1]])
         seen = []
@@ -126,7 +134,7 @@ class Hidden:
         )
 
     def source_row(self) -> float:
-        """Row of the ray from the source, level, to the axis [px]."""
+        """Compute the row of the level ray from the source to the axis [px]."""
         u, v = self.steps()
         centre = np.array([self.panel[0], self.sdd, self.panel[1]])
         ray = np.array([self.axis_x, self.sod, 0.0])
@@ -135,7 +143,9 @@ class Hidden:
 
 
 def drawn(rng: np.random.Generator, plain: Hidden) -> Hidden:
-    """Draw a scanner's offsets about those of a plain one."""
+    """Draw axis, panel and tilts of a scanner about those of a plain one; the rest is the
+    plain one's.
+    """
     wide = plain.pixel * plain.shape[1] / 956
     return replace(
         plain,
@@ -158,7 +168,7 @@ class Solids:
 
 
 def lego(rng: np.random.Generator) -> Solids:
-    """Build a hollow brick that leans on no axis, with studs, and beads in its walls."""
+    """Draw a hollow brick beside the axis, with studs, and nine beads."""
     shift = rng.uniform(-4, 4, 2)
     boxes = [[0, 0, 0, 16, 8, 10, 0.02], [0, 0, -1, 14.5, 6.5, 9, -0.02]]
     boxes += [[x, y, 11, 2.4, 2.4, 1, 0.02] for x in (-12, -4, 4, 12) for y in (-4, 4)]
@@ -173,7 +183,7 @@ def lego(rng: np.random.Generator) -> Solids:
 
 
 def porous(rng: np.random.Generator) -> Solids:
-    """Build an ellipsoid with 80 pores."""
+    """Draw an ellipsoid beside the axis, with 80 pores in it."""
     body = [[*rng.uniform(-3, 3, 2), 0, *rng.uniform(15, 20, 2), 22, 0.03]]
     for _ in range(80):
         direction = rng.normal(size=3)
@@ -184,7 +194,7 @@ def porous(rng: np.random.Generator) -> Solids:
 
 
 def smooth(rng: np.random.Generator) -> Solids:
-    """Five bodies whose density falls off smoothly: 12 shells each."""
+    """Draw five bodies whose density falls off smoothly, as 12 shells each."""
     out = []
     for _ in range(5):
         centre, half = rng.uniform(-9, 9, 3), rng.uniform(7, 12, 3)
@@ -195,7 +205,7 @@ def smooth(rng: np.random.Generator) -> Solids:
 
 
 def truncated(rng: np.random.Generator) -> Solids:
-    """Build a porous body that is wider and higher than the field of view."""
+    """Draw a porous body that is wider and higher than the field of view."""
     inside = porous(rng)
     wide = inside.ellipsoids.copy()
     wide[:, :3] *= 2.9
@@ -211,8 +221,13 @@ OBJECTS: Final[Mapping[str, Callable[[np.random.Generator], Solids]]] = {
 
 @numba.njit(cache=True, fastmath=True)
 def _window(solid, source, centre, u, v, shape):  # type: ignore[no-untyped-def]
-    """First row and column of the pixels that may see the solid's bounding box, and those after
-    the last."""
+    """Find the first row and column of the pixels that may see the solid's bounding box,
+    and those after the last.
+
+    Returns:
+        Top, bottom, left, right; all of the image where a corner is not ahead of the
+        source.
+    """
     normal, to = np.cross(u, v), centre - source
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for corner in range(8):
@@ -232,8 +247,15 @@ def _window(solid, source, centre, u, v, shape):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, fastmath=True)
 def add_chords(source, centre, u, v, solids, round_, out):  # type: ignore[no-untyped-def]
-    """Add the line integrals of ellipsoids (`round_`) or boxes (k, 7); u is perpendicular to
-    v."""
+    """Add the line integrals of solids to an image, in place.
+
+    Args:
+        source, centre: of the view (3,) [mm].
+        u, v: pixel steps (3,) [mm].
+        solids: (k, 7) centre, half axes [mm] and attenuation [1/mm].
+        round_: ellipsoids; else boxes.
+        out: (rows, cols).
+    """
     rows, cols = out.shape
     for k in range(len(solids)):
         e = solids[k]
@@ -267,7 +289,9 @@ def add_chords(source, centre, u, v, solids, round_, out):  # type: ignore[no-un
 
 
 def project(hidden: Hidden, solids: Solids, rays: int = 3) -> np.ndarray:
-    """Line integrals (views, rows, cols), the mean over `rays` x `rays` of each pixel."""
+    """Compute line integrals (views, rows, cols), the mean over `rays` x `rays` of each
+    pixel.
+    """
     rows, cols = hidden.shape
     out = np.empty((hidden.views, rows, cols), dtype=np.float32)
     for k in range(hidden.views):
@@ -314,7 +338,9 @@ def measured(
 
 
 def errors(found: Any, hidden: Hidden) -> dict[str, tuple[float, float]]:
-    """Error and sigma of the column [px], the axis's angle, the yaw [deg] and the row [px]."""
+    """Compare an alignment with the truth: (error, sigma) of "column" [px], "roll" (the
+    axis's angle) and, if they were found, "yaw" [deg] and "row" [px].
+    """
     column, angle = hidden.axis_in_image()
     p = found.parameters
     out = {
@@ -343,8 +369,18 @@ def _angle(found: Any) -> float:
 def left_of(
     true: np.ndarray, motion: Any, hidden: Hidden, degrees: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shifts that a motion leaves, less those that all frames share or that turn
-    once with the stage, and its sigmas, both (n, 2) as columns and rows [px]."""
+    """Compute the shifts that a motion leaves, less those that all frames share or that
+    turn once with the stage.
+
+    Args:
+        true: (n, 2) shifts [px].
+        motion: found.
+        hidden: the scanner.
+        degrees: (n,) of the stage.
+
+    Returns:
+        The rest and its sigmas, both (n, 2) as columns and rows [px].
+    """
     to_px = hidden.sdd / hidden.sod / hidden.pixel
     angle = np.radians(degrees)
     modes = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
@@ -357,8 +393,19 @@ def left_of(
 def shifted(
     name: str, plain: Hidden, size: float, photons: float, seed: tuple[int, ...]
 ) -> str:
-    """Say how much is left of shifts of `size` pixels (0.1496 mm, rms) in every frame, in
-    words."""
+    """Align one scan with shifts of `size` pixels (0.1496 mm, rms) in every frame, and
+    describe in words how much is left.
+
+    Args:
+        name: of the object.
+        plain: the scanner without offsets.
+        size: of the shifts [px].
+        photons: of the open beam.
+        seed: of all draws.
+
+    Returns:
+        One line; the reason if no motion was found.
+    """
     rng = np.random.default_rng([*seed, sorted(OBJECTS).index(name)])
     hidden, solids = drawn(rng, plain), OBJECTS[name](rng)
     factor = hidden.pixel / PIXEL
@@ -388,7 +435,9 @@ RADIUS: Final = 14.0
 
 
 def edges(plain: Hidden, rng: np.random.Generator) -> list[float]:
-    """Widths of a ball's edge in voxels: nominal geometry, aligned, true."""
+    """Reconstruct a ball with nominal, aligned and true geometry, and measure the width
+    of its edge, 10 to 90 %, in each [voxels].
+    """
     hidden = drawn(rng, plain)
     ball = Solids(np.array([[2.0, -1.0, 0.0, *3 * [RADIUS], 0.02]]), np.zeros((0, 7)))
     data = measured(project(hidden, ball), hidden, 10_000.0, rng)
@@ -421,8 +470,18 @@ SPOILT: Final = ("clean", "flat ramp 1 %", "flat ramp 3 %", "frame repeated", "3
 def spoilt(
     kind: str, hidden: Hidden, solids: Solids, rng: np.random.Generator
 ) -> tuple[np.ndarray, Hidden, np.ndarray, float]:
-    """Line integrals with something wrong with them, the scanner, which frames there are, and
-    the flat field's error."""
+    """Project solids with something wrong in the scan, of SPOILT.
+
+    Args:
+        kind: of the fault.
+        hidden: the scanner.
+        solids: the object.
+        rng: chooses frames.
+
+    Returns:
+        Line integrals, the scanner with the fault, indices of the frames that the data
+        set has, and the flat field's error.
+    """
     n = hidden.views
     span = {"200 deg": 200.0, "350 deg": 350.0}.get(kind, 360.0)
     drift = 0.5 * hidden.pixel * SOD / (SDD - SOD) if kind.startswith("drift") else 0.0
@@ -446,6 +505,9 @@ def spoilt(
 
 
 def main() -> None:
+    """Align drawn scans and print a line of errors and pulls for each object, kind and
+    number of photons, or what the options choose.
+    """
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--views", type=int, default=180)
     parser.add_argument("--binning", type=int, default=2)
@@ -528,6 +590,15 @@ def main() -> None:
 def _line(
     label: str, runs: list[tuple[dict[str, tuple[float, float]], float]], factor: int
 ) -> str:
+    """Format the runs of one kind: aligned of all, rms and largest error of each
+    parameter, pulls, values beyond four sigmas, mean time [s].
+
+    Args:
+        label: of the line.
+        runs: (errors by parameter, seconds) of each; empty errors where nothing was
+            found.
+        factor: binning, to state pixels of 0.1496 mm.
+    """
     told = [r for r, _ in runs if r]
     cells = [f"{label:40s}  {len(told)}/{len(runs)}"]
     pulls, wild = [], 0

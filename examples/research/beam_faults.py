@@ -98,7 +98,9 @@ class Laboratory:
 
 
 def rays(truth: Mapping[str, float], step: int = 1) -> Array:
-    """Return unit vectors from the source through every `step`-th pixel, (rows, cols, 3)."""
+    """Compute unit vectors from the source through every `step`-th pixel, (rows, cols,
+    3), with the offsets of `truth`.
+    """
     panel, across, down = own.places(np.zeros((1, 3)), np.zeros(1), own.SOD, truth)[1]
     column = np.arange(0, own.SHAPE[1], step) - (own.SHAPE[1] - 1) / 2
     row = np.arange(0, own.SHAPE[0], step) - (own.SHAPE[0] - 1) / 2
@@ -107,8 +109,17 @@ def rays(truth: Mapping[str, float], step: int = 1) -> Array:
 
 
 def cylinder(ray: Array, low: Array, high: Array, radius: float) -> Array:
-    """Chords of rays from the origin in the endless cylinder about the line from low to
-    high."""
+    """Compute the chords of rays from the origin in the endless cylinder about the line
+    from low to high [mm].
+
+    Args:
+        ray: (..., 3) unit vectors.
+        low, high: (3,) points of the axis [mm].
+        radius: [mm].
+
+    Returns:
+        (...), 0 where a ray misses it.
+    """
     way = (high - low) / np.linalg.norm(high - low)
     across = ray - (ray @ way)[..., None] * way
     start = low - (low @ way) * way
@@ -121,7 +132,18 @@ def cylinder(ray: Array, low: Array, high: Array, radius: float) -> Array:
 def radiographs(
     lab: Laboratory, rng: Rng, beads: Array, angles: Array, truth: Mapping[str, float]
 ) -> list[npt.NDArray[np.float32]]:
-    """Line integrals as a camera makes them, from flat-corrected counts."""
+    """Simulate line integrals as a camera makes them, from flat-corrected counts, one
+    image (rows, cols) for each angle.
+
+    Blur, scatter, lag, drift, saturation and dead pixels are those of `lab`.
+
+    Args:
+        lab: sample, beam and camera.
+        rng: of noise and dead pixels.
+        beads: (k, 3) [mm].
+        angles: (n,) of the stage [deg].
+        truth: offsets [mm, deg].
+    """
     if lab.strain is not None:
         beads = beads + beads @ lab.strain.T
     step = angles[1] - angles[0]
@@ -155,7 +177,16 @@ def light(
     truth: Mapping[str, float],
     straight: Array,
 ) -> Array:
-    """Return the transmitted share of the beam at one angle, (rows, cols)."""
+    """Compute the transmitted share of the beam at one angle, (rows, cols), through the
+    balls and their holder.
+
+    Args:
+        lab: materials, sizes and spectrum.
+        beads: (k, 3) [mm].
+        angle: of the stage [deg].
+        truth: offsets [mm, deg].
+        straight: unit vectors of `rays`.
+    """
     ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
     turn = np.array([angle])
     (at,), panel = own.places(np.concatenate([beads, ends]), turn, own.SOD, truth)
@@ -180,7 +211,9 @@ def light(
 
 
 def _blurred(image: Array, blur: tuple[float, float, float]) -> Array:
-    """With a Gaussian of two widths, the first along a line at an angle to the rows."""
+    """Blur an image with a Gaussian of two widths [px], the first along a line at an
+    angle [deg] to the rows.
+    """
     one, two, angle = blur
     if one == two:
         return np.asarray(cv2.GaussianBlur(image, (0, 0), one))
@@ -201,6 +234,9 @@ def _shifted(image: Array, shift: tuple[Array, Array]) -> Array:
 
 
 def _radial(rng: Rng) -> tuple[Array, Array]:
+    """Draw the shifts (rows, columns) [px] of a panel with a radial distortion of 0.3 to
+    1 px at 305 px from its middle.
+    """
     row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
     y, x = (
         (row - (own.SHAPE[0] - 1) / 2) / 305.0,
@@ -211,7 +247,9 @@ def _radial(rng: Rng) -> tuple[Array, Array]:
 
 
 def _tiles(rng: Rng) -> tuple[Array, Array]:
-    """Beyond a border the picture comes nearer by the gap."""
+    """Draw the shifts (rows, columns) [px] of a panel of two tiles with a gap of 0.5 to 2
+    px between them, which the image leaves out.
+    """
     row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
     axis, gap = int(rng.integers(2)), float(rng.uniform(0.5, 2.0))
     border = own.SHAPE[axis] * rng.uniform(0.4, 0.6)
@@ -227,9 +265,12 @@ def _with(**fields: object) -> Change:
 
 
 def _strained(i: int, j: int) -> Change:
-    """Strain the phantom by .05 to 1 % in one way."""
+    """Make a fault that strains the phantom by 0.05 to 1 %, by element (i, j) of the
+    strain.
+    """
 
     def change(lab: Laboratory, rng: Rng) -> Laboratory:
+        """Draw the strain's size and sign, and set it, with light of one energy."""
         strain = np.zeros((3, 3))
         strain[i, j] = rng.choice([-1, 1]) * math.exp(
             rng.uniform(math.log(5e-4), math.log(1e-2))
@@ -244,9 +285,12 @@ def _as_assumed(lab: Laboratory, rng: Rng) -> Laboratory:
 
 
 def _renumbered(shift: int, stays: bool) -> Change:
-    """From a frame on, or in that frame alone, images are those of `shift` frames later."""
+    """Make a fault of frame numbers: from a frame on (`stays`), or in that frame alone,
+    images are those of `shift` frames later.
+    """
 
     def shown(angles: Array, rng: Rng) -> Array:
+        """Return the angles that the images have, from a drawn frame on or in it alone."""
         n = len(angles)
         at = int(rng.integers(1, n))
         later = np.arange(n) >= at if stays else np.arange(n) == at
@@ -256,7 +300,9 @@ def _renumbered(shift: int, stays: bool) -> Change:
 
 
 def _four_tiles(rng: Rng) -> tuple[Array, Array]:
-    """Two columns and two rows of tiles, with a gap between each."""
+    """Draw the shifts (rows, columns) [px] of a panel of 2 x 2 tiles, with gaps of 0.5 to
+    2 px between them.
+    """
     row, column = np.mgrid[: own.SHAPE[0], : own.SHAPE[1]].astype(float)
     gaps = rng.uniform(0.5, 2.0, size=2)
     low, right = (
@@ -344,7 +390,9 @@ class Scored:
 
 
 def magnification(truth: Mapping[str, float]) -> float:
-    """Of a short line across the beam and along the panel's rows, on the axis."""
+    """Compute the magnification of a line of 1 mm across the beam and along the panel's
+    rows, on the axis.
+    """
     _, (panel, across, down) = own.places(np.zeros((1, 3)), np.zeros(1), own.SOD, truth)
     tau = np.array([truth["tau_x"], truth["tau_z"], 0.0])
     foot = own.places(tau[None], np.zeros(1), own.SOD, truth)[0][0, 0]
@@ -358,7 +406,16 @@ def magnification(truth: Mapping[str, float]) -> float:
 
 
 def scored(kind: str, seed: int, frames: int = 24) -> Scored:
-    """Make the scan, calibrate it and judge."""
+    """Make a scan of a kind, calibrate it, and compare the answer with the truth.
+
+    Args:
+        kind: of KINDS.
+        seed: of all draws.
+        frames: of the turn.
+
+    Returns:
+        The score; not offered where calibration is refused.
+    """
     rng = np.random.default_rng([seed, *kind.encode()])
     change, name = KINDS[kind]
     lab = change(Laboratory(), rng)
@@ -390,10 +447,10 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
 def _errors(
     result: Calibration, truth: Mapping[str, float], lab: Laboratory
 ) -> dict[str, float]:
-    """Of every value that is offered [sigma].
+    """Compute the error [sigma] of every value that a calibration offers, by name.
 
-    Where beads see one tile alone, no border is found, and the axis's column is that of its
-    tile.
+    Where beads see one tile alone, no border is found, and the axis's column is that of
+    its tile.
     """
     fit = result.fit
     assert fit is not None
@@ -411,7 +468,11 @@ def _errors(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Calibrate scans of each kind, print a line for each kind and the counts.
+
+    Returns:
+        1 if a value is more than WRONG_SIGMAS off, else 0.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--each", type=int, default=5, help="scans of each kind")
     parser.add_argument("--seed", type=int, default=0)

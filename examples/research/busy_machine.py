@@ -38,7 +38,9 @@ WARM_UP_S = 0.3
 
 
 def cases() -> dict[str, Callable[[], object]]:
-    """Name -> what is timed: small views, whose threads meet most often."""
+    """Return name -> work to time: projections and reconstructions of small views, whose
+    threads meet most often.
+    """
     scan = fx.ConeVec.circular(sod=300, sdd=600, angles=VIEWS, shape=SHAPE, pixel=1.0)
     random = np.random.default_rng(1)
     volume = fx.Volume(random.random((VOXELS,) * 3, dtype=np.float32), 0.4)
@@ -56,7 +58,9 @@ def cases() -> dict[str, Callable[[], object]]:
 
 @contextmanager
 def busy_loops(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Start busy processes, stopped at first, in a session of their own."""
+    """Start `count` processes that loop for ever, in a session of their own, within the
+    context; killed at its end.
+    """
     script = (
         f"import os\nfor _ in range({count - 1}):\n    if os.fork() == 0: break\nwhile "
         "True: pass\n"
@@ -78,6 +82,9 @@ def timed(work: Callable[[], object]) -> tuple[float, float]:
 
 
 def main() -> None:
+    """Time each case on the quiet and on the busy machine in turns, and print medians,
+    their ratio and that of processor time.
+    """
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--loops", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=5)

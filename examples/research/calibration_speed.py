@@ -30,16 +30,16 @@ from flexdt.twin.errors import TwinError
 
 
 def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
-    """Time calibration of a data set.
+    """Time the calibration of a data set: the fit alone, from memory, and from files.
 
     Args:
         folder: a data set.
-        phantom: what was scanned.
+        phantom: name of the scanned one.
         repeats: runs of each case, after one that is not counted.
 
     Returns:
-        For `solve`, `memory` and `files`: best_s, median_s and cpu_s (the least); and what was
-        calibrated.
+        `solve`, `memory` and `files`, each with best_s, median_s and cpu_s (the least);
+        and frames, shape, positions and cores.
 
     Raises:
         DatasetError: the folder is no data set.
@@ -79,7 +79,11 @@ def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
 
 
 def timed(work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Best and median wall seconds, least CPU seconds, of some runs after one for warmth."""
+    """Run work `repeats` times after one run for warmth.
+
+    Returns:
+        best_s and median_s of the wall clock, and cpu_s, the least processor time.
+    """
     work()
     wall, cpu = [], []
     for _ in range(repeats):
@@ -91,7 +95,11 @@ def timed(work: Callable[[], object], repeats: int) -> dict[str, float]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Time the calibration of the data set on the command line and print the figures.
+
+    Returns:
+        0; 1 after an error, which is printed.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--phantom", default="lego")

@@ -44,6 +44,7 @@ def _rows(document: Document, without: tuple[str, ...] = ()) -> list[Document]:
 
 
 def _span(values: Sequence[float | None]) -> str:
+    """Format the least and largest of some numbers, "-" if all are None."""
     some = [v for v in values if v is not None]
     if not some:
         return "-"
@@ -56,9 +57,19 @@ def _thesis(rows: Sequence[Document]) -> str:
 
 
 def _solved(limit: float, without: tuple[str, ...] = ()) -> Callable[[Document], Reading]:
-    """All runs recovered, MAE of each below a limit, at most eight iterations."""
+    """Make the reader of a target: all runs recovered, the largest MAE below a limit, at
+    most eight iterations.
+
+    Args:
+        limit: of the MAE.
+        without: settings that are left out.
+
+    Returns:
+        Document -> (figures, whether they are met, the thesis's figures).
+    """
 
     def read(document: Document) -> Reading:
+        """Read the figures of a study's rows."""
         rows = _rows(document, without)
         runs, good = sum(r["runs"] for r in rows), sum(r["success"] for r in rows)
         worst = max((r["mae_max"] for r in rows if r["mae_max"] is not None), default=1.0)
@@ -75,6 +86,7 @@ def _solved(limit: float, without: tuple[str, ...] = ()) -> Callable[[Document],
 
 
 def _refused(document: Document) -> Reading:
+    """Read how many runs with one bead were reported unidentifiable; met if all were."""
     (row,) = (r for r in document["rows"] if r["setting"] == "1")
     text = f"{row['unidentifiable']}/{row['runs']} reported unidentifiable"
     return (
@@ -87,9 +99,15 @@ def _refused(document: Document) -> Reading:
 def _in_images(
     row_limit: float, run_limit: float | None
 ) -> Callable[[Document], Reading]:
-    """MAE of each row, and of each run; one bead is to be refused, one placement is weak."""
+    """Make the reader of a target of rendered images: MAE of each row at most
+    `row_limit`, of each run at most `run_limit` (None: any).
+
+    All other runs must succeed; those of setting "1" (one bead or placement) must be
+    unidentifiable or weak.
+    """
 
     def read(document: Document) -> Reading:
+        """Read the largest MAE of a row and of a run, and whether the target is met."""
         alone = ("1",)  # one bead, or one placement: reported apart
         rows = _rows(document, alone)
         mae = max((r["mae"] for r in rows if r["mae"] is not None), default=1.0)
@@ -114,6 +132,9 @@ def _only(document: Document, settings: tuple[str, ...]) -> list[Document]:
 
 
 def _placements(document: Document) -> Reading:
+    """Read the figures for one, two and eight placements: one must be weak, the MAE of
+    two at most 0.01, of eight at most 0.005.
+    """
     rows = {r["setting"]: r for r in document["rows"]}
     one, two, eight = rows["1"], rows["2"], rows["8"]
     sigma = max(one["mean_sigma"].values())
@@ -127,6 +148,9 @@ def _placements(document: Document) -> Reading:
 
 
 def _bookkeeping(document: Document) -> Reading:
+    """Read how much of figure 6.4's change is left: met below 30 % of the thesis's, and
+    with right angles below 0.05 deg.
+    """
     f = document["figure_6_4"]
     text = f"{f['left']:.2f} deg left of {f['thesis']:.2f}; with right angles {f['ours']:.4f} deg"
     met = f["left"] < 0.3 * f["thesis"] and f["ours"] < 0.05
@@ -140,6 +164,9 @@ def _covered(document: Document) -> Reading:
 
 
 def _spoilt(document: Document) -> Reading:
+    """Read how many spoilt data sets had a wrong answer: met if none, and if at least
+    half of the sets were offered one.
+    """
     sets, offered = document["sets"], document["offered"]
     wrong = document["confident_wrong"]
     text = f"{wrong} of {offered} offered, {sets} sets"
@@ -147,7 +174,10 @@ def _spoilt(document: Document) -> Reading:
 
 
 def _speed(case: str, limit_s: float) -> Callable[[Document], Reading]:
+    """Make the reader of a time: met if the best one of a case is at most `limit_s`."""
+
     def read(document: Document) -> Reading:
+        """Read the best time of the case."""
         best = document[case]["best_s"]
         return f"{1e3 * best:.3g} ms", best <= limit_s, "under twenty minutes on a GPU"
 
@@ -201,7 +231,11 @@ TARGETS: Final = (
 
 
 def collected(folders: Sequence[Path]) -> dict[str, Document]:
-    """Documents found under some folders, by what they are; of two the later file's counts."""
+    """Read the JSON documents of studies below some folders, by study name; of two with
+    one name the later file counts.
+
+    Files that are no JSON or no known document are skipped.
+    """
     out: dict[str, Document] = {}
     files = {f for folder in folders for f in folder.rglob("*.json")}
     for file in sorted(files, key=lambda f: (f.stat().st_mtime, str(f))):
@@ -228,8 +262,12 @@ def collected(folders: Sequence[Path]) -> dict[str, Document]:
 
 
 def targets_table(found: Mapping[str, Document]) -> list[tuple[str, str, str, str]]:
-    """Rows (target, ours, thesis, met): yes, NO, or missing, then with the command for
-    `ours`."""
+    """Make the rows of the table of targets: target, our figures, the thesis's, and
+    whether it is met: yes or NO.
+
+    Where the document is missing, they are target, the command that makes it, "", and
+    "missing".
+    """
     out = []
     for target in TARGETS:
         document = found.get(target.source)
@@ -245,7 +283,14 @@ QUICK: Final = ("points", "noisy")
 
 
 def run_missing(folder: Path, found: Mapping[str, Document], images: bool) -> None:
-    """Run the studies that are missing, into a folder."""
+    """Run the studies of `flexdt study` whose documents are missing, and write each into
+    a folder of its own.
+
+    Args:
+        folder: that gets those folders.
+        found: documents that there are.
+        images: also run those on images, which take long.
+    """
     from flexdt_extensions.studies.study import run_study
 
     for source in dict.fromkeys(
@@ -258,7 +303,12 @@ def run_missing(folder: Path, found: Mapping[str, Document], images: bool) -> No
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; exit code 1 if a target is missed or a folder is not there."""
+    """Print the table of targets from the documents in some folders, after running
+    missing studies if requested.
+
+    Returns:
+        1 if a target is missed or a folder is missing, else 0.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
     parser.add_argument("--run", choices=("points", "images"), default=None)

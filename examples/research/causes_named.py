@@ -85,12 +85,12 @@ def calibrated(
     free: tuple[str, ...] = (),
     bead_tolerance_mm: float | None = None,
 ) -> Calibration:
-    """Calibrate a drawn scan from its spots, told only what the operator believes.
+    """Calibrate a drawn scan from its spots, with the operator's beliefs.
 
     Args:
         scan: the scan.
-        per_frame: what may differ from frame to frame.
-        free: what is free beside what the operator frees.
+        per_frame: parameters that may differ from frame to frame.
+        free: parameters that are free beside the operator's.
         bead_tolerance_mm: standard deviation of the beads' places.
     """
     looks = []
@@ -115,7 +115,9 @@ def calibrated(
 
 
 def scored(kind: str, seed: int) -> Scored:
-    """Draw a scan, calibrate it and judge what was said."""
+    """Draw a scan of a kind, calibrate it, and judge findings and values; a refusal is
+    scored, too.
+    """
     scan = drawn(kind, seed)
     try:
         result = calibrated(scan)
@@ -129,7 +131,12 @@ def scored(kind: str, seed: int) -> Scored:
 
 
 def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
-    """Return the largest error in sigmas; a parameter that moves may have any of its values."""
+    """Find the parameter or image quantity with the largest error [sigma], and its name;
+    (0, "") if all are exact.
+
+    A parameter that moves may have any of its values. Image quantities count only where
+    nothing moves and the spots were not changed.
+    """
     assert result.fit is not None
     worst, where = 0.0, ""
     for name, e in result.fit.certificate.estimates.items():
@@ -151,6 +158,11 @@ def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
 
 
 def _verdict(scan: Faulty, said: Sequence[str], offered: bool) -> str:
+    """Judge what was said of a scan: "right", "vague" or "none".
+
+    Right is every expected finding without a false one, or nothing where the scan may be
+    silent and was offered. Vague is something else, none nothing.
+    """
     named = all(any(re.search(one, s) for s in said) for one in scan.names)
     others = [
         s
@@ -166,7 +178,12 @@ def _verdict(scan: Faulty, said: Sequence[str], offered: bool) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Calibrate scans of each kind and print the counts, and every scan that was not
+    judged right.
+
+    Returns:
+        1 if an answer is confidently wrong, else 0.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--each", type=int, default=2, help="scans of each kind")
     parser.add_argument("--seed", type=int, default=0)

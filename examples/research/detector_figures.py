@@ -77,6 +77,12 @@ class Theory:
 
     @classmethod
     def of(cls, pixel_mm: float, ms: float) -> Theory:
+        """Compute the theory's figures of flat images at KV, POWER_W and FAR_MM.
+
+        Args:
+            pixel_mm: pitch.
+            ms: exposure time.
+        """
         panel = Detector()
         fluence = (
             tube_spectrum(KV, TubeModel()).fluence * POWER_W / KV * ms / 1000.0
@@ -100,7 +106,9 @@ class Theory:
 
     @property
     def own(self) -> float:
-        """`shared(0)` in closed form."""
+        """`shared(0)` in closed form: the part of a pixel's light that it keeps, squared
+        over the pixel.
+        """
         wide = self.sigma * sqrt(2.0)
         return erf(1 / (wide * sqrt(2))) - wide * sqrt(2 / pi) * (
             1 - exp(-1 / (2 * wide**2))
@@ -115,7 +123,9 @@ class Theory:
         return np.abs(np.sinc(f)) * np.exp(-2.0 * (pi * f * self.sigma) ** 2)
 
     def noise_power(self, f: np.ndarray) -> np.ndarray:
-        """Over the mean squared [mm2], along one axis."""
+        """Compute the noise power over the mean squared [mm^2] at frequencies `f` [cycles
+        a pixel] along one axis.
+        """
         folded = self.shared(0) + sum(
             2.0 * self.shared(n) * np.cos(2 * pi * f * n) for n in range(1, 12)
         )
@@ -127,8 +137,16 @@ class Theory:
 
 
 def images(pixel_mm: float, ms: float, count: int, side: int, seed: int) -> np.ndarray:
-    """Flat images without the fixed pattern, (count, side, side) [counts above the dark
-    level]."""
+    """Simulate flat images without the fixed pattern, (count, side, side) [counts above
+    the dark level].
+
+    Args:
+        pixel_mm: pitch.
+        ms: exposure time.
+        count: images.
+        side: pixels; a rim is cut off.
+        seed: of the noise.
+    """
     geometry = fx.ConeVec.from_vectors(
         np.tile([0.0, -600.0, 0.0], (count, 1)), (0, FAR_MM - 600.0, 0), (pixel_mm, 0, 0),
         (0, 0, -pixel_mm),
@@ -144,7 +162,9 @@ def images(pixel_mm: float, ms: float, count: int, side: int, seed: int) -> np.n
 
 
 def variance_curve(side: int = 256) -> dict[str, list[tuple[float, float, float]]]:
-    """Mean, variance and theory's variance [counts] by exposure."""
+    """Measure the mean, the variance and theory's variance [counts, counts^2] of flat
+    images for each of EXPOSURES_MS, by pixel size.
+    """
     found = {}
     for name, pixel in PIXELS_MM.items():
         rows = []
@@ -161,7 +181,12 @@ def variance_curve(side: int = 256) -> dict[str, list[tuple[float, float, float]
 def noise_power(
     pixel: float, count: int = 80, side: int = 256
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency [cycles a pixel] and noise power along an axis over the mean squared [mm2]."""
+    """Measure the noise power of flat images along an axis.
+
+    Returns:
+        Frequency [cycles a pixel] and power over the mean squared [mm^2], without the
+        lowest frequencies.
+    """
     stack = images(pixel, TIME_MS, count, side, 7)
     rest = (stack - stack.mean(axis=0)) * sqrt(count / (count - 1))  # no pattern
     n = side // BLOCK
@@ -179,8 +204,15 @@ def noise_power(
 
 
 def edge(pixel: float, rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency [cycles a pixel] and modulation, from a sheet of tungsten slanted by 3
-    degrees."""
+    """Measure the modulation transfer from a sheet of tungsten slanted by 3 degrees.
+
+    Args:
+        pixel: pitch [mm].
+        rays: along each side of a pixel.
+
+    Returns:
+        Frequency [cycles a pixel] and modulation.
+    """
     c, s = np.cos(np.deg2rad(3.0)), np.sin(np.deg2rad(3.0))
     geometry = fx.ConeVec.from_vectors(
         [[0, -600, 0]],
@@ -200,7 +232,9 @@ def edge(pixel: float, rays: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quality() -> dict[str, dict[str, np.ndarray]]:
-    """Measured and theoretical curves by pixel size."""
+    """Compute measured and theoretical curves by pixel size: MTF (also with one ray),
+    noise power and DQE, over their frequencies.
+    """
     found = {}
     for name, pixel in PIXELS_MM.items():
         theory = Theory.of(pixel, TIME_MS)
@@ -227,8 +261,9 @@ def thin_response(material: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def thick_response() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Energy left in 0.6 mm of CsI [keV] at `GVXR`'s energies: here if nothing escaped, here,
-    and published."""
+    """Compute the energy left in 0.6 mm of CsI [keV] at GVXR's energies: here if nothing
+    escaped, here, and published.
+    """
     energy = tables().energy_keV
     stopped = energy * -np.expm1(-CSI.attenuation() * 0.6)
     kept = energy * deposited(Filter(CSI, 0.6)).mean
@@ -237,7 +272,13 @@ def thick_response() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def figures(found: dict[str, dict[str, np.ndarray]], curve: dict) -> dict[str, object]:
-    """Return the figures of the page."""
+    """Sum up the figures of the page: ratios to theory, largest differences, and
+    responses over the published ones.
+
+    Args:
+        found: curves of `quality`.
+        curve: of `variance_curve`.
+    """
     made: dict[str, object] = {}
     for name, one in found.items():
         half, ratio = one["at"] <= 0.5, one["power"] / one["power_theory"]
@@ -266,6 +307,9 @@ def figures(found: dict[str, dict[str, np.ndarray]], curve: dict) -> dict[str, o
 
 
 def draw(found: dict[str, dict[str, np.ndarray]], curve: dict, folder: Path) -> None:
+    """Draw the curves of variance, sharpness, noise and DQE over the theory, into
+    image-quality.png and detector-response.png of a folder.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -308,6 +352,9 @@ def draw(found: dict[str, dict[str, np.ndarray]], curve: dict, folder: Path) -> 
 
 
 def _draw_response(plt: ModuleType, folder: Path) -> None:
+    """Draw the energy kept in thin layers and in 0.6 mm of CsI beside the published
+    values, into detector-response.png.
+    """
     figure, (thin, thick) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     energy = tables().energy_keV
     shown = (energy > 18) & (energy < 205)
@@ -340,6 +387,7 @@ def _draw_response(plt: ModuleType, folder: Path) -> None:
 
 
 def main() -> None:
+    """Print the figures of the detector as JSON, and draw them if a folder is named."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plots", type=Path, help="folder for the two drawings")
     options = parser.parse_args()

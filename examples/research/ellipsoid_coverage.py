@@ -51,13 +51,17 @@ class Draw:
 def draw(
     seed: int, model: BeadModel, scene: Scene, camera: Rendering, frames: int = 36
 ) -> Draw:
-    """Make, calibrate and compare one scan.
+    """Simulate one scan's images, calibrate it, and compare its 95 % intervals and
+    ellipsoid with the truth.
 
     Args:
         seed: of truth and noise.
         model, scene: the phantom.
         camera: how images are made.
         frames: over the turn.
+
+    Returns:
+        The draw; not offered if the calibration is not identifiable.
     """
     nominal, truth = careful_scan(np.random.default_rng([seed, 7]), frames)
     assert camera.counts is not None

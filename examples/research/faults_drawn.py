@@ -108,8 +108,9 @@ class Faulty:
 
 
 def in_images(world: World) -> dict[str, float]:
-    """Column of the axis in the middle row [px], and magnification of a short line on the axis
-    along the panel's rows, in the first frame."""
+    """Compute "axis_column", of the axis in the middle row [px], and "magnification" of a
+    short line on the axis along the panel's rows, in the first frame.
+    """
     still = {n: float(np.ravel(v)[0]) for n, v in world.offsets.items()}
     tau = np.array([still.get("tau_x", 0.0), still.get("tau_z", 0.0), 0.0])
     reach = 0.5
@@ -138,11 +139,14 @@ def in_images(world: World) -> dict[str, float]:
 
 
 def shadows(world: World) -> tuple[Array, Array]:
-    """Centres (n, k, 2) and radii (n, k) [px] of the outlines of the balls' shadows, the means
-    of each exposure.
+    """Compute the outlines of the balls' shadows, as means over each exposure.
 
-    The source is near the origin, the beam along +y, z up; a growing angle turns the object
-    clockwise seen from above.
+    The source is near the origin, the beam along +y, z up; a growing angle turns the
+    object clockwise seen from above. An outline is the conic through TOUCHING rays that
+    touch the ball.
+
+    Returns:
+        Centres (n, k, 2) and radii (n, k) [px].
     """
     if world.arc:
         # Legendre's points and weights of an even turn.
@@ -234,7 +238,9 @@ class Draft:
 
 
 def drawn(kind: str, seed: int) -> Faulty:
-    """Draw a scan with the fault `kind`, of KINDS."""
+    """Draw a scanner, a phantom and a scan with the fault `kind`, of KINDS, and compute
+    its noisy spots.
+    """
     rng = np.random.default_rng([seed, *kind.encode()])
     n, k = int(rng.choice([24, 36, 60])), int(rng.integers(5, 8))
     beads = phantom(rng, k)
@@ -301,7 +307,9 @@ UNSEEN: Final = {
 
 
 def _bent(draft: Draft, rng: Rng, after: Callable[..., list[Array | None]]) -> Draft:
-    """Distort the panel, and move it off its stated place as far as is usual."""
+    """Distort the panel by a change of the spots, `after`, and move it off its stated
+    place as far as is usual.
+    """
     offsets = {name: float(rng.normal(0.0, width)) for name, width in UNSEEN.items()}
     world = replace(draft.world, offsets={**offsets, **draft.world.offsets})
     return replace(draft, world=world, after=after, names=("panel_distorted",),
@@ -323,9 +331,18 @@ def _low_dose(draft: Draft, rng: Rng) -> Draft:
 def _offset(
     name: str, low: float, high: float, *names: str, silent: bool = False
 ) -> Fault:
-    """Offset one parameter by `low` to `high`; any of `names` is a right finding."""
+    """Make a fault that offsets one parameter by `low` to `high` [mm, deg], to either
+    side.
+
+    Args:
+        name: of the parameter.
+        low, high: least and largest offset.
+        names: parameters of which any is a right finding; without any, `name`.
+        silent: whether no finding is right, too.
+    """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the offset, and expect a finding of one of the names."""
         value = _sign(rng) * float(rng.uniform(low, high))
         world = replace(draft.world, offsets={**draft.world.offsets, name: value})
         pattern = (f"(held_parameter|priors_narrow).*({'|'.join(names or (name,))})",)
@@ -346,7 +363,12 @@ OTHERS: Final = ("vibration", "bead_errors", "drift")
 
 
 def _drift(name: str, low: float, high: float) -> Fault:
+    """Make a fault: a parameter drifts evenly over the scan, by `low` to `high` [mm, deg]
+    in all, to either side.
+    """
+
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the drift, and expect a finding of a drift of that parameter."""
         n = len(draft.world.angles)
         size = _sign(rng) * float(rng.uniform(low, high))
         draft = _varying(draft, name, size * np.linspace(0, 1, n))
@@ -356,7 +378,14 @@ def _drift(name: str, low: float, high: float) -> Fault:
 
 
 def _jump(name: str, low: float, high: float) -> Fault:
+    """Make a fault: a parameter jumps by `low` to `high` [mm, deg], to either side, in
+    the middle half of the scan.
+    """
+
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw frame and size of the jump, and expect a finding of motion (or, of alpha,
+        of an angle step).
+        """
         n = len(draft.world.angles)
         at = int(rng.integers(n // 4, 3 * n // 4))
         size = _sign(rng) * float(rng.uniform(low, high))
@@ -368,7 +397,9 @@ def _jump(name: str, low: float, high: float) -> Fault:
 
 
 def _spot_drift(draft: Draft, rng: Rng) -> Draft:
-    """Let the focal spot drift: it looks like the object drifting the other way."""
+    """Let the focal spot drift aside by 0.05 to 0.3 mm over the scan: it looks like the
+    object drifting the other way.
+    """
     n = len(draft.world.angles)
     way = np.array([_sign(rng) * rng.uniform(0.05, 0.3), 0.0, 0.0])
     world = replace(draft.world, spot=np.linspace(0, 1, n)[:, None] * way)
@@ -378,6 +409,7 @@ def _spot_drift(draft: Draft, rng: Rng) -> Draft:
 
 
 def _runout(draft: Draft, rng: Rng) -> Draft:
+    """Let the axis run out by 0.03 to 0.2 mm, two or three times a turn."""
     turn = np.radians(draft.world.angles)
     size = float(rng.uniform(0.03, 0.2))
     periods = int(rng.integers(2, 4))
@@ -387,6 +419,7 @@ def _runout(draft: Draft, rng: Rng) -> Draft:
 
 
 def _screw(draft: Draft, rng: Rng) -> Draft:
+    """Let the object rise evenly by 0.3 to 1.5 mm over the scan."""
     draft = _varying(
         draft, "dO_y", rng.uniform(0.3, 1.5) * np.linspace(0, 1, len(draft.world.angles))
     )
@@ -394,7 +427,7 @@ def _screw(draft: Draft, rng: Rng) -> Draft:
 
 
 def _wobble(draft: Draft, rng: Rng) -> Draft:
-    """Lean the axis to and fro, twice a turn."""
+    """Lean the axis to and fro by 0.1 to 0.4 deg, twice a turn."""
     turn = np.radians(draft.world.angles)
     size = float(rng.uniform(0.1, 0.4))
     draft = _varying(draft, "axis_tilt_z", size * np.sin(2 * turn))
@@ -402,6 +435,7 @@ def _wobble(draft: Draft, rng: Rng) -> Draft:
 
 
 def _vibration(draft: Draft, rng: Rng) -> Draft:
+    """Shift every frame at random along columns and rows, by 0.02 to 0.08 mm rms."""
     size = float(rng.uniform(0.02, 0.08))
     n = len(draft.world.angles)
     for name in ("dO_x", "dO_y"):
@@ -412,9 +446,16 @@ def _vibration(draft: Draft, rng: Rng) -> Draft:
 def _angles(
     change: Callable[[Array, Rng], Array], *names: str, beside: tuple[str, ...] = ()
 ) -> Fault:
-    """Turn the stage by other angles than the stated ones."""
+    """Make a fault: the stage's angles are those that `change` makes of the stated ones.
+
+    Args:
+        change: (angles [deg], generator) -> angles.
+        names: patterns of the expected findings.
+        beside: patterns of findings that are allowed, too.
+    """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the angles of the stage."""
         angles = change(draft.world.angles, rng)
         return replace(
             draft, world=replace(draft.world, angles=angles), names=names, beside=beside
@@ -431,11 +472,14 @@ def _gap(angles: Array, rng: Rng) -> Array:
 
 
 def _stuttered(draft: Draft, rng: Rng) -> Draft:
-    """Deliver some frames twice, as a camera that stutters."""
+    """Replace at least two frames, and a twelfth of them, by the one before, as a camera
+    that stutters.
+    """
     n = len(draft.world.angles)
     again = rng.choice(np.arange(1, n), size=max(2, n // 12), replace=False)
 
     def after(spots: list[Array | None]) -> list[Array | None]:
+        """Replace the spots of these frames by those of the frame before."""
         for i in sorted(again.tolist()):
             spots[i] = spots[i - 1]
         return spots
@@ -444,6 +488,7 @@ def _stuttered(draft: Draft, rng: Rng) -> Draft:
 
 
 def _missing_frames(draft: Draft, rng: Rng) -> Draft:
+    """Remove a fifth of the frames, at least one."""
     gone = rng.random(len(draft.world.angles)) < 0.2
     gone[int(rng.integers(len(gone)))] = True
 
@@ -454,6 +499,7 @@ def _missing_frames(draft: Draft, rng: Rng) -> Draft:
 
 
 def _swapped_frames(draft: Draft, rng: Rng) -> Draft:
+    """Swap the spots of two frames that are a quarter to half of a turn apart."""
     n = len(draft.world.angles)
     a = int(rng.integers(0, n - 1))
     b = (a + int(rng.integers(n // 4, n // 2))) % n
@@ -468,6 +514,15 @@ def _swapped_frames(draft: Draft, rng: Rng) -> Draft:
 def _beads(
     draft: Draft, beads: Array, *names: str, beside: tuple[str, ...] = ()
 ) -> Draft:
+    """Replace the balls that cast shadows by others of the same radius, all of them in
+    every frame.
+
+    Args:
+        draft: of the scan.
+        beads: (k, 3) [mm].
+        names: patterns of the expected findings.
+        beside: patterns of findings that are allowed, too.
+    """
     radii = np.full(len(beads), draft.world.radii[0])
     shown = np.ones((len(draft.world.angles), len(beads)), dtype=bool)
     world = replace(draft.world, beads=beads, radii=radii, shown=shown)
@@ -475,7 +530,10 @@ def _beads(
 
 
 def _lost(count: int) -> Fault:
+    """Make a fault: `count` of the beads are missing."""
+
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the missing beads, and expect them to be named."""
         k = len(draft.world.beads)
         gone = np.sort(rng.choice(k, size=count, replace=False))
         kept = np.delete(draft.world.beads, gone, axis=0)
@@ -485,6 +543,7 @@ def _lost(count: int) -> Fault:
 
 
 def _extra(draft: Draft, rng: Rng) -> Draft:
+    """Add one or two balls to the beads."""
     more = rng.uniform([-10, -10, -22], [10, 10, 22], size=(int(rng.integers(1, 3)), 3))
     return _beads(
         draft, np.concatenate([draft.world.beads, more]), "extra_spots", beside=OTHERS
@@ -492,6 +551,7 @@ def _extra(draft: Draft, rng: Rng) -> Draft:
 
 
 def _displaced(draft: Draft, rng: Rng) -> Draft:
+    """Displace one bead by 0.3 to 1.5 mm."""
     beads = draft.world.beads.copy()
     one = int(rng.integers(len(beads)))
     way = rng.normal(size=3)
@@ -502,6 +562,7 @@ def _displaced(draft: Draft, rng: Rng) -> Draft:
 
 
 def _tolerance(draft: Draft, rng: Rng) -> Draft:
+    """Displace all beads at random, by 0.03 to 0.1 mm rms along each axis."""
     beads = draft.world.beads + rng.uniform(0.03, 0.1) * rng.normal(
         size=draft.world.beads.shape
     )
@@ -511,6 +572,7 @@ def _tolerance(draft: Draft, rng: Rng) -> Draft:
 
 
 def _tolerance_and_roll(draft: Draft, rng: Rng) -> Draft:
+    """Displace all beads as `_tolerance`, and roll the detector by 2 to 3 deg."""
     draft = _tolerance(draft, rng)
     roll = _sign(rng) * float(rng.uniform(2.0, 3.0))
     world = replace(draft.world, offsets={**draft.world.offsets, "det_roll": roll})
@@ -555,7 +617,9 @@ def _no_beads(draft: Draft, rng: Rng) -> Draft:
 
 
 def _symmetric(draft: Draft, rng: Rng) -> Draft:
-    """Two rings of four balls: a quarter of a turn changes nothing."""
+    """Replace the phantom, also the believed one, by two rings of four balls, which look
+    the same after a quarter of a turn.
+    """
     quarter = 0.5 * math.pi * np.arange(4)
     ring = 9.0 * np.stack([np.cos(quarter), np.sin(quarter), 0 * quarter], axis=1)
     beads = np.concatenate([ring - [0, 0, 14.0], ring + [0, 0, 14.0]])
@@ -567,8 +631,18 @@ def _symmetric(draft: Draft, rng: Rng) -> Draft:
 
 
 def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
+    """Make a fault: images are mirrored along some axes.
+
+    Args:
+        axes: 0 for columns, 1 for rows.
+        names: patterns of the expected findings.
+    """
+
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Mirror all spots along the axes."""
+
         def after(spots: list[Array | None]) -> list[Array | None]:
+            """Mirror the spots of all frames, in place."""
             for s in spots:
                 assert s is not None
                 for a in axes:
@@ -581,15 +655,22 @@ def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
 
 
 def _distorted(terms: str) -> Fault:
-    """Distort the panel's picture smoothly, by up to a pixel at its upper edge."""
+    """Make a fault that distorts the panel's image smoothly, by 0.3 to 1 px at 305 px
+    from its middle.
+
+    Args:
+        terms: "radial", "decentred", or else any polynomial of second and third order.
+    """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the distortion's size and coefficients."""
         half = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
         size = float(_sign(rng) * rng.uniform(0.3, 1.0))
         one, two = rng.normal(size=2) / math.sqrt(2)
         bent = rng.normal(size=(2, 7))
 
         def shift(x: Array, y: Array) -> Array:
+            """Compute the shift (m, 2) at places x, y in units of 305 px from the middle."""
             square = x * x + y * y
             if terms == "radial":
                 return np.stack([x * square, y * square], axis=1)
@@ -602,6 +683,7 @@ def _distorted(terms: str) -> Fault:
             return np.asarray((bent @ np.array(powers)).T / 2)
 
         def after(spots: list[Array | None]) -> list[Array | None]:
+            """Shift the spots of all frames, in place."""
             for s in spots:
                 assert s is not None
                 x, y = ((s[:, :2] - half) / 305.0).T
@@ -614,12 +696,13 @@ def _distorted(terms: str) -> Fault:
 
 
 def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
-    """Two tiles of the panel with a gap between them, which the image does not show."""
+    """Move two tiles of the panel apart by 0.5 to 2 px, which the image leaves out."""
     axis = int(rng.integers(2))
     border = SHAPE[1 - axis] * rng.uniform(0.4, 0.6)
     gap = rng.uniform(0.5, 2.0)
 
     def after(spots: list[Array | None]) -> list[Array | None]:
+        """Shift the spots beyond the border, in place."""
         for s in spots:
             assert s is not None
             s[:, axis] -= np.where(s[:, axis] > border, gap, 0.0)
@@ -629,10 +712,11 @@ def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
 
 
 def _row_offset(draft: Draft, rng: Rng) -> Draft:
-    """Begin the read-out some rows late, as if the panel were higher or lower."""
+    """Shift all images by 2 to 7 rows, as if the panel were higher or lower."""
     rows = int(_sign(rng) * rng.integers(2, 8))
 
     def after(spots: list[Array | None]) -> list[Array | None]:
+        """Shift the rows of all spots, in place."""
         for s in spots:
             assert s is not None
             s[:, 1] += rows
@@ -642,7 +726,7 @@ def _row_offset(draft: Draft, rng: Rng) -> Draft:
 
 
 def _binned(draft: Draft, rng: Rng) -> Draft:
-    """Pixels are really of another size than is said."""
+    """Change the pixels' true size to half or 1.6 times the stated one."""
     world = replace(draft.world, pixel=draft.world.pixel * float(rng.choice([0.5, 1.6])))
     return replace(
         draft,
@@ -652,9 +736,12 @@ def _binned(draft: Draft, rng: Rng) -> Draft:
 
 
 def _held(name: str, low: float, high: float) -> Fault:
-    """One of the six is held exactly where it is not."""
+    """Make a fault: one of the six is stated as exactly known, but off by `low` to `high`
+    [mm, deg].
+    """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the error, and hold the parameter."""
         off = _sign(rng) * math.exp(rng.uniform(math.log(low), math.log(high)))
         value = draft.world.offsets[name]
         assert isinstance(value, float)
@@ -672,9 +759,12 @@ def _held(name: str, low: float, high: float) -> Fault:
 
 
 def _held_zero(*names: str) -> Fault:
-    """Offsets of the scanner are stated as exactly 0, and one of them is not."""
+    """Make a fault: an offset of the scanner, one of `names`, is stated as exactly 0, but
+    is 0.2 to 2 mm or deg.
+    """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the offset and its size."""
         name = names[int(rng.integers(len(names)))]
         value = _sign(rng) * float(rng.uniform(0.2, 2.0))
         world = replace(draft.world, offsets={**draft.world.offsets, name: value})
@@ -702,9 +792,14 @@ def _right(draft: Draft, rng: Rng) -> Draft:
 
 
 def _strained(kind: str) -> Fault:
-    """Strain the phantom against its file by 0.05 to 1 %."""
+    """Make a fault that strains the phantom against its file by 0.05 to 1 %.
+
+    Args:
+        kind: "x", "y", "z", "shear" (in the horizontal plane) or "lean".
+    """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the strain; below 0.3 % silence is right, too."""
         draft = _usual(draft, rng)
         size = _sign(rng) * math.exp(rng.uniform(math.log(5e-4), math.log(1e-2)))
         change = np.eye(3)
@@ -723,7 +818,9 @@ def _strained(kind: str) -> Fault:
 
 
 def _exposed_long(draft: Draft, rng: Rng) -> Draft:
-    """Expose while the stage turns, for a part of a step or all of it."""
+    """Expose while the stage turns, for 0.1 to 1 of a step; below 3 deg silence is right,
+    too.
+    """
     draft = _usual(draft, rng)
     step = 360.0 / len(draft.world.angles)
     share = float(rng.uniform(0.1, 1.0))
@@ -741,10 +838,12 @@ def _exposed_as_said(draft: Draft, rng: Rng) -> Draft:
 
 
 def _renumbered(shift: int) -> Fault:
-    """From a frame on, images are those of `shift` frames later: -1 where one was doubled, 1
-    where one was lost."""
+    """Make a fault: from a frame on, images are those of `shift` frames later, -1 where
+    one was doubled, 1 where one was lost.
+    """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the frame, and expect it or the one before to be named."""
         draft = _usual(draft, rng)
         n = len(draft.world.angles)
         at = int(rng.integers(1, n))
@@ -758,7 +857,7 @@ def _renumbered(shift: int) -> Fault:
 
 
 def _exposed_again(draft: Draft, rng: Rng) -> Draft:
-    """One frame shows what the one before shows, of another exposure."""
+    """Expose one frame at the angle of the one before."""
     draft = _usual(draft, rng)
     at = int(rng.integers(1, len(draft.world.angles)))
     angles = draft.world.angles.copy()
@@ -768,13 +867,14 @@ def _exposed_again(draft: Draft, rng: Rng) -> Draft:
 
 
 def _four_tiles(draft: Draft, rng: Rng) -> Draft:
-    """Shift each of a panel's 2 x 2 tiles a little."""
+    """Shift and skew each of a panel's 2 x 2 tiles a little, by 0.3 to 2 px."""
     column = SHAPE[1] * rng.uniform(0.42, 0.58)
     row = SHAPE[0] * rng.uniform(0.42, 0.58)
     across, down = (float(_sign(rng) * rng.uniform(0.3, 2.0)) for _ in range(2))
     askew = rng.normal(size=(2, 2)) * 0.1
 
     def after(spots: list[Array | None]) -> list[Array | None]:
+        """Shift the spots of the right and of the lower tiles, in place."""
         for s in spots:
             assert s is not None
             right, low = s[:, 0] > column, s[:, 1] > row
@@ -786,7 +886,9 @@ def _four_tiles(draft: Draft, rng: Rng) -> Draft:
 
 
 def _source_jumps(draft: Draft, rng: Rng) -> Draft:
-    """Let the focal spot jump aside, which looks like an object that jumps."""
+    """Let the focal spot jump aside by 0.02 to 0.3 mm in the middle half of the scan,
+    which looks like an object that jumps.
+    """
     draft = _usual(draft, rng)
     n = len(draft.world.angles)
     at = int(rng.integers(n // 4, 3 * n // 4))
@@ -797,7 +899,7 @@ def _source_jumps(draft: Draft, rng: Rng) -> Draft:
 
 
 def _grows(draft: Draft, rng: Rng) -> Draft:
-    """Let the phantom grow during the scan, as one that warms up."""
+    """Let the phantom grow by 0.05 to 0.7 % during the scan, as one that warms up."""
     draft = _usual(draft, rng)
     size = float(rng.uniform(5e-4, 7e-3))
     n = len(draft.world.angles)
@@ -811,7 +913,7 @@ def _grows(draft: Draft, rng: Rng) -> Draft:
 
 
 def _other_pitch(draft: Draft, rng: Rng) -> Draft:
-    """Pixels are a little larger or smaller than is said."""
+    """Make the true pixels 1 to 8 % larger or smaller than the stated ones."""
     draft = _usual(draft, rng)
     factor = 1.0 + _sign(rng) * rng.uniform(0.01, 0.08)
     world = replace(draft.world, pixel=draft.world.pixel * factor)

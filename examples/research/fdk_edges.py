@@ -59,7 +59,9 @@ def turned(vector: tuple[float, float, float], angles: FloatArray) -> FloatArray
 
 
 def scan(views: int, aside: float = 0.0, yaw: float = 0.0) -> ConeVec:
-    """Return a full turn; `aside` [mm] along x, `yaw` [rad] of the panel."""
+    """Make a full turn of `views`, with the panel moved `aside` along its rows [mm] and
+    turned by `yaw` about the vertical [rad].
+    """
     angles = np.linspace(0.0, 2.0 * np.pi, views, endpoint=False)
     u = (PITCH * np.cos(yaw), PITCH * np.sin(yaw), 0.0)
     return ConeVec.from_vectors(
@@ -71,8 +73,18 @@ def scan(views: int, aside: float = 0.0, yaw: float = 0.0) -> ConeVec:
 def layers(
     solids: list[Solid], geometry: ConeVec, radius: float, rtk: bool, wide: bool = False
 ) -> list[FloatArray]:
-    """Return the middle layer of the reconstruction out to `radius`, in units of MU, and
-    RTK's."""
+    """Reconstruct the middle layer out to `radius` [mm] by FDK, in units of MU.
+
+    Args:
+        solids: of the object.
+        geometry: of the scan.
+        radius: half the side of the layer [mm].
+        rtk: also by RTK.
+        wide: with RTK's correction of truncation.
+
+    Returns:
+        The layer (CELLS, CELLS), and RTK's if requested.
+    """
     images = project_scene(Scene(tuple(solids)), geometry, (ROWS, COLS))
     grid = Grid((1, CELLS, CELLS), 2.0 * radius / CELLS)
     layer = fdk(images, geometry, grid.blank(), errors=False).data[0]
@@ -83,7 +95,16 @@ def layers(
 def by_rtk(
     images: npt.NDArray[np.float32], geometry: ConeVec, grid: Grid, wide: bool = False
 ) -> FloatArray:
-    """RTK's volume by the geometry file made for it; its (x, y, z) is our (x, z, -y)."""
+    """Reconstruct by RTK's FDK with the geometry file made for it, in units of MU.
+
+    RTK's (x, y, z) is our (x, z, -y); the volume is turned back to (z, y, x).
+
+    Args:
+        images: (n, rows, cols).
+        geometry: n views.
+        grid: of the volume.
+        wide: correct truncation.
+    """
     import itk  # here, so that --help needs no peer
     from itk import RTK
 
@@ -131,6 +152,9 @@ def layer() -> tuple[FloatArray, FloatArray]:
 
 
 def moved_aside(views: int, rtk: bool) -> None:
+    """Print the error of a cylinder's attenuation [%] for panels moved aside and yawed,
+    and RTK's without yaw.
+    """
     print(
         "detector moved aside by a part of its half width; object out to 0.95 of the field"
     )
@@ -166,7 +190,7 @@ def moved_aside(views: int, rtk: bool) -> None:
 
 
 def prism(corners: int, radius: float) -> Shape:
-    """Return an upright regular prism around a circle."""
+    """Build an upright regular prism around a circle of `radius` [mm]."""
     turn = 0.2 + 2.0 * np.pi * np.arange(corners) / corners
     normals = [(float(np.cos(t)), float(np.sin(t)), 0.0) for t in turn]
     return ConvexPolyhedron(
@@ -193,7 +217,18 @@ def put_in(
     densities: tuple[float, float],
     rng: np.random.Generator,
 ) -> npt.NDArray[np.bool_]:
-    """Append drawn ellipses (see `INSIDE`); where a layer has none of them."""
+    """Append drawn ellipses to `solids`.
+
+    Args:
+        solids: gets them.
+        count: number.
+        sizes: least and largest half axis, in fields of view.
+        densities: least and largest, in MU.
+        rng: generator.
+
+    Returns:
+        (CELLS, CELLS), True where a layer has none of them.
+    """
     x, y = layer()
     outside = np.ones_like(x, dtype=bool)
     for _ in range(count):
@@ -205,6 +240,9 @@ def put_in(
 
 
 def wider(views: int, rtk: bool) -> None:
+    """Print the errors of the attenuation of objects wider than the panel [%], in three
+    rings of the field of view, and RTK's.
+    """
     print("\nobjects wider than the panel, error of the attenuation at r / field of view")
     print(f"{'':34}   0.0      0.5      0.9" + "        RTK: 0.0      0.5      0.9" * rtk)
     geometry, r = scan(views), distance()
@@ -213,6 +251,9 @@ def wider(views: int, rtk: bool) -> None:
     ]
 
     def row(name: str, solids: list[Solid], even: npt.NDArray[np.bool_]) -> FloatArray:
+        """Reconstruct an object and return the errors [%] in each ring, RTK's after ours;
+        with a name print them, too.
+        """
         found = layers(solids, geometry, FIELD, rtk, wide=True)
         errors = np.array(
             [100 * (f[ring & even].mean() - 1.0) for f in found for ring in rings]
@@ -256,8 +297,16 @@ def wider(views: int, rtk: bool) -> None:
 def drawn(
     outline: str, inside: str, rng: np.random.Generator
 ) -> tuple[list[Solid], npt.NDArray[np.bool_]]:
-    """Draw an object wider than the field of view, and where a layer of it is of its own
-    material."""
+    """Draw an object wider than the field of view.
+
+    Args:
+        outline: of OUTLINES.
+        inside: key of INSIDE.
+        rng: generator.
+
+    Returns:
+        Its solids, and (CELLS, CELLS), True where a layer is of the body's own material.
+    """
     x, y = layer()
     turn, place = rng.uniform(0.0, np.pi), FIELD * rng.uniform(-0.2, 0.2, 2)
     if outline == "polygon":
@@ -297,6 +346,13 @@ def drawn(
 
 
 def told(views: int, count: int) -> None:
+    """Reconstruct drawn objects of each outline and content, and print errors, warnings
+    and bounds in a ring of the field of view.
+
+    Args:
+        views: of the turn.
+        count: objects of each kind.
+    """
     print(
         f"\n{count} drawn objects of each kind: right within 1 %, warned of, warned of and "
         "right, beyond the bound (largest error, largest bound)"
@@ -339,6 +395,9 @@ BODY = 24.0  # mm
 
 
 def tilted(views: int, rtk: bool) -> None:
+    """Print errors [%], edge width [voxels] and noise [%] of FDK with rolled, pitched and
+    yawed panels, and RTK's.
+    """
     print(
         "\npanels rolled, pitched and yawed: mean and rms error, edge in voxels, noise"
         + ", RTK" * rtk
@@ -371,6 +430,9 @@ def tilted(views: int, rtk: bool) -> None:
     flat = (far > 3 * VOXEL) & (truth > 0) & (np.abs(z) < 18)
 
     def edge(volume: FloatArray) -> float:
+        """Fit the edges of all balls in a volume, and return their mean width, 10 to 90 %
+        [voxels].
+        """
         widths = []
         for off, (_, _, part) in zip(away, balls, strict=True):
             near = np.abs(off) < 4 * VOXEL

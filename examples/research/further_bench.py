@@ -104,9 +104,13 @@ def adjoint_names() -> list[str]:
 
 
 def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
-    """`back` beside `forward`, and how well they are each other's transpose.
+    """Measure `back` beside `forward`, and how exactly they are each other's transpose,
+    for each wanted case.
 
-    Both write into memory they are given; in `-new` entries `back` asks for new memory.
+    Both write into memory they are given; in `-new` entries `back` makes new memory.
+
+    Returns:
+        Entries with the error of the dot product and the ratio of times.
     """
     cases = {case.name: case for case in [*peer_cases(), *untuned_cases()]}
     entries = []
@@ -168,11 +172,16 @@ def fdk_names(size: str) -> list[str]:
 def fdk_entries(
     size: str, wanted: Callable[[str], bool], part: frozenset[str]
 ) -> Iterator[Entry]:
-    """Yield FDK of four kinds of images, against RTK's, without and with `errors`, one by one:
-    RTK may take minutes for each.
+    """Measure FDK of four kinds of images against RTK's, and yield the entries one by
+    one: RTK may take minutes for each.
 
-    Processor seconds and the most memory that arrays take beside the images come from calls of
-    their own, and are also told as multiples of those of the object seen whole.
+    Processor time and memory are also given as multiples of those of the first kind, the
+    object seen whole, if that was measured.
+
+    Args:
+        size: key of FDK_SIZES.
+        wanted: whether an entry of a name is measured.
+        part: peers that take part.
     """
     geometry, grid = fdk_scan(size)
     first = None
@@ -198,12 +207,27 @@ def fdk_entry(
     grid: Volume,
     part: frozenset[str],
 ) -> Entry:
-    """FDK of images into a grid, beside RTK's."""
+    """Measure FDK of images into a grid, beside RTK's if it takes part.
+
+    Args:
+        name: of the entry.
+        kind: of KINDS; noise has no error.
+        what: description.
+        images: (n, rows, cols).
+        geometry: n views.
+        grid: of the volume.
+        part: peers that take part.
+
+    Returns:
+        The entry: times, error of the middle's mean, processor time [ms], its ratio with
+        errors, and largest memory beside the images [MB].
+    """
     from flexdt.twin.reconstruction import fdk
 
     made: dict[str, Volume] = {}
 
     def ours(*, errors: bool = False) -> None:
+        """Reconstruct by flexdt without warnings, and keep the volume."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             made["flexdt"] = fdk(images, geometry, grid, errors=errors)
@@ -235,7 +259,9 @@ def fdk_entry(
 
 
 def peak_bytes(call: Callable[[], object]) -> int:
-    """Most bytes that NumPy's arrays and Python's objects take at a time in a call."""
+    """Measure the most bytes that NumPy's arrays and Python's objects take at a time in a
+    call.
+    """
     tracemalloc.start()
     try:
         call()
@@ -252,9 +278,19 @@ def rtk_fdk(
     center_mm: tuple[float, float, float],
     padding: float = 0.0,
 ) -> rtk.Work:
-    """RTK's FDK of projections (n, rows, cols) into a grid of counts (nz, ny, nx).
+    """Prepare RTK's FDK of projections (n, rows, cols) into a grid.
 
-    padding: of rows that are cut off, over their length (its correction of truncation).
+    Args:
+        images: line integrals.
+        rows: (n, 12) cone_vec.
+        counts: voxels (nz, ny, nx).
+        voxel_mm: pitch (x, y, z).
+        center_mm: of the volume (x, y, z).
+        padding: of rows that are cut off, over their length (its correction of
+            truncation).
+
+    Returns:
+        The call to time, and the function of its volume (z, y, x).
     """
     import itk
     from itk import RTK
@@ -265,6 +301,7 @@ def rtk_fdk(
     made: list[Float32Array] = []
 
     def run() -> None:
+        """Reconstruct with the ramp filter alone, and keep the volume in our axes."""
         reconstruct = RTK.FDKConeBeamReconstructionFilter[kind].New()
         reconstruct.SetInput(0, grid)
         reconstruct.SetInput(1, stack)
@@ -286,8 +323,10 @@ def _middle_error(volume: Volume) -> float:
 
 
 def cold_start() -> list[Entry]:
-    """Measure a new process until its first image, of 8^3 voxels on C1's detector: imports and
-    `forward` alone, its kernels on disk or compiled.
+    """Measure a new process until its first image, of 8^3 voxels on C1's detector, with
+    kernels on disk and with kernels compiled.
+
+    The time is that of the imports and of `forward`.
     """
     code = (
         "import time; t = time.perf_counter(); "
@@ -316,7 +355,9 @@ def cold_start() -> list[Entry]:
 
 
 def through_server() -> list[Entry]:
-    """C1 asked for over TCP beside the same projection in this process."""
+    """Measure C1 through a projector server over TCP, beside the same projection in this
+    process.
+    """
     command = [sys.executable, "-P", "-m", "flexdt.runtime.child"]
     with subprocess.Popen(
         [*command, "flexdt.server.projector.main", "--port", "0"],
@@ -333,6 +374,12 @@ def through_server() -> list[Entry]:
 
 
 async def _through(host: str, port: int) -> list[Entry]:
+    """Project C1 fifteen times through the server and directly, in turns.
+
+    Returns:
+        One entry: least and median time [ms], the direct one, their difference, and
+        whether the bytes are the same.
+    """
     from flexdt.server.imaging.projector_client import ProjectorClient
     from flexdt.server.imaging.projector_pool import ProjectorPool
 
@@ -363,7 +410,9 @@ async def _through(host: str, port: int) -> list[Entry]:
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=True)
 def read_all(data, workers):
-    """Sum of an array, shared out evenly; the sum is returned so that nothing is left out."""
+    """Sum up an array in `workers` equal parts, in parallel; the sum is returned so that
+    no reading is left out.
+    """
     sums = np.zeros(workers * 16)
     each = data.size // workers
     for w in prange(workers):
@@ -376,7 +425,7 @@ def read_all(data, workers):
 
 
 def bandwidth() -> Entry:
-    """Bytes a second that plain reading gets from memory, with one thread and with all."""
+    """Measure the rate of plain reading from memory [GB/s], with one thread and with all."""
     data = np.ones(2**27, np.float32)
     entry: Entry = {}
     for name, workers in (("one_thread", 1), ("all_threads", threads())):
@@ -390,14 +439,15 @@ BOUNDS = ("bound-C1", "bound-C2", "bound-C3", "bound-C1x36", "bound-C2x10", "bou
 
 
 def bounds(wanted: Callable[[str], bool]) -> list[Entry]:
-    """Compute what memory bandwidth and serial parts allow, for one view except FDK.
+    """Compute the times that memory bandwidth and serial parts allow, for the wanted
+    cases.
 
-    least: bytes that any method reads once; asked: those that ours asks for, of caches or
-        memory.
-    bound_ms: `least` at the speed at which all threads read. cached_ms: with every voxel column
-    in one place, where it stays in the cache. cpu_ms: of all threads, as loads disturb it
-    less.
-    serial_ms: what one thread does beside the kernels, by its own clock.
+    Returns:
+        Entries. `least_MB` any method reads once; `asked_MB` ours reads, from caches or
+        memory. `bound_ms` is `least_MB` at the rate of all threads. `cached_ms` is with
+        every voxel column in one place, where it stays in the cache. `cpu_ms` is of all
+        threads, as loads disturb it less. `serial_ms` is that of one thread beside the
+        kernels, by its own clock.
     """
     rate = bandwidth()["all_threads_GB_s"]
     entries = []
@@ -433,10 +483,13 @@ def bounds(wanted: Callable[[str], bool]) -> list[Entry]:
 
 
 def columns_passed(ray: FloatArray, box: VoxelBox, cols: int) -> int:
-    """Voxel columns that the lines of a view's detector columns pass, seen along z.
+    """Count the voxel columns that the lines of a view's detector columns pass, seen
+    along z.
 
     Args:
         ray: (12,) source, first pixel minus source, u, v in voxel units.
+        box: of the volume.
+        cols: detector columns.
     """
     start, far = ray[:2], ray[3:5] + np.arange(cols)[:, None] * ray[6:8]
     cuts = np.stack([-start / far, ((box.nx, box.ny) - start) / far])
@@ -449,8 +502,12 @@ def columns_passed(ray: FloatArray, box: VoxelBox, cols: int) -> int:
 
 
 def _fdk_bound(rate: float) -> Entry:
-    """FDK of `fdk_entry`: images are read once, or by each tile of voxel columns that they
-    meet."""
+    """Compute the bound of FDK, as if images were read once, and as by each tile of voxel
+    columns that they meet.
+
+    Args:
+        rate: of reading from memory [GB/s].
+    """
     from flexdt.twin.reconstruction import fdk
     from flexdt.twin.reconstruction.feldkamp import backprojection, fdk_views
 
@@ -494,6 +551,15 @@ def _bound(
     asked: float,
     n: int,
 ) -> Entry:
+    """Time a call, and make its entry beside the least time by memory bandwidth.
+
+    Args:
+        name, what: of the entry.
+        call: to time.
+        rate: of reading [GB/s].
+        least, asked: bytes that any method and ours reads.
+        n: views of a call.
+    """
     wall, cpu_ms = _spent(call)
     entry = plain(name, wall / n, what)
     entry |= {
@@ -512,8 +578,9 @@ def _spent(
     clock: Callable[[], float] = time.process_time,
     rounds: int = 5,
 ) -> tuple[float, float]:
-    """Least time [ms] of some calls, after a first one, by the clock on the wall and by
-    another."""
+    """Return the least time [ms] of `rounds` calls after a first one, by the wall clock
+    and by `clock`.
+    """
     found = []
     for _ in range(rounds + 1):
         wall, own = time.perf_counter(), clock()
@@ -524,8 +591,9 @@ def _spent(
 
 
 def bodies() -> list[Entry]:
-    """Solids and meshes of several sizes on both detectors: what a device would have to
-    beat."""
+    """Time solids and meshes of several sizes on both detectors, one view each, with
+    processor time [ms].
+    """
     things: dict[str, Body] = {
         name: load_phantom(name).scene for name in ("normal", "shepp-logan", "lego")
     }
@@ -556,7 +624,7 @@ class Point:
 
 
 def growth_with_rays() -> list[Entry]:
-    """Time against the number of rays, C1's volume."""
+    """Time a view of C1's volume against the number of rays, level and tilted."""
     volume = noise(C1_SHAPE)
     points: list[Point] = []
     for name, tilt in SERIES:
@@ -568,7 +636,9 @@ def growth_with_rays() -> list[Entry]:
 
 
 def growth_with_voxels() -> list[Entry]:
-    """Time against voxels a side: the same field of view in smaller voxels, as many rays."""
+    """Time a view against voxels a side: the same field of view in smaller voxels, as
+    many rays.
+    """
     points: list[Point] = []
     for side in (32, 64, 128, 256, 384, 512):
         volume = noise((side,) * 3, 51.2 / side)
@@ -579,7 +649,9 @@ def growth_with_voxels() -> list[Entry]:
 
 
 def growth_with_threads() -> list[Entry]:
-    """Time a view against threads, C1: one view, and 36 in one call."""
+    """Time a view of C1 against threads, by one view and by 36 in one call; the thread
+    count is restored.
+    """
     import numba
 
     before = numba.get_num_threads()
@@ -612,7 +684,11 @@ def _forward(
 
 
 def _curve(points: Sequence[Point]) -> list[Entry]:
-    """Best times a view of all points, taken turn by turn: what disturbs one disturbs all."""
+    """Time all points turn by turn, so that a disturbance meets all.
+
+    Returns:
+        Series, x and least time a view [ms] of each.
+    """
     timing = interleaved(
         {f"{i}": point.call for i, point in enumerate(points)}, budget_s=3.0
     )
@@ -638,7 +714,9 @@ def bead_scene() -> Scene:
 
 
 def scenes() -> list[Entry]:
-    """Analytic scenes on both detectors."""
+    """Time an analytic scene, a box and five beads, on both detectors, with its errors
+    against `scene_chords`.
+    """
     scene = bead_scene()
     entries = []
     for name, shape in (("scene-C1", BINNED), ("scene-C3", FULL)):
@@ -654,8 +732,13 @@ def scenes() -> list[Entry]:
 
 
 def scene_chords(scene: Scene, view: ConeVec, shape: tuple[int, int]) -> FloatArray:
-    """Line integrals of balls and upright boxes in one view, (1, rows, cols): a quadratic and
-    three pairs of planes for every ray, in double precision.
+    """Compute line integrals of balls and upright boxes in one view, (1, rows, cols), in
+    double precision.
+
+    Each ray is cut by a quadratic equation or three pairs of planes.
+
+    Raises:
+        TypeError: another solid.
     """
     ray = view.pixel_centers(shape)[0] - view.source[0]
     square = np.einsum("rci,rci->rc", ray, ray)
@@ -681,7 +764,7 @@ def scene_chords(scene: Scene, view: ConeVec, shape: tuple[int, int]) -> FloatAr
 
 
 def ball_mesh(subdivisions: int) -> TriangleMesh:
-    """Build a ball of 20 * 4^n triangles, 20 mm across."""
+    """Build a ball of 20 * 4^subdivisions triangles, 20 mm across."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=10.0)
@@ -689,7 +772,9 @@ def ball_mesh(subdivisions: int) -> TriangleMesh:
 
 
 def meshes(part: frozenset[str]) -> list[Entry]:
-    """Triangle meshes, beside embreex if it takes part."""
+    """Time triangle meshes of a ball, beside embreex if it takes part, with the errors of
+    CHECKED rays.
+    """
     entries = []
     view = circle(1, BINNED)
     out = np.empty((1, *BINNED), np.float32)
@@ -720,6 +805,7 @@ class Embree:
     """Path lengths through a convex mesh by embreex: the first hit from either side."""
 
     def __init__(self, mesh: TriangleMesh, view: ConeVec, shape: tuple[int, int]) -> None:
+        """Build embreex's scene of a mesh, and the rays of a view from both ends."""
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 
@@ -758,11 +844,19 @@ def mesh_paths(
     shape: tuple[int, int],
     pixels: np.ndarray[tuple[int, ...]],
 ) -> FloatArray:
-    """Path lengths [mm] of single rays through the same triangles: every triangle asked for
-    every ray (Moeller and Trumbore), in double precision.
+    """Compute the path lengths [mm] of single rays through a closed mesh, in double
+    precision.
+
+    Every triangle is tested for every ray (Moeller and Trumbore).
 
     Args:
+        mesh: closed.
+        view: one view.
+        shape: (rows, cols).
         pixels: (k, 2) row, column.
+
+    Returns:
+        (k,).
     """
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     one, two, start = b - a, c - a, view.source[0] - a
@@ -819,7 +913,12 @@ def names() -> list[str]:
 
 
 def run(only: Sequence[str], with_peers: bool) -> Document:
-    """Measure what is named, everything if nothing is, and return the document."""
+    """Measure the cases named, or all, print each, and return the document.
+
+    Args:
+        only: names of cases, "growth", "growth-KEY" or "memory"; all if empty.
+        with_peers: also measure RTK and embreex where they are installed.
+    """
     warm_up()
     missing = (
         {name: absent(name) for name in ("itk-rtk", "embreex")} if with_peers else {}
@@ -847,6 +946,9 @@ def run(only: Sequence[str], with_peers: bool) -> Document:
 
 
 def main() -> None:
+    """Measure the cases on the command line without a CUDA device, and print or write the
+    document.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, help="write bench.json here, do not print it")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", choices=names())

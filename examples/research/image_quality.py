@@ -56,7 +56,12 @@ class EdgeResponse:
     modulation: FloatArray
 
     def at(self, modulation: float) -> float:
-        """Lowest frequency at which the modulation falls to `modulation` [cycles a pixel]."""
+        """Find the lowest frequency at which the modulation falls to `modulation`,
+        linearly between samples [cycles a pixel].
+
+        Raises:
+            LimitError: it does not fall so far, or begins below.
+        """
         below = np.flatnonzero(self.modulation < modulation)
         if len(below) == 0 or below[0] == 0:
             raise LimitError(
@@ -83,11 +88,11 @@ def photon_transfer(
     *,
     reach: int = 3,
 ) -> PhotonTransfer:
-    """Conversion gain and read noise from pairs of equal exposures.
+    """Estimate conversion gain and read noise from pairs of equal exposures.
 
-    The difference of two equal images has no fixed pattern. Blur spreads the noise of a quantum
-    over neighbours without changing its sum, so the covariance with neighbours up to `reach`
-    pixels counts as variance.
+    The difference of two equal images has no fixed pattern. Blur spreads the noise of a
+    quantum over neighbours without changing its sum, so the covariance with neighbours up
+    to `reach` pixels counts as variance.
 
     Args:
         pairs: flats of growing exposure, none saturated, (rows, cols) each.
@@ -111,7 +116,9 @@ def _mean(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
 
 
 def _difference_variance(a: npt.ArrayLike, b: npt.ArrayLike, reach: int) -> float:
-    """Half the variance of a - b, with the covariances of pixels up to `reach` apart."""
+    """Compute half the variance of a - b, with the covariances of pixels up to `reach`
+    apart added.
+    """
     d = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
     d -= d.mean()
     rows, cols = d.shape
@@ -125,13 +132,19 @@ def _difference_variance(a: npt.ArrayLike, b: npt.ArrayLike, reach: int) -> floa
 
 
 def edge_mtf(image: npt.ArrayLike) -> EdgeResponse:
-    """Modulation transfer from a straight, slightly slanted, nearly vertical edge.
+    """Measure the modulation transfer from a straight, slightly slanted, nearly vertical
+    edge.
+
+    The profile across the edge is sampled in FINE bins a pixel; frequencies end at 1
+    cycle a pixel.
 
     Args:
-        image: (rows, cols) of a linear signal, the edge crossing all rows, flat on both sides.
+        image: (rows, cols) of a linear signal, the edge crossing all rows, flat on both
+            sides.
 
     Raises:
-        LimitError: there is no such edge.
+        LimitError: no edge crosses all rows, it is too close to the border, or not
+            slanted enough.
     """
     data = np.asarray(image, dtype=np.float64)
     rows, cols = data.shape

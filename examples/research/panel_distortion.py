@@ -24,7 +24,11 @@ SEEN = (np.linspace(300, 655, 12), np.linspace(150, 610, 12))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Calibrate scans with distorted panels, and print how much of the distortion is left
+    [px], and pulls of the parameters.
+
+    Shifts that a geometry can make are taken off first. Returns 0.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--each", type=int, default=25, help="scans of each kind")
     parser.add_argument("--seed", type=int, default=100)

@@ -33,7 +33,9 @@ BALL, CENTRE, RADIUS, MU = (
 
 
 def transmission(chain: Chain, *lengths: float) -> float:
-    """Signal behind slabs over the open beam's."""
+    """Compute the signal behind slabs of the chain's substances, of these lengths [mm],
+    over the open beam's.
+    """
     paths = np.empty((len(lengths), 3, 3), np.float32)
     paths[:] = np.array(lengths)[:, None, None]
     behind, free = (
@@ -43,7 +45,9 @@ def transmission(chain: Chain, *lengths: float) -> float:
 
 
 def slabs() -> float:
-    """Largest relative error of Beer-Lambert's law, one energy, plastic and steel."""
+    """Compute the largest relative error of Beer-Lambert's law for one energy behind
+    plastic and steel.
+    """
     two = tuple(material(n).substance for n in ("abs", "steel"))
     chain = Chain(Detector(), substances=two, thickest_mm=(50.0, 5.0), mono_keV=50.25)
     mu = [s.attenuation()[90] for s in two]  # the bin about 50.25 keV
@@ -55,7 +59,13 @@ def slabs() -> float:
 
 
 def wedge() -> dict[str, float]:
-    """Aluminium from 0 to 40 mm at 90 kV against the sum over the whole spectrum."""
+    """Compare a few effective energies with the complete spectrum at 90 kV, behind 0 to
+    40 mm of aluminium.
+
+    Returns:
+        Largest relative error, number of energies, and attenuation [1/mm] of the first
+        and the last layer.
+    """
     aluminium = material("aluminium").substance
     chain = Chain(Detector(), substances=(aluminium,), thickest_mm=(40.0,))
     signal, noise = weights_of(chain, 90.0)
@@ -73,12 +83,18 @@ def wedge() -> dict[str, float]:
 
 
 def detector() -> dict[str, object]:
-    """Photon transfer, flat correction, saturation, sharpness of the simulated panel."""
+    """Measure photon transfer, flat correction, saturation and sharpness of the simulated
+    panel.
+
+    Returns:
+        Figures by name, those of photon transfer over the truth.
+    """
     panel = Detector(dead_fraction=0.0)
     chain = Chain(panel)
     camera = CameraSettings("HW2SW1High", Roi(0, 0, 1199, 999))
 
     def flat(exposure: ExposureSettings, number: int) -> np.ndarray:
+        """Read out a flat image with the noise of a number."""
         empty = np.zeros((0, *camera.shape), np.float32)
         expected = expected_signal(chain, empty, VIEW, exposure)
         return read_out(panel, expected, camera, exposure, frame_rng(1, number))
@@ -113,7 +129,9 @@ def detector() -> dict[str, object]:
 
 
 def _edge(panel: Detector) -> float:
-    """Line pairs a mm at which the panel's own blur (no noise, unbinned) leaves half."""
+    """Measure the line pairs a mm at which the panel's own blur (no noise, unbinned)
+    leaves half the modulation.
+    """
     camera = CameraSettings("HW1SW1High", Roi(0, 0, 199, 199))
     y, x = np.mgrid[:200, :200]
     sharp = np.mean(
@@ -135,6 +153,9 @@ def _edge(panel: Detector) -> float:
 def circle(
     n: int, span: float = 360.0, *, aside: float = 0.0, repeat: bool = True
 ) -> ConeVec:
+    """Make `n` views over `span` [deg], the panel moved `aside` [mm]; with `repeat` the
+    last view is at the end of the span.
+    """
     a = np.deg2rad(np.linspace(0.0, span, n, endpoint=repeat))
     u = np.stack([np.cos(a), np.sin(a), 0 * a], 1)
     away = np.stack([-np.sin(a), np.cos(a), 0 * a], 1)
@@ -144,7 +165,13 @@ def circle(
 
 
 def ball(scan: ConeVec, iterations: int = 0) -> dict[str, object]:
-    """Attenuation and centre of a ball that comes back, voxels of 0.4 mm."""
+    """Reconstruct a ball by FDK, or by SIRT if iterations are given, with voxels of 0.4
+    mm.
+
+    Returns:
+        Attenuation over the true one, distance of the centre [voxels], and for SIRT
+        whether the residual always fell.
+    """
     data = project_scene(Scene((Solid(BALL, "a", MU),)), scan, (120, 130))
     like = Grid((80, 80, 80), 0.4).blank()
     residuals: list[float] = []
@@ -166,6 +193,7 @@ def ball(scan: ConeVec, iterations: int = 0) -> dict[str, object]:
 
 
 def main() -> None:
+    """Print the figures of physics and reconstruction as JSON."""
     figures = {
         "slabs_worst_error": slabs(),
         "wedge": wedge(),

@@ -62,8 +62,7 @@ rays."""
 def places(
     beads: Array, angles: Array, sod: float, truth: Mapping[str, float]
 ) -> tuple[Array, Array]:
-    """Where the beads are in the laboratory [mm], (n, k, 3), and the panel (3, 3): its centre
-    and the steps from one column and one row to the next.
+    """Compute the places of beads and panel in the laboratory [mm].
 
     The source is at the origin, the beam along +y, z is up.
 
@@ -72,6 +71,10 @@ def places(
         angles: (n,) of the stage [deg], clockwise seen from above.
         sod: distance of the rotation axis [mm].
         truth: offsets [mm, deg]; a name that is left out is 0.
+
+    Returns:
+        Beads (n, k, 3), and the panel (3, 3): its centre and the steps from one column
+        and one row to the next.
     """
 
     def t(name: str) -> float:
@@ -97,10 +100,11 @@ def places(
 
 
 def pixels(beads: Array, angles: Array, sod: float, truth: Mapping[str, float]) -> Array:
-    """Columns and rows at which the beads' centres appear, (n, k, 2); arguments as of `places`.
+    """Compute the columns and rows at which the beads' centres appear, (n, k, 2);
+    arguments as of `places`.
 
-    Each ray from the source through a bead is cut with the plane of the panel by solving for
-    the three unknowns of their equation.
+    Each ray from the source through a bead is cut with the plane of the panel by solving
+    for the three unknowns of their equation.
     """
     at, (panel, across, down) = places(beads, angles, sod, truth)
     out = np.empty((*at.shape[:2], 2))
@@ -120,7 +124,17 @@ def radiographs(
     radius: float = RADIUS,
     attenuation: float = ATTENUATION,
 ) -> list[npt.NDArray[np.float32]]:
-    """Line integrals of balls: each pixel counts the photons of RAYS x RAYS rays; blurred."""
+    """Simulate line integrals of balls, one image (rows, cols) for each angle.
+
+    Each pixel counts the photons of RAYS x RAYS rays, blurred by BLUR_PX, with the noise
+    of PHOTONS.
+
+    Args:
+        rng: of the noise.
+        beads, angles, sod, truth: as of `places`.
+        radius: of the balls [mm].
+        attenuation: of the balls [1/mm].
+    """
     at, panel = places(beads, angles, sod, truth)
     out = []
     for balls, centres in zip(at, pixels(beads, angles, sod, truth), strict=True):
@@ -138,16 +152,18 @@ def radiographs(
 def shadow(
     ball: Array, centre: Array, panel: Array, radius: float, sod: float
 ) -> tuple[tuple[Array, ...], Callable[[float], Array]]:
-    """Pixels about a ball's image, as an index, and what part of light passes it there.
+    """Find the pixels about a ball's image, and the part of light that passes there.
 
     Args:
-        ball: its centre [mm]; centre: of its image [px].
+        ball: its centre [mm].
+        centre: of its image [px].
         panel: as of `places`.
         radius: [mm].
         sod: of the axis [mm].
 
     Returns:
-        The index, and a function of an attenuation [1/mm]: means of RAYS x RAYS rays.
+        The pixels as an index of an image, and a function of an attenuation [1/mm] that
+        gives the mean of RAYS x RAYS rays there.
     """
     middle, across, down = panel
     reach = int(1.3 * radius * SDD / (0.7 * sod) / PIXEL)
@@ -173,8 +189,9 @@ def shadow(
 
 
 def axis_in_image(truth: Mapping[str, float], angle: float = 0.0) -> dict[str, float]:
-    """Where the rotation axis appears: its column in the middle row [px], and its angle
-    [deg]."""
+    """Compute where the rotation axis appears: "axis_column" in the middle row [px], and
+    "axis_angle" [deg].
+    """
     axis = np.array([truth["tau_x"], truth["tau_z"], 0.0])
     ends = np.array([axis - [0, 0, 9], axis + [0, 0, 9]])
     ((low, high),) = pixels(ends, np.array([angle]), SOD, truth)
@@ -184,10 +201,11 @@ def axis_in_image(truth: Mapping[str, float], angle: float = 0.0) -> dict[str, f
 
 
 def drawn(rng: np.random.Generator, wider: float, skewed: bool) -> dict[str, float]:
-    """Offsets of a scan [mm, deg]: the six in their range, the others from their priors.
+    """Draw the offsets of a scan [mm, deg]: the six evenly in their range, the others
+    from their priors, `wider` times as wide.
 
-    Skewed is an exponential distribution: one-sided, and its root mean square is the width of
-    the prior times `wider`.
+    With `skewed` these are one-sided, of an exponential distribution with the same root
+    mean square.
     """
     truth = {n: float(rng.uniform(-r, r)) for n, r in REACH.items()}
     for name, width in ASSUMED.items():
@@ -200,8 +218,20 @@ def scan(
     rng: np.random.Generator, truth: Mapping[str, float], frames: int, count: int, sure: bool,
     images: bool = False,
 ) -> tuple[FitResult | None, bool, dict[str, float]]:  # fmt: skip
-    """Fit one scan (of `count` placements, at two SODs), or None if it is refused;
-    whether its priors were widened; and the true values of what a reconstruction needs."""
+    """Simulate and calibrate one scan.
+
+    Args:
+        rng: of beads and noise.
+        truth: offsets [mm, deg].
+        frames: of each placement.
+        count: placements, 1 or 2, at two SODs.
+        sure: fit as if every prior were 0.
+        images: from radiographs; else from noisy points.
+
+    Returns:
+        The fit, None if it is refused; whether its priors were widened; and the true
+        place of the axis in the image.
+    """
     beads = spread(rng, 4 * RADIUS if images else 0.0)
     angles = 360.0 * np.arange(frames) / frames
     sods = [SOD, 0.75 * SOD][:count]
@@ -241,7 +271,9 @@ def scan(
 
 
 def spread(rng: np.random.Generator, apart: float) -> Array:
-    """Five balls, their centres at least `apart` from each other, (5, 3) [mm]."""
+    """Draw five balls in a box, their centres at least `apart` [mm] from each other, (5,
+    3) [mm].
+    """
     while True:
         beads = rng.uniform([-12, -12, -26], [12, 12, 26], size=(5, 3))
         distance = np.linalg.norm(beads[:, None] - beads, axis=2)
@@ -253,11 +285,11 @@ def study(
     scans: int, wider: float = 1.0, skewed: bool = False, frames: int = 36, count: int = 1,
     sure: bool = False, seed: int = 0, images: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Run the study.
+    """Draw, fit and compare scans with their truth.
 
     Args:
-        scans: how many.
-        wider: how many times wider than its prior an offset is drawn.
+        scans: number.
+        wider: width of drawn offsets over that of their priors.
         skewed: draw one-sidedly.
         frames: of each placement.
         count: 1, or 2 for a second placement at three quarters of the SOD.
@@ -266,9 +298,9 @@ def study(
         images: calibrate from radiographs.
 
     Returns:
-        Shares [%] of truths inside the intervals and regions among the answers offered, each
-        with the binomial standard error for 95 %, and the largest error of an answer offered
-        [sigma].
+        Shares [%] of truths inside the intervals and regions among the answers offered,
+        each with the binomial standard error for 95 %, and the largest error of an answer
+        offered [sigma].
     """
     inside: dict[str, list[bool]] = {}
     worst, refused, widened, names = 0.0, 0, 0, list(REACH)
@@ -308,7 +340,7 @@ def study(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Run the study of the command line and print its figures; returns 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=1000)
     parser.add_argument("--wider", type=float, default=1.0)

@@ -48,7 +48,14 @@ def cases(
 
 
 def run_case(case: tuple[str, int, str]) -> tuple[str, Outcome]:
-    """Make, spoil, calibrate and judge one data set; returns the phantom's name too."""
+    """Make, spoil, calibrate and judge one data set.
+
+    Args:
+        case: kind, seed and name of the phantom.
+
+    Returns:
+        The phantom's name, and the outcome.
+    """
     kind, seed, name = case
     phantom = load_phantom(name)
     spoilt = corrupt(
@@ -61,13 +68,14 @@ def run(
     sets: int, jobs: int | None = None, tell: bool = False, keep: Path | None = None,
     kinds: Sequence[str] = tuple(KINDS),
 ) -> dict[str, object]:  # fmt: skip
-    """Run the study.
+    """Calibrate spoilt data sets in several processes and count the outcomes.
 
     Args:
-        sets: how many data sets.
+        sets: number of data sets.
         jobs: processes; None is one for each core.
         tell: print progress.
-        keep: file to which each outcome is added as it comes; what it holds is not run again.
+        keep: file to which each outcome is added as it comes; those that it holds are not
+            run again.
         kinds: ways of spoiling, taken in turn.
 
     Returns:
@@ -97,7 +105,7 @@ def run(
 
 
 def _kept(file: Path) -> dict[int, tuple[str, Outcome]]:
-    """Outcomes of an earlier, interrupted run, by seed."""
+    """Read the outcomes of an earlier, interrupted run, by seed; {} without a file."""
     out = {}
     if file.is_file():
         for line in file.read_text("utf-8").splitlines():
@@ -109,7 +117,15 @@ def _kept(file: Path) -> dict[int, tuple[str, Outcome]]:
 
 
 def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, object]:
-    """Count in all and by kind."""
+    """Count outcomes in all and by kind, and list the confidently wrong ones.
+
+    Args:
+        outcomes: of all data sets.
+        phantoms: name of each one's phantom.
+
+    Returns:
+        The document: counts, `rows` of the kinds that occur, and `wrong`.
+    """
     rows = []
     for kind in KINDS:
         some = [o for o in outcomes if o.kind == kind]
@@ -153,8 +169,9 @@ def summary(outcomes: Sequence[Outcome], phantoms: Sequence[str]) -> dict[str, o
 
 
 def kinds_table(document: Mapping[str, Any]) -> list[str]:
-    """One line of Markdown a kind: data sets, refused, offered, worst error offered,
-    findings."""
+    """Make a Markdown table, one line a kind: data sets, refused, offered, wrong, largest
+    error offered [sigma], and the four most frequent findings.
+    """
     lines = [
         "| kind | data sets | refused | offered | wrong | largest error offered (sigma) "
         "| found |",
@@ -183,7 +200,17 @@ def coverage_case(task: tuple[int, str]) -> Draw:
 def coverage(
     seeds: int, camera: str, jobs: int | None = None, keep: Path | None = None
 ) -> dict[str, object]:
-    """Run the coverage study; `keep` as in `run`."""
+    """Calibrate simulated scans and count how often the truth is inside the 95 % regions.
+
+    Args:
+        seeds: number of scans.
+        camera: of CAMERAS.
+        jobs: processes; None is one for each core.
+        keep: as in `run`.
+
+    Returns:
+        Counts, shares [%], findings and the largest distance.
+    """
     draws: list[Draw] = []
     if keep is not None and keep.is_file():
         for line in keep.read_text("utf-8").splitlines():
@@ -228,7 +255,12 @@ def _positive(word: str) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line; exit code 1 if any answer is confidently wrong."""
+    """Run the study, or with `--coverage` that of coverage, and print and store its
+    document.
+
+    Returns:
+        1 if any answer is confidently wrong, else 0.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=_positive, default=1000)
     parser.add_argument("--kinds", nargs="+", choices=tuple(KINDS), default=tuple(KINDS))

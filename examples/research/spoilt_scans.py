@@ -53,7 +53,7 @@ class Outcome:
 def corrupt(
     kind: str, seed: int, phantom: BeadModel, scene: Scene, other: Scene
 ) -> Spoilt:
-    """Make a spoilt scan.
+    """Draw a scan, spoil it in one way, and render its images.
 
     Args:
         kind: one of KINDS.
@@ -85,8 +85,13 @@ def corrupt(
 
 
 def careful_scan(rng: Rng, frames: int) -> tuple[Poses, Offsets]:
-    """Draw a scan in scenario G0's geometry with its object near the right place, and a truth
-    that a careful operator may be off by, at any start angle."""
+    """Draw a scan as of a careful operator, in scenario G0's geometry.
+
+    The offsets are drawn evenly within _TRUTH, the start angle is any.
+
+    Returns:
+        Nominal poses, and the true offsets.
+    """
     nominal, _ = scenario("G0", frames)
     centre = np.array([0.0, 570.0, 22.0])
     nominal = replace(nominal, axis=np.broadcast_to(centre, (frames, 3)))
@@ -105,7 +110,13 @@ _TRUTH = {
 
 
 def judge(kind: str, seed: int, spoilt: Spoilt) -> tuple[Outcome, Calibration]:
-    """Calibrate a spoilt scan and compare with its truth."""
+    """Calibrate a spoilt scan, and compare values and the axis's image with its truth.
+
+    Where something moves during the scan, the right value is the mean over its frames.
+
+    Returns:
+        The outcome, wrong beyond WRONG_SIGMAS, and the calibration.
+    """
     result = calibrate(
         [Scan(ArrayFrames(spoilt.images, SHAPE), spoilt.nominal, kind)],
         spoilt.believed,

@@ -50,7 +50,7 @@ def geometry(angles: Array) -> ConeVec:
 
 
 def balls(rng: np.random.Generator, count: int) -> Array:
-    """Positions (count, 3) [mm], none near another."""
+    """Draw positions (count, 3) [mm] more than APART from each other."""
     out: list[Array] = []
     while len(out) < count:
         new = rng.uniform([-13, -13, -20], [13, 13, 20])
@@ -60,8 +60,12 @@ def balls(rng: np.random.Generator, count: int) -> Array:
 
 
 def unlike(found: Array, true: Array) -> tuple[float, float]:
-    """Largest distance [mm] of two sets of points, (k, 3) each in the same order, after the
-    best shift, turn and scale (Umeyama 1991), and that scale."""
+    """Compare two sets of points, (k, 3) each in the same order, after the best shift,
+    turn and scale (Umeyama 1991).
+
+    Returns:
+        Largest difference of a coordinate [mm], and the scale.
+    """
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, s, vt = np.linalg.svd(a.T @ b)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -70,8 +74,11 @@ def unlike(found: Array, true: Array) -> tuple[float, float]:
 
 
 def truth_of(rng: np.random.Generator) -> dict[str, float]:
-    """Offsets from their ranges and priors. Turn, height and place on the axis belong to the
-    markers' own frame, and the axis's distance to their scale."""
+    """Draw offsets from their ranges and priors.
+
+    Turn, height and place on the axis belong to the markers' own frame, and the axis's
+    distance to their scale: these are 0.
+    """
     return drawn(rng, 1.0, False) | {
         "alpha": 0.0,
         "tau_x": 0.0,
@@ -81,7 +88,9 @@ def truth_of(rng: np.random.Generator) -> dict[str, float]:
 
 
 def pulls(found: Calibration, truth: Mapping[str, float]) -> dict[str, float]:
-    """Error over sigma of each parameter that the images of unknown markers tell."""
+    """Compute error over sigma of each parameter that images of unknown markers
+    determine.
+    """
     assert found.fit is not None
     fit = found.fit
     told = ("dO_x", "dD_x", "dD_z", "det_roll", "det_pitch", "det_yaw", "axis_tilt_z")
@@ -89,7 +98,16 @@ def pulls(found: Calibration, truth: Mapping[str, float]) -> dict[str, float]:
 
 
 def rendered(seed: int, frames: int = 36) -> dict[str, Any]:
-    """One scan from images: what came out, see the keys."""
+    """Calibrate one scan of unknown balls from rendered images.
+
+    Args:
+        seed: of all draws.
+        frames: of the turn.
+
+    Returns:
+        Numbers of balls and of those found, residual [px], largest error of a position
+        [um], scale, whether identifiable, and pulls.
+    """
     rng = np.random.default_rng([7, seed])
     truth, beads = truth_of(rng), balls(rng, int(rng.integers(5, 21)))
     angles = 360.0 * np.arange(frames) / frames
@@ -114,7 +132,18 @@ def rendered(seed: int, frames: int = 36) -> dict[str, Any]:
 def marked(
     seed: int, views: int, count: int, noise: float, missing: float
 ) -> tuple[dict[str, float], Array, Array, Markers]:
-    """Truth, angles, positions and noisy annotations, some missing."""
+    """Draw a scan and noisy annotations of its markers, some missing.
+
+    Args:
+        seed: of all draws.
+        views: of the turn.
+        count: markers.
+        noise: of an annotation [px].
+        missing: share of annotations.
+
+    Returns:
+        True offsets, angles [deg], positions (count, 3) [mm] and annotations.
+    """
     rng = np.random.default_rng([8, seed])
     truth, beads = truth_of(rng), balls(rng, count)
     angles = 360.0 * np.arange(views) / views
@@ -132,7 +161,13 @@ def annotated(
     noise: float = HAND_PX,
     missing: float = 0.2,
 ) -> dict[str, Any]:
-    """One calibration from annotations with the distance of two markers."""
+    """Calibrate from annotations with the known distance of two markers; arguments as of
+    `marked`.
+
+    Returns:
+        Residual [px], whether identifiable, pulls, largest error of a position [mm], and
+        findings.
+    """
     truth, angles, beads, markers = marked(seed, views, count, noise, missing)
     data = markers_alone(geometry(angles), "marked")
     (some,), markers = seen_alone(data, markers)
@@ -153,8 +188,16 @@ def annotated(
 
 
 def write(folder: Path, seed: int = 0, views: int = 36) -> DataSet:
-    """Write a folder of float TIFFs, geometry.npy (ASTRA's vectors) and markers.csv beside
-    it."""
+    """Write a folder of float TIFFs with geometry.json and markers.csv beside it.
+
+    Args:
+        folder: gets them.
+        seed: of all draws.
+        views: of the turn.
+
+    Returns:
+        The data set of these markers.
+    """
     import tifffile
 
     rng = np.random.default_rng([7, seed])
@@ -176,7 +219,7 @@ def write(folder: Path, seed: int = 0, views: int = 36) -> DataSet:
 
 
 def spread(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Root mean square of the pulls of each parameter, in words."""
+    """Format the root mean square of the pulls of each parameter, in words."""
     names = rows[0]["pulls"]
     return ", ".join(
         f"{n} {np.sqrt(np.mean([r['pulls'][n] ** 2 for r in rows])):.2f}" for n in names
@@ -184,7 +227,9 @@ def spread(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Command line."""
+    """Calibrate unknown markers from images, positions and annotations, and print the
+    results; returns 0.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scans", type=int, default=0, help="from images")
     parser.add_argument("--drawn", type=int, default=0, help="from positions")

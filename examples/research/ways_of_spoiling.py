@@ -77,7 +77,7 @@ def _moved(scan: Spoilt, shift: npt.NDArray[np.float64]) -> Spoilt:
 
 
 def _kept_beads(scan: Spoilt, keep: npt.NDArray[np.bool_]) -> Spoilt:
-    """Only some of the beads are there."""
+    """Remove beads from the scanned object; `keep` (k,) says which stay."""
     solids = [
         s
         for s in scan.scene.solids
@@ -94,6 +94,7 @@ def _kept_beads(scan: Spoilt, keep: npt.NDArray[np.bool_]) -> Spoilt:
 
 
 def _bead_moved(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Move one bead by 0.05 to 3 mm in a random direction."""
     shift = np.zeros_like(scan.model.beads)
     direction = rng.normal(size=3)
     shift[rng.integers(len(shift))] = (
@@ -126,6 +127,7 @@ def _no_beads(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _mirrored(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Let calibration believe in beads mirrored along x, without a body."""
     return replace(
         scan,
         believed=BeadModel(
@@ -136,9 +138,12 @@ def _mirrored(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _scaled(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Spread the model's beads by 5 to 30 % too far or too near; their size is right. (A
-    model scaled with its beads looks exactly right at another distance; see
-    PLAUSIBLE_SHARE.)"""
+    """Spread the believed beads 8 to 30 % too far or too near, of the right size, without
+    a body.
+
+    A model scaled with its beads looks exactly right at another distance; see
+    PLAUSIBLE_SHARE.
+    """
     factor = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.08, 0.3)
     return replace(
         scan,
@@ -148,6 +153,7 @@ def _scaled(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _extra_beads(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Add one to three balls like the beads to the scanned object."""
     bead = next(s for s in scan.scene.solids if isinstance(s.shape, Sphere))
     assert isinstance(bead.shape, Sphere)
     more = []
@@ -160,6 +166,7 @@ def _extra_beads(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _foreign_box(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Add a steel box with sides of 1 to 10 mm to the scanned object."""
     x, y, z = rng.uniform([-20, -20, -25], [20, 20, 25]).tolist()
     size = tuple(rng.uniform(1.0, 10.0, size=3).tolist())
     box = Solid(Box((x, y, z), (size[0], size[1], size[2])), "steel", 0.8)
@@ -167,11 +174,14 @@ def _foreign_box(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _other_body(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Move the beads' holder by up to 3 mm, change its attenuation, or take it away."""
+    """Move the beads' holder by a few millimetres, and keep, change or remove its
+    attenuation.
+    """
     shift = rng.normal(size=3) * math.exp(rng.uniform(math.log(0.05), math.log(2.0)))
     factor = float(rng.choice([0.0, 1.0, math.exp(rng.normal())]))
 
     def changed(solid: Solid) -> Solid:
+        """Return a solid moved and with its attenuation changed."""
         place = (np.asarray(solid.shape.center) + shift).tolist()  # type: ignore[union-attr]
         shape = replace(solid.shape, center=tuple(place))  # type: ignore[call-arg]
         return replace(solid, shape=shape, mu_per_mm=factor * solid.mu_per_mm)
@@ -208,6 +218,7 @@ def _reversed(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _renumbered(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Skip one to three frames' angles from a frame on."""
     gap = int(rng.integers(1, 4))
     at = int(rng.integers(4, FRAMES - 4))
     return _angles(
@@ -249,6 +260,7 @@ def _shifted_halfway(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _source_drift(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Let the focal spot drift sideways over the scan, by up to a millimetre or so."""
     way = (
         math.exp(rng.uniform(math.log(0.002), math.log(1.0)))
         * rng.normal(size=3)
@@ -275,7 +287,7 @@ def _blurred(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _some_held(scan: Spoilt, rng: Rng, off: Callable[[], float]) -> Spoilt:
-    """One to three of the six are held, `off` from where they are (mm, deg)."""
+    """Hold one to three of the six, `off` from where they are [mm, deg]."""
     held = rng.choice(SIX, size=int(rng.integers(1, 4)), replace=False).tolist()
     edge = scan.truth.to_edge()
     start = Offsets.from_edge({n: edge[n] + off() for n in held})
@@ -284,7 +296,9 @@ def _some_held(scan: Spoilt, rng: Rng, off: Callable[[], float]) -> Spoilt:
 
 
 def _held_off(scan: Spoilt, rng: Rng) -> Spoilt:
-    """From what no data can tell to what anybody sees."""
+    """Hold some of the six off by 1e-5 to 1 mm or deg, from what no data can show to what
+    anybody sees.
+    """
     return _some_held(
         scan,
         rng,
@@ -297,8 +311,9 @@ def _held_right(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _scanner_off(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Detector and axis are all off at once, each as its prior allows, and half of the time
-    some of the six are held, rightly or wrongly."""
+    """Offset detector and axis all at once, each as its prior allows, and half of the
+    time hold some of the six, rightly or wrongly.
+    """
     off = {n: w * float(np.clip(rng.normal(), -3, 3)) for n, w in ASSUMED.items()}
     scan = replace(scan, truth=Offsets.from_edge(scan.truth.to_edge() | off))
     return (lambda s, _: s, _held_off, lambda s, _: s, _held_right)[int(rng.integers(4))](
@@ -307,7 +322,9 @@ def _scanner_off(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _detector_off(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Shift or tilt the detector by far more than its prior allows."""
+    """Shift (3 to 15 mm) or tilt (0.4 to 3 deg) the detector in one way, by far more than
+    its prior allows.
+    """
     largest = {"dD_x": 15.0, "dD_y": 15.0, "dD_z": 15.0, "det_roll": 2.0, "det_pitch": 3.0,
                "det_yaw": 3.0}  # fmt: skip
     name = str(rng.choice(list(largest)))
@@ -322,6 +339,7 @@ def _detector_off(scan: Spoilt, rng: Rng) -> Spoilt:
 def _each(
     scan: Spoilt, change: Callable[[Float32Array, int], Float32Array | None]
 ) -> Spoilt:
+    """Replace each image by `change(image, number)`; missing ones stay missing."""
     images = tuple(
         None if im is None else change(im, i) for i, im in enumerate(scan.images)
     )
@@ -343,6 +361,7 @@ def _half_dark(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _gradient(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Add a linear ramp and a wave along columns to all images."""
     rows, cols = SHAPE
     x, y = rng.normal(size=2) * 1.5
     ramp = (
@@ -353,10 +372,12 @@ def _gradient(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _dead_columns(scan: Spoilt, rng: Rng) -> Spoilt:
+    """Set up to 29 columns of all images to 9, and 400 pixels to -3."""
     columns = rng.integers(0, SHAPE[1], size=int(rng.integers(1, 30)))
     spots = rng.integers(0, [[SHAPE[0]], [SHAPE[1]]], size=(2, 400))
 
     def change(im: Float32Array, _: int) -> Float32Array:
+        """Return a copy of an image with these columns and pixels."""
         out = im.copy()
         out[:, columns] = 9.0
         out[spots[0], spots[1]] = -3.0
@@ -374,10 +395,11 @@ def _flipped_ud(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _rotated(scan: Spoilt, rng: Rng) -> Spoilt:
-    """As a panel rolled by that angle would see it; only priors can say that it is too much.
+    """Turn all images by 0.02 to 5 deg, as a panel rolled by that angle would see them;
+    the truth has that roll.
 
-    By a cubic spline at exact places: OpenCV takes them to 1/32 pixel, more than a centroid's
-    sigma.
+    It is done by a cubic spline at exact places: OpenCV takes them to 1/32 pixel, more
+    than a centroid's sigma.
     """
     angle = float(rng.choice([-1, 1]) * rng.uniform(0.02, 5.0))
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
@@ -391,7 +413,7 @@ def _rotated(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _repeated(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Replace some frames by the one before, as a camera that stutters."""
+    """Replace 3 to 30 % of the frames by the one before, as a camera that stutters."""
     stuck = rng.random(FRAMES) < rng.uniform(0.03, 0.3)
     images = list(scan.images)
     for i in range(1, FRAMES):

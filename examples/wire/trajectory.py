@@ -18,13 +18,19 @@ class Twin:
     """One connection; a request and its answer are a line of JSON each."""
 
     def __init__(self, host: str, port: int) -> None:
+        """Connect to a twin by TCP."""
         self.lines = socket.create_connection((host, port)).makefile(
             "rw", encoding="utf-8"
         )
         self.count = 0
 
     def call(self, method: str, **params: object) -> dict:
-        """Return the result of a request; events in between are skipped."""
+        """Send a request and return the result of its answer; events in between are
+        skipped.
+
+        Raises:
+            SystemExit: the answer is an error, or the server closes the connection.
+        """
         self.count += 1
         request = {"jsonrpc": "2.0", "id": self.count, "method": method, "params": params}
         self.lines.write(json.dumps(request) + "\n")
@@ -42,7 +48,9 @@ class Twin:
 def main(
     host: str = "127.0.0.1", port: str = "55000", name: str = "by-trajectory"
 ) -> None:
-    """Scan, wait, say where the data set is."""
+    """Scan one turn of 24 poses on a twin, wait for the job's end, and print its
+    warnings, state and data set.
+    """
     twin = Twin(host, int(port))
     twin.call("session.hello", protocol="1.0", client="trajectory.py")
     twin.call("sample.set", name="normal-5")
