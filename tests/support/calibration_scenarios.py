@@ -25,7 +25,14 @@ SCENARIOS = {
 
 
 def scenario(name: str, frames: int) -> tuple[Poses, Offsets]:
-    """Start poses (angles 360 n / N) and the truth."""
+    """The start poses of a named scenario of SCENARIOS, and the offsets that are hidden
+    in it.
+
+    Angles go once around: 360 deg * n / frames.
+
+    Raises:
+        KeyError: there is no such scenario.
+    """
     source, detector, start, shift, alpha = SCENARIOS[name]
     poses = Poses(
         from_unity(source),
@@ -42,7 +49,13 @@ def scenario(name: str, frames: int) -> tuple[Poses, Offsets]:
 def spiral(
     size: tuple[float, float, float], beads: int, radius: float = 2.0
 ) -> BeadModel:
-    """Beads on the spiral of calibration.md; size is width, breadth, height."""
+    """Beads on the spiral of docs/calibration.md: one turn from the bottom to the top.
+
+    Args:
+        size: width, breadth and height of what the beads have to stay inside [mm].
+        beads: how many; a single one lies at half height.
+        radius: of each bead [mm]; bead centres keep so far from the sides.
+    """
     k = np.arange(beads)
     height = (
         (k / (beads - 1) - 0.5) * (size[2] - 2 * radius) if beads > 1 else np.zeros(1)
@@ -74,7 +87,18 @@ def shadows(
     false: int = 0,
     noise: float = 0.05,
 ) -> list[Detections]:
-    """Detections in random order, some left out, some invented."""
+    """Detections of each frame in random order, some left out, some invented.
+
+    Places within ten pixels of an edge of SHAPE are not seen. The same seed gives the
+    same detections.
+
+    Args:
+        tracks: (frames, beads, 2) true places [pixels].
+        seed: of everything random.
+        missing: part of the true places that is left out.
+        false: places invented in each frame, anywhere on it.
+        noise: standard deviation added to true places [pixels].
+    """
     rng = np.random.default_rng(seed)
     rows, cols = SHAPE
     out = []

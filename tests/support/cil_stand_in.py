@@ -34,6 +34,9 @@ class Geometry:
     shape: tuple[int, ...]
 
     def allocate(self, value: float | None = 0) -> Data:
+        """Make data of this geometry, filled with a value; None leaves them as they are
+        made.
+        """
         data = Data(self)
         if value is not None:
             data._array[...] = value
@@ -101,7 +104,11 @@ class LinearOperator:
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `cil.framework` and `cil.optimisation.operators` be this module's classes."""
+    """Put this module's classes in the place of `cil.framework` and
+    `cil.optimisation.operators`.
+
+    The modules are put into `sys.modules`, until `monkeypatch` takes them out again.
+    """
     for name, content in (
         ("cil", {}),
         ("cil.framework", {c.__name__: c for c in (ImageGeometry, AcquisitionGeometry)}),

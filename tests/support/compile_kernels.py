@@ -17,6 +17,11 @@ from flexdt.twin.projection import warm_up
 
 
 def main() -> None:
+    """Use whatever the tests compile, once, so that numba's cache holds it before workers
+    begin.
+
+    Warnings are silenced from here on.
+    """
     warnings.simplefilter("ignore")  # nothing here has to be a good scan
     warm_up()
     scan = fx.ConeVec.circular(sod=600, sdd=1059, angles=12, shape=(96, 120), pixel=1.0)

@@ -15,7 +15,20 @@ STORAGE, STREAM, ROOT = 1, 2, 5
 
 
 def compound_file(streams: Mapping[str, bytes]) -> bytes:
-    """A file with these streams; a path is "storage/stream" or "stream"."""
+    """Write a compound file (OLE2, version 3) with these streams.
+
+    Streams below CUTOFF bytes go into the small sectors. A storage holds streams only, no
+    storages.
+
+    Args:
+        streams: contents by path; a path is "storage/stream" or "stream".
+
+    Returns:
+        The bytes of the file.
+
+    Raises:
+        AssertionError: the streams need a larger allocation table than a header can list.
+    """
     tree: dict[str, dict[str, bytes] | bytes] = {}
     for path, content in streams.items():
         *folder, name = path.split("/")
@@ -32,6 +45,11 @@ def compound_file(streams: Mapping[str, bytes]) -> bytes:
     mini = bytearray()
 
     def kept(content: bytes, size: int, chains: list[int], where: bytearray) -> int:
+        """Append a content as a chain of sectors.
+
+        Returns:
+            The number of its first sector; END for an empty content.
+        """
         first, count = len(chains), -(-len(content) // size)
         chains += [first + i + 1 for i in range(count - 1)] + [END] * (count > 0)
         where += content.ljust(count * size, b"\0")
@@ -41,7 +59,13 @@ def compound_file(streams: Mapping[str, bytes]) -> bytes:
     entries: list[list[object]] = [["Root Entry", ROOT, NOBODY, NOBODY, NOBODY, END, 0]]
 
     def placed(inside: Mapping[str, dict[str, bytes] | bytes]) -> int:
-        """The root of a balanced tree of entries, in the order of length, then of capitals."""
+        """Add the entries of a storage, those inside it included, as a balanced tree.
+
+        Entries are in the order of the length of their names, then of their capitals.
+
+        Returns:
+            The number of the tree's root; NOBODY if the storage is empty.
+        """
         names = sorted(inside, key=lambda n: (len(n), n.upper()))
         places = {}
         for name in names:
@@ -57,6 +81,9 @@ def compound_file(streams: Mapping[str, bytes]) -> bytes:
                                 kept(content, *chain), len(content)])  # fmt: skip
 
         def middle(some: list[str]) -> int:
+            """Join entries to a balanced tree and return the number of its root; NOBODY
+            of none.
+            """
             if not some:
                 return NOBODY
             half = len(some) // 2
@@ -94,6 +121,9 @@ def compound_file(streams: Mapping[str, bytes]) -> bytes:
 def _entry(
     name: str, kind: int, left: int, right: int, child: int, first: int, size: int
 ) -> bytes:
+    """Pack one directory entry of 128 bytes; all are black, without class, flags or
+    dates.
+    """
     text = name.encode("utf-16-le")
     black = 1
     return struct.pack(

@@ -22,9 +22,15 @@ def run_simulated(program: str, *arguments: str) -> None:
 
 
 def two_devices() -> list[int]:
-    """In the simulator: two devices, of which neither may touch an array of the other's.
+    """In the simulator: make two devices, of which neither may touch an array of the
+    other's.
 
-    Returns the device of each kernel launched from now on.
+    An array belongs to the device that was entered (`with cuda.gpus[i]`) when its memory
+    was first seen, the first device outside of any. Numba's simulator stays patched for
+    the process.
+
+    Returns:
+        The list to which every kernel launch from now on adds the number of its device.
     """
     import numpy as np
     from numba import cuda
@@ -47,6 +53,9 @@ def two_devices() -> list[int]:
             inside.pop()
 
     def of(array: Any) -> tuple[Any, int]:
+        """Return the memory of an array and the number of its device; an unknown one gets
+        the present.
+        """
         root = array._ary
         while isinstance(root.base, np.ndarray):
             root = root.base
@@ -59,14 +68,19 @@ def two_devices() -> list[int]:
     )
 
     def begun(self: Any, *arguments: Any, **options: Any) -> None:
+        """Make an array as the simulator does, and note its device."""
         begin(self, *arguments, **options)
         of(self)
 
     def fetched(self: Any, *arguments: Any, **options: Any) -> Any:
+        """Copy to the host; AssertionError if the array is not of the device entered."""
         assert of(self)[1] == inside[-1]
         return fetch(self, *arguments, **options)
 
     def called(self: Any, *arguments: Any) -> Any:
+        """Note a launch and run it; AssertionError if an argument is not of the device
+        entered.
+        """
         if not self._device:  # a kernel, not a function that one calls
             launches.append(inside[-1])
             arrays = [a for a in arguments if isinstance(a, FakeCUDAArray)]
@@ -80,11 +94,13 @@ def two_devices() -> list[int]:
 
 
 def as_on_a_device(block: tuple[int, int] = (32, 4)) -> None:
-    """In the simulator: run kernels as a device does, and refuse what a device only breaks at.
+    """In the simulator: run kernels as a device does, and refuse what a device only
+    breaks at.
 
-    Warps are 32 lanes that exchange values, which all of them have to reach; the threads of a
-    block wait for each other there and at `syncthreads`. Every index of an array has to be
-    inside it. Threads run one at a time, each until it waits: a run is the same every time.
+    Warps are 32 lanes that exchange values, which all of them have to reach; the threads
+    of a block wait for each other there and at `syncthreads`. Every index of an array has
+    to be inside it. Threads run one at a time, each until it waits: a run is the same
+    every time. Numba's simulator and `gpu_kernels` stay patched for the process.
 
     Args:
         block: threads a block of the projector's kernels; rows have to fill warps.
@@ -98,6 +114,9 @@ def as_on_a_device(block: tuple[int, int] = (32, 4)) -> None:
         return CheckedArray(FakeCUDAArray(allocate_local(self, shape, kind)))
 
     def shared(self: Any, shape: Any, kind: Any) -> CheckedArray:
+        """Return the one array of a block for the line that asks; the first thread there
+        makes it.
+        """
         caller = sys._getframe(1)
         place = caller.f_code, caller.f_lineno
         if place not in self._allocations:
@@ -107,6 +126,7 @@ def as_on_a_device(block: tuple[int, int] = (32, 4)) -> None:
         return self._allocations[place]
 
     def called(self: Any, *arguments: Any) -> Any:
+        """Call a device function directly; launch a kernel as the simulator does."""
         # The globals of a device function are those of the kernel that calls it.
         return self.fn(*arguments) if self._device else call(self, *arguments)
 
@@ -125,7 +145,10 @@ WARP = 32
 
 
 def exchange(value: int, step: int) -> int:
-    """What a kernel's `exchange` returns: the value of the lane that differs in the bit `step`.
+    """What a kernel's `exchange` returns: the value of the lane that differs in the bit
+    `step`.
+
+    It waits until all threads of the block have come so far, ended, or wait elsewhere.
 
     Raises:
         RuntimeError: lanes of the warp left the kernel, or went another way, before.
@@ -145,6 +168,7 @@ class CheckedArray:
     """An array in a kernel; an index outside raises IndexError, a negative one, too."""
 
     def __init__(self, item: Any) -> None:
+        """Take over the memory of a simulator's array; nothing is copied."""
         self._ary = item._ary
         self.dtype, self.shape, self.size = (
             self._ary.dtype,
@@ -153,6 +177,12 @@ class CheckedArray:
         )
 
     def _inside(self, index: Any) -> Any:
+        """Return an index as it is.
+
+        Raises:
+            IndexError: it has too few or too many parts, or one is negative or beyond its
+                length.
+        """
         places = index if isinstance(index, tuple) else (index,)
         if len(places) != len(self.shape):
             raise IndexError(f"{len(places)} indices of an array of shape {self.shape}")
@@ -177,6 +207,14 @@ class Lane(threading.Thread):
     def __init__(
         self, block: Block, block_index: Any, thread_index: Any, number: int
     ) -> None:
+        """Make a thread that does not run before `turn` is released.
+
+        Args:
+            block: whose kernel it runs.
+            block_index, thread_index: what the kernel reads as `blockIdx` and
+                `threadIdx`.
+            number: in the block, x fastest.
+        """
         super().__init__(daemon=True)
         self.block, self.blockIdx, self.threadIdx = block, block_index, thread_index
         self.thread_id, self.exchanges = number, 0
@@ -185,7 +223,11 @@ class Lane(threading.Thread):
         self.turn.acquire()
 
     def run(self) -> None:
-        """Run the kernel once it is this thread's turn."""
+        """Run the kernel once it is this thread's turn; not at all if the block aborts.
+
+        What it raises is left in `error`, with the thread's place noted, and `waiting` is
+        released.
+        """
         self.turn.acquire()
         try:
             if not self.abort:
@@ -208,13 +250,27 @@ class Block:
     """Numba's BlockManager, with threads that take turns."""
 
     def __init__(self, kernel: Any, grid: Any, block: Any, debug: Any) -> None:
+        """Keep a kernel and the size of its blocks; the grid and the debug flag do not
+        matter here.
+        """
         self._kernel, self._block = kernel, block
         self.given: dict[tuple[int, int], dict[int, tuple[int, int]]] = {}
         self.waiting = threading.Lock()
         self.waiting.acquire()
 
     def run(self, place: Any, *arguments: Any) -> None:
-        """Run all threads of one block to their ends, or raise what one of them met."""
+        """Run all threads of one block to their ends, in turns.
+
+        After the first error the threads that have not begun do not run, and those that
+        wait are told to abort.
+
+        Args:
+            place: the block's index in the grid.
+            arguments: of the kernel.
+
+        Raises:
+            Exception: what the first thread to fail met.
+        """
         import numpy as np
         from numba.cuda.simulator.kernelapi import Dim3
 

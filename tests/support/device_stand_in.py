@@ -47,7 +47,15 @@ def launcher(
     box: Any, voxels: Any, views: Any, images: Any, shape: Any, *, transposed: bool,
     factor: float = 1.0,
 ) -> Callable[[], None]:  # fmt: skip
-    """`gpu.launcher` by the processor, ray by ray."""
+    """Do what `gpu.launcher` does by the processor, ray by ray.
+
+    Args:
+        box, voxels, views, images, shape, transposed, factor: as of `gpu.launcher`.
+
+    Returns:
+        What launches: it overwrites `images` with the projections or, transposed, adds to
+        `voxels` (to integers, multiples of 1 / `factor`).
+    """
 
     def launch() -> None:
         pixels = images._ary.reshape(len(views), *shape)

@@ -28,6 +28,7 @@ class Listener:
     def __init__(
         self, stalls: Iterable[tuple[float, float]] = (), machine: Machine = FLEXRAY
     ) -> None:
+        """Begin at time 0 with no alarm; `alarms` collects all that follow."""
         self.alarms: list[Alarm] = []
         self.now = 0.0
         follower = Follower(machine, builtin_profile(FLEXRAY.default_profile))
@@ -35,6 +36,10 @@ class Listener:
         self.stalls = list(stalls)
 
     def hear(self, messages: Iterable[Message]) -> Listener:
+        """Take messages in order of time, with clock ticks in between; returns itself.
+
+        A message within a stall is taken at the stall's end, with the delay that it had.
+        """
         for at, data in messages:
             stall = next((s for s in self.stalls if s[0] <= at < s[1]), (at, at))
             self.wait(stall[0])
@@ -43,6 +48,11 @@ class Listener:
         return self
 
     def wait(self, until: float) -> Listener:
+        """Let time pass until `until` [s]; returns itself.
+
+        The session ticks each TICK_S while it waits for something; else only once, at the
+        end.
+        """
         while self.now + TICK_S < until:
             busy = self.session.mirror.waiting
             self.now = self.now + TICK_S if busy else until - TICK_S / 2
@@ -52,7 +62,12 @@ class Listener:
 
 
 def measured(overhead: tuple[float, float], n: int = 30) -> Machine:
-    """The machine with times of this median and spread, as known from n of each kind."""
+    """The FleX-ray machine with measured times, all kinds of command alike.
+
+    Args:
+        overhead: median [s] and spread of the logarithm of each kind's time.
+        n: how many commands of each kind they are known from.
+    """
     median, spread = overhead
     ends = {
         "p5_s": median * exp(-1.645 * spread),
@@ -67,7 +82,19 @@ def measured(overhead: tuple[float, float], n: int = 30) -> Machine:
 
 
 def missed(made: Conversation, stalls: Iterable[tuple[float, float]] = ()) -> list[str]:
-    """What of a conversation is not told, or is told though nothing is wrong."""
+    """What of a conversation is not told in time, or is told though nothing is wrong.
+
+    Wrong are: a fault without its alarm within TOLD_S, an error before AFTER_S before the
+    first fault of the machine, and more warnings up to there than one and one for each
+    fault.
+
+    Args:
+        made: what to hear.
+        stalls: (from, to) in which the listener does not read [s].
+
+    Returns:
+        A line for each; empty if all is well.
+    """
     listener = Listener(stalls).hear(made.heard())
     listener.wait(max((f.at_s for f in made.faults), default=listener.now) + AFTER_S)
     wrong = []

@@ -121,7 +121,11 @@ class Conversation:
     # -- what happens ------------------------------------------------------------------------
 
     def command(self) -> None:
-        """Something that a healthy machine does."""
+        """Add something that a healthy machine does, drawn: mostly a move, else a setting
+        or a pause.
+
+        Positions are asked for only in dialects that report the end of a command.
+        """
         what = self.rng.random()
         if what < 0.6:
             self.move()
@@ -234,6 +238,10 @@ class Conversation:
     def _short(
         self, component: str, command: str, argument: str, reply: str = ""
     ) -> None:
+        """Add a command that takes no more than the overhead, and its end with `reply`.
+
+        The end is left out in dialects that report none.
+        """
         say = self._begin(component, command, argument)
         self.now += self._more()
         if self.dialect.end != "none":
@@ -241,6 +249,9 @@ class Conversation:
         self.now += 0.002
 
     def _lasting(self, component: str, command: str, seconds: float) -> None:
+        """Add a command that takes `seconds` and the overhead, with feedback each
+        FEEDBACK_S, and its end.
+        """
         say, begun = self._begin(component, command, str(round(1000 * seconds))), self.now
         for k in range(1, math.ceil(seconds / FEEDBACK_S)):
             self._feedback(say, begun + k * FEEDBACK_S, None)
@@ -257,7 +268,13 @@ class Conversation:
     # -- how it is written -------------------------------------------------------------------
 
     def _begin(self, component: str, command: str, argument: str) -> dict[str, Any]:
-        """A command, and that it has been received."""
+        """Write a command and, where the dialect reports it, that it has been received.
+
+        In dialects with raw messages something that is no message follows now and then.
+
+        Returns:
+            The message, for the replies to it.
+        """
         dialect, rng = self.dialect, self.rng
         self._count += 1
         number: object = {
@@ -284,6 +301,14 @@ class Conversation:
         return said
 
     def _feedback(self, said: dict[str, Any], at: float, position: float | None) -> None:
+        """Write that a command goes on, as the dialect puts it; nothing in dialects
+        without feedback.
+
+        Args:
+            said: the command's message.
+            at: when [s].
+            position: of the axis that moves; None if none does.
+        """
         kind = self.dialect.feedback
         if kind == "none":
             return
@@ -291,6 +316,15 @@ class Conversation:
         self._say(said, at, "FDB", f"Moving... {at:.0f} sec" if kind == "text" else text)
 
     def _say(self, said: dict[str, Any], at: float, what: str, reply: str) -> None:
+        """Write a reply to a command, with what the dialect leaves out or changes in
+        replies.
+
+        Args:
+            said: the command's message; it is not changed.
+            at: when [s].
+            what: the reply type: RCV, FDB or ACK.
+            reply: the text.
+        """
         told, tick = {**said, "reply type": what, "reply": reply}, self.dialect.tick
         if self.dialect.arguments == "none":
             told |= {"arg1": "", "arg2": ""}
@@ -304,6 +338,9 @@ class Conversation:
         return 7 if self.dialect.tick == "constant" else self._ticks + round(1000 * at)
 
     def _write(self, at: float, told: dict[str, Any]) -> None:
+        """Append a message as the bytes of the dialect, twice (3 ms apart) where it
+        doubles all.
+        """
         text = json.dumps(
             told, indent=4 if self.dialect.indented else None, ensure_ascii=False
         )
@@ -318,8 +355,17 @@ SLIPS = ("dropped", "doubled", "late", "lost end", "late end", "overtaken")
 
 
 def conversation(dialect: Dialect, seed: int, commands: int = 8) -> Conversation:
-    """A drawn one: some commands, then a fault of the machine, and one of the server before
-    it."""
+    """Draw a conversation: some commands, perhaps a fault of the server, then perhaps one
+    of the machine.
+
+    The same dialect, seed and number give the same conversation. The fault of the machine
+    is in a move beyond the commands, three seconds after the last.
+
+    Args:
+        dialect: how messages are written.
+        seed: of all that is drawn.
+        commands: how many; at least two.
+    """
     rng = random.Random(f"{dialect.name} {seed}")
     made = Conversation(dialect, rng)
     fault, slip = rng.choice(("", *FAULTS)), rng.choice(("", *SLIPS))
@@ -385,7 +431,7 @@ def cluster(
     position: float, target: float, speed: float, acceleration: float, lower: float, upper: float,
     most_speed: float, most_acceleration: float,
 ) -> str:  # fmt: skip
-    """A motor's status as the scanner flattens it, one character for each byte."""
+    """A motor's status as the scanner flattens it, one character for each byte (latin-1)."""
     head = (position, target, speed, 0.0, acceleration, upper, lower, 0.0, most_speed, 0.0,
             most_acceleration, *[0.0] * 6)  # fmt: skip
     data = (

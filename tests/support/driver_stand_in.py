@@ -36,6 +36,7 @@ class Driver(ModuleType):
     CUstream = CUdeviceptr = CUfunction = int
 
     def __init__(self) -> None:
+        """Begin with no calls, no kernels and nothing that fails."""
         super().__init__("cuda.bindings.driver")
         self.calls: list[str] = []
         self.fails: Callable[[str], Any] = lambda name: 0
@@ -66,7 +67,17 @@ class Driver(ModuleType):
         return (self._called("wait"),)
 
     def cuLaunchKernel(self, function: int, *given: int) -> tuple[Any]:  # noqa: N802
-        """Run a kernel with the arguments at the addresses of a list."""
+        """Run a kernel with the arguments at the addresses of a list.
+
+        Args:
+            function: the kernel's number in `kernels`.
+            given: grid and block (three numbers each), shared bytes, the stream, the
+                address of the list of addresses, and the extra options; a third
+                dimension, shared memory and options are refused with AssertionError.
+
+        Returns:
+            The error code, alone in a tuple as the driver returns it.
+        """
         grid, block, (shared, _, addresses, extra) = given[:3], given[3:6], given[6:]
         assert (grid[2], block[2], shared, extra) == (1, 1, 0, 0), given
         kernel, kinds = self.kernels[function]
@@ -80,7 +91,16 @@ class Driver(ModuleType):
 
 
 def _argument(kind: str, places: Any) -> Any:
-    """Read an argument of a kernel from the next of the addresses."""
+    """Read an argument of a kernel from the next of the addresses.
+
+    Args:
+        kind: numba's name of its type; a scalar is at one address, an array at seven or
+            more.
+        places: the addresses, which go on.
+
+    Returns:
+        The number, or an array over the same memory.
+    """
     if kind in SCALARS:
         return SCALARS[kind].from_address(next(places)).value
     number, dimensions = ARRAYS[kind]
@@ -105,7 +125,15 @@ def _numbers(address: int, shape: tuple[int, ...], number: Any) -> Any:
 
 
 def stand_in() -> Driver:
-    """In the simulator: let `single_view` find a driver, and the kernels that it launches."""
+    """In the simulator: let `single_view` find a driver, and the kernels that it
+    launches.
+
+    Numba's simulator and `sys.modules` stay patched for the process; the cached probe of
+    devices is cleared.
+
+    Returns:
+        The driver that is found.
+    """
     from numba import cuda
     from numba.cuda.simulator.cudadrv.devicearray import FakeCUDAArray
     from numba.cuda.simulator.kernel import FakeCUDAKernel
@@ -124,7 +152,10 @@ def stand_in() -> Driver:
         return SimpleNamespace(handle=len(driver.calls), real=made)
 
     def overloads(kernel: Any) -> dict[Any, Any]:
-        """What numba has compiled of a kernel: nothing before its first launch."""
+        """What numba has compiled of a kernel: nothing before its first launch.
+
+        Each look gives the kernel another number with the driver.
+        """
         if kernel.grid_dim is None:
             return {}
         driver.kernels.append((kernel, single_view.ARGUMENTS))

@@ -33,7 +33,10 @@ class VoxelGrid:
 
 def ray_ends(rows: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
     """Sources and pixel centres [mm], each (n * rows * cols, 3), of rows (n, 12) of a
-    geometry."""
+    geometry.
+
+    Rays are in the order of view, row, column.
+    """
     r, c = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
     across, down = (c - (shape[1] - 1) / 2).ravel(), (r - (shape[0] - 1) / 2).ravel()
     pixels = (
@@ -48,9 +51,15 @@ def ray_ends(rows: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
 def pieces(
     grid: VoxelGrid, starts: Floats, ends: Floats
 ) -> Iterator[tuple[slice, Floats, npt.NDArray[np.int64]]]:
-    """Portions of rays: which, lengths in voxels [mm], and numbers of these voxels, z slowest.
+    """Cut rays at the planes of a grid, portion by portion, so that memory stays bounded.
 
-    Pieces outside the grid have length 0 and number 0.
+    Args:
+        grid: the voxels.
+        starts, ends: (n, 3) of the rays [mm].
+
+    Yields:
+        Which rays, the lengths of their pieces [mm], and the numbers of the voxels these
+        lie in (z slowest). Pieces outside the grid have length 0 and number 0.
     """
     low = grid.center_mm - grid.counts * grid.voxel_mm / 2
     each = int(grid.counts.sum()) + 5

@@ -35,7 +35,7 @@ class Outcome:
 
 
 def settings(state: Any) -> dict[str, Any]:
-    """What is to survive."""
+    """What of an answer to `state.get` has to survive a restart, by short names."""
     return {
         "estop": state["safety"]["estop"],
         "kV": state["tube"]["kV"],
@@ -49,7 +49,7 @@ def settings(state: Any) -> dict[str, Any]:
 
 
 def drawn(rng: random.Random) -> tuple[str, dict[str, Any]]:
-    """A request that changes something."""
+    """Draw a request that changes something: its method and parameters."""
     asked: list[tuple[str, dict[str, Any]]] = [
         ("tube.set", {"kV": float(rng.randint(40, 90))}),
         ("camera.set", {"exposure_ms": float(rng.randint(50, 900))}),
@@ -80,7 +80,19 @@ def ask(sim: Simulation, client: Client, rng: random.Random, outcome: Outcome) -
 
 
 def run_history(root: Path, seed: int) -> Outcome:
-    """Live one history; raises AssertionError where something acknowledged was lost."""
+    """Live one history: settings are changed while the disk fills, and the server is
+    killed, STATES times.
+
+    Args:
+        root: an empty directory.
+        seed: of all that is drawn.
+
+    Returns:
+        What came of its requests.
+
+    Raises:
+        AssertionError: something acknowledged was lost.
+    """
     rng, outcome = random.Random(seed), Outcome()
     sim = Simulation(root, seed)
     with sim:

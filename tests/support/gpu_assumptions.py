@@ -52,6 +52,9 @@ def lines(draw: Draw, count: int) -> Any:
 
 @claim
 def no_rounding_adds_up_in_fixed_point(draw: Draw) -> None:
+    """A line in fixed point stays within 2^-44 plus 2^-45 a slab of the exact one, and 63
+    bits hold it.
+    """
     for start, slope, slabs, across in lines(draw, 300):
         position, rate, *_ = kernels.fixed_line.fn(start, slope, across)
         for k in (0, 1, slabs // 2, slabs):
@@ -78,6 +81,12 @@ def a_slope_rounds_to_6e_11_voxels_after_2000_slabs(draw: Draw) -> None:
 
 @claim
 def a_crossing_is_off_by_1e_5_slabs_whatever_the_slope(draw: Draw) -> None:
+    """The row and the share before a crossing are those of exact fractions, within
+    CROSSING.
+
+    Crossings within CROSSING of a slab's end are not judged: they may fall on either
+    side.
+    """
     crossed = 0
     for start, slope, slabs, across in lines(draw, 70):
         position, rate, slope_32, steps, *_ = kernels.fixed_line.fn(start, slope, across)
@@ -112,6 +121,7 @@ def a_crossing_is_off_by_1e_5_slabs_whatever_the_slope(draw: Draw) -> None:
 
 @claim
 def a_ray_enters_and_leaves_within_the_margin(draw: Draw) -> None:
+    """Where a ray enters and leaves the box is off by less than half of MARGIN."""
     for start, slope, slabs, across in lines(draw, 700):
         found = kernels.fixed_line.fn(start, slope, across)
         if found[1] == 0:
@@ -132,6 +142,7 @@ def a_ray_enters_and_leaves_within_the_margin(draw: Draw) -> None:
 
 @claim
 def floor_is_in_the_lowest_bits_of_a_sum_that_is_rounded_down(draw: Draw) -> None:
+    """The lowest bits of a number added to MAGIC are its floor, within 2^22 of zero."""
     edge = 2**22 - 1
     for n in (-edge, -1, 0, 1, edge, *draw.integers(-edge, edge, 100).tolist()):
         # Between 2^23 and 2^24 single precision holds the integers and nothing between.
@@ -148,6 +159,8 @@ def floor_is_in_the_lowest_bits_of_a_sum_that_is_rounded_down(draw: Draw) -> Non
 
 @claim
 def all_lanes_of_a_warp_get_its_least_and_its_most(draw: Draw) -> None:
+    """`least` and `most` give every lane of a warp the warp's extremes."""
+
     @cuda.jit
     def vote(values, found):
         x, y = cuda.threadIdx.x, cuda.threadIdx.y
@@ -162,7 +175,11 @@ def all_lanes_of_a_warp_get_its_least_and_its_most(draw: Draw) -> None:
 
 
 def drawn_views(draw: Draw) -> Any:
-    """Views with the box they see; of each kind some."""
+    """Draw views with the box they see, 15 of each kind.
+
+    Yields:
+        The box, the rays in voxels, and the detector's rows and columns.
+    """
     for kind in (
         "diagonal",
         "level",
@@ -185,6 +202,9 @@ def drawn_views(draw: Draw) -> Any:
 
 @claim
 def rays_by_slabs_rise_one_voxel_a_slab_and_cross_the_whole_box(draw: Draw) -> None:
+    """Views that `by_slabs` takes have rays that rise at most a voxel a slab and end
+    outside the box.
+    """
     taken = 0
     for box, rays, shape in drawn_views(draw):
         if not gpu.by_slabs(box, rays, shape)[0]:
@@ -207,6 +227,9 @@ def rays_by_slabs_rise_one_voxel_a_slab_and_cross_the_whole_box(draw: Draw) -> N
 
 @claim
 def lanes_of_both_axes_keep_to_their_own_slabs(draw: Draw) -> None:
+    """A warp whose rays go along both axes projects as exactly as others, in four drawn
+    cases.
+    """
     mixed = 0
     while mixed < 4:
         case = drawn_case(draw, "diagonal", 9)
@@ -229,6 +252,7 @@ def lanes_of_both_axes_keep_to_their_own_slabs(draw: Draw) -> None:
 
 @claim
 def lanes_beyond_the_detector_write_nothing(draw: Draw) -> None:
+    """Numbers behind the images stay as they were, and all pixels are written."""
     volume = Volume(draw.random((3, 4, 5), dtype=np.float32), 1.0)
     layout, shape = volume.layout, (5, 3)
     view = ConeVec.from_vectors((0.1, -50, 0.2), (0, 50, 0), (1.1, 0, 0), (0, 0, -1.2))
@@ -245,6 +269,7 @@ def lanes_beyond_the_detector_write_nothing(draw: Draw) -> None:
 
 @claim
 def a_ray_in_a_plane_belongs_above_or_below_where_it_moves_down(draw: Draw) -> None:
+    """A ray in the plane between two layers counts in the upper one unless it moves down."""
     volume = Volume(np.array([[[1]], [[2]]], np.float32), 1.0)
     for rise, wanted in ((0.0, 2.0), (1e-17, 2.0), (-1e-17, 1.0)):
         # One row: its pixel is at the detector's centre, the source's height or nearly.
@@ -260,6 +285,7 @@ def a_ray_in_a_plane_belongs_above_or_below_where_it_moves_down(draw: Draw) -> N
 
 @claim
 def integers_of_a_deterministic_sum_stay_below_2_to_the_62(draw: Draw) -> None:
+    """`whole_factor` is a power of two that brings the largest sum between 2^60 and 2^62."""
     box = box_of(Volume(np.ones((2, 2, 2), np.float32), (0.3, 2.0, 0.7)).layout)
     for size in (1, 7, 4000):
         values = (10 ** draw.uniform(-20, 20) * draw.uniform(-1, 1, size)).astype(
@@ -272,7 +298,9 @@ def integers_of_a_deterministic_sum_stay_below_2_to_the_62(draw: Draw) -> None:
 
 
 def main() -> None:
-    """Check every claim, and print what is wrong by its name."""
+    """Check every claim and print a JSON object: what is wrong by its name, null where it
+    holds.
+    """
     as_on_a_device()
     found: dict[str, str | None] = {}
     for number, check in enumerate(CLAIMS):

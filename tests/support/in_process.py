@@ -49,6 +49,7 @@ class PointProjector:
     POINT = np.array([[2.0, -1.0, 0.3]])  # near the height of the source at home
 
     def __init__(self) -> None:
+        """Begin with no views and no names; without a delay or a limit."""
         self.views = 0
         self.names: list[str] = []
         self.down = False
@@ -65,6 +66,16 @@ class PointProjector:
     async def project(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int]
     ) -> Float32Array:
+        """Return one bright pixel a view, where the point is seen (at the edge if it is
+        beyond).
+
+        Its value tells the place within the pixel. It waits `delay_s`, and while `limit`
+        views are reached. Rays of a prediction give zeros at once and are not counted.
+
+        Raises:
+            ProjectorUnavailable: `down` is set.
+            AssertionError: the name is not one that was uploaded.
+        """
         assert name in self.names
         if self.down:
             raise ProjectorUnavailable("no projector at test")
@@ -91,6 +102,7 @@ class Client:
     """A session with its events."""
 
     def __init__(self, twin: TwinServer, name: str) -> None:
+        """Open a session of the twin; `events` collects what it is sent."""
         self.name = name
         self.events: list[dict[str, Any]] = []
         self.session = TwinSession(twin, self)
@@ -107,6 +119,19 @@ class Client:
         self.session.close()
 
     async def call(self, method: str, /, **params: object) -> Any:
+        """Call a method as over a connection; the result is checked against the method's
+        model.
+
+        Args:
+            method: its name.
+            params: as on the wire; they are parsed.
+
+        Returns:
+            The result as plain values.
+
+        Raises:
+            RpcError: the method's own error, or parameters that do not fit.
+        """
         m = METHODS[method]
         result = await self.session.handle(m, parse_params(m, params))
         if isinstance(result, Encoded):
@@ -147,12 +172,20 @@ class Lab:
         return Client(self.twin, f"client-{self.count}")
 
     async def until(self, condition: Callable[[], bool], what: str = "") -> None:
+        """Wait until a condition holds.
+
+        Raises:
+            AssertionError: it does not for PATIENCE_S; the text names `what`.
+        """
         until = asyncio.get_running_loop().time() + PATIENCE_S
         while not condition():
             assert asyncio.get_running_loop().time() < until, f"never happened: {what}"
             await asyncio.sleep(0.001)
 
     async def ended(self, client: Client, job: str) -> dict[str, Any]:
+        """Wait until a job is done, failed, aborted or incomplete, without a limit; its
+        status.
+        """
         while True:
             status: dict[str, Any] = await client.call("job.status", job=job)
             if status["state"] in ("done", "failed", "aborted", "incomplete"):
@@ -171,11 +204,16 @@ def run(
 
     Args:
         root: its data directory.
+        body: takes the lab; it may last 2 * PATIENCE_S.
         virtual: on a loop whose time jumps over every wait, its threads' work among it.
         options: of `TwinServer`.
+
+    Raises:
+        TimeoutError: the body lasts longer.
     """
 
     async def main() -> None:
+        """Open the lab and run the body in it, with a limit of time."""
         if virtual:
             options["wall"] = asyncio.get_running_loop().time
         async with Lab(root, **options) as lab:
@@ -187,6 +225,14 @@ def run(
 
 
 def script(frames: int = 9, speed: float = 22.5, exposure: float = 2000.0) -> str:
+    """The text of a fly scan: a dark frame, then `frames` projections on the way from
+    -191.25 to 551.25 deg.
+
+    Args:
+        frames: how many.
+        speed: of the stage [deg/s].
+        exposure: of a frame [ms].
+    """
     rows = [
         f"camera\tset ROI\t{ROI[0]} {ROI[1]} {ROI[2]} {ROI[3]}\t\tACK\t\t",
         f"camera\tset exposure\t{exposure}\t\tACK\t\t",
@@ -208,6 +254,7 @@ def script(frames: int = 9, speed: float = 22.5, exposure: float = 2000.0) -> st
 
 
 def digest(folder: Path) -> dict[str, str]:
+    """SHA-256 of each TIFF of a folder, by its name; the order is that of the names."""
     return {
         f.name: hashlib.sha256(f.read_bytes()).hexdigest()
         for f in sorted(folder.glob("*.tif"))

@@ -26,6 +26,7 @@ class InProcessTransport:
         handler: Callable[[Message], Iterable[Message]],
         codec: Codec = Codec.MSGPACK,
     ) -> None:
+        """Begin closed; `opened` counts how often it is opened."""
         self.handler, self.codec = handler, codec
         self.opened = 0
         self._client, self._server = Connection(codec), Connection()

@@ -9,7 +9,11 @@ from types import ModuleType
 
 
 def load(path: Path) -> ModuleType:
-    """Load a script, which may import the modules beside it."""
+    """Run a script as a module, which may import the modules beside it.
+
+    Its folder stays at the end of `sys.path`, and it in `sys.modules` as docs_NAME. A
+    second call runs it anew.
+    """
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
     spec = importlib.util.spec_from_file_location(f"docs_{path.stem}", path)

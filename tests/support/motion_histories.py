@@ -42,8 +42,12 @@ CLEAR_MM = 0.03
 
 
 def drawn_machine(rng: Rng) -> str:
-    """A machine file: motors along, across or at a slant, some shared by two parts, some with
-    micrometres of gearing; a turntable, a margin of its own."""
+    """Draw the text of a machine file.
+
+    Its two to five motors go along, across or at a slant; some are shared by two parts,
+    some have micrometres of gearing. It has a turntable, a tube, a table and a panel, and
+    a margin of its own.
+    """
     margin = round(float(10.0 ** rng.uniform(-1.0, 0.5)), 4)
     quantities = ["source_x", "source_z", "object_x", "object_y", "object_z", "detector_x",
                   "detector_y", "detector_z"]  # fmt: skip
@@ -158,7 +162,19 @@ class Judge:
     def look(
         self, stage: Stage, pose: Array, state: str, what: str, *, forget: bool = False
     ) -> None:
-        """Judge one pose at rest; `forget`: motors or parts were put there by no request."""
+        """Judge one pose at rest: what pairs within the margin lost, and whether the
+        state tells of them.
+
+        What is wrong is appended to `found`.
+
+        Args:
+            stage: what stands there.
+            pose: positions of the motors.
+            state: of the safety system.
+            what: happened before, for the report.
+            forget: motors or parts were put there by no request; earlier gaps do not
+                count.
+        """
         peaks = {}
         for p, gap in zip(stage.pairs, stage.clearances(pose).tolist(), strict=True):
             pair = p.names
@@ -182,6 +198,9 @@ class Subject:
     """A scanner on a drawn machine, with a sample and its judge."""
 
     def __init__(self, rng: Rng) -> None:
+        """Draw a machine and two samples, and begin with none on the stage and all motors
+        home.
+        """
         self.rng, self.now = rng, 0.0
         self.machine, self.profile, self.model = drawn_model(rng)
         self.samples: list[tuple[Prism | None, dict[str, float]]] = [(None, {})]
@@ -199,6 +218,9 @@ class Subject:
         self._look("start", forget=True)
 
     def _value(self, which: int) -> tuple[Sample, tuple[object, ...]]:
+        """A sample as the scanner takes it, and its hulls in the stage's axes; 0 is no
+        sample.
+        """
         shape, offset = self.samples[which]
         if shape is None:
             return Sample(), ()
@@ -213,6 +235,9 @@ class Subject:
         return SceneGuard(build_scene(self.machine, self.profile, parts, offsets))  # type: ignore[arg-type]
 
     def _fresh(self, positions: Mapping[str, float]) -> ScannerTwin:
+        """A new scanner with motors at `positions`, the present sample and correction in
+        force.
+        """
         s = ScannerTwin(self.machine, self.profile, self.now)
         s.place(positions, self.now)
         put = _correction(self.correction)
@@ -226,6 +251,7 @@ class Subject:
 
     @property
     def stage(self) -> Stage:
+        """The oracle's stage of the present sample and correction; up to 21 are kept."""
         key = self.which, tuple(sorted(self.correction.items()))
         if key not in self.stages:
             if len(self.stages) > 20:
@@ -247,7 +273,17 @@ class Subject:
     def do(
         self, what: str, ask: Callable[[ScannerTwin], object], *, rest: bool = True
     ) -> bool:
-        """One request, then rest; whether it was accepted."""
+        """Make one request; then let all come to rest and judge it, unless `rest` is
+        false.
+
+        Args:
+            what: the request's name in reports.
+            ask: makes it; a TwinError means that it was refused.
+            rest: whether to wait.
+
+        Returns:
+            Whether it was accepted.
+        """
         accepted = True
         try:
             ask(self.scanner)
@@ -260,7 +296,14 @@ class Subject:
         return accepted
 
     def change(self, which: int, correction: dict[str, float]) -> bool:
-        """Another sample or correction, certified and put in force."""
+        """Certify another sample or correction and put it in force; motion is not waited
+        for.
+
+        Gaps of the sample are forgotten when it is another one.
+
+        Returns:
+            Whether it was accepted; if not, nothing has changed.
+        """
 
         def ask(s: ScannerTwin) -> None:
             guard = self._guard(which, correction)
@@ -286,6 +329,9 @@ class Subject:
         self._look("restart")
 
     def draw_pose(self) -> dict[str, float]:
+        """Draw a position of every motor: anywhere on its travel, a turntable within half
+        a turn.
+        """
         m = self.model
         return {
             motor: float(self.rng.uniform(max(m.lower[i], -180.0), min(m.upper[i], 180.0)))
@@ -294,7 +340,11 @@ class Subject:
         }  # fmt: skip
 
     def approach(self) -> None:
-        """Somewhere near: random moves, of which the last is halted before a contact."""
+        """Bring parts near: up to 20 random moves, until one is halted or refused near
+        the margin.
+
+        The sample may be changed first. An alarm is reset after each move.
+        """
         if self.rng.random() < 0.7:
             self.change(int(self.rng.integers(3)), {})
         for _ in range(20):
@@ -313,7 +363,11 @@ class Subject:
                 return
 
     def enter(self) -> None:
-        """Within the margin: put there at a start, as after coasting or with another file."""
+        """Put motors within the margin at a start, as after coasting or with another
+        machine file.
+
+        After 300 drawn poses without one within the margin nothing is changed.
+        """
         here = self.scanner.positions(self.now)
         for _ in range(300):
             pose = dict(here)
@@ -330,7 +384,14 @@ class Subject:
     # Arms of the search ---------------------------------------------------------------------
 
     def arms(self) -> list[tuple[str, Callable[[], bool]]]:
-        """Small requests, each of which may be repeated."""
+        """Draw small requests, each of which may be repeated.
+
+        They are moves, jogs, moves with a stop or E-stop in between, corrections, a
+        change of sample and back, and a restart.
+
+        Returns:
+            (name, what makes the request and returns whether it was accepted).
+        """
         rng, m, out = self.rng, self.model, list[tuple[str, Callable[[], bool]]]()
 
         def move(axis: str, step: float) -> Callable[[], bool]:
@@ -409,6 +470,7 @@ class Subject:
 
 
 def _correction(values: Mapping[str, float]) -> NamedCorrection | None:
+    """A correction of these values under the name "drawn"; None where there are none."""
     return (
         NamedCorrection("drawn", "2026-01-01", Offsets.from_edge(dict(values)))
         if values
@@ -476,6 +538,7 @@ def _release(subject: Subject) -> None:
 
 
 def _outcome(subject: Subject, made: int, accepted: int) -> Outcome:
+    """What a history came to, with the first thing found only."""
     judge = subject.judge
     return Outcome(
         subject.requests, made, accepted, judge.loss, judge.least, judge.found[:1]
@@ -488,7 +551,18 @@ def _outcome(subject: Subject, made: int, accepted: int) -> Outcome:
 def profile(
     start: float, end: float, speed: float, acceleration: float
 ) -> Callable[[Array], Array]:
-    """Position over time of a motor from rest to rest: a trapezium or a triangle of speed."""
+    """Position over time of a motor from rest to rest: a trapezium or a triangle of
+    speed.
+
+    Args:
+        start, end: positions.
+        speed: the most.
+        acceleration: of both ramps.
+
+    Returns:
+        Gives positions at times from the begin [s], also before and after the motion; its
+        attribute `whole` is the duration [s].
+    """
     way = abs(end - start)
     sign = math.copysign(1.0, end - start)
     top = min(speed, math.sqrt(way * acceleration))
@@ -511,9 +585,18 @@ def profile(
 
 def densest(stage: Stage, model: MachineModel, here: Mapping[str, float],
             targets: Mapping[str, float]) -> tuple[float, float]:  # fmt: skip
-    """(least clearance, doubt) [mm] of a move from rest, sampled densely.
+    """Sample a move from rest at 400 times and measure every pair there.
 
     A pair that is near at the start, and only opens until it is apart, does not count.
+
+    Args:
+        stage, model: what stands there, and its machine.
+        here: positions of all motors.
+        targets: of those that move.
+
+    Returns:
+        (least clearance, what may be missed between two times) [mm]; inf if no pair
+        counts.
     """
     ways = {}
     for m, x in here.items():
@@ -558,7 +641,19 @@ class Verdicts:
 
 
 def dense_moves(rng: Rng, moves: int) -> Verdicts:
-    """Drawn moves from rest on one drawn machine: from free poses and where a history ended."""
+    """Make drawn moves from rest on one drawn machine, and compare answers with dense
+    sampling.
+
+    They begin at free poses and where a history of small steps ended. Moves within
+    CLEAR_MM of the margin, or in doubt, are not judged.
+
+    Args:
+        rng: draws all.
+        moves: how many.
+
+    Returns:
+        How many were safe and unsafe, and texts of those judged wrongly.
+    """
     subject, out = Subject(rng), Verdicts()
     for number in range(moves):
         if number % 3 == 0:

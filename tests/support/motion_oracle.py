@@ -77,6 +77,7 @@ class Prism:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper corner of the box around it, along the axes."""
         if self.outline is None:
             middle = np.array(self.centre)
             lower, upper = middle - self.radius, middle + self.radius
@@ -94,14 +95,22 @@ class Prism:
         return Prism(self.low, self.high, self.outline @ turn.T)
 
     def moved(self, x: float, y: float, z: float) -> Prism:
+        """The same prism, shifted."""
         if self.outline is None:
             at = (self.centre[0] + x, self.centre[1] + y)
             return Prism(self.low + z, self.high + z, None, at, self.radius)
         return Prism(self.low + z, self.high + z, self.outline + [x, y])
 
     def corners(self, ring: int = 360) -> Array:
-        """All corners; a disc is given by a polygon around it (outside, by 4e-5 of its
-        radius)."""
+        """All corners, the lower ring first.
+
+        Args:
+            ring: corners of the polygon around a disc; it lies outside the disc, at 360
+                by 4e-5 of the radius.
+
+        Returns:
+            (2 k, 3).
+        """
         outline = self.outline
         if outline is None:
             angles = 2.0 * np.pi * np.arange(ring) / ring
@@ -131,6 +140,9 @@ class Hull:
 
     @cached_property
     def faces(self) -> npt.NDArray[np.int64]:
+        """Triangles of the hull (n, 3), numbers of points, counter-clockwise from
+        outside.
+        """
         from scipy.spatial import ConvexHull
 
         found = ConvexHull(self.points)
@@ -176,6 +188,7 @@ class Body:
 
     @property
     def spins(self) -> bool:
+        """Whether turning changes where it is: false for a disc about its own axle."""
         if not self.turns.any():
             return False
         centred = isinstance(self.shape, Prism) and self.shape.centre == (0.0, 0.0)
@@ -192,6 +205,13 @@ class MachineModel:
     """A machine file, read anew."""
 
     def __init__(self, file: Path, profile: Mapping[str, Any] | None = None) -> None:
+        """Read a machine file.
+
+        Args:
+            file: TOML.
+            profile: zero offsets; None for those of the file's default profile, as
+                shipped.
+        """
         self.file = file
         self.text = file.read_text(encoding="utf-8")
         self.data: dict[str, Any] = tomllib.loads(self.text)
@@ -230,6 +250,7 @@ class MachineModel:
         )
 
     def _lineage(self, part: Mapping[str, Any] | None) -> list[Mapping[str, Any]]:
+        """A part, its parent, and so on; empty for None."""
         out = []
         while part is not None:
             out.append(part)
@@ -247,7 +268,17 @@ class MachineModel:
         )
 
     def _offset(self, quantity: str, correction: Mapping[str, float]) -> float:
-        """Zero offset and correction of a quantity of [geometry]; x, y, z are the world's."""
+        """Zero offset and correction of a quantity of [geometry]; x, y, z are the
+        world's.
+
+        Args:
+            quantity: its name, as "object_x".
+            correction: values by name; those absent are 0.
+
+        Returns:
+            Profile, fixed part and correction together [mm]; 0 for quantities without
+            any.
+        """
         c = {"dO_x": 0.0, **correction}
         profile = {
             "source_z": "src_ort",
@@ -289,6 +320,11 @@ class MachineModel:
         return motors, moved
 
     def _part(self, part: Mapping[str, Any], correction: Mapping[str, float]) -> Body:
+        """Make the body of a part from its table in the file.
+
+        Parts with a role go with the corrected X-ray geometry; others only where their
+        motors move them. A turned panel becomes a hull.
+        """
         motors, group = self._mounting(part)
         anchor = part.get("anchor", "world")
         slides = np.stack(
@@ -333,8 +369,9 @@ class MachineModel:
         )
 
     def _panel_turn(self, correction: Mapping[str, float]) -> Array:
-        """Roll of the profile, then yaw about the rows' direction, pitch, roll about the
-        normal."""
+        """How the panel is turned: roll of the profile, then yaw about the columns, pitch
+        about the rows, roll about the normal, each about the direction already turned.
+        """
         u, v = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
         roll = float(self.profile.get("det_roll_deg", 0.0))
         yaw, pitch, more = (
@@ -352,7 +389,11 @@ class MachineModel:
     def _sample(
         self, sample: Placed, holder: Mapping[str, Any], correction: Mapping[str, float]
     ) -> Body:
-        """A point b stands at c + T R(alpha + scale * angle) (b - tau) (docs/coordinates)."""
+        """Make the body of a sample on its holder.
+
+        A point b stands at c + T R(alpha + scale * angle) (b - tau) (docs/coordinates). A
+        sample that is tilted becomes a hull, its disc a polygon of 64 corners around it.
+        """
         assert sample.shape is not None
         motors, group = self._mounting(holder)
         slides = np.stack([self._quantity(f"object_{k}") for k in "xyz"], axis=1)
@@ -453,6 +494,7 @@ class PairModel:
         return body.origin + poses @ body.slides
 
     def _upright(self, poses: Array) -> Array:
+        """Distances of two prisms in poses (n, axes); negative by how far they overlap."""
         a, b = self.a.shape, self.b.shape
         assert isinstance(a, Prism)
         assert isinstance(b, Prism)
@@ -475,6 +517,7 @@ class PairModel:
         return turn, body.origin + pose @ body.slides
 
     def _tilted(self, pose: Array) -> float:
+        """Distance of the two bodies in one pose, by fcl; -1 where they touch or overlap."""
         made = []
         for (shape, shift), body in zip(self._fcl, (self.a, self.b), strict=True):
             turn, at = self._frame(body, pose)
@@ -485,8 +528,11 @@ class PairModel:
         return float(found) if found > 0.0 else -1.0
 
     def second_opinion(self, pose: Array) -> float:
-        """The same distance by another method: the nearest points of two hulls, by
-        projection."""
+        """The distance in one pose by another method: the nearest points of two hulls, by
+        projection.
+
+        Discs count as polygons around them. It is 0 where the hulls overlap.
+        """
         points = []
         for body in (self.a, self.b):
             turn, at = self._frame(body, pose)
@@ -500,8 +546,15 @@ class PairModel:
 
 
 def hull_distance(a: Array, b: Array) -> float:
-    """Distance of two convex hulls (0 where they overlap), by Wolfe's least-norm point of a -
-    b."""
+    """Distance of two convex hulls by Wolfe's least-norm point of a - b.
+
+    Args:
+        a, b: corners (n, 3).
+
+    Returns:
+        The distance, 0 where they overlap; after 1000 steps the best so far, which is an
+        upper bound.
+    """
     direction = a.mean(axis=0) - b.mean(axis=0)
     simplex: list[Array] = []
 
@@ -547,7 +600,10 @@ def hull_distance(a: Array, b: Array) -> float:
 
 
 def _as_fcl(shape: Shape) -> tuple[Any, Array]:
-    """A shape for fcl, and where its own centre lies in the body's frame."""
+    """A shape for fcl, and where its own centre lies in the body's frame.
+
+    Prisms on outlines other than rectangles along the axes become hulls.
+    """
     if isinstance(shape, Hull):
         faces = np.concatenate([np.full((len(shape.faces), 1), 3), shape.faces], axis=1)
         return fcl.Convex(shape.points, len(faces), faces.flatten()), np.zeros(3)
@@ -573,6 +629,9 @@ class _Laid:
 
 
 def _laid(shape: Prism, at: Array, degrees: Array) -> _Laid:
+    """A prism's outline in the plane, turned clockwise by `degrees` (n,) and put at `at`
+    (n, 2).
+    """
     angle = -np.radians(degrees)  # clockwise from above
     c, s = np.cos(angle), np.sin(angle)
     own = np.array([shape.centre]) if shape.outline is None else shape.outline
@@ -582,7 +641,9 @@ def _laid(shape: Prism, at: Array, degrees: Array) -> _Laid:
 
 
 def _flat(a: _Laid, b: _Laid) -> Array:
-    """Distance of two convex outlines in the plane, negative by how far they overlap."""
+    """Distances (n,) of two convex outlines in the plane, negative by how far they
+    overlap.
+    """
     if a.points.shape[1] == 1 and b.points.shape[1] == 1:
         gap = np.hypot(*(a.points - b.points)[:, 0].T)
     elif a.points.shape[1] == 1 or b.points.shape[1] == 1:
@@ -641,6 +702,13 @@ class Stage:
         sample: Placed | None = None,
         correction: Mapping[str, float] | None = None,
     ) -> None:
+        """Pair all bodies but those of one group and those whose contact is allowed.
+
+        Args:
+            machine: its file.
+            sample: None for none.
+            correction: values by name; None for none.
+        """
         self.machine = machine
         bodies = machine.bodies(sample or Placed(), correction or {})
         allowed = {frozenset(pair) for pair in machine.data.get("allowed_contacts", [])}
@@ -677,7 +745,15 @@ class Stage:
         return np.einsum("na,pak->npk", rows, self._slides)
 
     def clearances(self, pose: Array, exact: float = 5.0) -> Array:
-        """(pairs,) of one pose: exact where boxes around the bodies are within `exact` mm."""
+        """Clearances (pairs,) in one pose, negative where pairs overlap.
+
+        The last answer is kept, and given again for the same pose.
+
+        Args:
+            pose: positions of the motors.
+            exact: pairs whose boxes are nearer than this [mm] are measured; others are
+                given by their boxes, which is less than the distance.
+        """
         if not self.pairs:
             return np.empty(0)
         if self._last is None or self._last[0] != (pose.tobytes(), exact):
@@ -698,6 +774,9 @@ class Stage:
 
 
 def _box_of(body: Body) -> tuple[Array, Array]:
+    """Lower and upper corner of the box that holds a body at any angle, about its own
+    origin.
+    """
     lower, upper = body.shape.bounds
     if not body.spins:
         return lower, upper
@@ -814,16 +893,21 @@ class Watch:
     """
 
     def __init__(self, stage: Stage, reading: Reading) -> None:
+        """Begin with a stage, and motors where the reading says."""
         self.least = math.inf
         """Least clearance that was looked at, of pairs that were free [mm]."""
         self._last: tuple[Array, Array] | None = None
         self.put(stage, reading)
 
     def put(self, stage: Stage, reading: Reading, *, anew: bool = True) -> None:
-        """Another stage from now on; pairs that are too near there may be so (see `begun`).
+        """Watch another stage from now on; pairs that are too near there may be so (see
+        `begun`).
 
-        With `anew` false it is the same parts that stand a little elsewhere, and what they may
-        not fall below stays.
+        Args:
+            stage: what stands there.
+            reading: where the motors are.
+            anew: false if the same parts stand a little elsewhere; then what they may not
+                fall below stays.
         """
         kept = (
             {}
@@ -847,7 +931,10 @@ class Watch:
         self._floor = np.maximum(self._floor, np.minimum(free, clear - ALLOWED_MM))
 
     def too_near(self, reading: Reading) -> list[Pair]:
-        """Pairs nearer than the margin."""
+        """Names of pairs nearer than the margin, by more than ALLOWED_MM.
+
+        Tilted pairs count if the second opinion agrees.
+        """
         pose = self.machine.vector(reading)
         near = self.machine.margin - ALLOWED_MM
         clear = self.stage.clearances(pose)
@@ -884,7 +971,11 @@ class Watch:
         return [*joint, *self._moves(motion, hardest), *self._meets(motion)]
 
     def _joined(self, m: Motion) -> list[Violation]:
-        """Whether a command made a motor jump in position or velocity."""
+        """Violations at the begin of a motion: jumps in position or velocity since the
+        last one's end.
+
+        The end of this motion is remembered for the next.
+        """
         out, last = [], self._last
         if last is not None:
             tick = 8.0 * math.ulp(float(m.times[0]))
@@ -900,7 +991,13 @@ class Watch:
         return out
 
     def _moves(self, m: Motion, hardest: Array) -> list[Violation]:
-        """Limits of travel, speed and acceleration, and jumps."""
+        """Violations of limits of travel, speed and acceleration, and jumps within a
+        motion.
+
+        Args:
+            m: the motion, in parabolas.
+            hardest: the acceleration allowed for each motor.
+        """
         machine, out = self.machine, []
 
         def report(
@@ -937,7 +1034,11 @@ class Watch:
         return out
 
     def _meets(self, m: Motion) -> list[Violation]:
-        """Pairs nearer than they may be."""
+        """Violations by pairs nearer than they may be: the worst of each pair.
+
+        Tilted pairs count if the second opinion agrees; those that overlap at the start
+        may do so by OVERLAP_MM more.
+        """
         stage = self.stage
         if not stage.pairs:
             return []
@@ -979,8 +1080,19 @@ class Watch:
     def _worst(
         self, m: Motion, p: int, stretches: list[int]
     ) -> tuple[float, float, Array] | None:
-        """Where a pair is nearest, if it may be nearer than its floor: (distance, time,
-        pose)."""
+        """Where a pair is nearest, if it may be nearer than its floor.
+
+        Stretches are cut in eight, again and again, until parts move less than FINEST_MM
+        a step (four times that if tilted).
+
+        Args:
+            m: the motion.
+            p: the pair's number in the stage.
+            stretches: numbers of the parabolas to look at.
+
+        Returns:
+            (distance, time, pose); None of no stretch.
+        """
         pair, floor = self.stage.pairs[p], float(self._floor[p])
         slides, swing = pair.a.slides - pair.b.slides, pair.swing
         best: tuple[float, float, Array] | None = None
@@ -1028,6 +1140,7 @@ def _ranges(m: Motion) -> tuple[Array, Array]:
 
 
 def _parabola_range(x: Array, v: Array, a: Array, h: Array) -> tuple[Array, Array]:
+    """Least and greatest x + v t + a t^2 / 2 for t in 0..h, elementwise."""
     end = x + h * (v + 0.5 * h * a)
     with np.errstate(divide="ignore", invalid="ignore"):
         turn = np.where(a != 0.0, -v / a, -1.0)

@@ -118,8 +118,11 @@ def pieces(sample: Json | None) -> tuple[Polytope, ...]:
 
 @contextmanager
 def _patience() -> Iterator[None]:
-    """TimeoutError after PATIENCE_S of the processor's time, so that a busy machine makes no
-    hangs; in the main thread alone, where there are signals."""
+    """Within it, raise TimeoutError after PATIENCE_S of the processor's time.
+
+    A busy machine makes no hangs so. Outside the main thread, where there are no signals,
+    nothing is limited.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -140,6 +143,7 @@ class Episode:
     """One scanner, its oracle, and what was found."""
 
     def __init__(self, start: Start) -> None:
+        """Make the scanner of a start and the oracle that watches it."""
         self.start = start
         self.machine, self.profile = product(start.machine)
         self.model = model(start.machine)
@@ -166,6 +170,9 @@ class Episode:
     # The scanner --------------------------------------------------------------------------------
 
     def _fresh(self, positions: Mapping[str, float]) -> ScannerTwin:
+        """A new scanner with motors at `positions`, the present sample and correction in
+        force.
+        """
         scanner = ScannerTwin(self.machine, self.profile, self.now)
         scanner.place(positions, self.now)
         guard = self._guard(self.sample, self.correction)
@@ -175,6 +182,7 @@ class Episode:
         return scanner
 
     def _guard(self, sample: Json | None, correction: Json | None) -> Any:
+        """The scanner's own guard of a sample and a correction; None stands for none."""
         parameters = Offsets.from_edge(correction or {})
         return SceneGuard(
             build_scene(self.machine, self.profile, pieces(sample), parameters)
@@ -186,7 +194,17 @@ class Episode:
     # Requests -----------------------------------------------------------------------------------
 
     def do(self, request: Request) -> str:
-        """Lets time pass under the oracle's eye, then asks; returns what came of it."""
+        """Let time pass under the oracle's eye, then make a request and judge what it
+        did.
+
+        What is wrong is appended to `found`; `counts` and `slowest` are kept.
+
+        Args:
+            request: what to ask, and how long to wait before.
+
+        Returns:
+            accepted, halted, refused, certified, nothing, hang or raised.
+        """
         self._pass(self.now + request.wait)
         before = self._ahead()
         moving = self._moving()
@@ -227,6 +245,19 @@ class Episode:
         return outcome
 
     def _ask(self, request: Request, moving: set[str]) -> str | None:
+        """Make a request.
+
+        Args:
+            request: what to ask.
+            moving: motors that move; they don't matter here.
+
+        Returns:
+            What came of it; None for accepted.
+
+        Raises:
+            TwinError: it is refused (CollisionError with `halts_at` where it is carried
+                out in part).
+        """
         s, now, a = self.scanner, self.now, request.args
         match request.verb:
             case "move":
@@ -262,6 +293,15 @@ class Episode:
     # The stage is certified, then changed: at once, or (late) when `take` comes.
 
     def _change(self, sample: Json | None, correction: Json | None, late: bool) -> str:
+        """Certify another sample and correction; put them in force, or keep them if
+        `late`.
+
+        Returns:
+            certified, halted or accepted.
+
+        Raises:
+            TwinError: it is refused.
+        """
         change = self.scanner.stage_change(
             _sample(sample),
             _correction(correction),
@@ -275,12 +315,24 @@ class Episode:
         return self._put(change, sample, correction)
 
     def _put(self, change: Any, sample: Json | None, correction: Json | None) -> str:
+        """Put a certified change in force: halted if the scanner warns, else accepted."""
         warnings = self.scanner.take_stage(change, self.now)
         self.sample, self.correction = sample, correction
         self._changed = True
         return "halted" if warnings else "accepted"
 
     def _programme(self, legs: Sequence[Mapping[str, float]], late: bool) -> str:
+        """Certify a programme of legs from where motion ends; follow it, or keep it if
+        `late`.
+
+        Each leg begins 0.25 s after the one before has ended, with the speeds now set.
+
+        Returns:
+            certified or accepted.
+
+        Raises:
+            TwinError: it is refused.
+        """
         s, now = self.scanner, self.now
         at, x = 0.0, s.positions(s.rest_time(now))
         ways: dict[str, list[Any]] = {}
@@ -306,6 +358,7 @@ class Episode:
         legs: Sequence[Mapping[str, float]],
         accelerations: Mapping[str, float],
     ) -> str:
+        """Follow a certified programme, and remember its legs for `resume`."""
         self.scanner.follow(certificate, self.now)
         self._legs, self._accelerations = list(legs), dict(accelerations)
         self._running = True
@@ -324,6 +377,9 @@ class Episode:
         return self._programme(left, False)
 
     def _take_late(self) -> str:
+        """Put in force what was certified earlier; "nothing" if nothing was, or it has
+        been taken.
+        """
         pending, self._pending = self._pending, None
         match pending:
             case ("stage", change, sample, correction):
@@ -344,6 +400,11 @@ class Episode:
         self._pending, self._legs, self._running = None, [], False
 
     def _stop(self) -> None:
+        """Stop all motors, and compare what the answer says with what they do.
+
+        Where motors moved, how long and how far they went is added to `stops`, beside
+        independent braking.
+        """
         s, now = self.scanner, self.now
         speeds, here = s.velocities(now), s.positions(now)
         alone = [
@@ -369,13 +430,24 @@ class Episode:
     def _said(
         self, what: str, said: Mapping[str, float], is_: Mapping[str, float]
     ) -> None:
+        """Report each value that an answer says and that is off by more than 1e-6.
+
+        Args:
+            what: the request's name.
+            said: values by name.
+            is_: the true ones; it has all names of `said`.
+        """
         for m, x in said.items():
             if abs(x - is_[m]) > 1e-6:
                 text = f"{what} says {m} {x}, it is {is_[m]}"
                 self.found.append(Violation("answer", self.now, text, abs(x - is_[m])))
 
     def _moving(self) -> set[str]:
-        """Motors that have somewhere to go yet, if only later."""
+        """Motors that have somewhere to go yet, if only later.
+
+        Looks are taken up to the end of motion; all motors of a programme count while it
+        lasts.
+        """
         s, now = self.scanner, self.now
         end = s.rest_time(now)
         if not end > now:
@@ -392,6 +464,9 @@ class Episode:
         return [(self.now + dt, self.scanner.positions(self.now + dt)) for dt in AHEAD]
 
     def _pass(self, until: float) -> None:
+        """Let time pass until `until`, look at the motion meanwhile, and note what has
+        ended.
+        """
         s = self.scanner
         if self._jog is not None and until >= self._jog[0]:
             self.counts["lease end", self._jog[1]] += 1
@@ -406,7 +481,9 @@ class Episode:
         self._state()
 
     def _in_step(self, reading: Mapping[str, float], time: float) -> None:
-        """Motors of one virtual axis keep in step, however they are stopped."""
+        """Report motors of one virtual axis that are out of step by more than 1e-6,
+        however stopped.
+        """
         for axis, begun in self._coupled.items():
             gone = {
                 m: (reading[m] - begun[m]) / f for m, f in self.model.moves(axis).items()
@@ -419,6 +496,12 @@ class Episode:
                 self.found.append(Violation("coupling", time, what, spread))
 
     def _couple(self, request: Request, outcome: str, moving: set[str]) -> None:
+        """Note which virtual axes move their motors in step after a request.
+
+        A refused request changes nothing; a programme ends all coupling; another axis
+        that shares a motor ends its coupling. A virtual axis counts if none of its motors
+        moved before.
+        """
         if outcome == "refused" or request.verb not in (
             "move",
             "jog",
@@ -445,6 +528,7 @@ class Episode:
                 self._coupled[axis] = {m: here[m] for m in motors}
 
     def _state(self) -> None:
+        """Report a state "ready" with parts within the margin."""
         near = self.watch.too_near(self.scanner.positions(self.now))
         if near and self.scanner.state(self.now).safety.state == "ready":
             what = f"ready, although {' and '.join(near[0])} are within the margin"
@@ -457,6 +541,17 @@ class Episode:
         moving: set[str],
         before: list[tuple[float, dict[str, float]]],
     ) -> None:
+        """Judge what a request did, and set what the oracle allows from now on.
+
+        A refused request must leave the motion as it was. An accepted one sets the
+        acceleration that each motor may use, and a new sample or correction the pairs and
+        their floors; parts that it lets in too near are reported.
+
+        Args:
+            request, outcome: what was asked, and what came of it.
+            moving: motors that moved before.
+            before: readings at times ahead, as they were to be.
+        """
         s, now = self.scanner, self.now
         if outcome == "refused":
             for t, reading in before:
@@ -518,7 +613,9 @@ class Episode:
         self._state()
 
     def finish(self) -> None:
-        """All comes to rest, and stays."""
+        """Wait until all comes to rest, and report what never does or does not stay at
+        rest.
+        """
         end = self.scanner.rest_time(self.now)
         if not math.isfinite(end):
             self.found.append(
@@ -541,6 +638,7 @@ class Episode:
 
 
 def _sample(sample: Json | None) -> Sample:
+    """The sample as the scanner takes it; the empty one for None."""
     return (
         Sample()
         if sample is None
@@ -558,7 +656,14 @@ def _correction(values: Json | None) -> NamedCorrection | None:
 
 
 def draw_start(rng: Rng, machine: str) -> Start:
-    """A free pose, drawn at random with a liking for narrow places."""
+    """Draw a start at a free pose, with a liking for narrow places.
+
+    Four in five have a sample, some a correction, some a late time.
+
+    Args:
+        rng: draws all.
+        machine: the name of one of MACHINES.
+    """
     m = model(machine)
     while True:
         sample = draw_sample(rng) if rng.random() < 0.8 else None
@@ -574,6 +679,9 @@ def draw_start(rng: Rng, machine: str) -> Start:
 
 
 def draw_pose(rng: Rng, m: MachineModel) -> dict[str, float]:
+    """Draw a position of every motor; often the object's and the detector's along the
+    beam are near.
+    """
     pose = {a: draw_place(rng, m, a) for a in m.motors}
     near, far = m.along("object"), m.along("detector")
     if rng.random() < 0.7 and near is not None and far is not None:
@@ -588,7 +696,11 @@ def _travel(m: MachineModel, motor: str) -> tuple[float, float]:
 
 
 def draw_place(rng: Rng, m: MachineModel, motor: str) -> float:
-    """A position of a motor: anywhere, at an end, or where parts of the machine meet."""
+    """Draw a position of a motor: anywhere, at an end, or about its home.
+
+    Motors that turn are put at any angle or a multiple of 90 deg. It is within the
+    travel.
+    """
     low, high = _travel(m, motor)
     if m.turns(motor):
         angle = float(
@@ -606,6 +718,9 @@ def draw_place(rng: Rng, m: MachineModel, motor: str) -> float:
 
 
 def draw_sample(rng: Rng) -> Json:
+    """Draw a box or a cylinder with its size and its place on the stage, sometimes tilted
+    or far aside.
+    """
     kind = str(rng.choice(["box", "cylinder"]))
     wide = float(rng.choice([rng.uniform(5.0, 60.0), rng.uniform(60.0, 320.0)]))
     deep = float(rng.choice([rng.uniform(5.0, 40.0), rng.uniform(20.0, 200.0)]))
@@ -624,6 +739,9 @@ def draw_sample(rng: Rng) -> Json:
 
 
 def draw_correction(rng: Rng) -> Json:
+    """Draw one to four values of a correction, sometimes with a scale of the angle or
+    tilts.
+    """
     sizes = {"dO_x": 5, "dO_y": 3, "dO_z": 12, "alpha": 90, "tau_x": 2, "tau_z": 2,
              "dD_x": 5, "dD_y": 8, "dD_z": 12, "dS_x": 3, "dS_y": 3}  # fmt: skip
     names = rng.choice(list(sizes), int(rng.integers(1, 5)), replace=False).tolist()
@@ -638,6 +756,11 @@ def draw_correction(rng: Rng) -> Json:
 
 
 def draw_wait(rng: Rng, episode: Episode) -> float:
+    """Draw how long to wait [s]: not at all, a moment, some seconds, or about until
+    motion ends.
+
+    It is at most 720 s by the end of motion; else exponential.
+    """
     kind = rng.random()
     if kind < 0.15:
         return 0.0
@@ -650,7 +773,11 @@ def draw_wait(rng: Rng, episode: Episode) -> float:
 
 
 def draw(rng: Rng, episode: Episode) -> Request:
-    """The next request, aimed at trouble."""
+    """Draw the next request, aimed at trouble: what interrupts something that runs is
+    likely.
+
+    Nothing is asked; the episode is only read.
+    """
     m = episode.model
     wait = draw_wait(rng, episode)
     state = episode.scanner.safety.state
@@ -714,7 +841,10 @@ def draw(rng: Rng, episode: Episode) -> Request:
 
 
 def _fitting(rng: Rng, episode: Episode, sample: Json, wait: float) -> Json:
-    """A sample about as deep as there is room before the panel, now or where motion ends."""
+    """A sample about as deep as there is room before the panel, now or where motion ends.
+
+    It stays as it is on machines without motors along the beam.
+    """
     m, s = episode.model, episode.scanner
     near, far = m.along("object"), m.along("detector")
     if near is None or far is None:
@@ -741,7 +871,14 @@ def _rest(rng: Rng, episode: Episode, wait: float) -> float:
 
 
 def draw_legs(rng: Rng, episode: Episode) -> list[dict[str, float]]:
-    """Targets of one to four motors, one leg after the other, as scripts have them."""
+    """Draw one to five legs of one to four motors, one after the other, as scripts have
+    them.
+
+    They begin where motion ends.
+
+    Returns:
+        Targets by motor, leg by leg.
+    """
     m, s = episode.model, episode.scanner
     here = dict(s.positions(s.rest_time(episode.now)))
     chosen = rng.choice(
@@ -757,6 +894,12 @@ def draw_legs(rng: Rng, episode: Episode) -> list[dict[str, float]]:
 
 
 def draw_move(rng: Rng, episode: Episode) -> Json:
+    """Draw a move of one to four axes, virtual ones included, none of which share a
+    motor.
+
+    Returns:
+        Parameters of `axes.move`; some moves are relative, some take the shortest way.
+    """
     m, s = episode.model, episode.scanner
     count = int(rng.choice([1, 2, 3, 4], p=[0.35, 0.35, 0.2, 0.1]))
     here = (
@@ -795,6 +938,17 @@ def draw_move(rng: Rng, episode: Episode) -> Json:
 def draw_target(
     rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]
 ) -> float:
+    """Draw where a motor goes: anywhere, to the margin, near the other part on the beam,
+    or a way off.
+
+    It is within the travel.
+
+    Args:
+        rng: draws it.
+        episode: whose scanner it is.
+        motor: its name.
+        here: positions of all motors.
+    """
     m = episode.model
     low, high = _travel(m, motor)
     kind = rng.random()
@@ -820,7 +974,12 @@ def draw_target(
 def _meeting(
     rng: Rng, episode: Episode, motor: str, here: Mapping[str, float]
 ) -> float | None:
-    """Where a motor, going one way alone, would first bring something to the margin."""
+    """Where a motor, going one way alone, would first bring something to the margin.
+
+    Returns:
+        The position, within 0.02 mm of the margin or where 30 steps lead; None if nothing
+        is in the way.
+    """
     m, stage = episode.model, episode.watch.stage
     low, high = _travel(m, motor)
     x = here[motor]
@@ -843,7 +1002,11 @@ def _meeting(
 
 
 def run_episode(rng: Rng, machine: str, length: int) -> tuple[Episode, list[Request]]:
-    """Random requests until something is found, or `length` of them."""
+    """Make random requests until something is found, or `length` of them and a rest.
+
+    Returns:
+        The episode, whose `found` tells, and the requests made.
+    """
     episode = Episode(draw_start(rng, machine))
     history = []
     for _ in range(length):
@@ -856,6 +1019,7 @@ def run_episode(rng: Rng, machine: str, length: int) -> tuple[Episode, list[Requ
 
 
 def replay(start: Start, history: Sequence[Request]) -> Episode:
+    """Make the requests of a history until something is found, or all of them and a rest."""
     episode = Episode(start)
     for request in history:
         episode.do(request)
@@ -868,10 +1032,23 @@ def replay(start: Start, history: Sequence[Request]) -> Episode:
 def shortest(
     start: Start, history: Sequence[Request], kind: str, tries: int = 400
 ) -> tuple[Start, list[Request]]:
-    """A shorter history that still ends in a violation of that kind."""
+    """Shorten a history that ends in a violation, as long as it still ends in one of that
+    kind.
+
+    Requests are left out in halves, quarters and so on, then simplified; last the start.
+
+    Args:
+        start, history: what to shorten; neither is changed.
+        kind: of the violation.
+        tries: replays at most; then what is found so far is returned.
+
+    Returns:
+        The start and the requests; as given if nothing could be left out.
+    """
     history = list(history)
 
     def fails(begin: Start, candidate: Sequence[Request]) -> bool:
+        """Whether a candidate ends in such a violation; false once all tries are used."""
         nonlocal tries
         tries -= 1
         if tries < 0:
@@ -912,6 +1089,9 @@ def shortest(
 
 
 def _simpler(request: Request) -> list[Request]:
+    """Simpler requests to try in place of one: fewer targets, a rounded wait; perhaps
+    none.
+    """
     out = []
     if request.verb == "move" and len(request.args["targets"]) > 1:
         for axis in request.args["targets"]:

@@ -57,6 +57,14 @@ class Laboratory:
     """Hidden: limits, rates, sign, zero offsets, drift, times. `planted` is (about, folder)."""
 
     def __init__(self, seed: int, scans: int = 6, plants: int = 3) -> None:
+        """Draw a laboratory with its past scans, and plant contradictions in some.
+
+        Args:
+            seed: the same gives the same laboratory.
+            scans: how many, over three years at most, the last now.
+            plants: contradictions, each in another scan, none in the last; fewer than
+                `scans`.
+        """
         rng = self.rng = random.Random(f"laboratory {seed}")
         self.family = rng.choice(timing_ranges.FAMILIES)
         self.rig = Rig(rng, self.family)
@@ -87,6 +95,13 @@ class Laboratory:
         self.bodies = self._bodies()
 
     def _scan(self, i: int, ends: datetime, age: float) -> Past:
+        """Draw a scan: mode, region of the panel and positions.
+
+        Args:
+            i: its number, for its name.
+            ends: when the last scan was.
+            age: how many years before that it began.
+        """
         rng = self.rng
         mode = rng.choice(list(MODES))
         binning = MODES[mode]
@@ -113,6 +128,9 @@ class Laboratory:
         return Past(f"scan-{i}", started, years, at, mode, roi, binning=binning)
 
     def _bodies(self) -> np.ndarray:
+        """Draw the ellipsoids of the sample (8, 7): centre, half axes and density; the
+        first holds the others.
+        """
         rng = np.random.default_rng(self.rng.randrange(1 << 30))
         inside = np.column_stack(
             [rng.uniform(-0.55, 0.55, (7, 2)), rng.uniform(-0.7, 0.7, 7),
@@ -124,7 +142,13 @@ class Laboratory:
 
     def _where(self, p: Past, *, true: bool) -> tuple[float, float, float, float, float]:
         """x of the axis, SOD, SDD, x and z of the image's centre on the panel, from the
-        source."""
+        source [mm].
+
+        Args:
+            p: the scan.
+            true: as it is, with drift, hidden offsets and roll; false: as the laboratory
+                believes.
+        """
         left, top, right, bottom = p.roi
         aside = ((left + right) / 2 - (COLUMNS - 1) / 2) * PITCH
         up = -((top + bottom) / 2 - (ROWS - 1) / 2) * PITCH
@@ -141,6 +165,9 @@ class Laboratory:
         return axis, sod, sdd, panel + aside * c + up * s, z - aside * s + up * c
 
     def _rays(self, p: Past) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Centre of the image and steps of a column and a row, from the source [mm], as
+        they truly are.
+        """
         _, _, sdd, x, z = self._where(p, true=True)
         c, s = math.cos(self.roll), math.sin(self.roll)
         pixel = PITCH * p.binning
@@ -151,6 +178,7 @@ class Laboratory:
         )
 
     def true_column(self, p: Past) -> float:
+        """The column at which the axis of rotation crosses the image's middle row."""
         axis, sod, *_ = self._where(p, true=True)
         centre, u, v = self._rays(p)
         seen = []
@@ -161,6 +189,7 @@ class Laboratory:
         return float(c0 - r0 * (c1 - c0) / (r1 - r0) + (SHAPE[1] - 1) / 2)
 
     def images(self, p: Past) -> np.ndarray:
+        """Line integrals of a scan (frames, rows, columns), of a whole turn."""
         axis, sod, sdd, *_ = self._where(p, true=True)
         centre, u, v = self._rays(p)
         size = 0.36 * SHAPE[1] * PITCH * p.binning * sod / sdd
@@ -187,7 +216,12 @@ class Laboratory:
         return out
 
     def write(self, root: Path) -> list[Path]:
-        """All folders, the oldest first."""
+        """Write all scans to folders below `root`, and return the folders, the oldest
+        first.
+
+        Each holds settings, log, a dark frame, a flat field and projections with noise,
+        as TIFF. A folder that exists raises FileExistsError.
+        """
         rng = np.random.default_rng(self.rng.randrange(1 << 30))
         folders = []
         for p in self.scans:
@@ -211,6 +245,9 @@ class Laboratory:
         return folders
 
     def _log(self, p: Past) -> bytes:
+        """The executed script of a scan as the scanner writes it, with what is planted in
+        it.
+        """
         scan = Scan(self.rig)
         if "limits" in p.plants:
             low, high, *rates = self.rig.limits["tra_obj"]
@@ -235,7 +272,9 @@ class Laboratory:
         return scan.log
 
     def _text(self, p: Past) -> str:
-        """`scan settings.txt`, with the offsets that the laboratory believes in."""
+        """The text of `scan settings.txt`, with the offsets that the laboratory believes
+        in.
+        """
         axis, sod, sdd, x, z = self._where(p, true=False)
         sod += 1.0 * ("sod" in p.plants)
         pixel = PITCH * p.binning
@@ -270,8 +309,11 @@ class Laboratory:
         return "\r\n".join(out) + "\r\n"
 
     def _plant(self, p: Past, plant: str) -> None:
-        """Put a contradiction into a scan; the texts and the log look at `plants`
-        themselves."""
+        """Put a contradiction into a scan, and note it in `planted`.
+
+        The texts and the log look at the scan's `plants` themselves; "axis" and "mode"
+        change the scan.
+        """
         p.plants.append(plant)
         self.planted.append((NAMED[plant], p.name))
         if plant == "axis":

@@ -25,7 +25,14 @@ def some_parameters(rng: np.random.Generator, size: float = 1.0) -> Offsets:
 def some_poses(
     rng: np.random.Generator, views: int = 7, *, even: bool = True, still: bool = True
 ) -> Poses:
-    """A scan; `even` steps of angle, everything but the stage `still`."""
+    """Draw a scan of up to about 2.5 rad a view about an upright axis.
+
+    Args:
+        rng: draws all.
+        views: how many.
+        even: steps of angle are equal; otherwise each is drawn.
+        still: source, detector and axis stay; otherwise each is elsewhere in each view.
+    """
     sign = rng.choice([-1, 1])
     start, turn = rng.uniform(-9, 9), sign * rng.uniform(0.5, 2.5 * views)
     angle = np.linspace(start, start + turn, views)

@@ -50,7 +50,12 @@ def read(text: str) -> Seen:
 
 
 def write_circle(views: int) -> tuple[str, Seen]:
-    """RTK's circle about its own axis, with offsets and angles: its file, and what it says."""
+    """RTK's circle about its own axis, with offsets and angles: its file, and what RTK
+    says of it.
+
+    Args:
+        views: how many, 60 deg apart.
+    """
     rtk = _itk().RTK
     geometry = rtk.ThreeDCircularProjectionGeometry.New()
     for i in range(views):
@@ -71,7 +76,18 @@ def joseph(
     shape: tuple[int, int, int],
     pitch: float,
 ) -> NDArray[np.float32]:
-    """RTK's Joseph projector on a volume in RTK's own axes; shape is views, rows, columns."""
+    """Project a volume by RTK's Joseph projector.
+
+    Args:
+        text: RTK's geometry file.
+        volume: in RTK's own axes.
+        voxel: edge length [mm].
+        shape: views, rows and columns.
+        pitch: of the pixels [mm].
+
+    Returns:
+        Line integrals of that shape.
+    """
     itk = _itk()
     image = itk.image_from_array(np.ascontiguousarray(volume))
     image.SetSpacing([voxel] * 3)
@@ -112,6 +128,9 @@ def _end_at_once() -> None:
 
 
 def _itk() -> Any:
+    """Import ITK with its RTK, without the warnings that its wrappers give while they
+    load.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # its wrappers warn while they load
         import itk
@@ -121,6 +140,7 @@ def _itk() -> Any:
 
 
 def _read(text: str) -> Any:
+    """Read the text of a geometry file by RTK."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "geometry.xml"
         file.write_text(text)
@@ -131,6 +151,7 @@ def _read(text: str) -> Any:
 
 
 def _seen(geometry: Any) -> Seen:
+    """What RTK says of a geometry: matrices, distances and angles of all views."""
     views = range(len(geometry.GetGantryAngles()))
     itk = _itk()
     return Seen(

@@ -44,6 +44,11 @@ def replay(log: bytes, lines: tuple[Executed, ...]) -> Iterator[tuple[float, byt
 
 
 def _columns(log: bytes, lines: tuple[Executed, ...]) -> list[tuple[str, ...]]:
+    """The first five columns of each executed line of a log.
+
+    The log has to contain the lines in that order, with their replies; ValueError
+    otherwise.
+    """
     found, rest = [], log
     for line in lines:
         head = rest.split(b"\t", 5)
@@ -69,12 +74,16 @@ class Motor:
 
     @property
     def duration_s(self) -> float:
+        """Seconds from the begin of motion to rest, without the delay."""
         way = abs(self.target - self.start)
         if way < self.speed**2 / self.acceleration:
             return 2.0 * math.sqrt(way / self.acceleration)
         return way / self.speed + self.speed / self.acceleration
 
     def position(self, time: float) -> float:
+        """Position at a time after the command; the start before the delay is over, the
+        target afterwards.
+        """
         t = min(max(time - self.delay_s, 0.0), self.duration_s)
         way, total = abs(self.target - self.start), self.duration_s
         ramp = min(self.speed / self.acceleration, total / 2.0)

@@ -61,6 +61,7 @@ class Disk:
     """
 
     def __init__(self, root: Path, rng: random.Random) -> None:
+        """Watch a directory, with no fault set and all that is in it safe."""
         self.root = root
         self.ops: list[tuple[Kind, str]] = []
         """Every change so far: what, and the path from the root."""
@@ -100,7 +101,12 @@ class Disk:
         self._paths.clear()
 
     def cut(self) -> None:
-        """A power cut: what was not safe may be lost."""
+        """Cut the power: what was not safe may be lost, and no change gets through any
+        more.
+
+        Of each directory the latest changes of names are taken back, a drawn number of
+        them; files whose bytes are not safe are cut at a drawn length.
+        """
         self.off = True
         keep: dict[Path, int] = {}
         for folder in {folder for folder, _ in self._names}:
@@ -128,6 +134,9 @@ class Disk:
     def _open(
         self, path: Any, flags: int, mode: int = 0o777, *, dir_fd: int | None = None
     ) -> int:
+        """Open a file, and watch it if it is below the root and written (a directory in
+        any case).
+        """
         real = self._path(path, dir_fd)
         writes = bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
         new = real is not None and writes and not os.path.lexists(real)
@@ -147,6 +156,9 @@ class Disk:
         REAL["close"](fd)
 
     def _write(self, fd: int, data: Any) -> int:
+        """Write, half of the data where the fault is a short write; the bytes are not
+        safe then.
+        """
         if fd in self._paths:
             more = os.lseek(fd, 0, os.SEEK_CUR) + len(data) > os.fstat(fd).st_size
             if self._change("write", self._paths[fd], more):
@@ -156,12 +168,14 @@ class Disk:
         return written
 
     def _pwrite(self, fd: int, data: Any, offset: int) -> int:
+        """Write at a place. Its bytes are not counted as unsafe."""
         if fd in self._paths:
             self._change("write", self._paths[fd])
         written: int = REAL["pwrite"](fd, data, offset)
         return written
 
     def _posix_fallocate(self, fd: int, offset: int, length: int) -> None:
+        """Allocate room; counted as a write."""
         if fd in self._paths:
             self._change("write", self._paths[fd])
             self._bytes.add(os.fstat(fd).st_ino)
@@ -173,6 +187,9 @@ class Disk:
         REAL["ftruncate"](fd, length)
 
     def _fsync(self, fd: int) -> None:
+        """Make a file's bytes, or a directory's names, safe; files not watched are left
+        alone.
+        """
         path = self._paths.get(fd)
         if path is None:
             return  # a disk in memory needs none
@@ -191,6 +208,9 @@ class Disk:
         src_dir_fd: int | None = None,
         dst_dir_fd: int | None = None,
     ) -> None:
+        """Rename over a name, which is not safe until its directory is; what was there is
+        kept for that.
+        """
         source, target = self._path(src, src_dir_fd), self._path(dst, dst_dir_fd)
         if source is not None and target is not None:
             self._change("replace", target)
@@ -216,6 +236,10 @@ class Disk:
         dst_dir_fd: int | None = None,
         follow_symlinks: bool = True,
     ) -> None:
+        """Make a second name, which is not safe until its directory is.
+
+        It takes room if the root has not had the name before.
+        """
         self._path(src, src_dir_fd)
         before = len(self.named)
         target = self._path(dst, dst_dir_fd)
@@ -231,6 +255,9 @@ class Disk:
         )
 
     def _unlink(self, path: Any, *, dir_fd: int | None = None) -> None:
+        """Remove a name, which may come back until its directory is safe; none there
+        fails as usual.
+        """
         real = self._path(path, dir_fd)
         if real is not None and os.path.lexists(real):
             self._change("unlink", real)
@@ -242,6 +269,7 @@ class Disk:
     _remove = _unlink
 
     def _mkdir(self, path: Any, mode: int = 0o777, *, dir_fd: int | None = None) -> None:
+        """Make a directory, which may be lost with all in it until its parent is safe."""
         real = self._path(path, dir_fd)
         if real is not None and not os.path.lexists(real):
             self._change("mkdir", real)
@@ -251,7 +279,9 @@ class Disk:
         REAL["mkdir"](path, mode, dir_fd=dir_fd)
 
     def _path(self, path: Any, dir_fd: int | None) -> Path | None:
-        """Where it is, if below the root."""
+        """Where a path or descriptor is if below the root, else None; the name is noted
+        in `named`.
+        """
         if isinstance(path, int):
             return self._paths.get(path)
         name = Path(os.fsdecode(path))
@@ -266,7 +296,12 @@ class Disk:
         return name
 
     def _keep(self, file: Path) -> Path | None:
-        """A copy of what a change is about to replace; while it is not safe, a second name."""
+        """Keep what a change is about to replace: a copy, or a second name while it is
+        not safe.
+
+        Returns:
+            The file beside the root; None if there was no file.
+        """
         if not file.is_file():
             return None
         with suppress(FileExistsError):

@@ -81,6 +81,7 @@ class Simulation:
         projector: Any = None,
         **options: Any,
     ) -> None:
+        """Make the data directory and the disk that watches it; no server runs yet."""
         self.rng = random.Random(seed)
         self.data = root / "data"
         self.data.mkdir(parents=True, exist_ok=True)
@@ -140,7 +141,9 @@ class Simulation:
             raise
 
     async def _start(self) -> None:
-        """As `flexdt.server.twin.main` does."""
+        """Start a server as `flexdt.server.twin.main` does: lock the directory, then
+        recall the stage.
+        """
         root = open_data(self.data)
         self._lock = lock_folder(root)
         assert self._loop is not None
@@ -170,6 +173,11 @@ class Simulation:
         self.disk.on()
 
     def _end(self) -> None:
+        """Unlock the directory and cancel all that runs, again and again: it is a kill,
+        no request.
+
+        The time goes on from there at the next start. Nothing happens if no server runs.
+        """
         if self._lock is not None:
             self._lock()
             self._lock = None
@@ -219,7 +227,20 @@ class Simulation:
         self.run(asyncio.sleep(seconds), seconds + PATIENCE_S)
 
     def run(self, work: Awaitable[T], patience_s: float = PATIENCE_S) -> T:
-        """Run a coroutine in the server's loop; raises what it does, or `Crashed`."""
+        """Run a coroutine in the server's loop.
+
+        Args:
+            work: the coroutine.
+            patience_s: of the loop's time.
+
+        Returns:
+            Its result.
+
+        Raises:
+            Crashed: the power was cut meanwhile, whatever it raised.
+            TimeoutError: it takes longer.
+            Exception: what it raises otherwise.
+        """
         assert self._loop is not None, "no server runs"
 
         async def bounded() -> T:

@@ -68,8 +68,12 @@ def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules that may take longest begin first, then those with slow tests, then those with
-    many: no worker is left with one at the end."""
+    """Sort modules: those that may take longest first, then those with slow tests, then
+    by their number.
+
+    So no worker is left with a long one at the end. A browser test outside tests/viewer
+    raises UsageError, since `make page` looks there alone.
+    """
     spread_out(items)
     for item in items:
         if item.get_closest_marker("browser") and item.path.parent.name != "viewer":
@@ -121,8 +125,11 @@ class SharedServers:
     """As they started."""
 
     def as_new(self) -> None:
-        """No scan, stop, correction or data set is left, and everything stands where it
-        stood."""
+        """Leave no scan, stop, correction or data set behind, and everything where it
+        stood.
+
+        Jobs that run are aborted and control is taken by force.
+        """
         from flexdt.clients import TwinClient
         from flexdt.clients.client.twin_methods import FINAL_STATES
 
@@ -144,6 +151,7 @@ class SharedServers:
 
 @pytest.fixture(scope="session")
 def shared_servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedServers]:
+    """Start a twin and a projector for all modules of a worker; they stop at its end."""
     from flexdt.clients import TwinClient
 
     data = tmp_path_factory.mktemp("shared") / "data"

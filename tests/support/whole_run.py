@@ -57,7 +57,14 @@ def ask(method: str, **params: Any) -> Step:
 
 
 def job(name: str) -> Step:
-    """Wait for a job; one that has ended early, or waits for somebody, is told to go on."""
+    """A step that waits for a job; one that has ended early, or waits for somebody, is
+    told to go on.
+
+    The disk has room again before that. AssertionError after TRIES times.
+
+    Args:
+        name: of the job.
+    """
 
     def step(run: Part) -> None:
         for _ in range(TRIES):
@@ -100,8 +107,7 @@ def abort(run: Part) -> None:
 
 
 def load(run: Part) -> None:
-    """The scene as it is, with another sample, another correction, other settings and
-    positions."""
+    """Load the scene as it is, with another sample, correction, settings and positions."""
     document = run.sim.call(run.client, "scene.save")["document"]
     document["sample"] = {"name": "chiral"}
     document["correction"] = {
@@ -169,6 +175,9 @@ class Part:
     def __init__(
         self, name: str, root: Path, before: Path | None = None, seed: int = 0
     ) -> None:
+        """Copy the data directory to begin with, and make a simulation in which no server
+        runs yet.
+        """
         if before is not None:
             shutil.copytree(before, root / "data")
         self.steps = PARTS[name]
@@ -203,7 +212,7 @@ class Part:
         self.client = self.sim.client()
 
     def look(self) -> Seen:
-        """What is to survive, as clients see it."""
+        """What is to survive, as clients see it, by short names."""
         call = lambda method: self.sim.call(self.client, method)  # noqa: E731
         state = call("state.get")
         correction = state["correction"]
@@ -251,6 +260,24 @@ class Part:
         assert not list(self.sim.data.rglob("*unreadable*"))
 
     def _step(self, number: int, step: Step, before: Seen, right: Seen | None) -> Seen:
+        """Make one step, again where it crashed, and check what is left at each point.
+
+        A step that fails must have met the disk's fault, change nothing, also after a
+        restart, and then succeed; one that crashed was done or not done. What was
+        answered well is there after a kill.
+
+        Args:
+            number: of the step.
+            step: what to do.
+            before: what clients saw before it.
+            right: what they are to see after it; None if that is not known.
+
+        Returns:
+            What they see after it.
+
+        Raises:
+            AssertionError: something of that does not hold, or three tries did not do.
+        """
         was = self.sim.disk.failed
         for _ in range(3):
             try:
@@ -301,7 +328,9 @@ class Part:
         return now
 
     def _same(self, step: Step, one: Seen, other: Seen, *but: str) -> bool:
-        """Whether two sights agree; what a scan sets need not have been written yet."""
+        """Whether two sights agree, but for `but`; what a scan sets need not have been
+        written yet.
+        """
         apart = {
             *but,
             *(

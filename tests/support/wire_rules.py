@@ -80,7 +80,7 @@ OTHERS = dict(zip(SHAPES, [*SHAPES.values()][3:] + [*SHAPES.values()][:3], stric
 
 
 def stl(shape: Prism) -> bytes:
-    """A prism as triangles."""
+    """A prism on an outline as a binary STL; discs are refused with AssertionError."""
     assert shape.outline is not None
     ring = [tuple(p) for p in shape.outline.tolist()]
     n, faces = len(ring), []
@@ -110,7 +110,11 @@ def read_here(raw: bytes, **how: Any) -> Phantom:
 
 
 def data_with_samples(root: Path) -> Path:
-    """A data directory in which all samples are; made once."""
+    """Make a data directory with all samples of SHAPES uploaded; `root` is to be empty.
+
+    Returns:
+        Its folder of samples.
+    """
     with Simulation(root) as sim:
         sim.start()
         client = sim.client()
@@ -156,6 +160,9 @@ class WireEpisode:
     """
 
     def __init__(self, start: WireStart, root: Path, samples: Path) -> None:
+        """Make the simulation with its samples copied in; no server runs before it is
+        entered.
+        """
         self.start, self.root = start, root
         self.model = model(start.machine)
         machine, profile = product(start.machine)
@@ -207,6 +214,7 @@ class WireEpisode:
         self.tasks = []
 
     def _stage(self) -> Stage:
+        """The oracle's stage of the sample and correction that the server has in force."""
         scanner = self.sim.twin.scanner
         s, c = scanner.sample, scanner.correction
         offset = {k: getattr(s.offset, k) for k in ("x", "y", "z", "rx", "ry", "rz")}
@@ -214,7 +222,15 @@ class WireEpisode:
         return Stage(self.model, Placed(self.shapes.get(s.name), offset), values)
 
     def _seen(self, name: str, ask: Callable[..., Any]) -> Callable[..., Any]:
-        """A method of the scanner, with a look at what was published until it was called."""
+        """Wrap a method of the scanner: what was published until it was called is looked
+        at first.
+
+        What the method puts on the stage is judged afterwards.
+
+        Args:
+            name: of the method.
+            ask: the method; its errors go on.
+        """
         scanner = self.sim.twin.scanner
 
         @functools.wraps(ask)
@@ -252,6 +268,11 @@ class WireEpisode:
         self._incoming = None
 
     def _put(self, name: str, now: float) -> None:
+        """Judge a new stage: pairs let in nearer than before and the margin are reported;
+        then watch it.
+
+        What stood too near at the start is not judged.
+        """
         assert self._watch is not None
         old, new, scanner = self._watch.stage, self._stage(), self.sim.twin.scanner
         pose = self.model.vector(scanner.positions(now))
@@ -270,7 +291,9 @@ class WireEpisode:
         self._watch.put(new, scanner.positions(now))
 
     def look(self) -> None:
-        """At all that was published since the last look."""
+        """Look at all motion published since the last look, and at the state now; report
+        what is wrong.
+        """
         twin = self.sim.twin
         assert self._watch is not None
         now = twin.clock.now()
@@ -300,7 +323,16 @@ class WireEpisode:
         )
 
     def do(self, ask: Ask) -> str:
-        """Let time pass, ask, look; returns what came of it."""
+        """Let time pass, make a request and judge what it did.
+
+        What is wrong is appended to `found`, errors that the server logs included.
+
+        Args:
+            ask: what, by which client, and how long to wait before.
+
+        Returns:
+            accepted, halted, refused, begun, hang, waited, or what came of a restart.
+        """
         self._wait(ask.wait)
         if ask.verb == "restart":
             return self._restart()
@@ -359,12 +391,19 @@ class WireEpisode:
         self.found.append(Violation("raised", now, f"{ask.method}: {what[:500]}", 0.0))
 
     def _refused(self, ask: Ask, error: RpcError) -> str:
+        """What an error means: halted if motion was carried out in part, else refused.
+
+        An internal error is reported as well.
+        """
         if error.code == -32603:
             self._raised(ask, repr(error))
         data = error.data if isinstance(error.data, dict) else {}
         return "halted" if error.code == -32002 and data.get("halts_at") else "refused"
 
     def _answered(self, ask: Ask, answer: Json) -> str:
+        """Keep jobs and scenes of an answer, and return halted if its warnings say so,
+        else accepted.
+        """
         if "job" in answer and isinstance(answer["job"], str):
             self.jobs.append(answer["job"])
         if ask.method == "scene.save":
@@ -378,7 +417,10 @@ class WireEpisode:
         return "halted" if halted else "accepted"
 
     def _wait(self, seconds: float) -> None:
-        """Twin seconds; the loop's, where the clock stands still until somebody waits."""
+        """Let twin seconds pass, look, and count what has been answered meanwhile.
+
+        Where the clock stands still until somebody waits, a task waits for it.
+        """
         clock = self.sim.twin.clock
         if clock.speed_up != "max":
             seconds = seconds / float(clock.speed_up)
@@ -413,7 +455,7 @@ class WireEpisode:
         return "accepted"
 
     def finish(self) -> None:
-        """Abort what runs, and wait until all rests."""
+        """Abort what runs, and wait until all rests; report it if it never does."""
         twin = self.sim.twin
         with suppress(RpcError):
             self.sim.call(self.clients[0], "clock.set", speed_up=1000.0)
@@ -452,6 +494,7 @@ class _View:
 
 
 def draw_wire_start(rng: Rng, machine: str) -> WireStart:
+    """Draw a start: a free pose, the clock's speed and perhaps a sample."""
     m = model(machine)
     empty = Stage(m)
     while True:
@@ -464,6 +507,9 @@ def draw_wire_start(rng: Rng, machine: str) -> WireStart:
 
 
 def draw_sample_set(rng: Rng) -> Json:
+    """Draw parameters of `sample.set`: one of SHAPES somewhere on the stage, or the empty
+    stage.
+    """
     if rng.random() < 0.2:
         return {"name": "empty"}
     offset = {k: round(float(rng.normal(0.0, 8.0)), 3) for k in ("x", "y", "z")}
@@ -474,7 +520,10 @@ def draw_sample_set(rng: Rng) -> Json:
 
 
 def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
-    """The next thing that some client does."""
+    """Draw the next thing that some client does, mostly the one in control.
+
+    What interrupts a running job is likely. Nothing is asked; the episode is only read.
+    """
     e = episode
     view: Any = _View(e)
     m = e.model
@@ -590,6 +639,9 @@ def draw_ask(rng: Rng, episode: WireEpisode) -> Ask:
 
 
 def draw_poses(rng: Rng, view: Any) -> Json:
+    """Draw parameters of `trajectory.submit`: two to eight poses of one to three motors
+    each.
+    """
     m, here = view.model, dict(view.scanner.final_positions())
     poses = []
     for _ in range(int(rng.integers(2, 9))):
@@ -602,7 +654,9 @@ def draw_poses(rng: Rng, view: Any) -> Json:
 
 
 def draw_script(rng: Rng, view: Any) -> Json:
-    """A fly scan of a few frames, after moves to where it shall be."""
+    """Draw parameters of `script.submit`: a fly scan of a few frames, after moves to
+    where it shall be.
+    """
     here = dict(view.scanner.final_positions())
     near, far = view.model.along("object"), view.model.along("detector")
     text = script(int(rng.integers(2, 10)), float(rng.choice([22.5, 40.0])), 1000.0)
@@ -619,7 +673,18 @@ def draw_script(rng: Rng, view: Any) -> Json:
 def run_wire_episode(
     rng: Rng, machine: str, length: int, root: Path, samples: Path
 ) -> tuple[WireEpisode, list[Ask]]:
-    """Random requests until something is found, or `length` of them."""
+    """Make random requests until something is found, or `length` of them and a rest.
+
+    Args:
+        rng: draws all.
+        machine: its name.
+        length: most requests.
+        root: an empty folder.
+        samples: see `data_with_samples`.
+
+    Returns:
+        The episode, whose `found` tells, and the requests made.
+    """
     history: list[Ask] = []
     with WireEpisode(draw_wire_start(rng, machine), root, samples) as episode:
         for _ in range(length):
@@ -634,6 +699,9 @@ def run_wire_episode(
 def replay_wire(
     start: WireStart, history: Sequence[Ask], root: Path, samples: Path
 ) -> list[Violation]:
+    """Make the requests of a history until something is found, or all and a rest; what is
+    found.
+    """
     with WireEpisode(start, root, samples) as episode:
         for ask in history:
             episode.do(ask)
@@ -651,10 +719,23 @@ def shortest_wire(
     samples: Path,
     tries: int = 60,
 ) -> list[Ask]:
-    """A shorter history that still ends in a violation of that kind."""
+    """Shorten a history that ends in a violation, as long as it still ends in one of that
+    kind.
+
+    Args:
+        start, history: what to shorten; the list itself is not changed.
+        kind: of the violation.
+        root: a folder, which each try makes and removes.
+        samples: see `data_with_samples`.
+        tries: replays at most; then what is found so far is returned.
+
+    Returns:
+        The requests; all of them if none could be left out.
+    """
     history = list(history)
 
     def fails(candidate: Sequence[Ask]) -> bool:
+        """Whether a candidate ends in such a violation; false once all tries are used."""
         nonlocal tries
         tries -= 1
         if tries < 0:
