@@ -54,7 +54,9 @@ class PixelGrid:
 
     @property
     def edges_mm(self) -> tuple[float, float]:
-        """Unbinned pitch from column to column and from row to row [mm]; equal unless stated."""
+        """Unbinned pitch from column to column and from row to row [mm]; equal without a
+        `row_pitch_mm`.
+        """
         return (
             self.pitch_mm,
             self.pitch_mm if self.row_pitch_mm is None else self.row_pitch_mm,
@@ -96,7 +98,9 @@ class CameraSettings:
 
     @property
     def of_image(self) -> dict[str, Any]:
-        """Settings of an image, by name: mode, exposure_ms, roi (its edges), averages; no gain."""
+        """Settings of an image, by name: mode, exposure_ms, roi (its four edges),
+        averages; without the number of frames.
+        """
         return {
             "mode": self.mode,
             "exposure_ms": self.exposure_ms,
@@ -127,6 +131,12 @@ class CameraSettings:
 
         For the thesis's ROI 32 8 1943 1527 that is (+1.1968, 0), as flexDATA has it.
 
+        The centre is that of the whole binned pixels: a rest of the ROI that fills none
+        is cut off at the right and below.
+
+        Args:
+            grid: pixels of the sensor.
+
         Returns:
             (along growing columns, along growing rows).
         """
@@ -139,14 +149,22 @@ class CameraSettings:
 
 
 def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
-    """Parse the binning a*b of camera mode `HWaSWb{High,Low}`, which may have a prefix `N_`.
+    """Return the binning a*b of a camera mode: by its name in `modes`, else parsed from
+    `HWaSWb{High,Low}`, which may have a prefix `N_`.
+
+    Spaces around the name are ignored, and case outside `modes`.
 
     Args:
         mode: its name.
-        modes: binning by name, of a detector whose modes have other names.
+        modes: binning by name, of a detector whose modes have other names; None: there
+            are none.
+
+    Returns:
+        Unbinned pixels along each side of an image pixel.
 
     Raises:
-        LimitError: the mode is not in `modes` and does not have that form.
+        LimitError: the mode is not in `modes` and does not have that form, or a factor is
+            0; the allowed ones are listed.
 
     Example:
         >>> binning_of("HW2SW1High"), binning_of("2x2", {"1x1": 1, "2x2": 2})
@@ -162,9 +180,13 @@ def binning_of(mode: str, modes: Mapping[str, int] | None = None) -> int:
 
 
 def no_mode(mode: str, allowed: Sequence[str]) -> LimitError:
-    """Make the error for a camera mode that is not among those `allowed`."""
-    what = f"camera mode {mode!r} does not exist; allowed: {', '.join(allowed)}"
-    return LimitError(what, {"asked": mode, "allowed": list(allowed)})
+    """Make the error for a camera mode that is not among those `allowed`; returned, not
+    raised.
+
+    Its data has `asked` and `allowed`.
+    """
+    message = f"camera mode {mode!r} does not exist; allowed: {', '.join(allowed)}"
+    return LimitError(message, {"asked": mode, "allowed": list(allowed)})
 
 
 def without_number(mode: str) -> str:
@@ -175,27 +197,32 @@ def without_number(mode: str) -> str:
 def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
     """Check that `roi` is on the sensor and holds at least one binned pixel; return it.
 
-    Edges are inclusive and within 0 to size - 1; the first edge outside is named.
+    Edges are inclusive and within 0 to size - 1; the first edge outside, of left, top,
+    right, bottom, is named.
 
     Args:
         roi: region of interest, unbinned pixels.
         grid: pixels of the sensor.
         binning: unbinned pixels along each side of an image pixel.
 
+    Returns:
+        `roi`, unchanged.
+
     Raises:
-        LimitError: names the edge, its value and the allowed ones.
+        LimitError: an edge outside, with its name, value and the allowed ones; or fewer
+            columns or rows than `binning`.
     """
     for name, value in vars(roi).items():
         sides = name in ("left", "right")
         if sides:
-            what = "columns"
+            noun = "columns"
             size = grid.columns
         else:
-            what = "rows"
+            noun = "rows"
             size = grid.rows
         if not 0 <= value < size:
             raise LimitError(
-                f"ROI {roi}: {name} {value} is outside the sensor's {size} {what} "
+                f"ROI {roi}: {name} {value} is outside the sensor's {size} {noun} "
                 f"(allowed: 0 to {size - 1})",
                 {"asked": str(roi), "edge": name, "allowed": [0, size - 1]},
             )

@@ -111,10 +111,8 @@ _KEY_LIMITS: Final = {
 
 
 def _one_word(name: str) -> str:
-    """Return a name if it is one printable word of at most 100 characters; raise
-    PydanticCustomError otherwise.
-
-    No whitespace is allowed in it.
+    """Return a name if it is one word of 1 to 100 printable characters without
+    whitespace; raise PydanticCustomError otherwise.
     """
     if not (
         0 < len(name) <= 100 and name.isprintable() and not any(c.isspace() for c in name)
@@ -158,12 +156,14 @@ class Axis(_Frozen):
 
     @model_validator(mode="after")
     def _ordered(self) -> Axis:
-        """Check that home, speed and acceleration are within their limits.
+        """Check that lower is at most upper, home is within both, and speed and
+        acceleration are at most their maxima.
 
-        Lower at most upper, home within, speed and acceleration at most their maxima.
+        Returns the axis unchanged.
 
         Raises:
-            PydanticCustomError: names the field, its value and the allowed ones.
+            PydanticCustomError: names the first wrong field, its value and the allowed
+                ones.
         """
         _refuse_if(
             self.lower > self.upper, "upper", self.upper, f"at least lower, {self.lower}"
@@ -195,12 +195,13 @@ class VirtualAxis(_Frozen):
     @model_validator(mode="after")
     def _reads_what_it_moves(self) -> VirtualAxis:
         """Check that factor and shares are not 0, and that the axis reads a motor that it
-        moves, at the inverse share.
+        moves, with a share of 1 / factor (within 1e-6 of their product).
 
         Returns the axis unchanged.
 
         Raises:
-            PydanticCustomError: names the field, its value and the allowed ones.
+            PydanticCustomError: names the first wrong field, its value and the allowed
+                ones.
         """
         _refuse_if(self.factor == 0.0, "factor", self.factor, "a number other than 0")
         allowed = f"shares of motors, {self.of!r} (the `of`) among them"
@@ -276,7 +277,9 @@ class DetectorSpec(_Frozen):
 
     @property
     def mode_names(self) -> tuple[str, ...]:
-        """The camera modes that exist; the one at start is among them."""
+        """Names of the camera modes that exist, each once: the one at start, the
+        machine's own, then HWaSWb{High,Low} of all factors and gains.
+        """
         every = product(self.hardware_binning, self.software_binning, self.gains)
         names = [f"HW{a}SW{b}{gain}" for a, b, gain in every]
         return tuple(dict.fromkeys([self.mode, *self.modes, *names]))
@@ -284,13 +287,14 @@ class DetectorSpec(_Frozen):
     def check_mode(self, mode: str) -> str:
         """Check that a camera mode exists; case and a prefixed number do not matter.
 
-        Names of the machine's own modes must agree exactly.
-
-        Raises:
-            LimitError: lists the modes that exist.
+        Spaces around it are ignored; case and a prefixed number too, but not in the
+        machine's own modes (`modes`), whose names must agree exactly.
 
         Returns:
             `mode`, unchanged.
+
+        Raises:
+            LimitError: lists the modes that exist.
         """
         unnumbered = {
             without_number(name) for name in self.mode_names if name not in self.modes
@@ -301,14 +305,16 @@ class DetectorSpec(_Frozen):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
-        """Check that mode and ROI fit the panel, and that the response is physical: left
-        energies below the photon's, energies rising.
+        """Check that the mode has a binning, that the ROI is on the panel, and that the
+        response is physical.
 
-        Returns the detector unchanged; left energy is at most the photon's, energies rise
-        from above 0.
+        The energy that a photon leaves is at most its own; photon energies rise from
+        above 0. The mode at start always counts as one of `mode_names`. Returns the
+        detector unchanged.
 
         Raises:
-            PydanticCustomError: names the field, its value and the allowed ones.
+            PydanticCustomError: names the first wrong field, its value and the allowed
+                ones.
         """
         try:
             binning = binning_of(self.mode, self.modes)
@@ -339,8 +345,11 @@ class FilterSpec(_Frozen):
     @field_validator("material")
     @classmethod
     def _known(cls, text: str) -> str:
-        """Return the text unchanged; raise UnknownNameError or LimitError for an unknown
-        material.
+        """Check that a material is known; return its text unchanged.
+
+        Raises:
+            UnknownNameError: no material of that name.
+            LimitError: a formula or density that is not possible.
         """
         from flexdt.twin.attenuation.substances import Substance
 
@@ -378,8 +387,14 @@ class TubeSpec(_Frozen):
 
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
-        """Check the initial kV (both limits), the power (upper limit), and that spot_points
-        is not 2.
+        """Check that the initial kV is within min_kV and max_kV, the initial power at
+        most max_W, and spot_points not 2.
+
+        Returns the tube unchanged.
+
+        Raises:
+            PydanticCustomError: names the first wrong field, its value and the allowed
+                ones.
         """
         allowed = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
         _refuse_if(not self.min_kV <= self.kV <= self.max_kV, "kV", self.kV, allowed)
@@ -390,7 +405,9 @@ class TubeSpec(_Frozen):
 
 
 def _box_around(points: Iterable[Vector3]) -> tuple[Vector3, Vector3]:
-    """Compute size and centre of the upright box around points [mm]."""
+    """Compute size and centre of the upright box around points, at least one: (x, y, z)
+    each [mm].
+    """
     (x, x_), (y, y_), (z, z_) = ((min(c), max(c)) for c in zip(*points, strict=True))
     return (x_ - x, y_ - y, z_ - z), ((x + x_) / 2, (y + y_) / 2, (z + z_) / 2)
 
@@ -434,10 +451,11 @@ class Component(_Frozen):
 
     @model_validator(mode="after")
     def _round(self) -> Component:
-        """Check that size, centre and points agree with the shape: a round cylinder, a
-        hull's own box.
+        """Check that size, centre and points agree with the shape.
 
-        Returns the component unchanged; points are for hulls alone.
+        A cylinder is as wide in x as in y. A hull, and no other shape, has points; size
+        and centre are exactly those of the box around them. Returns the component
+        unchanged.
 
         Raises:
             PydanticCustomError: names the field, its value and the allowed ones.
@@ -503,7 +521,9 @@ class Timing(_Frozen):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of commands that have a time here, assumed or measured, without the "_s"."""
+        """Kinds of commands that have a time here, assumed or measured, without the "_s",
+        in the order of the fields; those whose time is None are left out.
+        """
         return tuple(
             name[:-2]
             for name in Timing.model_fields
@@ -511,28 +531,40 @@ class Timing(_Frozen):
         )
 
     def seconds(self, kind: str) -> float:
-        """Return the time of a kind of command [s], as `kinds` lists them (None for one
-        without).
+        """Return the time of a kind of command [s]; None for `sequence_overhead` without
+        a time.
+
+        Raises:
+            AttributeError: a name that is not in `kinds`.
         """
         value: float = getattr(self, f"{kind}_s")
         return value
 
     @property
     def sequence(self) -> str:
-        """Kind whose time a sequence of images takes beyond its exposures."""
+        """Kind whose time a sequence of images takes beyond its exposures:
+        sequence_overhead, or, if that is None, take_image_overhead.
+        """
         if self.sequence_overhead_s is None:
             return "take_image_overhead"
         return "sequence_overhead"
 
     @model_validator(mode="after")
     def _spreads_hold(self) -> Timing:
-        """Check that each kind with a spread has a time, and that it is from p5_s to p95_s."""
+        """Check that each kind with a spread has a time, from its p5_s to its p95_s.
+
+        Returns the times unchanged.
+
+        Raises:
+            PydanticCustomError: names the first wrong kind, its value and the allowed
+                ones.
+        """
         _require(self.spread, self.kinds, "spread", "kind of command")
-        for kind, found in self.spread.items():
+        for kind, spread in self.spread.items():
             middle = self.seconds(kind)
-            allowed = f"from p5_s to p95_s, [{found.p5_s:g}, {found.p95_s:g}]"
+            allowed = f"from p5_s to p95_s, [{spread.p5_s:g}, {spread.p95_s:g}]"
             _refuse_if(
-                not found.p5_s <= middle <= found.p95_s, f"{kind}_s", middle, allowed
+                not spread.p5_s <= middle <= spread.p95_s, f"{kind}_s", middle, allowed
             )
         return self
 
@@ -548,7 +580,9 @@ class EStop(_Frozen):
 
 
 def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
-    """Return priors unchanged if all name offsets; raise PydanticCustomError otherwise."""
+    """Return priors, offset -> standard deviation, unchanged if all name offsets
+    (`NAMES`); raise PydanticCustomError for the first that does not.
+    """
     for name in priors:
         if name not in NAMES:
             raise _refused(name, priors[name], f"a known offset: {', '.join(NAMES)}")
@@ -627,10 +661,16 @@ class Machine(_Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> Machine:
-        """Check the relations between tables: names, kinds of axes, chains,
-        roles, E-stop, contacts.
+        """Check the relations between tables: quantities, axes and their kinds, fixed
+        places, response, names, chains, roles, E-stop, contacts.
 
-        The first violation is raised.
+        Quantities of `geometry` and `fixed` are known (`angle` is not fixed); their
+        factors are not 0 and of linear axes, of rotation axes for `angle`; a fixed
+        mount_x or mount_y has a motor. A measured response reaches the tube's max_kV.
+        Names of axes and virtual axes differ, case ignored, from each other, from the
+        tube's and from `_COMPONENTS_OF_SCRIPTS`. See `_check_chains` and `_check_roles`.
+        Category 0 of the E-stop has a deceleration for every motor. The first violation
+        is raised. Returns the machine unchanged.
 
         Raises:
             PydanticCustomError: names the key, its value and the allowed ones.
@@ -683,12 +723,12 @@ class Machine(_Frozen):
     def _check_chains(self) -> None:
         """Check the kinematic chains of the components.
 
-        The first violation is raised.
+        A name is used once and is not `SAMPLE`; parents come first; a part's axis is a
+        motor of the machine that drives its anchor and occurs once in its chain; a part
+        carried by a moved one has its anchor; a stage on the turntable (mount_x, mount_y)
+        is carried by all motors of the angle.
 
-        A name is used once and is not the sample's; parents come first; a part's axis is
-        a motor of the machine that drives its anchor and occurs once in its chain; a
-        moved part has the anchor of its parent; a stage on the turntable is carried by
-        it.
+        The first violation is raised.
 
         Raises:
             PydanticCustomError: names the component's key, its value and the allowed
@@ -752,14 +792,17 @@ class Machine(_Frozen):
             )
 
     def _check_roles(self) -> None:
-        """Check that focal spot, active area and holder are where the X-ray geometry has
-        them.
+        """Check that focal spot, active area, holder and mount are where the X-ray
+        geometry has them.
 
-        Machines without components pass; a sample_mount may be missing.
+        Tube, sample_holder and panel have exactly one component each, unless the machine
+        has no components at all; a sample_mount may be missing or occur more than once.
+        Each is at its own anchor, carried by all motors of that anchor, and large enough
+        to contain its place (within 1e-6 mm, a panel within `_AREA_SLACK_MM`). Otherwise
+        a motor of `geometry` would move the image and leave the body behind, and a
+        collision would count as free.
 
-        Each role has one component, at its own anchor, carried by all motors of that
-        anchor, and large enough to hold its place. Otherwise a motor of `geometry` would
-        move the image and leave the body behind, and a collision would count as free.
+        The first violation is raised.
 
         Raises:
             PydanticCustomError: names the component's key, its value and the allowed
@@ -817,15 +860,20 @@ class Machine(_Frozen):
         return any(motor in self.geometry.get(q, {}) for q in ("mount_x", "mount_y"))
 
     def _motors_of(self, anchor: str) -> list[str]:
-        """List the motors that drive a coordinate of `anchor`; the object has angle and
-        mount, too.
+        """List the motors that drive a coordinate of `anchor`, in the order of
+        `QUANTITIES`; those of the object include the motors of angle, mount_x and
+        mount_y.
+
+        A motor that drives two coordinates is listed twice.
         """
         quantities = [q for q in QUANTITIES if q.startswith(f"{anchor}_")]
         quantities += ["angle", "mount_x", "mount_y"] if anchor == "object" else []
         return [motor for q in quantities for motor in self.geometry.get(q, {})]
 
     def chain(self, component: Component) -> tuple[str, ...]:
-        """List the motors that carry `component`, from its own to the outermost; () for none."""
+        """List the motors that carry `component`, from its own to the outermost; () if it
+        stands still.
+        """
         parents = {c.name: c for c in self.components}
         motors: list[str] = []
         part: Component | None = component
@@ -842,7 +890,10 @@ class Machine(_Frozen):
         return axis in self.axes or axis in self.virtual_axes
 
     def moves(self, axis: str) -> Mapping[str, float]:
-        """Return motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual axis.
+        """Return motor -> mm (deg) of it per mm (deg) of `axis`, a motor or a virtual
+        axis.
+
+        For a motor it is {axis: 1.0}.
 
         Raises:
             UnknownNameError: lists the machine's axes.
@@ -865,7 +916,11 @@ class Machine(_Frozen):
 
 
 def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
-    """Make an error of several keys together, reported at `at`, relative to the model."""
+    """Make the error of a value, reported at `at`, relative to the model's own key;
+    returned, not raised.
+
+    The message is "must be" and `allowed`.
+    """
     context = {"at": at, "value": value, "allowed": allowed}
     return PydanticCustomError("refused", "must be {allowed}", context)
 
@@ -890,7 +945,7 @@ def unknown_axis(name: str, machine: Machine) -> UnknownNameError:
 def parse_machine(
     text: str, file: str = "<machine>", corners: Corners | None = None
 ) -> Machine:
-    """Parse and validate a machine description.
+    """Parse and validate a machine description, with its base and meshes.
 
     `base = NAME` at the top of the text inherits everything else from a machine that
     ships, except its zero offsets and the axes and components that `without` lists.
@@ -901,7 +956,7 @@ def parse_machine(
         text: TOML.
         file: name for error messages.
         corners: reads the meshes that it names (`flexdt.library.machines.parsed` reads
-            those beside the file).
+            those beside the file); None: meshes are an error.
 
     Raises:
         MachineFileError: TOML or content is invalid, a motor moves nothing, or none turns
@@ -955,12 +1010,18 @@ def builtin_machine_text(name: str) -> str:
 
 
 def profile_of(machine: Machine, name: str | None = None) -> Profile:
-    """Load the shipped profile `name` of a machine, or its default, or one of zero offsets.
+    """Load the shipped profile `name`, or the default of a machine, or make one of zero
+    offsets.
 
-    Zero offsets are called `ZERO` and are only for a machine without a default.
+    Zero offsets, called `ZERO`, are for a machine without a default and no name, "" or
+    `ZERO`. Whether a named profile is of this machine is not checked.
+
+    Args:
+        machine: whose default is taken.
+        name: of a profile; None or "": the default.
 
     Raises:
-        UnknownNameError: lists the shipped profiles.
+        UnknownNameError: no such profile ships; lists those that do.
     """
     chosen = name or machine.default_profile
     if chosen in ("", ZERO) and not machine.default_profile:
@@ -969,7 +1030,8 @@ def profile_of(machine: Machine, name: str | None = None) -> Profile:
 
 
 def default_profile(machine: Machine, file: str) -> Profile:
-    """Load the profile that `machine` names as its own, or one of zero offsets.
+    """Load the shipped profile that `machine` names as its own, or make one of zero
+    offsets if it names none.
 
     Args:
         machine: whose.
@@ -995,7 +1057,8 @@ def builtin_machines() -> tuple[str, ...]:
 
 
 def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
-    """List the names of the shipped profiles, sorted, of `machine` or (None) of all machines.
+    """List the names of the shipped profiles, sorted: those of `machine`, or (None) of
+    all machines.
 
     For a machine the profiles are read; an unknown machine gives ().
     """
@@ -1006,7 +1069,9 @@ def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
 
 
 def _names(kind: str) -> tuple[str, ...]:
-    """List the names of the shipped files of a kind ("machines" or "profiles"), sorted."""
+    """List the names of the shipped TOML files of a kind ("machines" or "profiles"),
+    sorted, without ".toml".
+    """
     folder = resources.files("flexdt.twin") / "data" / kind
     return tuple(
         sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
@@ -1014,10 +1079,18 @@ def _names(kind: str) -> tuple[str, ...]:
 
 
 def _data(kind: str, name: str) -> str:
-    """Read the text of a shipped file; raise UnknownNameError, with the allowed names, if none."""
+    """Read the text of a shipped TOML file.
+
+    Args:
+        kind: "machines" or "profiles".
+        name: of the machine or profile.
+
+    Raises:
+        UnknownNameError: there is none; lists the allowed names.
+    """
     if name not in _names(kind):
-        what = f"no {kind[:-1]} called {name!r} ships with flexdt; there are"
-        raise UnknownNameError.among(what, name, _names(kind))
+        message = f"no {kind[:-1]} called {name!r} ships with flexdt; there are"
+        raise UnknownNameError.among(message, name, _names(kind))
     path = resources.files("flexdt.twin") / "data" / kind / f"{name}.toml"
     return path.read_text(encoding="utf-8")
 
@@ -1025,8 +1098,8 @@ def _data(kind: str, name: str) -> str:
 def _meshed(own: Raw, corners: Corners | None) -> Raw:
     """Replace the meshes of components by their convex bodies, in place.
 
-    The corners are moved by `mesh_at_mm` (else not); shape becomes "hull" with size and
-    centre of their box.
+    The corners are moved by `mesh_at_mm`, if it is given; shape becomes "hull" with size
+    and centre of their box. Components without a mesh stay.
 
     Args:
         own: content of a machine file; it is changed.
@@ -1036,7 +1109,9 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
         `own` itself.
 
     Raises:
-        UnknownNameError: names the component and its problem.
+        UnknownNameError: a shape, size, centre or points beside a mesh; a `mesh_at_mm`
+            that is not three numbers; a name that is no text; no reader; or the reader's
+            error. Names the component and its problem.
     """
     parts = own.get("components", [])
     if parts:
@@ -1065,20 +1140,22 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
                 allowed = "a file's name"
             raise UnknownNameError(f"{where}.mesh: must be {allowed} (value: {name!r})")
         try:
-            found = corners(name)
+            hull = corners(name)
         except TwinError as error:
             raise UnknownNameError(f"{where}.mesh: {error.message}") from None
-        points = [tuple(float(v + a) for v, a in zip(p, at, strict=True)) for p in found]
+        points = [tuple(float(v + a) for v, a in zip(p, at, strict=True)) for p in hull]
         size, center = _box_around(points)  # type: ignore[arg-type]
         part.update(shape="hull", points_mm=points, size_mm=size, center_mm=center)
     return own
 
 
 def _inherited(own: Raw) -> Raw:
-    """Merge a machine's content into that of its base.
+    """Merge a machine's content into that of its base, less the axes and components of
+    `without`.
 
-    Without base and `without` the content is returned as it is. A new name loses the
-    base's default profile; bases may have bases.
+    Without base and `without` the content is returned as it is. A content with a name of
+    its own loses the base's default profile; bases may have bases. See `_drop` and
+    `_merged`.
 
     Args:
         own: content of a machine file; `base` and `without` are removed from it.
@@ -1087,7 +1164,9 @@ def _inherited(own: Raw) -> Raw:
         The complete content.
 
     Raises:
-        UnknownNameError: no such base, or a value where the base has a table.
+        UnknownNameError: no such base, no base but `without`; components that are no
+            tables, or a value where the base has a table; or a removed name that the base
+            does not have.
     """
     name = own.pop("base", None)
     without = own.pop("without", [])
@@ -1117,8 +1196,9 @@ def _inherited(own: Raw) -> Raw:
 def _drop(base: Raw, name: object) -> None:
     """Remove an axis or a component from a machine's content, and from all that names it.
 
-    Parts that the removed one carried go to its parent; a virtual axis that reads it
-    goes, too.
+    Parts that the removed component carried go to its parent; parts that the removed
+    motor moved are mounted rigidly; a virtual axis that reads it goes, too, and others
+    lose their share of it.
 
     Args:
         base: content of a machine file; changed in place.
@@ -1158,13 +1238,14 @@ def _drop(base: Raw, name: object) -> None:
 def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
     """Merge a machine's content into that of its base, key by key.
 
-    In `geometry` each quantity, and the `moves` of an axis, are replaced whole;
-    components are merged by name.
+    In `geometry` each quantity is replaced whole, elsewhere a table `moves`; components
+    are merged by name (`_merged_parts`). Merged tables say in `source` which values come
+    from the file (`_credit`).
 
     Args:
-        base: content of the base.
-        own: content that goes before it.
-        whole: tables that are replaced; others are merged.
+        base: content of the base; unchanged.
+        own: content of the file, whose values go before the base's.
+        whole: keys whose tables are replaced; others are merged.
 
     Returns:
         A new table; values of both are shared.
@@ -1185,11 +1266,11 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
 
 
 def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
-    """Merge components by name.
+    """Merge components by name: values of the file replace those of the base key by key.
 
-    Values of the file replace those of the base key by key.
-
-    Two components of one name are both kept, so that the check of names finds them.
+    Of two components of one name in the file the first is merged and the other kept, so
+    that the check of names finds them. Each merged component says in `source` which
+    values come from the file (`_credit`).
 
     Args:
         old: of the base machine.
@@ -1210,10 +1291,16 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 
 
 def _credit(merged: Raw, old: Raw, own: Raw) -> None:
-    """Write into `merged["source"]` which values come from this file and which from the
-    base.
+    """Write into `merged["source"]` which keys come from this file, and the base's source
+    for the others.
 
-    Nothing if this file has no values or a source of its own, or the base has none.
+    Does nothing if this file has no values or a source of its own, or the base has no
+    `source`. An empty source of the base becomes "as the base has it".
+
+    Args:
+        merged: table that is changed in place.
+        old: of the base.
+        own: of the file.
     """
     if own and isinstance(old.get("source"), str) and "source" not in own:
         keys = ", ".join(key for key in own if key != "name")
@@ -1226,10 +1313,11 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
     """Parse and validate TOML, and collect all problems into one error.
 
     A text that is no TOML, or nests too deep, and too large numbers are such errors, too.
+    An error of `prepared` is raised alone, before the validation.
 
     Args:
         model: type of the result.
-        prepared: converts the content before it is validated.
+        prepared: converts the content before it is validated; may raise UnknownNameError.
         text: TOML.
         file: name for error messages.
 
@@ -1237,7 +1325,8 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
         A value of `model`.
 
     Raises:
-        MachineFileError: one line for each problem; data has file and problems.
+        MachineFileError: one line for each problem: file, key path, message and value;
+            data has file and, after a validation, problems (path, message, value).
     """
     try:
         content = tomllib.loads(text)
@@ -1280,9 +1369,14 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
 
 
 def _limit(path: str) -> str:
-    """Return the limitation that a key (by the beginning of its last part) comes from, or "".
+    """Return the limitation of the twin that a key comes from, as the end of an error
+    message, or "".
 
-    The text refers to docs/limits.md and ends an error message.
+    The text is of the first of `_KEY_LIMITS` with which the last part of `path`, case
+    ignored, begins, and refers to docs/limits.md.
+
+    Args:
+        path: of the key, parts separated by dots.
     """
     last = path.rpartition(".")[2].lower()
     limit = next(
@@ -1296,9 +1390,16 @@ def _limit(path: str) -> str:
 def _require(
     names: Iterable[str], allowed: Iterable[str], where: str, what: str, more: str = ""
 ) -> None:
-    """Raise `_refused` for the first of `names` that is not in `allowed`.
+    """Raise the error of `_refused` for the first of `names` that is not in `allowed`.
 
-    `where` is the key, `what` the noun of the message, `more` its end.
+    The message lists the allowed ones, or that there is none.
+
+    Args:
+        names: to check.
+        allowed: names.
+        where: key path of the error.
+        what: noun of the message, such as "axis".
+        more: end of the message.
     """
     valid = list(allowed)
     for name in names:

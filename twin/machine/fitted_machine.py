@@ -23,39 +23,46 @@ def fitted_text(
     axes: Collection[str],
     parse: Callable[[str, str], Machine] = parse_machine,
 ) -> str:
-    """Write the timing and some axes of `machine` into the machine file `text`, comments kept.
+    """Write the timing and some axes of `machine` into the machine file `text`, comments
+    kept.
 
     Args:
         text: TOML of the machine that was fitted.
         machine: the fitted one.
-        axes: names of the axes that are replaced.
+        axes: names of the axes that are replaced, all in `machine`.
         parse: reads a machine file's text, with its meshes if it has any.
-
-    Raises:
-        MachineFileError: the file does not write its axes and times as tables.
 
     Returns:
         TOML.
+
+    Raises:
+        MachineFileError: the new text does not parse to `machine`, for instance because
+            the file does not write its axes and times as tables.
     """
     blocks = {f"axes.{name}": _axis_table(name, machine.axes[name]) for name in axes}
     new_text = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
     if parse(new_text, "fitted machine") != machine:
-        what = "the base machine's file must write axes as tables [axes.NAME] and times as [timing]"
-        raise MachineFileError(what, {"allowed": ["[axes.NAME]", "[timing]"]})
+        message = (
+            "the base machine's file must write axes as tables [axes.NAME] and times as "
+            "[timing]"
+        )
+        raise MachineFileError(message, {"allowed": ["[axes.NAME]", "[timing]"]})
     return new_text
 
 
 def _replaced(text: str, blocks: Mapping[str, str]) -> str:
-    """Replace tables of `text`; a comment stays unless it is right before one.
+    """Replace tables of `text`, and remove tables timing.*; other comments stay.
 
-    Tables named timing.* that are not in `blocks` are removed.
+    A comment directly before a replaced table is removed, and those within it; one
+    separated by an empty line stays. A table timing.* that is in `blocks` is replaced.
 
     Args:
         text: of a machine file.
-        blocks: table's name -> its new text; those that the file lacks are appended.
+        blocks: table's name -> its new text with its header; those that the file lacks
+            are appended.
 
     Returns:
-        The new text.
+        The new text, with a newline at its end.
     """
     left = dict(blocks)
     out: list[str] = []
@@ -91,16 +98,17 @@ def _axis_table(name: str, axis: Axis) -> str:
 
 
 def _timing_table(timing: Timing) -> str:
-    """Format times as the TOML tables [timing] and [timing.spread], with measured or
-    assumed behind each.
+    """Format times as the TOML tables [timing] and [timing.spread], each with "measured,
+    log" or "assumed" as a comment.
 
-    Defaults and None are left out; a kind with a spread counts as measured.
+    Defaults and None are left out; a kind with a spread, and drift, count as measured;
+    source has no comment.
     """
     lines = ["[timing]"]
     for line in _keys(timing, {"spread"}):
         kind = line.split("_s = ")[0]
-        found = timing.spread.get(kind)
-        measured = found is not None or kind.startswith("drift")
+        spread_of_kind = timing.spread.get(kind)
+        measured = spread_of_kind is not None or kind.startswith("drift")
         origin = ""
         if not kind.startswith("source"):
             origin = "assumed"
@@ -117,7 +125,9 @@ def _timing_table(timing: Timing) -> str:
 
 
 def _keys(model: BaseModel, beside: set[str] | None = None) -> list[str]:
-    """Format a model's values as TOML lines, without defaults, None, and the fields `beside`."""
+    """Format a model's values as TOML lines, one for each field, without defaults, None,
+    and the fields `beside`.
+    """
     values = model.model_dump(exclude_defaults=True, exclude=beside)
     return [
         f"{key} = {json.dumps(value, ensure_ascii=False)}"

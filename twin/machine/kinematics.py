@@ -53,7 +53,11 @@ def poses(
     camera: CameraSettings,
     positions: Mapping[str, npt.ArrayLike],
 ) -> Poses:
-    """Compute nominal poses for motor positions within their travel; see `motor_poses`.
+    """Compute nominal poses for motor positions, all checked to be within their travel;
+    see `motor_poses`.
+
+    A motor without values (an empty array) is not checked. Positions beyond a limit by
+    rounding alone pass.
 
     Raises:
         UnknownNameError: a motor the machine does not have.
@@ -73,13 +77,15 @@ def motor_poses(
 ) -> Poses:
     """Compute nominal poses for motor positions as they were read, without limits.
 
-    The pixel's directions follow the profile's roll only; no correction is applied.
+    The pixel's directions follow the profile's roll only; no correction is applied. The
+    detector's place includes the shift of the ROI's centre.
 
     Args:
         machine: whose motors these are.
         profile: zero offsets in force.
         camera: decides pixel pitch and the place of the image's centre on the sensor.
-        positions: motor -> scalar or (n,) [mm, deg]; motors left out are at home.
+        positions: motor -> scalar or (n,) [mm, deg], broadcast together; motors left out
+            are at home.
 
     Returns:
         n poses (n = 1 if every position is a scalar).
@@ -95,7 +101,8 @@ def motor_poses(
     values = dict(zip(machine.axes, columns, strict=True))
 
     def total(quantity: str) -> FloatArray:
-        """Sum up a quantity over its motors and its fixed part, (n,) [mm, deg].
+        """Sum up a quantity over its motors and its fixed part, (n,) [mm, deg]; zero
+        offsets are not in it.
 
         A quantity that no motor moves is its fixed part, or zero.
         """
@@ -105,7 +112,9 @@ def motor_poses(
         return out
 
     def place(anchor: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
-        """Compute a place from the motors and `x`, `y`, `z` added to it, (n, 3) [mm]."""
+        """Compute a place in the world from the motors of `anchor` and `x`, `y`, `z`
+        added to it, (n, 3) [mm].
+        """
         added = zip(COORDINATES, (x, y, z), strict=True)
         return np.stack([total(f"{anchor}_{c}") + more for c, more in added], axis=1)
 
@@ -143,14 +152,16 @@ def resolve_targets(
     *,
     relative: bool = False,
 ) -> dict[str, float]:
-    """Resolve targets of motors and virtual axes to motor targets within their travel.
+    """Resolve targets of motors and virtual axes to motor targets within their travel;
+    targets beyond it by no more than the tolerance become the limit.
 
-    `twin/machine/travel.py` has the rule for targets beyond a limit.
+    `twin/machine/travel.py` has the rule for targets beyond a limit. A motor that two
+    axes move gets the later one's target; each axis begins at `positions`.
 
     Args:
         machine: whose axes these are.
         targets: axis -> value [mm, deg], absolute, or a displacement when `relative`.
-        positions: where the motors are (or their present targets).
+        positions: motor -> where it is [mm, deg] (or its present target).
         relative: read `targets` as displacements.
 
     Returns:
@@ -168,13 +179,13 @@ def resolve_targets(
     """
     out: dict[str, float] = {}
     for name, value in targets.items():
-        asked = motor_targets(machine, name, value, positions, relative=relative)
-        found = arrival(machine, name, asked)
-        if found.beyond is not None:
+        requested = motor_targets(machine, name, value, positions, relative=relative)
+        limited = arrival(machine, name, requested)
+        if limited.beyond is not None:
             raise _too_far(
-                machine, name, value, positions, found.beyond, relative=relative
+                machine, name, value, positions, limited.beyond, relative=relative
             )
-        out.update(found.motors)
+        out.update(limited.motors)
     return out
 
 
@@ -186,13 +197,15 @@ def motor_targets(
     *,
     relative: bool = False,
 ) -> dict[str, float]:
-    """Compute the motor targets of a move of `axis`, limits ignored.
+    """Compute the motor targets of a move of `axis`, without regard to limits.
+
+    The motors of a virtual axis move by their shares of the displacement.
 
     Args:
         machine: whose axes these are.
         axis: motor or virtual axis.
         value: absolute target [mm, deg], or a displacement when `relative`.
-        positions: of the motors.
+        positions: motor -> reading [mm, deg].
         relative: read `value` as a displacement.
 
     Returns:
@@ -222,7 +235,8 @@ def _too_far(
     """Convert a motor's limit error to one of the axis that was to move; returned, not
     raised.
 
-    The range is what all its motors can do from where they are.
+    The range is that of the axis while all its motors stay within their travel, from
+    where they are.
 
     Args:
         machine: with the virtual axis.
@@ -233,7 +247,7 @@ def _too_far(
         relative: `value` is a step.
 
     Returns:
-        The error with the range of the virtual axis; `error` itself for a motor.
+        The error with target and range of the virtual axis; `error` itself for a motor.
     """
     if axis in machine.axes:
         return error
@@ -274,7 +288,7 @@ class Place:
 def places(machine: Machine) -> list[Place]:
     """List SOD, SDD and the other quantities that motors move or the file fixes.
 
-    SOD and SDD are listed in any case.
+    SOD and SDD are listed in any case. The order is that of `_QUANTITY_NAMES`.
 
     Example:
         >>> from flexdt.twin.machine.description import builtin_machine
@@ -292,11 +306,13 @@ def places(machine: Machine) -> list[Place]:
 def place(machine: Machine, quantity: str) -> Place:
     """Describe one quantity by its name in the machine file.
 
-    The formula is text such as "600 + rot - 2 mag"; "0" if nothing moves it.
+    The formula is text such as "600 + rot - 2 mag": the fixed part, then a term for each
+    motor; "0" if there is neither. The ends are sums over the ends of all motors.
+    object_z includes the machine's `sample_height_mm`.
 
     Args:
         machine: the machine.
-        quantity: such as object_y.
+        quantity: such as object_y, of `QUANTITIES`.
 
     Returns:
         Name, formula, and the values at the ends of travel and at home [mm, deg].

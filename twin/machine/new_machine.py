@@ -60,11 +60,14 @@ class Answers:
 
 
 def new_machine_text(answers: Answers) -> str:
-    """Write a machine file (TOML) from answers; it is parsed before it is returned.
+    """Write a machine file (TOML) from answers, with only the differences from the base;
+    it is parsed before it is returned.
 
-    A range for SOD or SDD becomes the travel of its first motor, two equal ends a fixed
-    distance without motors. Values that are None are the base's. A fixed panel may get a
-    rail for SDD only.
+    A range for SOD or SDD becomes the travel of the first motor that drives it, two equal
+    ends a fixed distance without its motors. A panel that is fixed in the base gets a
+    rail `_RAIL_AXIS` for a range of SDD. Values that are None are the base's; initial kV,
+    power and homes are moved into new limits. A panel of other size gets a body that is
+    wider than its active area by `_HOUSING_MARGIN_MM`.
 
     Args:
         answers: name, base, and the values that differ from it.
@@ -74,8 +77,8 @@ def new_machine_text(answers: Answers) -> str:
 
     Raises:
         UnknownNameError: no such base, or it has no such axis.
-        LimitError: a range of SOD for a base without a motor along it; SOD or SDD and the
-            travel of its motor.
+        LimitError: a range of SOD for a base without a motor along it (of SDD likewise,
+            where the panel is carried); or a range and the travel of its motor as well.
         MachineFileError: the answers do not make a machine; key, value and allowed
             values.
 
@@ -184,14 +187,14 @@ def new_machine_text(answers: Answers) -> str:
 
 
 def _detector(answers: Answers, base: Machine) -> dict[str, object]:
-    """Collect the values of `[detector]`; None for those that stay.
+    """Collect the values of `[detector]`, by key; None for those that stay.
 
-    With columns or rows also a model name and the whole panel as region; the pitch is
-    (column, row).
+    With columns or rows also a model name and the whole panel as region; row_pitch_mm
+    only where it differs from pitch_mm.
 
     Args:
         answers: columns, rows, pitch and bits, as far as they are known.
-        base: machine that it begins with.
+        base: machine that the file begins with.
     """
     pitch = answers.pitch_mm
     own = base.detector
@@ -213,7 +216,9 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
 
 
 def _lines(values: Mapping[str, object]) -> str:
-    """Format values as TOML lines, each with its newline; None are left out."""
+    """Format values as TOML lines, each with its newline; values that are None are left
+    out.
+    """
     return "".join(
         f"{key} = {json.dumps(value, ensure_ascii=False)}\n".replace("\x7f", "\\u007f")
         for key, value in values.items()

@@ -46,9 +46,11 @@ class Arrival:
 
 
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
-    """Apply the rule for targets beyond a limit to a move of `axis`; raises nothing.
+    """Apply the rule for targets beyond a limit to a move of `axis`: move targets into
+    the travel and say which lay beyond; raises nothing.
 
-    Beyond is by more than rounding; motors of a virtual axis are shortened together.
+    Beyond is by more than `POSITION_ROUNDING`; motors of a virtual axis are shortened
+    together (`clamp`).
 
     Args:
         machine: whose motors these are.
@@ -57,7 +59,7 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
 
     Returns:
         Targets within the travel, a message for each that lies beyond, and the error of
-        the first that lies beyond by more than its tolerance, or None.
+        the first that lies beyond by more than its axis's `arrival_tolerance`, or None.
     """
     messages = []
     beyond = None
@@ -76,13 +78,15 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
     """Apply the rule to a speed or acceleration of `axis` that may be above its motors'
     maximum; raises nothing.
 
-    A value that is no number counts as above.
+    A value above by a share of `POSITION_ROUNDING` or less passes; one that is no number
+    counts as above. There is no lower limit.
 
     Args:
         machine: whose motors these are.
         axis: motor or virtual axis.
-        what: speed or acceleration.
-        value: of the axis [mm or deg, per s or s2].
+        what: "speed" or "acceleration".
+        value: of the axis [mm or deg, per s or s2]; a motor's is that times the absolute
+            value of its share.
 
     Returns:
         Rates within the maximum, a message for each that is above, and the first one's
@@ -113,11 +117,18 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
 def check_target(machine: Machine, axis: str, value: float) -> float:
     """Check that `value` is within the travel of motor `axis`.
 
+    Args:
+        machine: with the motor.
+        axis: a motor; virtual axes are unknown here.
+        value: a target [mm, deg].
+
     Returns:
-        The value; the limit, if it is beyond that by rounding alone.
+        The value; the limit, if it is beyond that by at most `POSITION_ROUNDING`.
 
     Raises:
-        LimitError: names axis, value, unit and limits.
+        LimitError: names axis, value, unit and limits; also for a value that is no
+            number.
+        UnknownNameError: no such motor.
     """
     a = machine.axis(axis)
     if not _distance_beyond(machine, axis, value) <= POSITION_ROUNDING:
@@ -126,10 +137,14 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
 
 
 def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
-    """Move the targets of an axis's motors into their travel.
+    """Return the targets of an axis's motors, moved into their travel.
 
-    If a motor of a virtual axis is cut short, all its motors give up the same share, and
-    are then limited once more.
+    If a motor of a virtual axis is cut short, all its motors give up the same
+    displacement of the axis, the largest that one needs, and are then limited once more.
+
+    Args:
+        targets: motor -> target [mm, deg]; for a virtual axis those of all its motors.
+        axis: motor or virtual axis that is moved.
     """
     bounded = _bounded(machine, targets)
     if axis in machine.axes or bounded == targets:
