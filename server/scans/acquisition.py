@@ -9,9 +9,10 @@ are due is decided in `runner`; `dataset_writer` writes the files.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -86,7 +87,7 @@ class Acquisition:
             images = [self.radiography.dark(batch[0].camera)] * len(batch)
         before = [await self._earlier_images(frame) for frame in batch]
         trapped = [await self._trapped_charge(frame) for frame in batch]
-        await asyncio.to_thread(self._store, batch, images, before, trapped)
+        await _ended(asyncio.to_thread(self._store, batch, images, before, trapped))
         if self.shown is not None and batch[-1].xrays_on:
             self.shown(batch[-1], images[-1])
 
@@ -261,6 +262,19 @@ class Acquisition:
                 image, frame.camera, settings, rng, earlier, traps
             )
             self.put(frame.file, counts)
+
+
+async def _ended(work: Coroutine[Any, Any, None]) -> None:
+    """Wait until work in a thread has ended, also where the wait is cancelled meanwhile.
+
+    A thread cannot be cancelled: after this it writes nothing more.
+    """
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.wait({task})
+        raise
 
 
 def settings_of(frame: Exposure) -> ExposureSettings:

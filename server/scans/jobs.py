@@ -612,6 +612,8 @@ class Jobs:
             await asyncio.to_thread(self._mark_incomplete, job, scan, str(error))
             return self._store_failure(job, error)
         finally:
+            if job.runner is not None:
+                job.runner.recount(scan.store.present)
             scan.store.close()
         return "done"
 

@@ -321,6 +321,17 @@ class ScanRunner:
         made = sum(e.kind == "projection" for e in batch)
         self._set_progress(frames_done=self.progress.frames_done + made)
 
+    def recount(self, present: Collection[str]) -> None:
+        """Set the number of finished projections to those that the data set has.
+
+        A batch that the end of the run cut short is stored in part.
+
+        Args:
+            present: names of the images of the data set.
+        """
+        stored = [e for e in self._frames if e.kind == "projection" and e.file in present]
+        self._set_progress(frames_done=len(stored))
+
     async def _apply_step(self, step: PlanStep) -> None:
         """Apply a command of the plan and show it in `progress`; after a TwinError pause,
         and try again on resume.

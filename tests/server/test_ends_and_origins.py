@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import random
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import trimesh
 from in_process import Client, Lab, M, P, PointProjector, run, script
 
 from flexdt.runtime.files.directory import open_data
+from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.twin.core import TwinServer
 
 
@@ -115,6 +118,37 @@ def test_an_abort_says_who_and_switches_x_rays_off(tmp_path: Path, paused: bool)
         assert again["ended_by"] is None
         lab.projector.limit = None
         assert (await lab.ended(owner, job))["state"] == "done"
+
+    run(tmp_path, body)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_aborted_scan_counts_the_images_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """A slow disk is in the midst of a batch when the scan is aborted; counted by file
+    names."""
+    rng = random.Random(seed)
+    after, pause_s = rng.randint(2, 14), rng.uniform(0.002, 0.008)
+    put = DatasetWriter.put
+
+    def slow(writer: DatasetWriter, *image: Any) -> None:
+        time.sleep(pause_s)
+        put(writer, *image)
+
+    monkeypatch.setattr(DatasetWriter, "put", slow)
+
+    async def body(lab: Lab) -> None:
+        client = lab.client()
+        submitted = await client.call("script.submit", text=script(frames=60))
+        stored = lambda: len(list(tmp_path.rglob("scan_*.tif")))  # noqa: E731
+        await lab.until(lambda: stored() >= after, "images are under way")
+        await client.call("job.abort", job=submitted["job"])
+        status = await lab.ended(client, submitted["job"])
+        assert 0 < status["frames_done"] < 60
+        assert status["frames_done"] == stored()
+        await asyncio.sleep(10 * pause_s)
+        assert status["frames_done"] == stored()
 
     run(tmp_path, body)
 
