@@ -119,6 +119,7 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
         return job
     was = job.phase
     job.phase = "incomplete"
+    job.last = Progress("done", memory.elapsed_s, stored_projections(folder))
     there = sum(name.endswith(".tif") for name in folder.names())
     job.error = {
         "code": int(Code.BUSY),
@@ -132,6 +133,15 @@ def recalled(memory: JobMemory, root: Directory, now: datetime) -> Job:
         },
     }
     return job
+
+
+def stored_projections(folder: Directory) -> int:
+    """Count the projections that a data set has on the disk; 0 if it cannot be read."""
+    try:
+        planned = read_document(folder).files("projection")
+        return len(folder.names().intersection(planned))
+    except (OSError, DatasetError):
+        return 0
 
 
 def is_complete(folder: Directory) -> bool:

@@ -87,6 +87,8 @@ def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
         there = digests(data / "cut")
         stamps = {n: (data / "cut" / n).stat().st_mtime_ns for n in there}
         assert 7 <= len(there) < 33
+        stored = sum(name.startswith("scan_") for name in there)
+        assert jobs[job]["frames_done"] == stored
         assert not json.loads((data / "cut" / "flexdt.json").read_text())["complete"]
         # A correction that comes into force now is not that of the frames that are there.
         wire.call("calibration.apply", parameters={"dD_x": 0.9}, name="another")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,8 @@ READ = """() => {
   const text = (id) => document.getElementById(id)?.textContent.trim() ?? '';
   const shown = (id) => document.getElementById(id)?.offsetParent != null;
   const ids = ['connection', 'holder', 'beam', 'geometry-title', 'warnings', 'film-old',
-    'film-beam', 'job-name', 'job-state', 'job-what', 'job-frames', 'welcome-title', 'near',
-    'stale', 'report', 'veil'];
+    'film-beam', 'notes', 'job-name', 'job-state', 'job-what', 'job-frames', 'welcome-title',
+    'near', 'stale', 'report', 'veil'];
   const buttons = ['job-pause', 'job-resume', 'job-abort', 'job-back'];
   const sample = document.getElementById('sample');
   const rows = [...document.querySelectorAll('#readouts dt')].map((dt) =>
@@ -59,11 +60,13 @@ class Wire:
         state: its state.
         job: the scan that runs, waits or ended last; None for none.
         image: (rows, cols) line integrals of now; None where none can be made.
+        stored: projections that the data set of `job` has.
     """
 
     state: State
     job: JobStatus | None
     image: Any = None
+    stored: int | None = None
 
 
 def asked(twin: TwinClient, image: bool = True) -> Wire:
@@ -73,7 +76,9 @@ def asked(twin: TwinClient, image: bool = True) -> Wire:
     going = [job for job in jobs if job.state in UNENDED]
     last = going[0] if going else (jobs[-1] if jobs else None)
     picture = np.asarray(twin.projection().image) if image and not going else None
-    return Wire(state, last, picture)
+    sets = {} if going else {one.name: one.present for one in twin.datasets().datasets}
+    of_last = None if last is None else sets.get(Path(last.dataset or "").name)
+    return Wire(state, last, picture, of_last)
 
 
 @dataclass
@@ -162,6 +167,10 @@ def of_machine(said: dict[str, Any], state: State) -> list[str]:
     claim(
         ("ON" in texts["beam"] or "warm" in texts["beam"]) == state.tube.on, texts["beam"]
     )
+    own = said["session"]
+    claim(
+        not own or own not in texts["notes"], f"a note names the reader: {texts['notes']}"
+    )
     holder = state.controller
     words = (
         "nobody"
@@ -211,6 +220,9 @@ def of_scan(said: dict[str, Any], wire: Wire) -> list[str]:
         return [f"{job.job} is {job.state}, and no scan is shown"]
     if texts["job-name"] != (job.name or job.job):
         return [f"the scan shown is {texts['job-name']}, not {job.name}"]
+    done = re.match(r"\d+", texts["job-frames"])
+    if wire.stored is not None and done and int(done[0]) != wire.stored:
+        found.append(f"scan: {texts['job-frames']}, and {wire.stored} on the disk")
     if not texts["job-state"].startswith(job.state):
         found.append(f"scan: {texts['job-state']}, not {job.state}")
     if job.state == "aborted" and job.ended_by:
