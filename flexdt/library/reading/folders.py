@@ -19,9 +19,14 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
+from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_doubts import SATURATED
 from flexdt.library.datasets.saving import unfinished
-from flexdt.library.reading.foreign_files import SCAN_FORMATS, open_file
+from flexdt.library.reading.foreign_files import (
+    SCAN_FORMATS,
+    open_file,
+    refuse_distances,
+)
 from flexdt.library.reading.listed_images import NO_DARK, in_order, listed
 from flexdt.runtime.files.dataset_folder import (
     Folder,
@@ -61,6 +66,8 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.image_order import duplicate
+from flexdt.twin.plausibility.scan_geometry import azimuths
+from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
 from flexdt.twin.signatures import public
 
 FLAT_NAME: Final = re.compile(r"flat|white|bright|open|blank|gain|^io", re.IGNORECASE)
@@ -98,15 +105,15 @@ def load_dataset(
             reproduces the printed figures.
         ignore_document: use the texts alone even if flexdt.json or a saved geometry is
             there.
-        geometry: one view for each projection, in place of a file's, or where an NXtomo
-            or .txrm file has none. Ignored for folders of flexdt's or a scanner's own.
+        geometry: one view for each projection, in place of the stated one, with no
+            correction in force, or where an NXtomo or .txrm file has none.
         distances: source to axis and source to panel [mm], of an NXtomo file that has
-            angles and pixels only. Ignored where `geometry` is given, and for folders of
-            flexdt's or a scanner's own.
+            angles and pixels only. Ignored where `geometry` is given.
 
     Raises:
-        DatasetError: the data set is invalid, or its folder was not saved to the end;
-            names the path.
+        DatasetError: the data set is invalid, its folder was not saved to the end, or
+            distances with any other data set; names the path.
+        ExchangeError: a geometry with another number of views, or of another panel.
 
     Example:
         >>> data = load_dataset("my-scans/lego")  # doctest: +SKIP
@@ -124,11 +131,34 @@ def load_dataset(
     foreign = _foreign_file(content)
     if foreign is not None:
         return open_file(foreign, geometry, distances)
+    if distances is not None:
+        refuse_distances(content.path, "flexdt or a scanner", distances)
     if content.document is not None and not ignore_document:
-        return _from_document(content, machine, profile)
-    if content.geometry is not None and not ignore_document:
-        return _from_geometry(content)
-    return _from_texts(content, machine, profile)
+        data = _from_document(content, machine, profile)
+    elif content.geometry is not None and not ignore_document:
+        data = _from_geometry(content)
+    else:
+        data = _from_texts(content, machine, profile)
+    if geometry is None:
+        return data
+    return _with_given(data, geometry)
+
+
+def _with_given(data: DataSet, geometry: ConeVec) -> DataSet:
+    """Replace a data set's geometry; its own angles and pixels are compared with the new
+    ones, and a difference is a warning.
+
+    Raises:
+        ExchangeError: another number of views, or another panel.
+    """
+    replaced = with_geometry(data, geometry)
+    pixel_mm = float(np.linalg.norm(data.cone_vec.u[0]))
+    findings = (
+        *angle_findings(geometry, azimuths(data.cone_vec)),
+        *pixel_findings(geometry, pixel_mm),
+    )
+    doubts = settled(findings, DatasetFormatError, data.where)
+    return replace(replaced, warnings=(*replaced.warnings, *doubts))
 
 
 @public

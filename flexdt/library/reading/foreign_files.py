@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.exchange_formats import FORMATS
@@ -65,9 +65,7 @@ def open_file(
     for form in SCAN_FORMATS:
         if ending in form.endings:
             if distances is not None and not form.distant:
-                named = ", ".join(one.name for one in SCAN_FORMATS if one.distant)
-                said = f"{path}: distances with a scan of {form.name}"
-                raise DatasetFormatError.instead(said, list(distances), f"with {named}")
+                refuse_distances(path, form.name, distances)
             more = () if distances is None else (distances,)
             with parsing(path, form.name):
                 return form.read(path, geometry, *more)
@@ -82,3 +80,19 @@ def open_file(
             "allowed": [one for form in SCAN_FORMATS for one in form.endings],
         },
     )
+
+
+def refuse_distances(path: Path, name: str, distances: tuple[float, float]) -> NoReturn:
+    """Refuse distances with a scan that states its own.
+
+    Args:
+        path: of the scan.
+        name: of its format.
+        distances: source to axis and to panel [mm].
+
+    Raises:
+        DatasetFormatError: names the formats that are allowed.
+    """
+    named = ", ".join(one.name for one in SCAN_FORMATS if one.distant)
+    said = f"{path}: distances with a scan of {name}"
+    raise DatasetFormatError.instead(said, list(distances), f"with {named}")
