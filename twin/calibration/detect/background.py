@@ -41,12 +41,14 @@ class Background:
             straight.
         plane: (m, 3) line integral behind the middle of each window and its change by a pixel
             to the right and down.
+        slope: (m, 2) its change by a pixel to the right and down beside `bend`.
     """
 
     misfit: FloatArray
     disturbed: npt.NDArray[np.bool_]
     bend: Float32Array | None
     plane: FloatArray
+    slope: FloatArray
 
 
 def survey(flat: Float32Array, alone: Float32Array) -> Background:
@@ -90,12 +92,34 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     ratio = np.where(enough, np.maximum(misfit / typical, 1.0), 1.0)
     limit = 1.0 + FAR_OUT * np.sqrt(2.0 / np.maximum(free, 1))
     bend: Float32Array | None = None
+    slope = plane[:, 1:] / (side / 2)
     if bent:
+        slope = coefficients[:, 1:3] / (side / 2)
         fine = _shapes(np.arange(side, dtype=np.float64), side)
         coefficients[:, :3] = 0.0
         bend = (coefficients @ fine.T).astype(np.float32).reshape(m, side, side)
     plane = plane / np.array([1.0, side / 2, side / 2])
-    return Background(ratio, enough & (ratio > limit), bend, plane)
+    return Background(ratio, enough & (ratio > limit), bend, plane, slope)
+
+
+def levelled(
+    flat: Float32Array, slope: FloatArray, which: npt.NDArray[np.bool_]
+) -> Float32Array:
+    """Subtract the slope of the background from some windows.
+
+    Args:
+        flat: (m, side, side) line integrals.
+        slope: of `Background`, (m, 2).
+        which: (m,) windows to level.
+
+    Returns:
+        New windows (m, side, side), unchanged in their middles.
+    """
+    at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
+    right, down = slope[which].astype(np.float32).T[:, :, None, None]
+    out = flat.copy()
+    out[which] -= right * at + down * at[:, None]
+    return out
 
 
 def _bends(

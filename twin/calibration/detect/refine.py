@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.background import Background, survey
+from flexdt.twin.calibration.detect.background import Background, levelled, survey
 from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
 from flexdt.twin.calibration.detect.fading import evened, fading
 from flexdt.twin.calibration.detect.patches import (
@@ -211,8 +211,9 @@ def _measured(
 
     The rendered spots contain the effects of pixels and blur on a ball, its neighbours,
     and the displacement of a ball's spot from the projection of its centre; corrections
-    of `LARGEST_PX` or more are not applied. Bent backgrounds and fading are removed
-    first. Complete spots are fitted too where the noise exceeds `FIT_NOISE` and the blur
+    of `LARGEST_PX` or more are not applied. Bent backgrounds, fading and the slope behind
+    spots that are not complete are removed first. Complete spots are fitted too where the
+    noise exceeds `FIT_NOISE` and the blur
     `FIT_BLUR_PX`, unless an edge of the body crosses them.
 
     Args:
@@ -231,6 +232,9 @@ def _measured(
         if behind.bend is not None:
             patches = replace(patches, flat=patches.flat - behind.bend)
         patches = _evened(patches, behind, body)
+        # A fit of a spot that is cut or touched knows a level alone.
+        partial = ~windows.whole.ravel()
+        patches = replace(patches, flat=levelled(patches.flat, behind.slope, partial))
     results = centroids(patches, patches.entire)
     patches = replace(
         patches, peaks=contrasts(results, patches), radii=patches.radii * sharp.scale
