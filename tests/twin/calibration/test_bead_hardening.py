@@ -22,9 +22,9 @@ HARDNESS = np.array([0.6, 1.0, 3.0, 10.0])
 """Attenuation of four energies, in units of the middle one's."""
 PANELS = {0.15: (760, 956), 0.3: (380, 478), 0.6: (190, 239)}
 """Pixel pitch [mm] and shape of one panel at three binnings."""
-MOST_SIGMAS = 1.6
-"""Largest rms error of measured places, in their sigmas (2.5 to 4.2 without hardening or with nine
-rays a pixel)."""
+SIGMAS = (0.7, 1.3)
+"""Bounds of the rms error of measured places, in their sigmas (up to 2.6 without the error of
+the rendering, 2.5 to 4.2 without hardening or with nine rays a pixel)."""
 CALM = {"causes_open", "held_unchecked"}
 """Findings that state no problem of the scan."""
 
@@ -69,6 +69,8 @@ def scanned(
         pytest.param(2, 0.6, 24, marks=pytest.mark.slow),
         pytest.param(3, 0.3, 24, marks=pytest.mark.slow),
         pytest.param(4, 0.15, 24, marks=pytest.mark.slow),
+        pytest.param(105, 0.6, 24, marks=pytest.mark.slow),
+        pytest.param(112, 0.6, 24, marks=pytest.mark.slow),
     ],
 )
 def test_beads_in_a_hard_beam_are_where_they_are(
@@ -79,5 +81,5 @@ def test_beads_in_a_hard_beam_are_where_they_are(
     error = measured.tracks - centres
     sigma = np.sqrt(np.diagonal(measured.covariances, axis1=2, axis2=3))
     assert np.isfinite(error).mean() > 0.8
-    assert np.sqrt(np.nanmean((error / sigma) ** 2)) < MOST_SIGMAS
+    assert SIGMAS[0] < np.sqrt(np.nanmean((error / sigma) ** 2)) < SIGMAS[1]
     assert {f.code for f in found.findings} <= CALM

@@ -38,6 +38,7 @@ from flexdt.twin.calibration.detect.sharpness import (
     Sharp,
     balls_of,
     fine_rays,
+    rendering_error,
     rest_of_blur,
     seen_sharpness,
     sharpness,
@@ -148,6 +149,7 @@ def measure_beads(
     body: Float32Array | None = None
     data = images
     seen = NO_BODY
+    rough = 0.0
     if scene is None:
         described = Scene(())
     else:
@@ -193,6 +195,9 @@ def measure_beads(
         rest = rest_of_blur(sharp.true, fine)
         beads = render_windows(Scene(()), cone, windows, fine, balls)
         alone = blurred_windows(beads, rest)
+        # Fewer rays than the images' place a rim by where the lattice lies.
+        if not draft and len(sample):
+            rough = rendering_error(sharp, balls, patches, sample, cone, fine)
         if body is not None:
             # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
             # body adds to the line integral depends on the bead in front of it.
@@ -201,7 +206,12 @@ def measure_beads(
             data = images - (blurred_windows(both, rest) - alone)
             patches = replace(patches, flat=data.reshape(n * k, side, side))
     measured = _measured(patches, None if draft else alone, body, sharp)
-    return replace(measured, body=seen)
+    return replace(
+        measured,
+        body=seen,
+        covariances=measured.covariances + rough**2 * np.eye(2),
+        sampling_px=max(measured.sampling_px, rough),
+    )
 
 
 def _measured(
