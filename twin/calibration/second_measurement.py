@@ -72,7 +72,8 @@ def _measured(
     state: Calibration, fit: FitResult, solids: Scene | None, draft: bool
 ) -> tuple[Calibration, list[Windows]]:
     """Measure the beads of every scan at their fitted places; lag is estimated in the
-    first round only and removed in each, if seen.
+    first round only and removed in each, if seen, and blur and size only in drafts and in a
+    first round.
 
     Windows of frames that are not usable become NaN.
 
@@ -96,8 +97,11 @@ def _measured(
         contrast = seen_contrasts(model, spots, state.identifications[g].index)
         images = scan.frames.windows(plan)
         usable = np.array([look.state is FrameState.USABLE for look in state.looks[g]])
+        known = None
         if state.measured:
             lag = state.lags[g]
+            if not draft:
+                known = state.measured[g].as_fitted
         else:
             lag = lag_of(images, scan.frames, plan, usable)
         if lag.seen:
@@ -105,7 +109,9 @@ def _measured(
         images[~usable] = np.nan
         images = mended(images, plan)
         measured.append(
-            measure_beads(images, plan, cone, model, contrast, solids, draft=draft)
+            measure_beads(
+                images, plan, cone, model, contrast, solids, draft=draft, known=known
+            )
         )
         lags.append(lag)
         plans.append(plan)

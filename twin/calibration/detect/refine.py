@@ -42,6 +42,7 @@ from flexdt.twin.calibration.detect.sharpness import (
     rest_of_blur,
     seen_sharpness,
     sharpness,
+    spread,
 )
 from flexdt.twin.calibration.detect.windows import (
     Balls,
@@ -103,6 +104,8 @@ class Refined:
         blur_px: blur of the images, estimated from the spots or assumed.
         sampling_px: what remains of the error that depends on a spot's place in the pixel grid.
         body: the phantom's, as seen in the images.
+        as_fitted: blur and size of the best fit, which a geometry that is almost the same
+            does not change; None unless from `measure_beads`.
     """
 
     tracks: FloatArray
@@ -113,6 +116,7 @@ class Refined:
     blur_px: float
     sampling_px: float
     body: SeenBody = NO_BODY
+    as_fitted: Sharp | None = None
 
 
 def measure_beads(
@@ -124,6 +128,7 @@ def measure_beads(
     scene: Scene | None = None,
     *,
     draft: bool = False,
+    known: Sharp | None = None,
 ) -> Refined:
     """Measure every bead in its window.
 
@@ -140,6 +145,8 @@ def measure_beads(
         scene: the phantom's solids; all but beads are subtracted. None: only planes are.
         draft: leave out the correction by rendered beads, which takes most of the time
             and needs a geometry that is right to a few hundredths of a pixel.
+        known: blur and size that an earlier measurement of these images found (`as_fitted`);
+            None, or values that were not seen: they are estimated.
 
     Returns:
         Positions, nan where a spot fails the checks of `_accept`.
@@ -170,10 +177,14 @@ def measure_beads(
     )
     there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
     patches = replace(patches, entire=patches.entire[there])
-    sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
+    sample = spread(patches.entire, SAMPLE)
     first = centroids(patches, sample)
     patches = replace(patches, peaks=contrasts(first, patches))
-    sharp = sharpness(patches, sample, BLUR_PX)
+    if known is None or not known.seen:
+        as_fitted = sharpness(patches, sample, BLUR_PX)
+    else:
+        as_fitted = known
+    sharp = as_fitted
     if draft:
         plain = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
         balls: Balls = ((plain, None),)
@@ -197,7 +208,7 @@ def measure_beads(
         alone = blurred_windows(beads, rest)
         # Fewer rays than the images' place a rim by where the lattice lies.
         if not draft and len(sample):
-            rough = rendering_error(sharp, balls, patches, sample, cone, fine)
+            rough = rendering_error(sharp, balls, patches, sample, cone, alone, fine)
         if body is not None:
             # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
             # body adds to the line integral depends on the bead in front of it.
@@ -209,6 +220,7 @@ def measure_beads(
     return replace(
         measured,
         body=seen,
+        as_fitted=as_fitted,
         covariances=measured.covariances + rough**2 * np.eye(2),
         sampling_px=max(measured.sampling_px, rough),
     )

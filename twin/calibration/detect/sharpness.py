@@ -33,7 +33,7 @@ from flexdt.twin.calibration.detect.windows import (
     window_rays,
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 # Blur of the images and apparent size of the beads, estimated from the spots themselves.
@@ -61,6 +61,8 @@ BODY_BLUR_PX = 0.18
 """Blur of the images below which the rendered body is subtracted as it is."""
 ALIKE = 1.1
 """Ratio of the contrasts of two beads below which they harden the beam alike."""
+CHECK_SAMPLE = 8
+"""Number of those spots that are rendered to check the method: without noise few decide."""
 PROFILES = 12
 """Number of spots from which a hardening is estimated."""
 SLIGHT_BLUR_PX = 0.45
@@ -183,12 +185,11 @@ def seen_sharpness(
     if not sharp.seen:
         return sharp, hardened_balls(sharp, patches, cone, model)[0]
     slight = sharp.blur < SLIGHT_BLUR_PX
+    few = spread(sample, CHECK_SAMPLE)
     trial = replace(sharp, true=sharp.blur, size=1.0)
     for _ in range(MOST_ROUNDS):
         balls, blur = hardened_balls(trial, patches, cone, model)
-        found, dimmed = _as_rendered(
-            replace(trial, true=blur), balls, patches, sample, cone
-        )
+        found, dimmed = _as_rendered(replace(trial, true=blur), balls, patches, few, cone)
         if not found.seen:
             break
         if slight:
@@ -208,6 +209,12 @@ def seen_sharpness(
             return replace(trial, true=blur), balls
     balls, blur = hardened_balls(sharp, patches, cone, model)
     return replace(sharp, true=blur), balls
+
+
+def spread(index: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
+    """Pick at most `most` of some indices, evenly from the first to the last."""
+    places = np.linspace(0, len(index) - 1, min(most, len(index)))
+    return np.asarray(index[places.astype(np.intp)])
 
 
 def hardened_balls(
@@ -233,9 +240,7 @@ def hardened_balls(
     groups = []
     for group in np.split(order, breaks):
         spots = patches.entire[np.isin(patches.entire % k, group)]
-        spots = spots[
-            np.linspace(0, len(spots) - 1, min(PROFILES, len(spots))).astype(int)
-        ]
+        spots = spread(spots, PROFILES)
         ball = Scene(tuple(solids[i] for i in group))
         groups.append((ball, _profiles_of(ball, sharp, patches, spots, cone)))
     variance = 0.0
@@ -353,17 +358,8 @@ def _as_rendered(
         fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
         rays = render_windows(Scene(()), cone[frames], few, fine, balls)
         seen = blurred_windows(rays, rest_of_blur(true.true, fine))
-    side = few.side
     every = np.arange(len(sample))
-    rendered = replace(
-        patches,
-        flat=seen.reshape(-1, side, side),
-        offsets=patches.offsets[sample],
-        radii=patches.radii[sample],
-        stretch=patches.stretch[sample],
-        peaks=patches.peaks[sample],
-        windows=few,
-    )
+    rendered = _rendered(patches, sample, seen, few)
     results = centroids(rendered, every)
     good = results[:, kernels.OK] > 0
     if not good.any():
@@ -373,12 +369,35 @@ def _as_rendered(
     return sharpness(rendered, every, true.true), dimmed
 
 
+def _rendered(
+    patches: Patches, sample: npt.NDArray[np.intp], seen: Float32Array, few: Windows
+) -> Patches:
+    """Return some windows with rendered line integrals in place of the images'.
+
+    Args:
+        patches: windows of the images.
+        sample: (j,) indices of the rendered ones.
+        seen: their line integrals, (j, side, side) in any shape.
+        few: their places.
+    """
+    return replace(
+        patches,
+        flat=seen.reshape(-1, few.side, few.side),
+        offsets=patches.offsets[sample],
+        radii=patches.radii[sample],
+        stretch=patches.stretch[sample],
+        peaks=patches.peaks[sample],
+        windows=few,
+    )
+
+
 def rendering_error(
     true: Sharp,
     balls: Balls,
     patches: Patches,
     sample: npt.NDArray[np.intp],
     cone: ConeVec,
+    alone: Float32Array,
     fine: int,
 ) -> float:
     """Estimate the error of rendered spots' places that finite rays leave, by the same spots
@@ -390,8 +409,9 @@ def rendering_error(
         true: estimate for the images.
         balls: the beads.
         patches: windows of the images.
-        sample: indices of the windows to render.
+        sample: indices of the windows to compare.
         cone: geometry of the frames.
+        alone: all windows rendered with `fine` rays and blurred, (n, k, side, side).
         fine: rays along a pixel's side.
 
     Returns:
@@ -400,21 +420,13 @@ def rendering_error(
     """
     frames, beads = np.divmod(sample, patches.windows.corner.shape[1])
     few = patches.windows.pick(frames, beads)
-    every = np.arange(len(sample))
-    found = []
-    for rays in (fine, max(fine // 2, 1)):
-        drawn = render_windows(Scene(()), cone[frames], few, rays, balls)
-        seen = blurred_windows(drawn, rest_of_blur(true.true, rays))
-        rendered = replace(
-            patches,
-            flat=seen.reshape(-1, few.side, few.side),
-            offsets=patches.offsets[sample],
-            radii=patches.radii[sample],
-            stretch=patches.stretch[sample],
-            peaks=patches.peaks[sample],
-            windows=few,
-        )
-        found.append(centroids(rendered, every))
+    rays = max(fine // 2, 1)
+    drawn = render_windows(Scene(()), cone[frames], few, rays, balls)
+    rough = blurred_windows(drawn, rest_of_blur(true.true, rays))
+    found = [
+        centroids(_rendered(patches, sample, seen, few), np.arange(len(sample)))
+        for seen in (alone[frames, beads], rough)
+    ]
     good = (found[0][:, kernels.OK] > 0) & (found[1][:, kernels.OK] > 0)
     if not good.any():
         return 0.0
