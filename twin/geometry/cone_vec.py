@@ -99,7 +99,20 @@ class ConeVec:
         v: npt.ArrayLike,
         shape: Shape2 | None = None,
     ) -> ConeVec:
-        """Build from four vectors, each (3,) or (n, 3) [mm], broadcast against each other.
+        """Build from four vectors, each (3,) or (n, 3) [mm], broadcast against each
+        other.
+
+        Args:
+            source, detector, u, v: focal spot, detector centre, steps to the next column
+                and row.
+            shape: detector (rows, cols), or None.
+
+        Returns:
+            n views.
+
+        Raises:
+            GeometryError: a row that is not finite or not of twelve numbers; vectors that
+                do not broadcast raise numpy's ValueError.
 
         Example:
             >>> c = ConeVec.from_vectors([[0, -9, 0], [9, 0, 0]], [0, 0, 0], [1, 0, 0], [0, 0, -1])
@@ -142,6 +155,9 @@ class ConeVec:
             tilts: roll, pitch and yaw of the detector [deg], right-handed: yaw about v,
                 then pitch about the turned u, then roll about the turned normal u x v.
             height: of focal spot and detector above the object frame's origin [mm].
+
+        Returns:
+            A view for each angle.
 
         Raises:
             GeometryError: names the number that no scanner has.
@@ -192,8 +208,12 @@ class ConeVec:
             height: of focal spot and detector half-way between the first and the last
                 view [mm].
 
+        Returns:
+            A view for each angle.
+
         Raises:
-            GeometryError: names the number that no scanner has.
+            GeometryError: names the number that no scanner has: 0 < sod <= sdd, pixels
+                and turns above 0, all finite, at least one angle.
 
         Example:
             >>> scan = ConeVec.helical(sod=600, sdd=1059, angles=[0, 360], rise=8, pixel=0.15)
@@ -204,8 +224,8 @@ class ConeVec:
             request = f"rise {rise:g} mm a turn, {turns:g} turns"
             allowed = "finite, more than 0 turns"
             raise GeometryError.instead(request, [rise, turns], allowed)
-        given = _stage_angles(angles, turns)
-        rises = rise * (given - (given[0] + given[-1]) / 2) / FULL_TURN_DEG
+        degrees = _stage_angles(angles, turns)
+        rises = rise * (degrees - (degrees[0] + degrees[-1]) / 2) / FULL_TURN_DEG
         pitch = _numbers("pixel", pixel, 2, "mm", repeated=True)
         columns, down = _numbers("offset", offset, 2, "mm")
         roll, tilt, yaw = (math.radians(a) for a in _numbers("tilts", tilts, 3, "deg"))
@@ -226,7 +246,7 @@ class ConeVec:
         source = np.array([0.0, -sod, height])
         centre = np.array([0.0, sdd - sod, height]) + columns * right + down * below
         u, v = turn_detector(right * pitch[0], below * pitch[1], yaw, tilt, roll)
-        turn = rotation_z(np.radians(given))
+        turn = rotation_z(np.radians(degrees))
         up = np.multiply.outer(rises, np.array(UP))
         parts = turn @ source + up, turn @ centre + up, turn @ u, turn @ v
         return cls(np.concatenate(parts, axis=1), shape)
@@ -270,6 +290,10 @@ class ConeVec:
     def from_tomosipo(cls, geometry: Any) -> ConeVec:
         """Convert tomosipo's cone geometry (`ts.cone`, `ts.cone_vec`), or the arguments
         of `ts.cone_vec` by name; its vectors are (z, y, x).
+
+        Args:
+            geometry: tomosipo's object, or a mapping with shape, src_pos, det_pos, det_v,
+                det_u.
 
         Raises:
             GeometryError: another geometry.
@@ -333,16 +357,16 @@ class ConeVec:
     def from_rtk(
         cls, file: File, *, pixel: float | Sequence[float], shape: Shape2 | None = None
     ) -> ConeVec:
-        """Read RTK's circular geometry from its XML file, which has neither pixel
+        """Read RTK's circular geometry from its XML file, which contains neither pixel
         size nor shape.
 
         Args:
             file: the path.
             pixel: pitch of the pixels [mm], or (along columns, along rows).
-            shape: detector (rows, cols).
+            shape: detector (rows, cols); None: unknown.
 
         Raises:
-            TwinError: the file does not hold.
+            TwinError: the file is invalid.
             OSError: it cannot be read.
 
         Example:
@@ -387,7 +411,8 @@ class ConeVec:
             file: the path; its ending determines the format unless `format` does: .json
                 (flexdt or CTSimU), .npy, .txt (ASTRA's vectors), .npz (tomosipo), .cil,
                 .tigre, .leap, .csv, .xml (RTK), .toml (flexDATA).
-            format: ctsimu, rtk, astra, tomosipo, cil, tigre, leap, flexdata or csv.
+            format: ctsimu, rtk, astra, tomosipo, cil, tigre, leap, flexdata or csv; None:
+                by the file's ending.
             shape: detector (rows, cols), if the file does not contain it.
             pixel: pitch of the pixels [mm], if the file does not contain it.
 
@@ -407,8 +432,12 @@ class ConeVec:
         return found
 
     def save(self, file: File, *, format: str | None = None) -> None:
-        """Write a file that `load` reads; its ending determines the format
-        unless `format` does.
+        """Write a file that `load` reads; its ending determines the format unless
+        `format` does.
+
+        Args:
+            file: the path.
+            format: as for `load`; None: by the file's ending.
 
         Raises:
             TwinError: the format cannot carry this geometry, or the ending is not known.
@@ -425,12 +454,11 @@ class ConeVec:
 
     @classmethod
     def concatenate(cls, parts: Sequence[ConeVec]) -> ConeVec:
-        """Stack several geometries, in order; the detector's shape is kept if all share it.
-
-        Else it is unknown (None).
+        """Stack several geometries, in order; the detector's shape is kept if all share
+        it, else unknown (None).
 
         Raises:
-            GeometryError: no geometry.
+            GeometryError: `parts` is empty.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -504,11 +532,12 @@ class ConeVec:
         return f"<table><caption>ConeVec</caption>{cells}</table>"
 
     def _facts(self) -> dict[str, str]:
-        """Format sizes and distances for printing, under the keys views, detector, source
-        to detector and source to origin.
+        """Format numbers of views, size and pitch of the detector, and distances for
+        printing, under the keys views, detector, source to detector, source to origin.
 
-        Values that differ between views are ranges; pitch as columns x rows if they
-        differ.
+        Distances are positive, in mm. Values that differ between views are ranges; the
+        pitch is columns x rows if those differ. Without a shape the detector has its
+        pitch only.
         """
         steps = [_span(np.linalg.norm(step, axis=1)) for step in (self.u, self.v)]
         if steps[0] == steps[1]:
@@ -545,7 +574,7 @@ class ConeVec:
     def from_dict(cls, document: Mapping[str, Any]) -> ConeVec:
         """Make a geometry from the document of `to_dict`.
 
-        A document without `detector_shape` gives None.
+        A document without `detector_shape` gives None. Other keys are ignored.
 
         Raises:
             GeometryError: the rows do not have twelve finite numbers each, or the shape
@@ -559,9 +588,9 @@ class ConeVec:
         try:
             rows = np.asarray(document["rows"], dtype=np.float64)
         except (KeyError, TypeError, ValueError) as error:
-            what = f"a geometry's document has rows of twelve numbers: {error!r}"
+            message = f"a geometry's document has rows of twelve numbers: {error!r}"
             raise GeometryError(
-                what, {"asked": repr(document)[:100], "allowed": "rows"}
+                message, {"asked": repr(document)[:100], "allowed": "rows"}
             ) from None
         return cls(rows, document.get("detector_shape"))
 
@@ -575,9 +604,9 @@ class ConeVec:
         return len(self), *self.of_shape()
 
     def of_shape(self, shape: Shape2 | None = None) -> Shape2:
-        """Return the detector's (rows, cols): those given, or the geometry's own.
+        """Return the detector's (rows, cols): those given, or else the geometry's own.
 
-        A given shape must be positive.
+        A given shape must be positive, and equal the geometry's own if that is known.
 
         Args:
             shape: (rows, cols); None: those of the geometry.
@@ -600,14 +629,14 @@ class ConeVec:
                 "columns)",
                 {"asked": list(given), "allowed": list(own)},
             )
-        found = own if given is None else given
-        if found is None:
+        known = own if given is None else given
+        if known is None:
             raise GeometryError(
                 "the detector's shape is not known; give shape=(rows, columns), or a geometry "
                 "that carries it: geometry.with_shape((rows, columns))",
                 {"asked": None, "allowed": ["rows", "cols"]},
             )
-        return found
+        return known
 
     def with_shape(self, shape: Shape2 | None) -> ConeVec:
         """Replace the detector's (rows, cols) about the same centre, or remove it.
@@ -694,7 +723,7 @@ class ConeVec:
         The ray to pixel (row, column) is the second of these + column * u + row * v.
 
         Args:
-            shape: detector (rows, cols); default: the geometry's own.
+            shape: detector (rows, cols), if the geometry has none; see `of_shape`.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -716,20 +745,19 @@ class ConeVec:
         """Project points through the focal spot onto the detector.
 
         Points behind the source are projected through it, too; pixels outside the
-        detector are returned.
+        detector are returned. Pixels may be skew.
 
         Args:
-            points: (k, 3) [mm], object frame.
-            shape: detector (rows, cols); default: the geometry's own.
+            points: (k, 3), or one (3,) [mm], object frame.
+            shape: detector (rows, cols), if the geometry has none; see `of_shape`.
 
         Returns:
             (n, k, 2) pixel coordinates (column, row); pixel centres are integers. A point
-            in the
-            plane of the source parallel to the detector gives inf or nan: it has no
-            projection.
+            in the plane of the source parallel to the detector gives inf or nan: it has
+            no projection.
 
         Raises:
-            GeometryError: points of another shape.
+            GeometryError: points of another shape, or the detector's shape is not known.
 
         Example:
             >>> cone = ConeVec.from_vectors([0, -500, 0], [0, 500, 0], [0.5, 0, 0], [0, 0, -0.5])
@@ -759,10 +787,13 @@ class ConeVec:
         return np.stack([column, row], axis=-1)
 
     def piercing_points(self, shape: Shape2 | None = None) -> FloatArray:
-        """Compute the foot of the perpendicular from the focal spot, (n, 2)
-        pixels (column, row).
+        """Compute the foot of the perpendicular from the focal spot on each detector
+        plane, (n, 2) pixels (column, row).
 
         It may be outside the detector; pixel centres are whole numbers.
+
+        Args:
+            shape: detector (rows, cols), if the geometry has none; see `of_shape`.
 
         Raises:
             GeometryError: the detector's shape is not known.
@@ -781,9 +812,14 @@ class ConeVec:
         )
 
     def pixel_centers(self, shape: Shape2 | None = None) -> FloatArray:
-        """Compute the positions of all pixel centres, (n, rows, cols, 3) [mm].
+        """Compute the positions of all pixel centres in the object frame, (n, rows, cols,
+        3) [mm].
 
-        In the object frame; the detector's shape must be known.
+        Args:
+            shape: detector (rows, cols), if the geometry has none; see `of_shape`.
+
+        Raises:
+            GeometryError: the detector's shape is not known.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -800,11 +836,14 @@ class ConeVec:
         )
 
     def moved(self, rotation: npt.ArrayLike, translation: npt.ArrayLike) -> ConeVec:
-        """Transform to another frame: points p become R p + t, steps u, v become R u, R v.
+        """Transform to another frame: points p become R p + t, steps u, v become R u, R
+        v.
+
+        The detector's shape is kept. Whether R is a rotation is not checked.
 
         Args:
-            rotation: (3, 3) or (n, 3, 3).
-            translation: (3,) or (n, 3) [mm].
+            rotation: R, (3, 3) or one a view (n, 3, 3).
+            translation: t, (3,) or (n, 3) [mm].
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -821,17 +860,20 @@ class ConeVec:
         return ConeVec(rows, self.detector_shape)
 
     def binned(self, factor: int, shape: Shape2 | None = None) -> ConeVec:
-        """Bin the image by `factor`; columns and rows beyond a multiple of it are cut off.
+        """Bin the image by `factor`; columns and rows beyond a multiple of it are cut
+        off.
 
-        The centre moves with what is cut off. The result has a detector shape only if
-        this one has.
+        The centre moves with the pixels that are cut off. The result has a detector shape
+        only if this one has.
 
         Args:
             factor: pixels per coarse pixel along each side.
-            shape: (rows, cols) of the fine image.
+            shape: (rows, cols) of the fine image, if the geometry has none; see
+                `of_shape`.
 
         Raises:
-            GeometryError: a factor that leaves no pixel, or is no whole number.
+            GeometryError: a factor that is no whole number from 1 to the smaller side, or
+                the detector's shape is not known.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -840,9 +882,9 @@ class ConeVec:
         """
         rows, cols = self.of_shape(shape)
         if factor not in range(1, min(rows, cols) + 1):
-            what = f"binning by {factor!r}; allowed: a whole number from 1 to {min(rows, cols)}"
+            message = f"binning by {factor!r}; allowed: a whole number from 1 to {min(rows, cols)}"
             raise GeometryError(
-                what, {"asked": repr(factor), "allowed": [1, min(rows, cols)]}
+                message, {"asked": repr(factor), "allowed": [1, min(rows, cols)]}
             )
         shift_u = (cols // factor * factor - cols) / 2
         shift_v = (rows // factor * factor - rows) / 2
@@ -856,42 +898,46 @@ class ConeVec:
 
 
 def check_shape(shape: Shape2) -> Shape2:
-    """Return (rows, cols) as ints; raise GeometryError unless both are positive.
+    """Return (rows, cols) as ints after checking that both are positive.
 
-    Numbers that are not whole raise TypeError.
+    Raises:
+        GeometryError: one is 0 or less.
+        TypeError: one is no whole number.
+        ValueError: not two of them.
     """
     rows, cols = map(operator.index, shape)
     if rows <= 0 or cols <= 0:
-        what = f"detector shape {shape!r}; allowed: (rows, cols), both positive"
-        raise GeometryError(what, {"asked": repr(shape), "allowed": ["rows", "cols"]})
+        message = f"detector shape {shape!r}; allowed: (rows, cols), both positive"
+        raise GeometryError(message, {"asked": repr(shape), "allowed": ["rows", "cols"]})
     return rows, cols
 
 
 def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray:
-    """Return stage angles (n,) [deg]: given ones, or a number of them from 0 on, even
-    over full turns.
+    """Return stage angles (n,) [deg]: those given, or a number of them from 0 on, evenly
+    spread over `turns`.
 
-    Given angles are returned as float64, not wrapped.
+    Given angles are returned as float64, not wrapped; `turns` does not change them.
 
     Args:
         angles: a number of views, or angles (n,) [deg].
         turns: over which a number of views is spread; the end is not a view.
 
     Raises:
-        GeometryError: no views, or an angle that is not finite.
+        GeometryError: no views, an array of more dimensions, or an angle that is not
+            finite.
     """
-    found: FloatArray = np.asarray(angles, dtype=np.float64)
+    degrees: FloatArray = np.asarray(angles, dtype=np.float64)
     if isinstance(angles, int | np.integer):
-        found = np.linspace(
+        degrees = np.linspace(
             0.0, FULL_TURN_DEG * turns, max(int(angles), 0), endpoint=False
         )
-    if found.ndim != 1 or len(found) == 0 or not np.isfinite(found).all():
-        shown = angles if np.ndim(angles) == 0 else f"an array of shape {found.shape}"
-        what = f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]"
+    if degrees.ndim != 1 or len(degrees) == 0 or not np.isfinite(degrees).all():
+        shown = angles if np.ndim(angles) == 0 else f"an array of shape {degrees.shape}"
+        message = f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]"
         raise GeometryError(
-            what, {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"}
+            message, {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"}
         )
-    return found
+    return degrees
 
 
 def _numbers(
@@ -902,9 +948,9 @@ def _numbers(
     Args:
         name: of the argument, for the message.
         value: one number or several.
-        count: how many.
+        count: number of them.
         unit: for the message.
-        repeated: whether one number is repeated.
+        repeated: whether one number is repeated `count` times.
 
     Raises:
         GeometryError: another number of them, or one that is not finite.
@@ -916,8 +962,8 @@ def _numbers(
         wanted = "one finite number"
         if count != 1:
             wanted = f"{count} finite numbers"
-        what = f"{name} is {value!r}; allowed: {wanted} [{unit}]"
-        raise GeometryError(what, {"asked": repr(value)[:100], "allowed": wanted})
+        message = f"{name} is {value!r}; allowed: {wanted} [{unit}]"
+        raise GeometryError(message, {"asked": repr(value)[:100], "allowed": wanted})
     return tuple(array.tolist())
 
 
@@ -934,9 +980,11 @@ def _span(values: FloatArray) -> str:
 
 
 def check_spread(cone_vec: ConeVec) -> ConeVec:
-    """Check that each pixel of each view has a ray of its own; returns its argument.
+    """Check that each pixel of each view has a ray of its own: u and v span a plane, and
+    the source is outside it; return the argument.
 
-    Parallel, and in the plane, is within a sine of `MIN_SINE`.
+    Directions count as parallel, and the source as in the plane, up to a sine of
+    `MIN_SINE`.
 
     Args:
         cone_vec: n views.
@@ -975,15 +1023,17 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
     """Check the sanity rules of thesis 4.8.3 (pitch, orthogonal sides, SDD above 0);
     return the argument, so it can guard an expression.
 
-    In that order; pitch and cosine within `PITCH_TOLERANCE`.
+    In that order, within `PITCH_TOLERANCE`: lengths of u and v relative to the pitch, and
+    the cosine between them.
 
     Args:
         cone_vec: the geometry to check.
-        pixel_mm: the binned pixel pitch that |u| and |v| must have [mm], or one for each.
+        pixel_mm: the binned pixel pitch that |u| and |v| must have [mm], or a tuple of
+            one for each.
 
     Raises:
-        GeometryError: names the first offending row, the check, the value and the allowed
-            one.
+        GeometryError: names the check, a row, its value and the allowed one: the first
+            wrong row for the pitch, the worst one for the other two.
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)

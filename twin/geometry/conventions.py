@@ -57,10 +57,16 @@ def as_numbers(
 ) -> npt.NDArray[Any]:
     """Convert to an array of real numbers.
 
-    Array-likes of that type are returned without a copy; finiteness is not checked.
+    An array of that type is returned itself, without a copy; finiteness and shape are not
+    checked.
+
+    Args:
+        what: name of the value, for the message.
+        value: to convert.
+        dtype: of the result.
 
     Raises:
-        GeometryError: it holds something else.
+        GeometryError: `value` contains something that is no number.
 
     Example:
         >>> as_numbers("distances", [1, 2]).tolist()
@@ -102,9 +108,8 @@ def rotation_y(angle: float) -> FloatArray:
 
 
 def rotation_z(angle: float | FloatArray) -> FloatArray:
-    """Compute the right-handed rotation by `angle` [rad] about +z, shape (..., 3, 3).
-
-    One matrix for each angle.
+    """Compute right-handed rotations by `angle` [rad] about +z, one matrix for each
+    angle: (...) -> (..., 3, 3).
 
     Example:
         >>> (rotation_z(np.pi / 2) @ [1, 0, 0]).round(9).tolist()
@@ -123,10 +128,10 @@ def rotation_z(angle: float | FloatArray) -> FloatArray:
 
 
 def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
-    """Compute right-handed rotations (..., 3, 3) by `angle` [rad] about directions
-    (..., 3) (Rodrigues).
+    """Compute right-handed rotations (..., 3, 3) by `angle` [rad] about directions (...,
+    3) (Rodrigues).
 
-    Directions are normalised; one of length 0 gives NaN.
+    Directions are normalised; one of length 0 gives NaN. All are turned by the one angle.
 
     Example:
         >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))
@@ -167,7 +172,11 @@ def from_unity(vector: npt.ArrayLike) -> FloatArray:
 def turn_detector(
     u: npt.ArrayLike, v: npt.ArrayLike, yaw: float, pitch: float, roll: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Turn pixel steps by yaw about v, pitch about the turned u, roll about the turned normal.
+    """Turn pixel steps by yaw about v, pitch about the turned u, roll about the turned
+    normal.
+
+    In that order, for each pair of steps. The steps keep their lengths and the angle
+    between them.
 
     Args:
         u: steps to the next column, (..., 3) [mm].
@@ -176,13 +185,13 @@ def turn_detector(
         pitch: [rad].
         roll: [rad], about u x v.
 
+    Returns:
+        Turned u and v, (..., 3) [mm].
+
     Example:
         >>> u, v = turn_detector([1, 0, 0], [0, 0, -1], yaw=0.0, pitch=0.0, roll=np.pi / 2)
         >>> u.round(9).tolist()  # seen from the source, columns now grow downwards
         [0.0, 0.0, -1.0]
-
-    Returns:
-        Turned u and v, (..., 3) [mm].
     """
     u1, v1 = (np.asarray(step, dtype=np.float64)[..., None] for step in (u, v))
     u1 = rotation_about(v, yaw) @ u1

@@ -23,15 +23,18 @@ MOVABLE: Final = ("dO_x", "dO_y", "dO_z", "alpha", "dS_x", "dS_y", "dD_x", "dD_y
 
 
 def require_movable(names: Sequence[str]) -> Sequence[str]:
-    """Return the names if all are parameters that may differ from frame to frame.
+    """Return the names unchanged if all are parameters that may differ from frame to
+    frame (`MOVABLE`).
+
+    An empty sequence passes.
 
     Raises:
-        UnknownNameError: lists those that can.
+        UnknownNameError: names the first other one, and lists those allowed.
     """
     for name in names:
         if name not in MOVABLE:
-            what = f"{name!r} cannot differ from frame to frame; allowed"
-            raise UnknownNameError.among(what, name, MOVABLE)
+            message = f"{name!r} cannot differ from frame to frame; allowed"
+            raise UnknownNameError.among(message, name, MOVABLE)
     return names
 
 
@@ -53,8 +56,8 @@ class Motion:
     evidence: tuple[float, ...]
 
     def __repr__(self) -> str:
-        """Format as one line: number of frames, and the range (maximum less minimum) of each
-        offset.
+        """Format as one line: number of frames, and the range (maximum less minimum) of
+        each parameter in its edge unit (mm, deg).
         """
         sizes = ", ".join(
             f"{n} {to_edge(n, float(np.ptp(self.values[:, i]))):.3g} {UNITS[n]}"
@@ -63,8 +66,11 @@ class Motion:
         return f"<Motion: {len(self.values)} frames, {sizes}>"
 
     def near(self, other: Motion) -> bool:
-        """Return whether two estimates of one motion differ by less than a
-        hundredth of a sigma."""
+        """Return whether two estimates of one motion differ by at most a hundredth of
+        this one's sigma, in every value.
+
+        Where sigma is NaN the values must be equal.
+        """
         difference = np.abs(self.values - other.values)
         return bool((difference <= 0.01 * np.nan_to_num(self.sigma)).all())
 
@@ -72,12 +78,15 @@ class Motion:
         """Return poses with the deviations added to axis, angle, source and detector,
         `sign` times.
 
-        Deviations are added in the world frame [mm], to the angle in rad; other fields
-        stay.
+        Deviations are added in the world frame [mm], to the angle in rad; u, v and mount
+        stay. Parameters without deviations do not move.
 
         Args:
             poses: of as many frames; not changed.
             sign: -1 removes the deviations to first order.
+
+        Returns:
+            New poses, n.
 
         Raises:
             TwinError: another number of frames.
@@ -90,7 +99,12 @@ class Motion:
         )
 
         def shift(part: str) -> FloatArray:
-            """Return the shift of a part in the world frame, (n, 3) [mm]."""
+            """Return the deviation of a part in the world frame, (n, 3) [mm]; 0 along
+            directions without a parameter.
+
+            Args:
+                part: "dS", "dO" or "dD".
+            """
             z = d.get(f"{part}_z", np.zeros(len(poses)))
             return from_unity(np.stack([d[f"{part}_x"], d[f"{part}_y"], z], axis=1))
 
@@ -103,11 +117,10 @@ class Motion:
         )
 
     def to_dict(self) -> dict[str, dict[str, object]]:
-        """Convert to parameter -> {unit, values, sigmas, evidence, moves} in edge
-        units (mm, deg).
+        """Convert to parameter -> {unit, values, sigmas, evidence, moves}, values and
+        sigmas as lists in edge units (mm, deg).
 
-        A standard error that is not finite becomes None; `moves` is whether any value is
-        not 0.
+        A sigma that is not finite becomes None; `moves` is whether any value is not 0.
         """
         return {
             name: {
@@ -127,13 +140,16 @@ class Motion:
     def from_dict(cls, document: Mapping[str, Mapping[str, object]]) -> Motion:
         """Make a motion from the document of `to_dict`.
 
-        The unit in the document is not read; a null standard error becomes NaN.
+        Unit and `moves` are not read; a null sigma becomes NaN.
 
         Args:
-            document: parameter -> its values and standard errors [mm, deg].
+            document: parameter -> values, sigmas [mm, deg] and evidence.
 
         Raises:
-            TwinError: the document is not of that form; the message names the parameter.
+            TwinError: a missing key, values that are not finite numbers, one a frame; the
+                message names the parameter. Or numbers of frames that differ, or no
+                parameter.
+            UnknownNameError: a parameter that is not in `MOVABLE`.
         """
         columns = {}
         for name in require_movable(tuple(document)):

@@ -61,8 +61,8 @@ class Offsets:
         """
         for name in values:
             if name not in UNITS:
-                what = f"unknown parameter {name!r}; allowed"
-                raise UnknownNameError.among(what, name, NAMES)
+                message = f"unknown parameter {name!r}; allowed"
+                raise UnknownNameError.among(message, name, NAMES)
         return cls(**{name: to_internal(name, value) for name, value in values.items()})
 
     def to_edge(self) -> dict[str, float]:
@@ -104,12 +104,15 @@ NOMINAL: Final = Offsets()
 
 
 def require_plausible(parameters: Offsets, reach_mm: float) -> None:
-    """Check offsets for slips of a unit, a sign or a digit (limits assumed).
+    """Check that offsets are within the range of a real scanner, to find slips of a unit,
+    a sign or a digit (limits assumed).
 
-    The first is named; a value that is not a number is out of range.
+    Shifts are within `reach_mm`, tilts within `MAX_TILT_DEG`, angle_scale within
+    `ANGLE_SCALE_RANGE`, ends included; `alpha` may be any angle. The first outside is
+    named; NaN is outside.
 
     Args:
-        parameters: the offsets to check; `alpha` may be any angle.
+        parameters: the offsets to check.
         reach_mm: the longest travel, the largest plausible shift.
 
     Raises:
@@ -126,14 +129,17 @@ def require_plausible(parameters: Offsets, reach_mm: float) -> None:
             unit = ""
             if UNITS[name] != "1":
                 unit = f" {UNITS[name]}"
-            what = f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}"
+            message = f"{name} {value:g}{unit}; allowed: {low:g} to {high:g}"
             raise GeometryError(
-                what, {"check": name, "asked": value, "allowed": [low, high]}
+                message, {"check": name, "asked": value, "allowed": [low, high]}
             )
 
 
 def to_internal(name: str, value: float) -> float:
-    """Convert one offset from its edge unit to mm or rad.
+    """Convert one offset from its edge unit to the internal one: degrees to rad, others
+    unchanged.
+
+    KeyError for a name that is not in `NAMES`.
 
     Example:
         >>> round(to_internal("det_roll", 180.0), 6), to_internal("dS_x", 2.0)
@@ -145,7 +151,10 @@ def to_internal(name: str, value: float) -> float:
 
 
 def to_edge(name: str, value: float) -> float:
-    """Convert one offset from mm or rad to its edge unit.
+    """Convert one offset from its internal unit to that of the edge: rad to degrees,
+    others unchanged.
+
+    KeyError for a name that is not in `NAMES`.
 
     Example:
         >>> round(to_edge("det_roll", to_internal("det_roll", 0.5)), 9)

@@ -62,9 +62,10 @@ class PanelModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coefficients, in order: affine terms, bending terms, then panel gaps.
+        """Names of the m coefficients, in order: affine terms, the column's terms of
+        bending, the row's, then two for each tile border.
 
-        A term of bending or gap has one coefficient for the column and one for the row.
+        For instance column_x2y0, row_from_column_768.
         """
         bent = [f"{way}_x{i}y{j}" for way in ("column", "row") for i, j in TERM_POWERS]
         gaps = [
@@ -76,8 +77,8 @@ class PanelModel:
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations of the coefficients' priors, (m,) [px]; the priors' means are
-        zero.
+        """Standard deviations of the coefficients' priors, (m,) [px], in the order of
+        `names`; the priors' means are zero.
 
         `width_px` for affine and bending terms, `GAP_SIGMA_PX` for gaps between tiles.
         """
@@ -89,7 +90,7 @@ class PanelModel:
     def terms(self, places: FloatArray) -> FloatArray:
         """Compute the shifts [px] that each coefficient of 1 causes at places.
 
-        Places are scaled by half the longer side about the middle; beyond a border its
+        Places are scaled by half the longer side about the middle; from a border on its
         gap shifts by 1.
 
         Args:
@@ -129,20 +130,24 @@ class Panel:
 
     @classmethod
     def flat(cls, shape: tuple[int, int]) -> Panel:
-        """Make a panel without distortion, lag and tile borders, for images (rows, cols)."""
+        """Make a panel without distortion, lag and tile borders, for images of `shape`
+        (rows, cols).
+        """
         model = PanelModel(0.0, shape)
         return cls(model, (0.0,) * len(model.names))
 
     def shift(self, places: FloatArray) -> FloatArray:
-        """Compute measured minus undistorted places [px], (..., 2), at measured places."""
+        """Compute measured minus undistorted places [px], at measured places (..., 2):
+        column and row.
+        """
         if places.ndim > 2:  # row by row: the terms of a whole image take 200 MB
             return np.stack([self.shift(row) for row in places])
         return np.asarray(self.model.terms(places) @ np.array(self.coefficients))
 
     @cached_property
     def _map(self) -> tuple[Float32Array, Float32Array]:
-        """Columns and rows of the panel, (rows, cols) both, to which
-        undistorted pixels belong.
+        """Columns and rows of the distorted image, float32 (rows, cols) both, at which
+        the pixels of an undistorted one are measured; computed once.
 
         Inverted by four fixed-point steps; a pixel in a gap between tiles is interpolated
         between the lines beside it.
@@ -168,10 +173,18 @@ class Panel:
         return out[..., 0].astype(np.float32), out[..., 1].astype(np.float32)
 
     def without_lag(self, image: Float32Array, before: Float32Array) -> Float32Array:
-        """Subtract from line integrals (rows, cols) the light of the frame `before`, as
-        that shows it itself: of a lag of 5 % some 0.2 % remain.
+        """Subtract from an image's line integrals the light of the frame `before` that it
+        still shows.
 
-        At least `MIN_LIGHT_SHARE` of the light that is shown stays.
+        The earlier frame counts as it was measured, with its own lag: of a lag of 5 %
+        some 0.2 % remain. At least `MIN_LIGHT_SHARE` of each pixel's light stays.
+
+        Args:
+            image: line integrals, (rows, cols).
+            before: line integrals of the frame before, as measured.
+
+        Returns:
+            New line integrals, float32 (rows, cols).
         """
         share = self.lag / (1.0 - self.lag)
         shown = np.exp(-image)
@@ -183,7 +196,8 @@ class Panel:
     def undistorted(self, image: Float32Array) -> Float32Array:
         """Resample an image as a panel without distortion would have taken it.
 
-        By Lanczos interpolation; beyond the edge the edge's values go on.
+        By Lanczos interpolation; places beyond the image get the value at its edge. The
+        lag is not removed.
 
         Args:
             image: (rows, cols).
@@ -234,12 +248,15 @@ class Panel:
         """Make a panel from a document.
 
         Lag is 0 if absent; the width of the priors is not in the document and becomes 0.
+        `model` is not read.
 
         Args:
-            document: shape, borders, coefficients and lag.
+            document: shape, borders, coefficients by name and perhaps lag, as `to_json`
+                has them.
 
         Raises:
-            TwinError: it is not one of `to_json`.
+            TwinError: a key is missing or its value is not of that form; a lag outside 0
+                to `MAX_LAG` (excluded).
         """
         try:
             rows, cols = (int(n) for n in document["shape"])
@@ -248,11 +265,13 @@ class Panel:
                 for b in document["borders"]
             )
             model = PanelModel(0.0, (rows, cols), borders)
-            found = document["coefficients"]
+            coefficients = document["coefficients"]
             lag = float(document.get("lag", 0.0))
             if not 0.0 <= lag < MAX_LAG:
                 raise ValueError(f"lag {lag:g}; allowed: 0 to {MAX_LAG:g}")
-            return cls(model, tuple(float(found[name]) for name in model.names), lag)
+            return cls(
+                model, tuple(float(coefficients[name]) for name in model.names), lag
+            )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise TwinError(
                 f"the panel's distortion cannot be read ({error}); allowed: the panel of a "

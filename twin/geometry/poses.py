@@ -54,10 +54,11 @@ class Poses:
     mount: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        """Broadcast each field to the number of angles, (n,) or (n, 3), as read-only float64
-        copies.
+        """Broadcast each field to the number of angles, (n,) or (n, 3), as read-only
+        float64 copies.
 
-        Shapes that do not broadcast raise numpy's ValueError; values are not checked.
+        One value or row stands for all frames. Shapes that do not broadcast raise numpy's
+        ValueError; values are not checked.
         """
         n = np.size(self.angle)
         for f in fields(self):
@@ -98,7 +99,9 @@ class Poses:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Poses]) -> Poses:
-        """Stack several sets of poses, in order."""
+        """Stack several sets of poses, in order; at least one (numpy's ValueError
+        otherwise).
+        """
         return cls(
             *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls))
         )
@@ -112,7 +115,8 @@ class Poses:
         pixel: float,
         angle: npt.ArrayLike,
     ) -> Poses:
-        """Make poses with an upright detector of square pixels.
+        """Make poses with an upright detector of square pixels, and no shift of a stage
+        on the turntable.
 
         Args:
             source, axis, detector: as the attributes, (3,) or (n, 3) [mm].
@@ -136,17 +140,19 @@ class Poses:
         frame order (no step is larger than half a turn), so an object at rest in the
         world stays at rest here and correction parameters keep their meaning. A panel
         turned by det_yaw is taken for a turn of the sample, which only shifts alpha. The
-        axis is the object frame's z.
+        axis is the object frame's z and passes through the world's origin. The detector's
+        shape is lost.
 
         Raises:
-            GeometryError: u has no horizontal part in some view; names the first.
+            GeometryError: u is vertical in some view (horizontal part below 1e-6 of it);
+                names the first.
         """
         u = cone_vec.u
         standing = np.hypot(u[:, 0], u[:, 1]) < 1e-6 * np.linalg.norm(u, axis=1)
         if standing.any():
             i = int(np.argmax(standing))
-            what = f"cone_vec row {i}: u is vertical, so the stage angle cannot be read from it"
-            raise GeometryError(what, {"row": i})
+            message = f"cone_vec row {i}: u is vertical, so the stage angle cannot be read from it"
+            raise GeometryError(message, {"row": i})
         # stage_rotation(phi)^-1 turns +x to (cos phi, sin phi).
         angle = np.unwrap(np.arctan2(u[:, 1], u[:, 0]))
         world = cone_vec.moved(stage_rotation(angle), np.zeros(3))
@@ -196,8 +202,8 @@ class Poses:
         return world.moved(t_object_world, tau - self.mount)
 
     def _turned_detector(self, p: Offsets) -> tuple[FloatArray, FloatArray]:
-        """Turn the pixel steps u and v by the detector's yaw, pitch and roll; unchanged if
-        all are 0.
+        """Turn the pixel steps u and v by the detector's yaw, pitch and roll offsets
+        [rad]: `turn_detector`; unchanged if all are 0.
         """
         if p.det_yaw == 0.0 and p.det_pitch == 0.0 and p.det_roll == 0.0:
             return self.u, self.v

@@ -56,8 +56,8 @@ class Rigid:
 
         Raises:
             GeometryError: shapes other than (3, 3) and (3,), a shift that is not finite,
-                or a `turn` that is not orthogonal within `ORTHOGONAL_TOLERANCE` or
-                mirrors.
+                or a `turn` that mirrors or is not orthogonal within
+                `ORTHOGONAL_TOLERANCE`.
         """
         turn, shift = (
             np.array(part, dtype=np.float64) for part in (self.turn, self.shift)
@@ -99,17 +99,17 @@ class Rigid:
         angle_deg: float,
         about: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> Rigid:
-        """Make a right-handed turn.
+        """Make a right-handed turn about an axis through a point.
 
-        A direction is normalised; one of length 0 raises, too.
+        A direction is normalised.
 
         Args:
             axis: "x", "y", "z", or a direction (3,).
             angle_deg: [deg].
-            about: a point of the axis, (3,) [mm].
+            about: a point on the axis, (3,) [mm]; it stays where it is.
 
         Raises:
-            GeometryError: an unknown axis.
+            GeometryError: an unknown name of an axis, or a direction of length 0.
 
         Example:
             >>> (Rigid.rotate("z", 90, about=(1, 0, 0)) @ [0.0, 0.0, 0.0]).round(9).tolist()
@@ -117,8 +117,8 @@ class Rigid:
         """
         if isinstance(axis, str):
             if axis not in AXES:
-                what = f"axis {axis!r}; allowed: x, y, z or a direction (3,)"
-                raise GeometryError(what, {"asked": axis, "allowed": list(AXES)})
+                message = f"axis {axis!r}; allowed: x, y, z or a direction (3,)"
+                raise GeometryError(message, {"asked": axis, "allowed": list(AXES)})
             axis = AXES[axis]
         turn = rotation_about(axis, math.radians(angle_deg))
         point = np.asarray(about, dtype=np.float64)
@@ -136,10 +136,14 @@ class Rigid:
     @overload
     def __matmul__(self, other: npt.ArrayLike) -> FloatArray: ...
     def __matmul__(self, other: Any) -> Any:
-        """Apply this motion to another one, to a geometry, or to points (..., 3) [mm].
+        """Apply this motion after another one, to a geometry, or to points (..., 3) [mm].
+
+        Returns:
+            A `Rigid` for a `Rigid`, a `ConeVec` for a `ConeVec`, else the points (..., 3)
+            [mm], moved.
 
         Raises:
-            GeometryError: points of another shape.
+            GeometryError: points whose last dimension is not 3.
         """
         if isinstance(other, Rigid):
             return Rigid(self.turn @ other.turn, self.turn @ other.shift + self.shift)

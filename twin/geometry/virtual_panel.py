@@ -18,17 +18,18 @@ MOVED_BEHIND: Final = 1.001
 
 
 def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
-    """Compute the factor on each panel's distance from the source that puts it
-    behind an object.
+    """Compute the factor on each panel's distance from the source that puts it behind an
+    object, and 1 where it is behind already.
 
-    A moved panel is `MOVED_BEHIND` times as far as the farthest point; 1 without points.
+    A moved panel is `MOVED_BEHIND` times as far as the farthest point; without points all
+    factors are 1.
 
     Args:
         cone_vec: n views.
         points: (k, 3) whose convex hull holds the object [mm].
 
     Returns:
-        (n,), 1 where the panel is behind the object already.
+        (n,), each at least 1.
     """
     if not len(points) or not len(cone_vec):
         return np.ones(len(cone_vec))
@@ -41,14 +42,15 @@ def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
 
 
 def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
-    """Move the panels that cut an object behind it, and enlarge their pixels: the same rays.
+    """Move the panels that cut an object or are before it behind it, and enlarge their
+    pixels: the same rays.
 
     Args:
         cone_vec: n views.
         points: (k, 3) whose convex hull holds the object [mm].
 
     Returns:
-        The geometry; the argument itself where no panel cuts.
+        A new geometry; the argument itself where no panel cuts.
 
     Example:
         >>> scan = ConeVec.circular(sod=100, sdd=100, angles=4, pixel=0.5)
@@ -60,10 +62,15 @@ def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
 
 
 def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
-    """Move panels to `times` (n,) their distance from the source, with
-    pixels enlarged alike.
+    """Move panels to `times` their distance from the source, with pixels enlarged alike,
+    so that the images stay the same.
 
-    Unchanged, the same object, if all are 1; the image stays the same.
+    Args:
+        cone_vec: n views.
+        times: (n,), factors; 1 leaves a view as it is.
+
+    Returns:
+        A new geometry; the argument itself if all are 1.
     """
     moved = times != 1.0
     if not moved.any():
@@ -74,10 +81,13 @@ def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
 
 
 def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
-    """Stretch rows (n, 12), or changes of them, to panels `times` (n,) as far
-    from the source.
+    """Stretch rows (n, 12), or changes of such rows, to panels `times` (n,) as far from
+    the source, with pixels enlarged alike.
 
-    The source's three stay; the input is not changed.
+    The source's three numbers stay; the input is not changed.
+
+    Returns:
+        New rows, (n, 12).
     """
     out = rows.copy()
     many = times[:, None]
@@ -87,11 +97,18 @@ def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
 
 
 def relaxed_gradient(gradient: FloatArray, times: FloatArray) -> FloatArray:
-    """Convert derivatives (n, 12) by the rows of `stretched_steps` to those by
-    the original rows.
+    """Convert derivatives by the rows of `stretched_steps` to derivatives by the original
+    rows (chain rule).
 
-    Of detector and pixels they are times the stretch; the source's has a share of the
-    detector's.
+    Those by detector and pixels are multiplied by the stretch; those by the source get (1
+    - stretch) of the detector's.
+
+    Args:
+        gradient: (n, 12), by the stretched rows; not changed.
+        times: (n,), the factors of the stretch.
+
+    Returns:
+        (n, 12), by the rows before they were stretched.
     """
     out = gradient.copy()
     many = times[:, None]
