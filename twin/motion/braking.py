@@ -73,11 +73,12 @@ def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Tra
     Args:
         drives: every motor with all that it is to follow.
         now: from when on [s].
-        most: motor -> greatest acceleration, not below the one in force [mm/s2, deg/s2].
+        most: motor -> greatest acceleration [mm/s2, deg/s2], of every motor; the motion
+            in force may have more. None: that of the motion in force.
 
     Returns:
-        Motor -> trajectory, of those that had anything left to do. Positions stray from
-        the path by at most `PATH_TOLERANCE`.
+        Motor -> trajectory from `now` on, of those that had anything left to do.
+        Positions stray from the path by at most `PATH_TOLERANCE`.
     """
     due = {name: drive for name, drive in drives.items() if drive.end > now}
     cells = _cells(due, now, most)
@@ -87,10 +88,11 @@ def braked_along(drives: Drives, now: float, most: Most = None) -> dict[str, Tra
 def braked_apart(
     machine: Machine, drives: Drives, now: float, most: Most = None
 ) -> dict[str, Trajectory]:
-    """Stop every motor as soon as it can; motors of one virtual axis stay in step.
+    """Stop every motor as soon as it can; motors of one virtual axis that move in step
+    stay so, and brake as long as the slowest of them.
 
-    Those that stand end where they are. A stop within rounding of the present target ends
-    exactly there.
+    A motor with motions left that stands now ends where it is. A stop within
+    `POSITION_ROUNDING` of the present target ends exactly there.
 
     Args:
         machine: defines which motors belong together.
@@ -133,18 +135,21 @@ def braked_apart(
 def coasting(
     machine: Machine, drives: Drives, now: float, decelerations: Mapping[str, float]
 ) -> dict[str, Trajectory]:
-    """Compute motion without power: each motor slows by friction, or ends at its hard stop.
+    """Compute motion without power: each motor slows by friction, or ends at its hard
+    stop.
 
-    At a hard stop the motor rests at once, at the limit.
+    At a hard stop, the limit of its travel, the motor rests at once.
 
     Args:
         machine: travel limits.
         drives: every motor with all that it is to follow.
         now: when power is cut [s].
-        decelerations: motor -> by how much it slows [mm/s2, deg/s2].
+        decelerations: motor -> by how much it slows, of each that is under way [mm/s2,
+            deg/s2].
 
     Returns:
-        Motor -> trajectory, of those that are under way.
+        Motor -> trajectory from `now` on, of those that have anything left to do; one
+        that stands now rests where it is.
     """
     out = {}
     for name, drive in drives.items():
@@ -168,9 +173,16 @@ def coasting(
 
 
 def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
-    """Compute the programme time [s] at which a stop along the path, begun at `at`, ends.
+    """Compute the programme time [s] to which a stop along the path, begun at `at`,
+    advances.
 
-    Returns `at` if nothing moves then or later.
+    It is before the end of the programme that is left. Returns `at` if nothing moves
+    then.
+
+    Args:
+        drives: every motor with all that it is to follow.
+        at: start of braking [s].
+        most: as for `braked_along`.
     """
     due = {name: drive for name, drive in drives.items() if drive.end > at}
     cells = _cells(due, at, most)
@@ -182,15 +194,20 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
 def braked_at(
     drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
 ) -> dict[str, Drive]:
-    """Return `drives` that follow `trajectories` and brake along their path from `at` on.
+    """Return `drives` that follow `trajectories` up to `at` and brake along their common
+    path from then on.
 
-    Drives that have nothing to do at `at` are not braked.
+    Drives that have nothing left to do at `at` are not braked.
 
     Args:
         drives: motors; not changed.
         at: start of braking [s].
-        trajectories: motor -> trajectory.
-        most: motor -> greatest acceleration; None: as planned.
+        trajectories: motor -> trajectory, which replaces all that this motor was to
+            follow.
+        most: as for `braked_along`.
+
+    Returns:
+        Motor -> drive, of all motors.
     """
     following = {**drives, **{n: drives[n].following(t) for n, t in trajectories.items()}}
     braked = braked_along(following, at, most)
@@ -203,7 +220,16 @@ def braked_at(
 
 
 def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[str]]:
-    """Yield the motors of each virtual axis that move in step now, within `STEP_TOLERANCE`."""
+    """Yield, for each virtual axis whose motors move in step now, the names of its
+    motors.
+
+    In step: their velocities divided by their shares agree within `STEP_TOLERANCE` of the
+    fastest, and are not all 0.
+
+    Args:
+        machine: with the virtual axes.
+        velocity: motor -> velocity [mm/s, deg/s]; 0 for those left out.
+    """
     for virtual in machine.virtual_axes.values():
         rates = [velocity.get(name, 0.0) / share for name, share in virtual.moves.items()]
         fastest = max(map(abs, rates))
@@ -212,10 +238,10 @@ def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[s
 
 
 def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
-    """Return the acceleration that a motor may brake with while it follows
+    """Return the acceleration that a motor may brake with at `time` while it follows
     `leg` [mm/s2, deg/s2].
 
-    The planned one, or that of `most` if greater.
+    It is the largest that `leg` has from then on, or that of `most` if greater.
     """
     planned = leg.acceleration(time)
     if most is None:
@@ -224,18 +250,23 @@ def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
 
 
 def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
-    """Compute the law of programme time that brings all motors to rest soonest, within limits.
+    """Compute the law of programme time that brings all motors to rest soonest, within
+    their accelerations.
 
-    No cells if nothing moves noticeably. Constant slowing in each; where a motor
-    accelerates it is an approximation, in short cells.
+    It begins with the programme time `now` at rate 1, and has constant slowing in each
+    cell. A cell ends where a motor's acceleration changes. Where a motor accelerates,
+    constant slowing is an approximation, in cells so short that it strays by at most
+    `PATH_TOLERANCE`. No more cells follow once all are slower than `VELOCITY_ROUNDING`;
+    none at all if nothing moves.
 
     Args:
-        drives: motors that are under way.
+        drives: motors with something left to do.
         now: start of braking [s].
-        most: accelerations that braking may use.
+        most: as for `braked_along`.
 
     Returns:
-        Cells that join up, until the rate is zero.
+        Cells that join up in real and programme time, until the rate is zero or all
+        stand.
     """
     cells: list[_Cell] = []
     s = now
@@ -289,17 +320,18 @@ class _State:
     until: float
 
     def slowing(self, rate: float, ahead: float) -> float:
-        """Compute by how much programme time may slow without exceeding the motor's
-        acceleration.
+        """Compute by how much programme time may slow, at a constant rate, without
+        exceeding the acceleration that the motor may use.
 
-        It may speed up or brake by itself meanwhile.
+        The acceleration that the motor has by itself counts: braking leaves less for the
+        slowing, speeding up more; 0 if braking leaves nothing.
 
         Args:
-            rate: of programme time, programme seconds a second.
+            rate: of programme time at the start, programme seconds a second.
             ahead: programme seconds over which the slowing is constant.
 
         Returns:
-            The greatest slowing [1/s]; inf for a motor at rest.
+            The greatest slowing [1/s]; inf for a motor without velocity now and `ahead`.
         """
         speed = abs(self.velocity)
         a = abs(self.acceleration)
@@ -317,10 +349,14 @@ class _State:
 
 
 def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
-    """Evaluate a motor at programme time `s`: velocity, acceleration, limit of its acceleration.
+    """Evaluate a motor at programme time `s`: velocity, acceleration, the acceleration
+    that it may use, and until when that holds.
 
-    It also has until when that law holds: the end of the piece or the next trajectory's
-    start.
+    It holds to the end of the piece, the moment at which the motor turns round, or the
+    start of the next trajectory.
+
+    Args:
+        most: as for `braked_along`.
     """
     leg = drive.at(s)
     velocity, acceleration, until = leg.law(s)
@@ -333,10 +369,12 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
 
 
 def _braked_trajectory(drive: Drive, cells: list[_Cell], now: float) -> Trajectory:
-    """Convert the cells to one motor's trajectory.
+    """Convert the cells to one motor's trajectory from `now` on.
 
-    At rest at once if it does not move; a target within `POSITION_ROUNDING` of the leg's
-    own is set to that.
+    A motor that does not move in the cells rests at once where it is. Within a cell of
+    constant slowing an accelerated motor has two pieces of constant acceleration, or one
+    if it is shorter than `MAX_SINGLE_PIECE_S`. An end within `POSITION_ROUNDING` of the
+    present trajectory's target is set to that.
 
     Args:
         drive: the motor's programme.

@@ -55,10 +55,11 @@ class Drive:
         return max(0, bisect_right(self._starts, now) - 1)
 
     def at(self, now: float) -> Trajectory:
-        """Return the trajectory in force at `now`, in the twin's time [s].
+        """Return the trajectory in force at `now`, in the twin's time [s]: the last that
+        has begun, or the first.
 
-        If the drive's programme has another origin, the trajectory is shifted; the last
-        one is kept.
+        If the programme has another origin the trajectory is shifted; the one shifted
+        last is cached.
         """
         index = self._index(now)
         if not self.origin:
@@ -76,8 +77,9 @@ class Drive:
         return {}
 
     def next_start(self, now: float) -> float:
-        """Return the start of the trajectory after the one in force [s]; inf if
-        there is none."""
+        """Return the start of the trajectory after the one in force at `now`, in the
+        twin's time [s]; inf if there is none.
+        """
         index = self._index(now) + 1
         if index < len(self._starts):
             return self._starts[index]
@@ -94,8 +96,10 @@ class Drive:
         return self.trajectories[-1].target
 
     def ahead(self, now: float) -> Trajectory:
-        """Join the trajectory in force at `now` and all later ones into one, in the twin's
-        time [s].
+        """Join the trajectory in force at `now` and all later ones into one, in the
+        twin's time [s].
+
+        One that has ended is among them if no later one has begun.
         """
         left = self.trajectories[self._index(now) :]
         if self.origin:
@@ -129,26 +133,29 @@ def plan_move(
     relative: bool = False,
     shortest: bool = False,
 ) -> dict[str, Trajectory]:
-    """Plan the motion of the motors that `targets` moves; all begin now.
+    """Plan the motions to `targets` of the motors that these move; all begin now, from
+    the present motion.
 
-    Motors of a virtual axis keep in step; acceleration is at least the present one.
-    `shortest` is ignored for relative targets.
+    Motors of a virtual axis get paces in proportion, so that from rest they keep in step;
+    acceleration is at least that of the motion in force. `shortest` is ignored for
+    relative targets.
 
     Args:
         machine: whose motors these are.
         drives: every motor.
-        targets: axis (motor or virtual) -> position [mm, deg].
+        targets: axis (motor or virtual) -> position, or displacement [mm, deg].
         now: time of the command [s].
         relative: targets are displacements from where the motors are bound for.
         shortest: rotations go the shorter way round to an equivalent angle (thesis
             4.5.2).
 
+    Returns:
+        Motor -> trajectory, of those that `targets` moves.
+
     Raises:
         UnknownNameError: no such axis.
-        LimitError: a target outside its travel, or two targets of one motor.
-
-    Returns:
-        Motor -> trajectory.
+        LimitError: a target outside its travel by more than the tolerance, or two targets
+            of one motor.
     """
     bound = {name: d.at(now).target for name, d in drives.items()}
     _refuse_double(machine, targets)
@@ -176,24 +183,27 @@ def plan_jog(
     lease_s: float,
     now: float,
 ) -> dict[str, Trajectory]:
-    """Plan a jog: run until the lease ends, brake; brake in time for a travel limit.
+    """Plan a jog: run until the lease ends, then brake; or go to a travel limit and stop
+    there, if that comes first.
 
     Motors of a virtual axis brake together, when the first must for its limit.
+    Acceleration is at least that of the motion in force.
 
     Args:
         machine: whose motors these are.
         drives: every motor.
         axis: motor or virtual axis.
         velocity: signed [mm/s, deg/s]; 0 brakes.
-        lease_s: how long it runs unless renewed [s].
+        lease_s: how long it runs unless renewed [s], above 0.
         now: time of the command [s].
+
+    Returns:
+        Motor -> trajectory, of the motors of `axis`.
 
     Raises:
         UnknownNameError: no such axis.
-        LimitError: faster than the motor allows, or not a finite number.
-
-    Returns:
-        Motor -> trajectory.
+        LimitError: a velocity above the motors' `max_speed` or not a finite number; a
+            lease that is not positive and finite.
     """
     moves = machine.moves(axis)
     if not (math.isfinite(lease_s) and lease_s > 0):
@@ -211,8 +221,8 @@ def plan_jog(
     def run(name: str, lease: float) -> Trajectory:
         """Plan a motor's share of a jog: it runs for `lease` [s], then brakes.
 
-        If it would end beyond a limit, it goes to that limit instead and stops there.
-        Braking is at least as strong as the current acceleration.
+        If it would end beyond a limit, it goes to that limit and stops there, whatever
+        the lease. Acceleration is at least that of the motion in force.
         """
         axis = machine.axes[name]
         current = drives[name].at(now)
@@ -247,7 +257,8 @@ def with_settings(
 ) -> dict[str, Drive]:
     """Change speed and acceleration of the motors of `axis` for motions to come.
 
-    Motion under way is not changed. The limits of an axis are those of its slowest motor.
+    Motion under way is not changed. A virtual axis is limited by the motor that reaches
+    its maximum first; its motors get their shares.
 
     Args:
         machine: whose motors these are.
@@ -257,11 +268,12 @@ def with_settings(
         acceleration: [mm/s2, deg/s2] of the axis; None keeps it.
 
     Returns:
-        All drives, changed ones replaced.
+        Motor -> drive, of all motors.
 
     Raises:
         UnknownNameError: no such axis.
-        LimitError: not within (0, maximum].
+        LimitError: not from `MIN_RATE` (of each motor) to the maximum; axis, setting,
+            value and range.
     """
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
@@ -300,22 +312,30 @@ def with_settings(
 
 
 def _refuse_double(machine: Machine, targets: Mapping[str, float]) -> None:
-    """Raise LimitError if two targets move the same motor (a motor and a virtual axis of it)."""
+    """Raise LimitError if two of `targets` move the same motor, such as a motor and a
+    virtual axis of it.
+
+    UnknownNameError for an axis that the machine does not have.
+    """
     seen: dict[str, str] = {}
     for name in targets:
         for motor in machine.moves(name):
             if motor in seen:
-                what = f"{motor} is asked to move twice: by {seen[motor]} and by {name}"
-                raise LimitError(what, {"axis": motor, "asked": [seen[motor], name]})
+                message = (
+                    f"{motor} is asked to move twice: by {seen[motor]} and by {name}"
+                )
+                raise LimitError(message, {"axis": motor, "asked": [seen[motor], name]})
             seen[motor] = name
 
 
 def _paces(
     machine: Machine, drives: Drives, targets: Mapping[str, float]
 ) -> dict[str, tuple[float, float]]:
-    """Compute motor -> (speed, acceleration) for the axes of `targets`.
+    """Compute motor -> (speed, acceleration) for the motors of the axes of `targets`,
+    from the drives' settings [mm/s, deg/s; per s2].
 
-    Motors of a virtual axis run in step: its slowest motor determines all.
+    Motors of a virtual axis run in step: the least speed and the least acceleration per
+    share determine all. Values of `targets` are not used.
     """
     out: dict[str, tuple[float, float]] = {}
     for name in targets:
@@ -327,9 +347,11 @@ def _paces(
 
 
 def _shortest(axis: Axis, position: float, target: float) -> float:
-    """Find the angle equivalent to `target` nearest to `position` and within travel [deg].
+    """Find the angle equivalent to `target`, by full turns, nearest to `position` and
+    within travel [deg].
 
-    `target` unchanged for a linear axis, or if no equivalent angle is within travel.
+    `target` unchanged for a linear axis, or if the nearest equivalent angle and those a
+    turn beside it are outside travel.
     """
     if axis.kind != "rotation":
         return target

@@ -80,7 +80,9 @@ class Trajectory:
         return self.pieces[bisect_right(self.knots, time, hi=len(self.pieces)) - 1]
 
     def position(self, time: float) -> float:
-        """Compute the position at `time` [s]: before the motion its start, after it the target."""
+        """Compute the position at `time` [s]: before the motion its start, from its end
+        on the target.
+        """
         piece = self._piece(time)
         if piece is None:
             if time >= self.end:
@@ -105,11 +107,12 @@ class Trajectory:
         return AxisPath.along(self).positions(times)
 
     def law(self, time: float) -> tuple[float, float, float]:
-        """Return velocity, acceleration, and the time until which the motor obeys them [s].
+        """Return velocity and acceleration at `time`, and until when that acceleration
+        holds without a change of direction [s].
 
-        Before the start it rests until then.
-
-        It also ends where the motor turns round; inf for a motor that rests for good.
+        Before the start they are 0 until then; after the end 0 until inf. A motor that
+        brakes obeys until it turns round; within `TIME_ROUNDING_S` of that its velocity
+        is 0.
 
         Args:
             time: moment [s].
@@ -134,10 +137,10 @@ class Trajectory:
         return velocity, a, until
 
     def acceleration(self, time: float) -> float:
-        """Return the largest acceleration after `time`, >= 0: the one that braking
-        was planned with.
+        """Return the largest absolute acceleration from `time` on, the one that braking
+        was planned with [mm/s2, deg/s2].
 
-        0 after the end.
+        Before the start it is that of the whole motion; after the end 0.
         """
         if time >= self.end:
             return 0.0
@@ -163,7 +166,9 @@ class Trajectory:
     def redirected(
         self, target: float, speed: float, acceleration: float, time: float
     ) -> Trajectory:
-        """Plan the motion to rest at `target` from the state at `time`; see `move`."""
+        """Plan the motion from the state at `time` to rest at `target`; see `move` for
+        arguments and errors.
+        """
         return move(
             self.position(time), self.velocity(time), target, speed, acceleration, time
         )
@@ -177,9 +182,11 @@ class Trajectory:
         return Trajectory(pieces, self.end + dt, self.target)
 
     def time_at(self, position: float) -> float | None:
-        """Find the first time at which the motor passes `position`.
+        """Find the first time at which the motor passes `position`, from the start of its
+        motion on.
 
-        A position within 1e-9 of the target is passed at the end at the latest.
+        Rounding counts as passing: a position within 1e-9 of the target is passed at the
+        end at the latest.
 
         Args:
             position: of the motor [mm, deg].
@@ -224,12 +231,21 @@ class AxisPath(ArrayValue):
     def of(
         cls, start: float, trajectories: Sequence[tuple[float, Trajectory]]
     ) -> AxisPath:
-        """Join trajectories, each in force from its time until the next one's."""
+        """Join trajectories, each in force from its own start until the next one's, after
+        rest at `start`.
+
+        Args:
+            start: position of the rest, from time 0 [mm, deg].
+            trajectories: (time, trajectory) in the order of their starts; the times are
+                not used.
+        """
         return cls.along(joined([at_rest(start), *(later for _, later in trajectories)]))
 
     @classmethod
     def along(cls, trajectory: Trajectory) -> AxisPath:
-        """Convert one trajectory to a table of pieces; rest at the target follows a finite end."""
+        """Convert one trajectory to a table of pieces; after a finite end comes a piece
+        at rest at the target.
+        """
         rows = [
             (p.start, p.position, p.velocity, p.acceleration) for p in trajectory.pieces
         ]
@@ -244,7 +260,11 @@ class AxisPath(ArrayValue):
         return cls(zero, np.array([position]), zero, zero)
 
     def _at(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], FloatArray]:
-        """Find the piece in force at each of `times`, and the time since its start [s]."""
+        """Find for each of `times` the index of the piece in force, and the time since
+        its start [s], of the same shape.
+
+        Before the path: 0 and 0.
+        """
         t = np.asarray(times, dtype=np.float64)
         index = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, None)
         return index, np.maximum(t - self.times[index], 0.0)
@@ -255,13 +275,16 @@ class AxisPath(ArrayValue):
         return np.asarray(self.x[i] + dt * (self.v[i] + 0.5 * self.a[i] * dt))
 
     def velocities(self, times: npt.ArrayLike) -> FloatArray:
-        """Compute velocities at `times` [s], of the same shape."""
+        """Compute velocities at `times` [s], of the same shape; before the path that of
+        its first piece.
+        """
         i, dt = self._at(times)
         return np.asarray(self.v[i] + self.a[i] * dt)
 
 
 def at_rest(position: float, time: float = 0.0) -> Trajectory:
-    """Make the trajectory of a motor at rest at `position`.
+    """Make the trajectory of a motor at rest at `position`, from `time` [s] on and
+    before.
 
     Example:
         >>> at_rest(5.0).position(100.0)
@@ -280,14 +303,10 @@ def move(
 ) -> Trajectory:
     """Plan the fastest trapezoidal motion to rest at `target` from any state of motion.
 
-    Positions are not limited here; no time passes if it rests at the target.
-
-    Raises:
-        ValueError: speed or acceleration is not positive.
-
     Velocity is continuous. A motor that is too fast to stop in time, or runs the wrong
     way, brakes to rest first and then comes back; one that is faster than `speed` brakes
-    to it first.
+    to it first. A short motion is triangular. Positions are not limited here; a motor at
+    rest at the target gets a trajectory without duration.
 
     Args:
         position: where the motor is.
@@ -296,6 +315,15 @@ def move(
         speed: cruise speed, > 0.
         acceleration: of speeding up and braking, > 0.
         time: now [s].
+
+    Raises:
+        ValueError: speed or acceleration is not positive.
+
+    Velocity is continuous. A motor that is too fast to stop in time, or runs the wrong
+
+    way, brakes to rest first and then comes back; one that is faster than `speed` brakes
+
+    to it first.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
@@ -330,9 +358,17 @@ def move(
 def stop(
     position: float, velocity: float, acceleration: float, time: float
 ) -> Trajectory:
-    """Plan the fastest stop.
+    """Plan the fastest stop, with constant acceleration; limits of the travel are not
+    considered.
 
-    Limits are not looked at.
+    Args:
+        position: where the motor is.
+        velocity: its speed, signed; 0 gives a trajectory without duration.
+        acceleration: of braking, > 0.
+        time: now [s].
+
+    Returns:
+        The trajectory to rest where the motor gets.
 
     Raises:
         ValueError: the acceleration is not positive.
@@ -358,12 +394,22 @@ def jog(
 ) -> Trajectory:
     """Plan a run at velocity `wanted` (signed) for `lease` seconds, then braking to rest.
 
-    A lease of 0 or less brakes at once; positions are not limited here.
+    A lease of 0 or less brakes at once; positions are not limited here. If the lease is
+    shorter than the ramp, the motor brakes from the velocity reached by then.
+
+    Args:
+        position: where the motor is.
+        velocity: how fast it moves now, signed.
+        wanted: velocity of the run, signed.
+        lease: duration of ramp and run [s], before braking.
+        acceleration: of ramp and braking, > 0.
+        time: now [s].
 
     Raises:
         ValueError: the acceleration is not positive.
 
     If the lease is shorter than the ramp, the motor brakes from the velocity reached by
+
     then.
 
     Example:
@@ -384,7 +430,11 @@ def jog(
 
 
 def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
-    """Join `before` until time `at` and `after`, which begins there.
+    """Join the part of `before` that begins before time `at`, and `after`, which begins
+    at `at`.
+
+    End and target are those of `after`; whether position and velocity agree is not
+    checked.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
@@ -397,9 +447,10 @@ def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
 
 
 def continued(trajectory: Trajectory, at: float) -> Trajectory:
-    """Cut off the part of `trajectory` before time `at`.
+    """Return `trajectory` without its part before time `at` [s].
 
-    Before its start it is returned unchanged; after its end it is rest at the target.
+    Up to its start it is returned unchanged; from its end on it is rest at the target
+    from `at`.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
@@ -423,11 +474,15 @@ def continued(trajectory: Trajectory, at: float) -> Trajectory:
 
 
 def joined(trajectories: Sequence[Trajectory]) -> Trajectory:
-    """Join trajectories, each followed from its start until the next begins.
+    """Join trajectories, each followed from its start until the next begins; one that
+    ends earlier rests until then.
 
     Args:
         trajectories: at least one, in the order of their starts; each begins where the
             motor is.
+
+    Returns:
+        The trajectory, with end and target of the last.
 
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
@@ -465,9 +520,10 @@ class _Builder:
         self.pieces: list[Piece] = []
 
     def _add(self, dt: float, acceleration: float) -> None:
-        """Add a piece of `dt` seconds and move time and position to its end; none for `dt` <= 0.
+        """Add a piece of `dt` seconds and move time and position to its end; do nothing
+        for `dt` <= 0.
 
-        The velocity is left for the caller to change.
+        The velocity stays that of the piece's start: the caller changes it.
         """
         if dt <= 0.0:
             return
@@ -488,16 +544,21 @@ class _Builder:
         self._add(dt, 0.0)
 
     def rest_at(self, target: float) -> Trajectory:
-        """Return the trajectory, at rest at `target` from now on."""
+        """Return the trajectory of the pieces, at rest at `target` from the present time
+        on; without pieces rest since the beginning.
+
+        Whether the pieces end at `target` is not checked.
+        """
         pieces = self.pieces or [Piece(self.begin[0], target, 0.0, 0.0)]
         return Trajectory(tuple(pieces), self.time, target)
 
 
 def _first_root(a: float, b: float, c: float) -> float | None:
-    """Solve for the smallest non-negative root of a x^2 + b x + c, or None.
+    """Solve a x^2 + b x + c = 0; return the smallest non-negative finite root, or None if
+    there is none.
 
-    A discriminant that is negative by rounding counts as 0; None if there is no such root
-    or all are infinite.
+    A discriminant that is negative by rounding counts as 0. With c = 0 the root is 0,
+    whatever the others.
 
     Args:
         a: quadratic coefficient.
