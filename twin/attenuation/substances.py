@@ -312,8 +312,8 @@ def _row(symbol: str) -> int:
     """
     elements = tables().elements
     if symbol not in elements:
-        what = f"no element {symbol!r} in the attenuation table; it has"
-        raise UnknownNameError.among(what, symbol, elements)
+        message = f"no element {symbol!r} in the attenuation table; it has"
+        raise UnknownNameError.among(message, symbol, elements)
     return elements[symbol]
 
 

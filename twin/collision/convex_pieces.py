@@ -65,8 +65,10 @@ def convex_pieces(
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if len(mesh.faces) == 0 or not np.isfinite(vertices).all():
-        what = f"a sample mesh needs faces and finite vertices; this has {len(mesh.faces)} faces"
-        raise GeometryError(what, {"faces": len(mesh.faces), "vertices": len(vertices)})
+        message = f"a sample mesh needs faces and finite vertices; this has {len(mesh.faces)} faces"
+        raise GeometryError(
+            message, {"faces": len(mesh.faces), "vertices": len(vertices)}
+        )
     if rotation is None:
         turn = np.eye(3)
     else:

@@ -179,8 +179,8 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     u, v = cone_vec.u, cone_vec.v
     lengths = np.stack([np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)], axis=1)
     cosine = np.abs(np.einsum("ni,ni->n", u, v)) / (lengths[:, 0] * lengths[:, 1])
-    what = f"{format_name} knows panels with orthogonal rows and columns; their cosine"
-    require_each(what, cosine, SQUARE_TOLERANCE)
+    message = f"{format_name} knows panels with orthogonal rows and columns; their cosine"
+    require_each(message, cosine, SQUARE_TOLERANCE)
     change = np.abs(lengths / lengths[0] - 1.0).max(axis=1)
     require_each(
         f"{format_name} knows one pixel size; its change", change, SQUARE_TOLERANCE

@@ -68,8 +68,8 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
         ExchangeError: the shape or type is different.
     """
     if array.ndim != 2 or array.shape[1] != 12 or not _real(array):
-        what = f"{file}: an array of {array.dtype}"
-        raise ExchangeError.of_shape(what, array.shape, ("n", 12), ", numbers")
+        message = f"{file}: an array of {array.dtype}"
+        raise ExchangeError.of_shape(message, array.shape, ("n", 12), ", numbers")
     return cone_vec_of(array, file)
 
 
@@ -183,9 +183,9 @@ def read_tomosipo(
     shape = arrays["shape"]
     for name, array in zip(TOMOSIPO_NAMES[1:], vectors, strict=True):
         if array.ndim != 2 or array.shape != (len(vectors[0]), 3) or not _real(array):
-            what = f"{file}: {name}"
+            message = f"{file}: {name}"
             like = " like the others"
-            raise ExchangeError.of_shape(what, array.shape, ("n", 3), like)
+            raise ExchangeError.of_shape(message, array.shape, ("n", 3), like)
     if (
         shape.shape != (2,)
         or not np.issubdtype(shape.dtype, np.integer)
@@ -322,8 +322,8 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
     """
     document = read_json(text, file)
     if (form := (document.get("kind"), document.get("schema"))) != (KIND, SCHEMA):
-        what = f"{file}: kind {form[0]!r}, schema {form[1]!r}"
-        raise ExchangeError.instead(what, list(form), f"{KIND!r}, schema {SCHEMA}")
+        message = f"{file}: kind {form[0]!r}, schema {form[1]!r}"
+        raise ExchangeError.instead(message, list(form), f"{KIND!r}, schema {SCHEMA}")
     try:
         found = _Document.model_validate(
             {k: v for k, v in document.items() if v is not None}

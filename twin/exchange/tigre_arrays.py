@@ -75,17 +75,17 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     apart = c.source - c.detector
     normal = right_handed * np.sign(np.einsum("ni,ni->n", right_handed, apart))[:, None]
     level = np.hypot(normal[:, 0], normal[:, 1])
-    what = "TIGRE knows panels that do not lie flat; the sine of their normal to the xy plane"
-    require_each(what, np.sqrt(np.maximum(1.0 - level**2, 0.0)), 1.0 - MIN_LEVEL_PART)
+    message = "TIGRE knows panels that do not lie flat; the sine of their normal to the xy plane"
+    require_each(message, np.sqrt(np.maximum(1.0 - level**2, 0.0)), 1.0 - MIN_LEVEL_PART)
     angles = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
     back = rotation_z(-angles)
     source, apart, u, v = (
         np.einsum("nij,nj->ni", back, p) for p in (c.source, apart, u, v)
     )
-    what = "TIGRE knows sources before the object's origin; the distance [mm] that it is behind"
-    require_each(what, -source[:, 0], 0.0)
-    what = "TIGRE knows panels behind the source; the distance [mm] before it"
-    require_each(what, -apart[:, 0], 0.0)
+    message = "TIGRE knows sources before the object's origin; the distance [mm] that it is behind"
+    require_each(message, -source[:, 0], 0.0)
+    message = "TIGRE knows panels behind the source; the distance [mm] before it"
+    require_each(message, -apart[:, 0], 0.0)
     aside = np.column_stack([np.zeros(len(c)), source[:, 1], source[:, 2]])
     moved = -np.einsum("nij,nj->ni", rotation_z(angles), aside)
     per_view = {

@@ -283,13 +283,13 @@ class _Writer(MotorTargets):
         if not self.has(*moved):
             moved = ("object_z",)
         if not self.has(*moved):
-            what = (
+            message = (
                 "has no motors that raise source and detector together, and none that "
                 "lowers the "
                 "sample, which a helical scan needs"
             )
             missing = ["source_z", "detector_z", "object_z"]
-            raise self.lacking(what, asked="helical", missing=missing)
+            raise self.lacking(message, asked="helical", missing=missing)
         yield from self.go(*self.aside)
         station = self.station(w.sod_mm)
         targets: dict[str, tuple[float, float, float]] = {}
@@ -297,10 +297,13 @@ class _Writer(MotorTargets):
             motor = self.drivers.get(quantity, "")
             moves = [q for q, factors in m.geometry.items() if motor in factors]
             if list(m.geometry[quantity]) != [motor] or moves != [quantity]:
-                what = "raises or lowers with motors that move something else too, so flexdt writes"
+                message = (
+                    "raises or lowers with motors that move something else too, so flexdt "
+                    "writes"
+                )
                 axes = list(m.geometry[quantity])
                 raise self.lacking(
-                    f"{what} no helical scan for it", asked="helical", axes=axes
+                    f"{message} no helical scan for it", asked="helical", axes=axes
                 )
             at = station[motor]
             factor = m.geometry[quantity][motor]

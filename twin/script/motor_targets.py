@@ -113,8 +113,8 @@ class MotorTargets:
             LimitError: no motor is left for it.
         """
         if quantity not in self.drivers:
-            what = f"has no motor of its own for {QUANTITIES[quantity]}"
-            raise self.lacking(what, missing=quantity)
+            message = f"has no motor of its own for {QUANTITIES[quantity]}"
+            raise self.lacking(message, missing=quantity)
         return self.drivers[quantity]
 
     def need(self, what: str, quantity: str) -> None:
@@ -161,8 +161,13 @@ def beside_beam(
     """
     places = MotorTargets(machine, profile)
     if not places.aside:
-        what = "has no motor that takes the sample out of the beam, so no flat image can be taken"
-        raise places.lacking(what, asked="a flat field", missing=["object_x", "object_z"])
+        message = (
+            "has no motor that takes the sample out of the beam, so no flat image can be "
+            "taken"
+        )
+        raise places.lacking(
+            message, asked="a flat field", missing=["object_x", "object_z"]
+        )
     [quantity] = places.aside
     name = places.drivers[quantity]
     axis = machine.axis(name)
