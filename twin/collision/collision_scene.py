@@ -54,10 +54,10 @@ class SceneParts:
         return tuple(m for q in ("mount_x", "mount_y") for m in geometry.get(q, {}))
 
     def at(self, positions: Mapping[str, float]) -> CollisionScene:
-        """Build the scene with the stages on the turntable fixed at the motors'
-        `positions`.
+        """Build the scene with the stages on the turntable (`mounts`) fixed at the
+        motors' `positions`.
 
-        Positions of other motors are not used.
+        Positions of other motors are not used: all their travel stays covered.
 
         Args:
             positions: motor -> position [mm]; those left out are at home.
@@ -108,10 +108,13 @@ class CollisionScene:
     """
 
     def separation(self, pair: tuple[int, int]) -> Separate:
-        """Return the function that certifies how far two bodies are apart, from a pair of
-        indices.
+        """Return the function that certifies how far the two bodies of a pair are apart;
+        see `separation_of`.
 
         It is made at the first call for a pair and kept.
+
+        Args:
+            pair: indices of the bodies.
         """
         if pair not in self._separations:
             a, b = (self.bodies[i].solid for i in pair)
@@ -133,16 +136,20 @@ class CollisionScene:
         return PairStack.of(len(self.axes), self.bodies, (*self.pairs, *self.distant))
 
     def candidates(self, lower: FloatArray, upper: FloatArray) -> PairStack:
-        """Return the pairs to check while motors stay in [lower, upper]: the near
-        ones, or all."""
+        """Return the pairs to check while motors stay in [lower, upper]: the near ones,
+        or all if a motor may leave `reach`.
+
+        Args:
+            lower, upper: positions, (axes,) [mm, deg].
+        """
         within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
         return self.near if within else self.all
 
     def path(
         self, trajectories: Mapping[str, Trajectory], start: float, end: float
     ) -> Path:
-        """Make the path of all motors from `start` to `end` [s]; motors left out
-        are at home.
+        """Make the path of all motors from `start` to `end` [s], from trajectories by
+        motor; motors left out stand at home.
 
         Names that are no motors of the scene are ignored.
         """
@@ -197,7 +204,7 @@ class PairStack:
 
         Args:
             axes: number of motors that move them.
-            bodies: all bodies.
+            bodies: all bodies, with slides (axes, 3) and turns (axes,).
             pairs: indices of the two bodies of each pair.
         """
         chosen = [(bodies[i], bodies[j]) for i, j in pairs]
@@ -222,17 +229,18 @@ class PairStack:
         return np.abs(self.slides)
 
     def clearances(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        """Compute lower bounds of the clearances while motors stay within a box of positions.
+        """Compute lower bounds of the clearances while motors stay within a box of
+        positions.
 
         Motors that carry both bodies of a pair cancel; turning bodies count at every
-        angle.
+        angle. Bodies are bounded by their boxes; where these may overlap the bound is 0.
 
         Args:
-            lower: (..., axes) positions.
-            upper: (..., axes).
+            lower: (..., axes) least positions [mm, deg].
+            upper: (..., axes) greatest positions.
 
         Returns:
-            (..., m) [mm].
+            (..., m) [mm], never too large.
         """
         shape = (*lower.shape[:-1], len(self.pairs), 3)
         middle = (0.5 * (lower + upper) @ self.slides).reshape(shape) + self.offset
@@ -252,15 +260,18 @@ def build_scene(
 ) -> CollisionScene:
     """Build the scene of a machine with a sample.
 
-    Without components the scene has at most the sample and no pairs. Positions up to
-    `REACH_SLACK_MM` beyond the travel are covered.
+    Without components the scene has no bodies and no pairs, a sample or not. Positions up
+    to `REACH_SLACK_MM` beyond the travel are covered by the near pairs.
 
     Args:
         machine: its components, limits, margin.
         profile: zero offsets, so that bodies sit where the X-ray geometry is.
         sample: convex pieces in the object's frame (see `convex_solids.convex_pieces`).
         parameters: the correction in force; bodies are at the places that it gives.
-        margin_mm: clearance to keep; default: the machine's.
+        margin_mm: clearance to keep; None: the machine's `safety_margin_mm`.
+
+    Returns:
+        The scene, with `parts` to build it again.
     """
     axes = tuple(machine.axes)
     bodies = stage_bodies(machine, profile, parameters)
@@ -298,17 +309,20 @@ def scene_of(
 ) -> CollisionScene:
     """Build a scene of any bodies: sort their pairs into near, distant and allowed.
 
-    Bodies of one group are no pair. Distant pairs are beyond the margin everywhere in
-    reach, and apart by construction: on one stage, or in a direction that no motor
-    changes.
+    Bodies of one group are no pair, nor are those in `allowed`. Distant pairs are beyond
+    margin and tolerance everywhere in reach, and apart by construction: of one stage (or
+    with the world), or separated along a coordinate that no motor changes.
 
     Args:
         axes: motors, in the order of the bodies' columns.
         bodies: all bodies.
         allowed: pairs of names that may touch.
-        reach: (axes, 2) positions for which pairs may be called distant.
+        reach: (axes, 2) lower and upper positions for which pairs may be called distant.
         home: (axes,) positions of motors that a pose leaves out.
         limits: margin, tolerance, accuracy.
+
+    Returns:
+        The scene, without `parts`.
     """
     may_touch = set(allowed)
     pairs = [
@@ -342,8 +356,8 @@ def _one_stage(a: Body, b: Body) -> bool:
 
 
 def _levels_apart(a: Body, b: Body) -> bool:
-    """Return whether a coordinate that no motor changes between the bodies separates their
-    boxes.
+    """Return whether the bodies' boxes are separated along a coordinate in which no motor
+    slides one against the other.
 
     Touching boxes are not separated.
     """

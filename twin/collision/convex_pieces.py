@@ -48,17 +48,18 @@ def convex_pieces(
 ) -> tuple[Polytope, ...]:
     """Divide a mesh into convex pieces that together contain its solid.
 
-    The piece of the largest volume is cut next, while that saves enough volume.
+    The piece of the largest volume is cut in two next, while that saves enough volume
+    (`MAX_VOLUME_SHARE`); one that no cut makes smaller stays.
 
     Args:
         mesh: its surface [mm].
-        rotation: (3, 3) turn of the sample on the stage, applied first.
+        rotation: (3, 3) turn of the sample on the stage, applied first; None: none.
         offset: (3,) shift on the stage [mm].
-        max_pieces: at most so many.
+        max_pieces: largest number of pieces.
 
     Returns:
-        The pieces, placed; the convex hull alone for a mesh of more than
-        `MAX_CUTTING_FACES`.
+        The pieces, placed [mm]; the convex hull alone for a mesh of more than
+        `MAX_CUTTING_FACES` faces.
 
     Raises:
         GeometryError: the mesh has no faces or is not finite.
@@ -95,7 +96,9 @@ class _Piece:
     """Triangles whose hull holds a part of the solid."""
 
     def __init__(self, triangles: FloatArray) -> None:
-        """Compute the convex hull of triangles (n, 3, 3) [mm], and the hull's volume [mm³]."""
+        """Keep triangles (n, 3, 3) [mm], and compute their convex hull and its volume
+        [mm³].
+        """
         self.triangles = triangles
         self.hull = hull(triangles.reshape(-1, 3))
         corners = self.hull.vertices[self.hull.faces]
@@ -103,9 +106,10 @@ class _Piece:
 
 
 def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
-    """Find the halves of the least volume, from cuts at quarters along each axis.
+    """Find the cut with the least volume of both halves' hulls, at a quarter, half or
+    three quarters of the extent along x, y and z.
 
-    Volumes are those of the hulls.
+    Cuts that leave a half without triangles are skipped.
 
     Args:
         piece: with its triangles and hull.
@@ -136,7 +140,8 @@ def _best_cut(piece: _Piece) -> Sequence[_Piece] | None:
 def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArray:
     """Clip triangles at a plane, and close the cut with a convex cap.
 
-    Triangles that cross the plane are cut there; corners in the plane count as kept.
+    Triangles that cross the plane are cut there; corners in the plane count as kept. The
+    cap is the convex hull of the cut.
 
     Args:
         triangles: (n, 3, 3) corners [mm].
@@ -173,7 +178,17 @@ def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArra
 
 
 def _led_by(triangles: FloatArray, height: FloatArray, sign: float) -> FloatArray:
-    """Rotate the corners of triangles so that the first has the largest sign * height."""
+    """Rotate the corners of triangles, in their order, so that the one with the largest
+    sign * height comes first.
+
+    Args:
+        triangles: (n, 3, 3) corners.
+        height: of the corners, (n, 3).
+        sign: +1 or -1.
+
+    Returns:
+        (n, 3, 3); the sense of turning stays.
+    """
     first = np.argmax(sign * height, axis=1)
     order = (first[:, None] + np.arange(3)) % 3
     return np.take_along_axis(triangles, order[:, :, None], axis=1)

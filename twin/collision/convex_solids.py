@@ -73,9 +73,10 @@ class Polytope(ConvexSolid):
     faces: IntArray
 
     def __post_init__(self) -> None:
-        """Copy the vertices as read-only float64; raise ValueError unless finite and (k, 3).
+        """Copy the vertices as read-only float64; raise ValueError unless they are finite
+        and (k, 3).
 
-        The faces are not checked.
+        The faces are neither copied nor checked.
         """
         vertices = np.array(self.vertices, dtype=np.float64)
         if (
@@ -90,7 +91,9 @@ class Polytope(ConvexSolid):
         object.__setattr__(self, "vertices", vertices)
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """Find the vertex farthest along each of `directions` (..., 3), (..., 3) [mm]."""
+        """Find the vertex farthest along each of `directions` (..., 3): (..., 3) [mm]; of
+        equals the first.
+        """
         corner: FloatArray = self.vertices[
             np.argmax(directions @ self.vertices.T, axis=-1)
         ]
@@ -122,9 +125,11 @@ class UprightCylinder(ConvexSolid):
     height: float
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """Find the point farthest along each of `directions` (..., 3), (..., 3) [mm]: on a rim.
+        """Find the point farthest along each of `directions` (..., 3): (..., 3) [mm], on
+        a rim.
 
-        For a vertical direction it is the middle of the end face.
+        For a vertical direction it is the middle of the end face; a horizontal one gets a
+        rim by the sign of its zero.
         """
         across = np.hypot(directions[..., 0], directions[..., 1])
         out = directions * (self.radius / np.where(across > 0.0, across, 1.0))[..., None]
@@ -152,7 +157,8 @@ class UprightCylinder(ConvexSolid):
         return self._upright(axis) and self.center[0] == 0.0 and self.center[1] == 0.0
 
     def prism(self, sides: int = 48) -> Polytope:
-        """Make a prism that contains the cylinder, with `sides` sides that touch it.
+        """Make a prism that contains the cylinder, with as many sides as `sides`, each
+        touching it.
 
         Its edges are 0.2 % of the radius outside for 48 sides.
         """
@@ -180,28 +186,26 @@ def box(size: npt.ArrayLike, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Polytop
 
 
 def hull(points: npt.ArrayLike) -> Polytope:
-    """Compute the convex hull of points.
+    """Compute the convex hull of points, with faces turned outwards.
 
-    Faces are turned outwards; vertices inside are dropped.
-
-    Flat or thin point sets are thickened by a micrometre, outwards, so that every hull is
-    a solid.
+    Vertices inside are dropped. A flat or thin set is thickened by a micrometre in all
+    directions, so that every hull is a solid.
 
     Args:
-        points: (k, 3) [mm].
+        points: (k, 3) [mm], finite.
     """
     from scipy.spatial import ConvexHull, QhullError
 
     p = np.asarray(points, dtype=np.float64)
     try:
-        found = ConvexHull(p)
+        convex = ConvexHull(p)
     except QhullError:
         p = np.concatenate([p + 1e-3 * corner for corner in _CORNERS])
-        found = ConvexHull(p)
-    corners = p[found.simplices]
+        convex = ConvexHull(p)
+    corners = p[convex.simplices]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inward = np.einsum("ij,ij->i", normals, found.equations[:, :3]) < 0
-    simplices = found.simplices.copy()
+    inward = np.einsum("ij,ij->i", normals, convex.equations[:, :3]) < 0
+    simplices = convex.simplices.copy()
     simplices[inward] = simplices[inward][:, ::-1]
     used, faces = np.unique(simplices, return_inverse=True)
     return Polytope(p[used], faces.reshape(-1, 3).astype(np.int32))

@@ -74,10 +74,10 @@ class PathSearch:
 
     @cached_property
     def _nearest_first(self) -> tuple[list[Pair], list[float]]:
-        """Pairs that move relative to each other, and bounds of their
+        """Pairs that move relative to each other on the path, and lower bounds of their
         clearances, ascending [mm].
 
-        The bounds are of the whole path's box of positions, never too large.
+        The bounds hold for the box of all positions of the whole path.
         """
         lower = self.path.q.min(axis=0)
         upper = self.path.q.max(axis=0)
@@ -98,8 +98,8 @@ class PathSearch:
         return self._nearest_first[1]
 
     def motion(self, k: int) -> RelativeMotion:
-        """Return the motion of the first body of pair k relative to the second; made once,
-        then kept.
+        """Return the motion of the first body of the pair with index `k` in `pairs`
+        relative to the second; made once, then kept.
         """
         if k not in self._motions:
             a, b = (self.scene.bodies[i] for i in self.pairs[k])
@@ -107,18 +107,20 @@ class PathSearch:
         return self._motions[k]
 
     def first_contact(self, *, only_contacts: bool = False) -> SweepResult:
-        """Find the first contact, and the least clearance on the way (not refined).
+        """Find the first contact on the path, and the least clearance on the way (not
+        refined).
 
-        Pairs are taken nearest bound first, and left out once their bound exceeds the
-        best. With a contact, clearance and pair are the contact's.
+        Pairs are taken nearest bound first, and the search ends at one whose bound is
+        beyond margin and tolerance and not below the best. With a contact, clearance and
+        pair are the contact's.
 
         Args:
-            only_contacts: skip pairs too distant for a contact, so that clearances are
-                incomplete.
+            only_contacts: stop at the first pair too distant for a contact; without a
+                contact the clearance is then incomplete.
 
         Returns:
-            The contact or None, the least clearance [mm] with its pair, and the number of
-            distance evaluations.
+            The contact or None, the least clearance [mm] (inf without moving pairs) with
+            its pair, and the number of distance evaluations.
         """
         limits = self.scene.limits
         best = math.inf
@@ -135,12 +137,12 @@ class PathSearch:
             if motion.time(START) > until:
                 continue
             separate = self.scene.separation(self.pairs[k])
-            found = sweep_pair(motion, separate, limits, until=until)
-            looks += found.looks
-            if found.contact is not None and motion.time(found.contact) < until:
-                first = (motion.time(found.contact), k, found)
-            if found.least < best:
-                best = found.least
+            result = sweep_pair(motion, separate, limits, until=until)
+            looks += result.looks
+            if result.contact is not None and motion.time(result.contact) < until:
+                first = (motion.time(result.contact), k, result)
+            if result.least < best:
+                best = result.least
                 nearest = self.scene.names(self.pairs[k])
         if first is None:
             return SweepResult(None, best, nearest, looks=looks)
@@ -150,13 +152,15 @@ class PathSearch:
     def refined(self, guess: SweepResult) -> SweepResult:
         """Refine the least clearance of a free path, from a guess.
 
-        The guess is returned if no pair can be nearer; evaluations add up.
+        Pairs whose bound cannot be below the best by more than the accuracy are skipped.
+        The numbers of evaluations add up.
 
         Args:
             guess: result of a sweep that found no contact.
 
         Returns:
-            The result with the least clearance within the scene's accuracy.
+            Result without a contact; its least clearance is within the scene's accuracy,
+            that of the guess if no pair is nearer.
         """
         best = guess.min_clearance_mm
         nearest = guess.nearest
@@ -173,10 +177,12 @@ class PathSearch:
         return SweepResult(None, best, nearest, looks=looks)
 
     def contact(self, k: int, found: PairResult) -> Contact:
-        """Convert the contact of pair k to the scene's terms.
+        """Convert the sweep's result of the pair with index `k` to a `Contact`: names,
+        times, positions of all motors, clearance.
 
-        Without a contact in the result it is at the path's start. The last free moment is
-        the start if there is none; the contact says so.
+        A result without a contact counts as one at the start of the pair's motion.
+        Without a last free moment that is the start of the path, and `free_before` is
+        False.
 
         Args:
             k: index of the pair.
@@ -202,7 +208,13 @@ class PathSearch:
 
 
 def clearance(scene: CollisionScene, positions: Mapping[str, float]) -> NearestPair:
-    """Find the nearest pair of a pose (all pairs that must not touch), with 0 for a contact."""
+    """Find the nearest pair of a pose among all that must not touch, with 0 for an
+    overlap; (inf, None) without pairs.
+
+    Args:
+        scene: bodies and pairs.
+        positions: motor -> position [mm, deg]; motors left out are at home.
+    """
     q = scene.vector(positions)
     stack = scene.candidates(q, q)
     return _nearest(scene, q, stack.pairs, stack.clearances(q, q))
@@ -211,16 +223,24 @@ def clearance(scene: CollisionScene, positions: Mapping[str, float]) -> NearestP
 def touching(
     scene: CollisionScene, positions: Mapping[str, float]
 ) -> list[tuple[tuple[str, str], float]]:
-    """List every pair of a pose that is within the margin, with its clearance [mm]."""
-    found = bodies_touching(scene, scene.vector(positions))
-    return [(scene.names(pair), gap) for pair, gap in found]
+    """List every pair of a pose that is within the margin (and tolerance), by names, with
+    its clearance [mm]; 0 for an overlap.
+
+    Several bodies of one name give several entries; see `bodies_touching`.
+
+    Args:
+        scene: bodies and pairs.
+        positions: motor -> position [mm, deg]; motors left out are at home.
+    """
+    gaps = bodies_touching(scene, scene.vector(positions))
+    return [(scene.names(pair), gap) for pair, gap in gaps]
 
 
 def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, float]]:
-    """List every pair within the margin with the motors at `q` (axes,), with
+    """List every pair within margin plus tolerance with the motors at `q` (axes,), with
     its clearance [mm].
 
-    Overlaps have clearance 0; in no order. Within the tolerance counts.
+    Pairs are indices of bodies, in the scene's order; overlaps have clearance 0.
     """
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
@@ -234,12 +254,12 @@ def clearance_trace(
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
     """Compute the least clearance of the scene at moments of a path.
 
-    inf and None where no pair is near enough to be a candidate.
+    inf and None where there is no pair; () without times.
 
     Args:
         scene: bodies and pairs.
         path: of all motors.
-        times: moments [s].
+        times: moments [s]; outside the path its ends count.
 
     Returns:
         (time [s], clearance [mm], nearest pair or None) for each moment.
@@ -258,10 +278,16 @@ def clearance_trace(
 def _nearest(
     scene: CollisionScene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray
 ) -> NearestPair:
-    """Find the nearest pair with the motors at `q`; `bounds` are lower bounds
-    of the clearances.
+    """Find the nearest pair with the motors at `q`; `bounds` are lower bounds of the
+    clearances.
 
-    (inf, None) without pairs; of equal gaps the first is kept.
+    A `NearestPair` of inf and None without pairs; of equal gaps the one with the smaller
+    bound is kept.
+
+    Args:
+        q: (axes,) positions.
+        pairs: m candidates.
+        bounds: (m,) lower bounds of their clearances [mm].
     """
     best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
@@ -278,6 +304,14 @@ def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
     for an overlap.
 
     It is never more than the true distance.
+
+    Args:
+        scene: the bodies.
+        pair: indices of two.
+        q: (axes,) positions [mm, deg].
+
+    Returns:
+        Clearance, never more than the true distance.
     """
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)

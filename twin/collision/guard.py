@@ -30,18 +30,18 @@ class SceneGuard:
         self, trajectories: Mapping[str, Trajectory], now: float
     ) -> Contact | None:
         """Find the first contact from `now` on; when nothing moves, the nearest pair that
-        touches.
+        is within the margin.
 
-        Motion without an end is looked at for `HORIZON_S`.
-
-        Pairs that overlap already stop only motion that brings them closer.
+        Motion without an end is swept for `HORIZON_S`. Pairs that overlap at the start
+        stop only motion that brings them closer (`leaving`).
 
         Args:
             trajectories: motor -> trajectory; motors left out are at home.
             now: since when [s].
 
         Returns:
-            The contact, or None for a free motion.
+            The contact, or None for a free motion. When nothing moves it is at `now`,
+            with `free_before` False.
         """
         scene = self.scene
         ends = [
@@ -62,10 +62,11 @@ class SceneGuard:
         return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
     def standing(self, positions: Mapping[str, float]) -> SceneGuard:
-        """Return the guard with stages on the turntable fixed where they are.
+        """Return a guard with the stages on the turntable fixed where they are.
 
         Contacts are then those of this pose, and not those of all that such a stage can
-        sweep with its sample.
+        sweep with its sample. A scene without such stages, or of other bodies, gives this
+        guard itself.
 
         Args:
             positions: motor -> position [mm, deg].
@@ -86,6 +87,9 @@ class SceneGuard:
             positions: motor -> position; motors left out are at home.
             deep: measure overlaps, as negative clearances; it takes some milliseconds a
                 pair.
+
+        Returns:
+            Names -> clearance.
         """
         scene = self.scene
         q = self.scene.vector(positions)

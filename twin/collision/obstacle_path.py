@@ -42,17 +42,21 @@ def free_moves(
 ) -> tuple[list[dict[str, float]] | None, Contact | None]:
     """Find moves from `start` to `targets` without a contact, each from rest to rest.
 
+    First all motors at once, then one by one, then with motors of the obstructing bodies
+    aside. Motors at their target already are not moved.
+
     Args:
         scene: bodies and pairs that must not touch.
         machine: travel limits, speeds, accelerations.
         start: positions of all motors (those left out are at home) [mm, deg].
-        targets: motors to move, absolute, within their travel.
+        targets: motor -> position [mm, deg], within its travel.
         paces: motor -> (speed, acceleration); default: the machine's.
 
     Returns:
         (moves, contact). Moves in order, each motor -> position, the motors of one move
-        together; one move if the direct path is free, None if no free path was found. The
-        contact is that of all motors moving at once, or None.
+        together; one move if the direct path is free, none if nothing is to move; None if
+        no free path was found, or the target itself touches. The contact is that of all
+        motors moving at once, or None.
     """
     search = _Planner(scene, machine, dict(start), dict(paces or {}))
     goal = {axis: value for axis, value in targets.items() if value != search.at(axis)}
@@ -125,7 +129,8 @@ class _Planner:
         return contact
 
     def free(self, moved: Mapping[str, float], axis: str, value: float) -> bool:
-        """Return whether one motor's move touches nothing; the answer is remembered.
+        """Return whether one motor's move touches nothing; the answer is remembered, so
+        that a repeated question costs no sweep.
 
         Args:
             moved: motor -> position before the move, where it is not that of the start.
@@ -142,17 +147,17 @@ class _Planner:
         return motion.move(start, 0.0, end, *self.pace(axis), 0.0).duration
 
     def stations(self, goal: Mapping[str, float]) -> dict[str, list[float]]:
-        """List positions worth a stop for the goal's motors and those of the obstacles.
+        """List positions worth a stop for the goal's motors and for all that move a
+        blocking body.
 
-        Motors are those of the goal and all that move a blocking body; a rotation is
-        tried `ASIDE_TURN_DEG` to each side, within travel.
+        A rotation is tried `ASIDE_TURN_DEG` to each side, within travel; a slide at its
+        limits, home and the middle.
 
         Args:
             goal: motor -> target [mm, deg].
 
         Returns:
-            Motor -> positions: where it is, its target, limits, home, middle, or turns
-            aside.
+            Motor -> positions without repeats: where it is, its target, then those aside.
         """
         chains = [
             body.slides.any(axis=1) | (body.turns != 0.0)
@@ -183,23 +188,24 @@ class _Planner:
     ) -> list[tuple[str, float]] | None:
         """Search for the quickest free path over stations (A*), one motor at a time.
 
-        It counts time of single moves; `free` is asked only for moves that would be an
-        improvement.
+        The cost is the time of the moves one after the other; `free` is asked only for
+        moves that would be an improvement.
 
         Args:
             stations: motor -> positions that are tried [mm, deg].
             goal: motor -> target [mm, deg]; the others return to where they are.
 
         Returns:
-            (motor, position) in order; None if there is none within `MAX_SWEEPS`.
+            (motor, position) in order; None if there is none, or none before the planner
+            has made `MAX_SWEEPS` sweeps in all.
         """
         axes = list(stations)
         begin: Station = tuple(self.at(axis) for axis in axes)
         end: Station = tuple(goal.get(axis, self.at(axis)) for axis in axes)
 
         def left(station: Station) -> float:
-            """Estimate the remaining time from below [s]: each axis directly to its end, one
-            by one.
+            """Compute the least remaining time [s]: each axis directly to its end, one by
+            one.
             """
             return sum(
                 self.duration(axis, x, y)
@@ -236,10 +242,10 @@ class _Planner:
     def shortened(
         self, way: list[tuple[str, float]], goal: Mapping[str, float]
     ) -> list[tuple[str, float]]:
-        """Shorten the excursions of a path as far as it stays free.
+        """Shorten the excursions of a path by bisection (`HALVINGS` steps each), as far
+        as the whole path stays free.
 
-        Each by bisection, in order; moves to where the motor already stands are not
-        changed either.
+        One after the other; moves to a motor's goal, or back to its start, stay.
 
         Args:
             way: (motor, position) in order, free.
@@ -270,7 +276,9 @@ class _Planner:
         return way
 
     def _all_free(self, way: Sequence[tuple[str, float]]) -> bool:
-        """Return whether every move of a path (axis, target) is free, made one after the other."""
+        """Return whether every move of a path (motor, position) is free, made one after
+        the other from the start.
+        """
         moved: dict[str, float] = {}
         for axis, value in way:
             if not self.free(moved, axis, value):
@@ -279,7 +287,7 @@ class _Planner:
         return True
 
     def joined(self, way: Sequence[tuple[str, float]]) -> list[dict[str, float]]:
-        """Join neighbouring moves where moving together is free as well.
+        """Join each move with the one before it where moving together is free as well.
 
         Two moves of one motor are never joined.
 

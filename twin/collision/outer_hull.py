@@ -29,8 +29,10 @@ RELATIVE_LIFT: Final = 1e-9
 def outer_hull(points: npt.ArrayLike) -> Polytope:
     """Build a convex body that contains points and has at most `MAX_POINTS` corners.
 
-    The exact hull if that has few enough corners; else planes are cut from a box,
-    farthest first, until nothing is `MIN_CUT_MM` outside or the number is reached.
+    The exact hull if that has few enough corners. Else planes of its faces are cut from a
+    box, `PLANES_PER_CUT` at a time, farthest first, until nothing is more than
+    `MIN_CUT_MM` outside or the next cut would give too many corners; the result stands
+    out by the `RELATIVE_LIFT`.
 
     Args:
         points: (k, 3) [mm].
@@ -72,14 +74,15 @@ def outer_hull(points: npt.ArrayLike) -> Polytope:
 def _planes(solid: Polytope) -> FloatArray:
     """Compute the outward planes of the solid's largest faces, at most `MAX_PLANES`.
 
-    Faces in one plane (to 1e-6) count together; the offset is that of the farthest
-    vertex.
+    Faces in one plane (to 1e-6) count together; faces without area are left out. The
+    offset is that of the farthest vertex.
 
     Args:
         solid: convex.
 
     Returns:
-        (m, 4): unit normal n and offset d, with n . x + d <= 0 inside [mm].
+        (m, 4): unit normal n and offset d, with n . x + d <= 0 inside [mm]; from the
+        smallest face to the largest.
     """
     a, b, c = np.moveaxis(solid.vertices[solid.faces], 1, 0)
     normals = np.cross(b - a, c - a)
@@ -101,12 +104,15 @@ def _planes(solid: Polytope) -> FloatArray:
 
 
 def _corners(planes: list[FloatArray], inside: FloatArray) -> FloatArray:
-    """Compute the corners (k, 3) of the body that planes (n, 4) bound around a point `inside`.
+    """Compute the corners (k, 3) of the body that planes (n, 4) bound, each once (to
+    1e-6).
 
-    Corners equal to 1e-6 are returned once.
+    Args:
+        planes: unit normal n and offset d of each, with n . x + d <= 0 inside [mm].
+        inside: (3,) point strictly within.
     """
     from scipy.spatial import HalfspaceIntersection
 
-    found = HalfspaceIntersection(np.array(planes), inside).intersections
-    _, first = np.unique(found.round(6), axis=0, return_index=True)
-    return np.asarray(found[first])
+    corners = HalfspaceIntersection(np.array(planes), inside).intersections
+    _, first = np.unique(corners.round(6), axis=0, return_index=True)
+    return np.asarray(corners[first])

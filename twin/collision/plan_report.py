@@ -70,7 +70,7 @@ def collision_check(
 def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
     """Sweep a plan for its contacts and clearances.
 
-    Without pairs in motion the clearance is None; points where nothing is near are left
+    Without pairs in motion the least clearance is None. Moments without any pair are left
     out of the trace.
 
     Args:
@@ -78,8 +78,9 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
         scene: bodies and pairs that must not touch.
 
     Returns:
-        All contacts in the order of time, the least clearance [mm] with its pair, and a
-        trace of clearances.
+        All contacts in the order of time, each with line, pair and the last free
+        positions; the least clearance [mm] with its pair; and a trace of (time [s],
+        clearance [mm]) at about `TRACE_POINTS` moments.
     """
     path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
     search = PathSearch(scene, path)
@@ -100,20 +101,21 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
 def _least(
     search: PathSearch, contacts: Sequence[Contact]
 ) -> tuple[float, tuple[str, str] | None]:
-    """Find the least clearance [mm] and its pair (None if nothing is near); with
-    contacts, those of the worst.
+    """Find the least clearance [mm] and its pair: of the nearest contact, or, without
+    contacts, of the whole path within the scene's accuracy.
 
-    Without contacts it is refined to the scene's accuracy.
+    (inf, None) if no pair moves.
     """
     if contacts:
         worst = min(contacts, key=lambda c: c.clearance_mm)
         return worst.clearance_mm, worst.pair
-    found = search.refined(search.first_contact())
-    return found.min_clearance_mm, found.nearest
+    result = search.refined(search.first_contact())
+    return result.min_clearance_mm, result.nearest
 
 
 def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
-    """Make an upright cylinder of a sample's size on the stage's origin, or no body.
+    """Make an upright cylinder of a sample's size, centred on the stage's origin; () for
+    no body.
 
     No body without a size or diameter; without a height it is as high as wide.
     """
@@ -124,18 +126,19 @@ def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
 
 
 def _contacts(search: PathSearch) -> list[Contact]:
-    """Find all contacts of a path, by time; of one pair only the first in each segment.
+    """Find all contacts of a path, by time; of contacts of the same two names in one
+    segment only the first.
 
-    Pairs whose bound is beyond margin plus tolerance are skipped.
+    Pairs whose bound is beyond margin plus tolerance are skipped. See `_contacts_of`.
     """
     limits = search.scene.limits
-    found = []
+    contacts = []
     for k, bound in enumerate(search.bounds):
         if bound > limits.margin + limits.tolerance:
             break
-        found += _contacts_of(search, k)
+        contacts += _contacts_of(search, k)
     first: dict[tuple[tuple[str, str], float], Contact] = {}
-    for contact in sorted(found, key=lambda c: c.time):
+    for contact in sorted(contacts, key=lambda c: c.time):
         # Pieces of one sample touch one after the other in one and the same motion.
         segment = float(np.searchsorted(search.path.times, contact.time, side="right"))
         first.setdefault((contact.pair, segment), contact)
@@ -145,8 +148,8 @@ def _contacts(search: PathSearch) -> list[Contact]:
 def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
     """Find the contacts of one pair; after each it must come free before it counts again.
 
-    It counts as free at margin plus two tolerances, looked for at the beginnings of
-    `MAX_LOOKS_IN_CONTACT` segments; else the search ends.
+    It is free again at more than margin plus two tolerances, looked for at the beginnings
+    of the next `MAX_LOOKS_IN_CONTACT` segments; if none is, the search ends.
 
     Args:
         search: path and pairs.
@@ -176,9 +179,10 @@ def _contacts_of(search: PathSearch, k: int) -> list[Contact]:
 
 
 def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
-    """Find the line of the last motion under way at the contact that moves one of the two.
+    """Find the line of the script that causes a contact: that of the last motion under
+    way that moves one of the two bodies.
 
-    0 for a plan without steps.
+    If none is, that of the last step begun by then, else that of the first step.
 
     Args:
         plan: with its steps.
@@ -186,8 +190,7 @@ def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
         contact: of one pair.
 
     Returns:
-        Line of the script; that of the last step begun where no motion is under way, or
-        0.
+        Line of the script; 0 for a plan without steps.
     """
     pairs = [scene.names(pair) == contact.pair for pair in scene.all.pairs]
     motors = {scene.axes[i] for i in np.flatnonzero(scene.all.moves[pairs].any(axis=0))}
@@ -207,7 +210,15 @@ def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
 def _trace_times(path: Path, count: int) -> FloatArray:
     """Choose about `count` times for a plot: half evenly by travel, half evenly by time.
 
-    Sorted, without repeats. Only start and end if nothing moves or `count` is below 2.
+    Sorted, without repeats. Only start and end of the path if nothing moves or `count` is
+    below 2.
+
+    Args:
+        path: of all motors.
+        count: number of times.
+
+    Returns:
+        (m,) times [s], m at most `count` (or 2).
     """
     travelled = np.abs(np.diff(path.q, axis=0)).sum(axis=1)
     along = np.concatenate([[0.0], np.cumsum(travelled)])

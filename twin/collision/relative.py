@@ -68,7 +68,9 @@ class Path:
     a: FloatArray
 
     def vectors(self, times: FloatArray) -> FloatArray:
-        """Compute positions at `times` (n,) [s], (n, axes); times outside the path get its ends."""
+        """Compute positions at `times` (n,) [s]: (n, axes) [mm, deg]; times outside the
+        path get its ends.
+        """
         i = np.clip(
             np.searchsorted(self.times, times, side="right") - 1, 0, len(self.v) - 1
         )
@@ -85,7 +87,9 @@ class Path:
         )
 
     def after(self, time: float) -> Path:
-        """Return the rest of the path from `time` on; `time` must be before the end."""
+        """Return the rest of the path from `time` [s] on, which is within the path and
+        before its end.
+        """
         later = self.times > time
         first = max(0, int(np.argmax(later)) - 1)
         dt = time - self.times[first]
@@ -110,18 +114,19 @@ def path_of(
     """Make the path of `axes` from `start` to `end`, cut wherever a motor changes its
     law.
 
-    Motors that stand have zero rates. At least one segment, of no length if `end` is not
-    later.
+    Cuts are where a motor changes its acceleration or reverses. Motors that stand have
+    zero rates. There is at least one segment, of no length if `end` is not later.
 
     Args:
         axes: names of the motors, in the order of the columns.
-        tables: motor -> positions and velocities over time.
+        tables: motor -> its path; it rests before the beginning.
         start: of the path [s].
         end: of the path [s].
 
     Raises:
         KeyError: a motor has no table.
-        ValueError: a motor jumps; a sweep over it would prove nothing.
+        ValueError: a motor jumps by more than `JUMP_TOLERANCE` and the rounding of the
+            times; a sweep over it would prove nothing.
     """
     moving = [
         (column, name, tables[name])
@@ -175,7 +180,8 @@ def _stands(table: AxisPath) -> bool:
 def _state(
     table: AxisPath, times: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute position, velocity and acceleration from each of `times` on, (n,) each.
+    """Compute position, velocity and acceleration of a motor from each of `times` on,
+    (n,) each.
 
     Before the table's beginning the motor rests at its first position.
     """
@@ -187,7 +193,9 @@ def _state(
 
 
 def _turning_times(table: AxisPath) -> FloatArray:
-    """Find the times at which the motor reverses inside a piece, not at its end."""
+    """Find the times at which the motor reverses inside a piece; reversals within
+    `MIN_SEGMENT_S` of its end are left out.
+    """
     turning = table.v * table.a < 0.0
     if not turning.any():
         return table.times[:0]
@@ -236,10 +244,11 @@ class _Bound:
     def first_fall(
         self, at: Moment, lengths: FloatArray, value: float, level: float
     ) -> Moment | None:
-        """Find the first moment from `at` on at which the bound, being `value`
-        there, reaches `level`.
+        """Find the first moment from `at` on at which the bound, being `value` there, has
+        fallen to `level`.
 
-        `lengths` and the bound's own arrays are not changed.
+        Dips within a segment count. The argument `lengths` and the bound's own arrays are
+        not changed.
 
         Args:
             at: segment, and time in it [s].
@@ -277,7 +286,13 @@ def _fall_time(above: float, rate: float, growth: float, length: float) -> float
     """Solve for the first dt in [0, length] at which above + rate dt + growth dt^2 / 2 is
     0; None if there is none.
 
-    Rates are per second; a touching parabola counts.
+    0 if `above` is 0 or less; a parabola that touches counts.
+
+    Args:
+        above: value at dt = 0.
+        rate: per s.
+        growth: per s^2.
+        length: longest dt [s].
     """
     if above <= 0.0:
         return 0.0
@@ -314,7 +329,8 @@ class _Turn:
         """Evaluate the turning of a body over the segments of a path.
 
         `sense` is the one direction of turning over all kept segments, 0 if it changes or
-        it stands.
+        the body stands. In a segment in which it reverses, `nearing` has its fastest rate
+        throughout.
 
         Args:
             body: that turns.
@@ -363,14 +379,17 @@ class _Turn:
     def lever(
         self, normal: FloatArray, orientation: FloatArray, allowance: float
     ) -> tuple[float, float]:
-        """Compute (mm per rad, rad): within that turn the solid approaches by no
-        more per radian.
+        """Compute a bound of how fast the solid approaches by turning, and within what
+        turn it holds: (mm per rad, rad).
 
-        The second is infinite where the crude bound (reach across the axis) is good
-        enough.
+        The crude bound, the reach across the axis, holds for any turn (inf) and is taken
+        where it is good enough. Else it is a chord, since the nearing along a fixed
+        normal is a convex function of the turn.
 
-        The nearing along a fixed normal is a convex function of the turn, so a chord is a
-        bound.
+        Args:
+            normal: (3,) unit direction from b to a.
+            orientation: of the body, (3, 3).
+            allowance: approach for which the bound is made [mm], > 0.
         """
         along = float(normal @ self.body.spin_axis)
         crude = self.body.reach * math.sqrt(max(0.0, 1.0 - along * along))
@@ -393,11 +412,12 @@ class RelativeMotion:
     """
 
     def __init__(self, a: Body, b: Body, path: Path) -> None:
-        """Compute the motion of body `a` relative to body `b` along a path.
+        """Compute the motion of body `a` relative to body `b` along a path, for each
+        segment in which it changes.
 
         Segments in which neither moves relative to the other are left out; if all are
         such, the first one is kept. Whole turns that repeat the same relative motion are
-        taken out, too.
+        taken out, too (`_leave_out_repeated_turns`).
         """
         slides = a.slides - b.slides
         velocity = path.v @ slides
@@ -429,12 +449,11 @@ class RelativeMotion:
         self._leave_out_repeated_turns()
 
     def _leave_out_repeated_turns(self) -> None:
-        """Shorten segments in which one body turns evenly in place: later turns
-        repeat the first.
+        """Shorten segments in which one body turns evenly in place by the whole turns
+        that repeat the first.
 
-        Nothing with none or two turning bodies; at least one whole turn stays.
-
-        Whole turns are taken out of such segments, so they end in the pose they ended in.
+        They end in the pose they ended in; at least one whole turn stays. Does nothing if
+        none or both of the bodies turn. Later segments keep their times.
         """
         if len(self._turning) != 1:
             return
@@ -462,8 +481,8 @@ class RelativeMotion:
             separate: certified separation of the two solids in a pose.
 
         Returns:
-            The moment, the gap [mm] (0 for an overlap), its direction, and the
-            orientations of the bodies.
+            The moment, the gap [mm] (0 for an overlap, by `separation_of`), its unit
+            direction from b to a, and the orientations of a and b.
         """
         i = at.segment
         dt = at.dt
@@ -480,15 +499,17 @@ class RelativeMotion:
         return Look(at, gap, normal, (turn_a, turn_b))
 
     def next_at(self, look: Look, level: float) -> Moment | None:
-        """Find the first moment after a look at which the gap may have fallen to `level` [mm].
+        """Find the first moment after a look at which the gap may have fallen to `level`,
+        or the bound's validity ends.
 
         It is never too late: the gap is above `level` until then.
-
-        `level` is below the look's gap. None if the gap stays above it to the end.
 
         Args:
             look: a distance evaluation.
             level: gap below the look's [mm].
+
+        Returns:
+            The moment; None if the gap stays above `level` to the end.
         """
         bound = self._slide(look.normal)
         horizons = []
@@ -500,27 +521,30 @@ class RelativeMotion:
             bound = bound.less(turn.nearing, lever)
             if math.isfinite(horizon):
                 horizons.append(turn.left.first_fall(look.at, self.lengths, horizon, 0.0))
-        found = [bound.first_fall(look.at, self.lengths, look.gap, level), *horizons]
+        moments = [bound.first_fall(look.at, self.lengths, look.gap, level), *horizons]
         return min(
-            (f for f in found if f is not None),
+            (f for f in moments if f is not None),
             key=lambda f: (f.segment, f.dt),
             default=None,
         )
 
     def after_travel(self, at: Moment, distance: float) -> Moment | None:
-        """Find the first moment after `at` by which a gap may have grown by `distance` [mm].
+        """Find the first moment after `at` by which two points of the bodies may have
+        moved apart by `distance` [mm].
 
-        Two points of the bodies move apart no faster than the origins slide and the
-        farthest points turn. None if they travel less to the end.
+        They move apart no faster than the origins slide and the farthest points turn.
+
+        Returns:
+            The moment; None if they travel less to the end.
         """
         return self._travel.first_fall(at, self.lengths, distance, 0.0)
 
     @cached_property
     def _travel(self) -> _Bound:
-        """Bound that falls as travel is used up. Speeds are convex in a segment: the
-        chord is a bound.
+        """Bound of travel, sliding plus turning times reach, that falls as travel is used
+        up [mm/s; mm/s2].
 
-        Sliding and turning (reach times angular speed) are added, [mm].
+        Speeds are convex in a segment: the chord between its ends is a bound.
         """
         lengths = self.lengths[:, None]
         begin = np.linalg.norm(self._velocity, axis=1)
@@ -533,10 +557,11 @@ class RelativeMotion:
         return _Bound(-begin, -growth)
 
     def nearest_end(self, look: Look) -> Moment:
-        """Find the segment end after a look that is farthest towards b along
-        its normal, unturned.
+        """Find the segment end, from the look's segment on, at which a has slid farthest
+        towards b along the look's normal.
 
-        The normal is that of the look; a guess, not a bound.
+        Turning is ignored, and the time in the look's segment: it is a guess, not a
+        bound.
         """
         i = look.at.segment
         slide = self._slide(look.normal)
@@ -595,12 +620,11 @@ def sweep_pair(
     start: Moment = START,
     until: float = math.inf,
 ) -> PairResult:
-    """Sweep one pair until it touches, the motion ends, or `until`.
+    """Sweep one pair from `start` until it touches, the motion ends, or `until`.
 
-    Without a contact the end nearest by a guess is evaluated, too.
-
-    A pair that starts within the tolerance of the margin, or nearer, may move, but not
-    below its floor.
+    A pair that starts within the tolerance of the margin, or nearer without overlap, may
+    move, but not below its floor (`safety.floor`). Without a contact the segment end that
+    is nearest by a guess is evaluated, too.
 
     Args:
         motion: of one body relative to the other.
@@ -611,7 +635,8 @@ def sweep_pair(
 
     Returns:
         The least gap that was evaluated [mm], the moment of the contact and the last free
-        one before it (None without them), and the number of evaluations.
+        one before it (None without them), and the number of evaluations. A pair that
+        overlaps at the start is a contact there, without a free moment.
     """
     level = floor(math.inf, limits.margin)
     near = limits.margin + limits.tolerance
@@ -652,7 +677,7 @@ def refine_pair(
 ) -> tuple[float, int]:
     """Refine the least clearance of a pair that is known to be free.
 
-    An overlap ends it.
+    It ends once the best clearance is within the slack of 0, an overlap for instance.
 
     Args:
         motion: of one body relative to the other.
@@ -678,7 +703,11 @@ def refine_pair(
 
 
 def _last_free(motion: RelativeMotion, before: Look, wanted: float) -> Moment:
-    """Find the last moment known to have clearance `wanted`, or the last one evaluated."""
+    """Find the moment after the look `before` until which the gap stays above `wanted`
+    [mm].
+
+    The look's own moment if its gap is not above that, or the gap never falls to it.
+    """
     if before.gap <= wanted:
         return before.at
     return motion.next_at(before, wanted) or before.at

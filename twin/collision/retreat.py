@@ -52,10 +52,12 @@ REFINEMENT_STEPS = 40
 
 
 def leaving(scene: CollisionScene, path: Path) -> Contact | None:
-    """Find the first contact of a motion that begins with bodies overlapping, or None.
+    """Find the first contact of a motion that begins with bodies overlapping; None for a
+    retreat.
 
-    Overlapping is a clearance up to `GRAZING_MM`; such pairs stop only what brings them
-    closer.
+    Pairs up to `GRAZING_MM` apart count as overlapping: they stop only what brings them
+    closer, or touches again once they were free (`_pair_contact`). All others keep the
+    margin.
 
     Args:
         scene: bodies and pairs that must not touch.
@@ -63,14 +65,16 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
     """
     stuck = [pair for pair, gap in bodies_touching(scene, path.q[0]) if gap <= GRAZING_MM]
     others = first_contact(_without(scene, stuck), path)
-    found = [c for pair in stuck if (c := _pair_contact(scene, path, pair)) is not None]
-    contacts = [*found, *([] if others is None else [others])]
+    stopping = [
+        c for pair in stuck if (c := _pair_contact(scene, path, pair)) is not None
+    ]
+    contacts = [*stopping, *([] if others is None else [others])]
     return min(contacts, key=lambda contact: contact.time, default=None)
 
 
 def _pair_contact(scene: CollisionScene, path: Path, pair: Pair) -> Contact | None:
-    """Find the contact that stops one overlapping pair: coming closer, or touching again
-    once free.
+    """Find the contact that stops one overlapping pair: coming closer, or coming to the
+    margin again once free.
 
     A pair that comes free is then swept alone for its next contact.
 
@@ -80,7 +84,8 @@ def _pair_contact(scene: CollisionScene, path: Path, pair: Pair) -> Contact | No
         pair: of bodies that overlap at the beginning.
 
     Returns:
-        The contact; None if the bodies only come apart.
+        The contact, with clearance 0 and the last evaluated position where they come
+        closer; None if the bodies only come apart.
     """
     a, b = (scene.bodies[i] for i in pair)
     motion = RelativeMotion(a, b, path)
@@ -104,10 +109,17 @@ def _pair_contact(scene: CollisionScene, path: Path, pair: Pair) -> Contact | No
 def _deeper(
     motion: RelativeMotion, overlap: _Overlap, margin: float
 ) -> tuple[Moment, Moment] | None:
-    """Find when the separation falls to its floor: (last look before, moment);
-    None for never.
+    """Find when the separation of an overlapping pair falls to its floor.
 
-    The floor follows from the gap at the start and the margin.
+    The floor follows from the separation at the start and the margin (`safety.floor`).
+
+    Args:
+        motion: of one body relative to the other.
+        overlap: directions across which the bodies are judged.
+        margin: clearance to keep [mm].
+
+    Returns:
+        The moment of the look before, and that of the fall; None for never.
     """
     look = motion.look(START, overlap.separate)
     level = floor(look.gap, margin)
@@ -122,11 +134,14 @@ def _deeper(
 def _free_from(
     motion: RelativeMotion, separate: Separate, limits: Limits, until: float
 ) -> float | None:
-    """Find when the two exceed the margin by twice the tolerance, before `until`;
-    else None [s].
+    """Find when the gap of two bodies exceeds margin plus tolerance, before the time
+    `until`.
 
-    Where they are not clear by one tolerance, the other one has yet to be travelled, so
-    that every look is that far from the one before.
+    It is looked at from the start, each time after the travel that could open it to
+    margin plus two tolerances.
+
+    Returns:
+        Time of the first such look [s]; None if there is none.
     """
     at: Moment | None = START
     while at is not None and motion.time(at) < until:
@@ -167,8 +182,9 @@ class _Overlap:
     def at(cls, a: Body, b: Body, q: FloatArray) -> _Overlap:
         """Find the directions in which two overlapping bodies are to come apart.
 
-        They are the inward face normals of the bodies' Minkowski difference, and one
-        refined direction.
+        They are the inward face normals of the bodies' Minkowski difference, and a
+        refined one from the best of them (`_refined`). Bodies of many corners are
+        simplified for that (`_corners`).
 
         Args:
             a, b: the bodies.
@@ -196,22 +212,26 @@ class _Overlap:
     def _reach_of(
         self, i: int, directions: FloatArray, turned: tuple[FloatArray, FloatArray]
     ) -> FloatArray:
-        """Compute how far body `i` extends towards the other across directions, (k,) [mm]."""
+        """Compute how far body `i` (0 or 1) extends from its origin towards the other
+        across directions, (k,) [mm].
+
+        Args:
+            directions: (k, 3) unit directions from the second to the first, in the world.
+            turned: orientations of both.
+        """
         towards = directions if i else -directions
         return self.bodies[i].solid.support(towards @ turned[i])
 
     def separate(
         self, offset: FloatArray, turn_a: FloatArray | None, turn_b: FloatArray | None
     ) -> Separation:
-        """Compute the widest slab between the bodies [mm] and its
-        direction, as `relative.Separate`.
+        """Compute the widest slab between the bodies [mm] and its direction (3,) from b
+        to a, as `relative.Separate`.
 
-        A body of very many corners is not taken as the one that the directions turn
-        against.
-
-        The width is negative for an overlap, and never too large. Looked at are
-        directions that turn with either body. How far that body reaches across them does
-        not change, so that one of many corners costs no more than another.
+        The width is negative for an overlap, and never too large. Tried are the
+        directions, turned with either body since the beginning; not with one if the other
+        has many corners (`_many`), so that one of many corners costs no more than
+        another.
 
         Args:
             offset: from b's origin to a's (3,) [mm].
@@ -250,13 +270,15 @@ class _Overlap:
         return self.separate(at_a - at_b, turn_a, turn_b)[0]
 
     def _refined(self, q: FloatArray) -> FloatArray:
-        """Search for the direction (1, 3) of the widest gap, where no faces give it exactly.
+        """Search for the direction of the widest gap, where no faces give it exactly:
+        unit vector (1, 3).
 
-        From the best of known directions, by `REFINEMENT_STEPS` shrinking steps along x,
-        y, z: a local search.
+        From the best of the known directions, in `REFINEMENT_STEPS` steps to the best of
+        six neighbours along x, y, z; the step shrinks where none is better. A local
+        search.
 
         Args:
-            q: positions of all motors (axes,) [mm, rad].
+            q: positions of all motors (axes,) [mm, deg].
         """
         (_, at_a), (_, at_b) = (_pose(body, q) for body in self.bodies)
 
@@ -293,15 +315,16 @@ def _pose(body: Body, q: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _many(solid: ConvexSolid) -> bool:
-    """Return whether a solid has too many corners to use all."""
+    """Return whether a solid is a polytope of more than `MAX_EXACT_CORNERS` corners."""
     return isinstance(solid, Polytope) and len(solid.vertices) > MAX_EXACT_CORNERS
 
 
 def _corners(solid: ConvexSolid) -> FloatArray:
-    """Return the corners of a body (k, 3) [mm]; of a cylinder those of a prism around it.
+    """Return corners of a body in its own frame (k, 3) [mm]; of a cylinder those of a
+    prism around it.
 
-    A body with too many gives only those farthest along `MAX_EXACT_CORNERS` fixed
-    directions.
+    A body with too many gives only those farthest along `MAX_EXACT_CORNERS` directions,
+    always the same random ones.
     """
     if _many(solid):
         ways = np.random.default_rng(0).normal(size=(MAX_EXACT_CORNERS, 3))

@@ -60,16 +60,16 @@ def separation_of(
     ) -> Separation:
         """Compute the separation of the two solids in a pose; thread-safe.
 
-        The gap is never more than the distance; the normal of touching solids has no
-        meaning.
+        The gap is never more than the distance. fcl proposes the normal; where the slab
+        is thinner than its distance by more than `MAX_DEFICIT_MM` it is improved.
 
         Args:
             offset: from b's origin to a's (3,) [mm].
             turn_a, turn_b: orientations (3, 3); None for a body that never turns.
 
         Returns:
-            Gap [mm] and unit normal (3,) from b to a; a gap of 0 for solids that touch or
-            overlap.
+            Gap [mm] and unit normal (3,) from b to a; `_TOUCHING`, a gap of 0 and no
+            meaningful normal, for solids that touch or overlap.
         """
         # Nothing is shared that changes: several threads may call at once.
         ra, rb = (_IDENTITY if turn is None else turn for turn in (turn_a, turn_b))
@@ -107,9 +107,9 @@ def _improved(
     """Improve a certificate by Gilbert's search for the nearest point of the hull of all
     differences.
 
-    It stops within `MAX_DEFICIT_MM` of the distance or after `MAX_SEARCH_STEPS`.
-
-    fcl is off by millimetres where two edges are parallel, as those of upright boxes are.
+    It stops within `MAX_DEFICIT_MM` of the distance, after `MAX_SEARCH_STEPS`, or where
+    the least squares fail. fcl is off by millimetres where two edges are parallel, as
+    those of upright boxes are.
 
     Args:
         a, b: the solids.
@@ -147,15 +147,14 @@ def _improved(
 
 
 def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
-    """Make fcl's shape of a solid.
-
-    Of a polytope it is the origin.
+    """Make fcl's shape of a cylinder or polytope.
 
     Args:
         solid: in its own frame.
 
     Returns:
-        The shape, and its own centre in the solid's frame (3,) [mm].
+        The shape, and its own centre in the solid's frame (3,) [mm]; the origin for a
+        polytope.
 
     Raises:
         TypeError: neither cylinder nor polytope.

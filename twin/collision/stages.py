@@ -89,9 +89,10 @@ class Body:
 
     @cached_property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Corners of a box about the body's origin that holds the solid, (3,) each [mm].
+        """Corners of a box about the body's origin, in world directions, that contains
+        the solid, (3,) each [mm].
 
-        A spinning body's box holds it at every angle.
+        A spinning body's box contains it at every angle.
         """
         lower, upper = self.solid.bounds()
         if not self.spins:
@@ -104,10 +105,10 @@ class Body:
         return ends.min(axis=0) - across, ends.max(axis=0) + across
 
     def turn_until(self, toward: FloatArray, allowance: float, sense: float) -> float:
-        """Compute how far the body may turn before its support along `toward` grows
+        """Compute a turn that the body can make before its support along `toward` grows
         by `allowance` [rad].
 
-        For a cylinder it follows from its reach alone; one way it is at most half a turn.
+        For a cylinder it follows from its reach alone. One way it is at most half a turn.
 
         Args:
             toward: (3,) unit direction in the body's turned frame.
@@ -115,7 +116,7 @@ class Body:
             sense: of the turn, +1 or -1; 0 for both ways.
 
         Returns:
-            A lower bound of that turn; huge if it never grows so much.
+            A lower bound of that turn; for both ways huge if it never grows so much.
         """
         if not isinstance(self.solid, Polytope):
             return allowance / self.reach
@@ -139,7 +140,8 @@ class Body:
         """Points, their velocities about the axis, and their distances from it, stacked
         (3 k, 3).
 
-        k is the number of vertices; none for a cylinder.
+        k is the number of vertices, 0 for a cylinder. Distances are vectors across the
+        axis.
         """
         if isinstance(self.solid, Polytope):
             points = self.solid.vertices
@@ -150,8 +152,8 @@ class Body:
 
     @cached_property
     def _rodrigues(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Compute three (3, 3) matrices of the spin axis: projection on it, across it, cross
-        product.
+        """Three (3, 3) matrices of the spin axis: projection on it, projection across it,
+        cross product with it.
         """
         x, y, z = self.spin_axis
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -168,9 +170,7 @@ class Body:
 def stage_bodies(
     machine: Machine, profile: Profile, parameters: Offsets = NOMINAL
 ) -> list[Body]:
-    """Place the components of a machine as bodies.
-
-    In the order of the components; () components give none.
+    """Place the components of a machine as bodies, one for each, in their order.
 
     Args:
         machine: its components and its linear map.
@@ -197,13 +197,13 @@ def sample_bodies(
 
     A point b of a piece is at c + T R(alpha + angle_scale * angle) (b + mount - tau), the
     map of `Poses.cone_vec`; a piece is as large as all that a stage on the turntable can
-    sweep with it.
+    sweep with it. All are called `SAMPLE` and are of the holder's group.
 
     Args:
         machine: whose component holds the sample.
-        profile: offsets of its motors.
+        profile: zero offsets of the machine's motors.
         sample: convex pieces in the sample's frame [mm].
-        parameters: offsets of the geometry.
+        parameters: the correction in force.
 
     Returns:
         One body for each piece; none for a machine without a holder.
@@ -239,12 +239,12 @@ def sample_bodies(
 def _shifts(machine: Machine, profile: Profile, p: Offsets) -> dict[str, FloatArray]:
     """Compute the offset of each anchor from the motors' readings (3,) [mm].
 
-    The anchors are world, source, object and detector; fixed quantities of the machine
-    are added.
+    The anchors are world (0), source, object and detector; the object's contains tau.
+    Fixed quantities of the machine are added.
 
     Args:
         machine: which motors move which anchor.
-        profile: offsets of its motors.
+        profile: zero offsets of its motors.
         p: offsets of the geometry.
 
     Returns:
@@ -274,9 +274,10 @@ def _enlarged_by_stage(
     solid: UprightCylinder | Polytope,
     place: FloatArray | None = None,
 ) -> ConvexSolid:
-    """Enlarge `solid` to all places to which a stage on the turntable brings it.
+    """Enlarge `solid` to the hull of all places to which a stage on the turntable brings
+    it.
 
-    Places are corners of the stage's travel, horizontal, with the fixed part of `mount_x`
+    The stage moves it horizontally by its whole travel, plus the fixed part of `mount_x`
     and `mount_y`.
 
     Args:
@@ -284,10 +285,11 @@ def _enlarged_by_stage(
         part: the component, or the holder of a sample.
         solid: in the frame of the turntable.
         place: of a sample, which is on top of every such stage: its turn on the turntable
-            (3, 3).
+            (3, 3). None for a component: only the motors that carry it count.
 
     Returns:
-        The hull of all places; `solid` itself where no such stage carries it.
+        The hull of all places; `solid` itself where no such stage moves it, or it is not
+        at the object.
     """
     if part.anchor != "object":
         return solid
@@ -320,11 +322,9 @@ def _chain(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute origin, slides and turns of a component's frame.
 
-    Motors that do not carry the part have zero columns; turns only of parts at the object
-    [rad].
-
-    An offset belongs to the motor's reading, so it moves the same parts as the motor; a
-    fixed part is at its anchor, and one with a role where the X-ray geometry has it.
+    Motors that do not carry the part have zero columns; only parts at the object turn.
+    The anchor's offset counts along a coordinate that a carrying motor drives or the
+    machine fixes, and along all for a part with a role.
 
     Args:
         machine: axes and components.
@@ -332,7 +332,8 @@ def _chain(
         shifts: anchor -> offset (3,) [mm].
 
     Returns:
-        Origin (3,) [mm], and slides (axes, 3) and turns (axes,) per unit of each motor.
+        Origin with every motor at zero (3,) [mm], slides (axes, 3) [mm] and turns (axes,)
+        [rad] per unit of each motor.
     """
     chain = machine.chain(part)
     columns = {name: i for i, name in enumerate(machine.axes)}
@@ -354,10 +355,10 @@ def _chain(
 
 
 def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | Polytope:
-    """Make the solid of a component in its own frame [mm]: cylinder, hull of points, or box.
+    """Make the solid of a component in its own frame [mm]: cylinder, hull of its points,
+    or box.
 
-    Only a panel is turned, by the profile's roll and the offsets' tilts; its solid is
-    then a polytope.
+    A panel that is no cylinder is turned by the profile's roll and the offsets' tilts.
     """
     if part.shape == "cylinder":
         return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
@@ -387,9 +388,18 @@ def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
 def _placed(
     piece: ConvexSolid, place: FloatArray, tau: FloatArray
 ) -> UprightCylinder | Polytope:
-    """Move a piece by p -> place (p - tau); returned as it is if that changes nothing.
+    """Move a sample's piece by p -> place (p - tau); return it as it is if that changes
+    nothing.
 
-    A moved cylinder becomes a prism around it. Raises: TypeError for another solid.
+    A moved cylinder becomes a prism around it.
+
+    Args:
+        piece: cylinder or polytope [mm].
+        place: (3, 3) rotation.
+        tau: (3,) [mm].
+
+    Raises:
+        TypeError: another kind of solid.
     """
     if not isinstance(piece, (UprightCylinder, Polytope)):
         raise TypeError(f"cannot place a {type(piece).__name__}")
@@ -401,9 +411,10 @@ def _placed(
 
 
 def _group(machine: Machine, part: Component) -> str:
-    """Return the name of the part with a motor that carries `part` rigidly (maybe itself).
+    """Return the name of the first part, from `part` up its parents, that a motor moves;
+    "" if none does.
 
-    "" if no motor carries it.
+    Parts of one group are fixed to each other.
     """
     named = {c.name: c for c in machine.components}
     while part.axis is None and part.parent is not None:
