@@ -68,8 +68,11 @@ def flexdata_text(geometry: ScanGeometry) -> str:
     first, last = float(circle.angle[0]), float(circle.angle[-1])
     reach = float(np.linalg.norm(source) + np.linalg.norm(detector))
     beside = np.abs(np.linspace(first, last, len(circle.angle)) - circle.angle) * reach
-    what = "flexDATA's geometry.toml has no list of angles, only first and last; the distance [mm]"
-    g.require_each(f"{what} from equal steps", beside, ROUNDED_MM)
+    message = (
+        "flexDATA's geometry.toml has no list of angles, only first and last; "
+        "the distance [mm]"
+    )
+    g.require_each(f"{message} from equal steps", beside, ROUNDED_MM)
     if source[1] >= 0.0 or detector[1] - source[1] <= 0.0:
         raise ExchangeError("flexDATA: the source must stand before axis and detector")
     axes = np.stack(

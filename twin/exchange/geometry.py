@@ -159,8 +159,11 @@ def circle_of(
         angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12]
     )
     miss = np.abs(found.cone_vec().rows - cone_vec.rows).max(axis=1)
-    what = f"{format_name} knows one circle with everything else standing still; the distance [mm]"
-    require_each(f"{what} from it", miss, tolerance_mm)
+    message = (
+        f"{format_name} knows one circle with everything else standing still; "
+        "the distance [mm]"
+    )
+    require_each(f"{message} from it", miss, tolerance_mm)
     return found
 
 

@@ -174,8 +174,11 @@ class Follower:
                 and quiet > MAX_SILENCE_S
                 and mirror.speaks is not False
             ):
-                what = f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
-                mirror = _alarm(mirror, now, "warning", "silent", about, what)
+                message = (
+                    f"{waiting.heard.text!r} is under way and has said nothing "
+                    f"for {quiet:.1f} s"
+                )
+                mirror = _alarm(mirror, now, "warning", "silent", about, message)
                 mirror = replace(mirror, speaks=mirror.speaks or False)
             if quiet > max(FORGOTTEN_AFTER_S, waiting.most_s):
                 mirror = _rests(mirror.finished(waiting.heard), waiting)
@@ -205,8 +208,8 @@ class Follower:
             return replace(mirror.cleared("link"), connected=True)
         axes = {n: a.at_rest for n, a in mirror.axes.items()}
         mirror = replace(mirror, connected=False, waiting={}, axes=axes, due_s=None)
-        what = f"the link is lost: {why}; positions are those heard last"
-        return _alarm(mirror, now, "error", "lost", "link", what)
+        message = f"the link is lost: {why}; positions are those heard last"
+        return _alarm(mirror, now, "error", "lost", "link", message)
 
     def told(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
         """Return the mirror with the alarms of `ahead`: new ones are added, those that
@@ -264,15 +267,15 @@ class Follower:
             where = "the move under way"
             if p.line:
                 where = f"line {p.line}"
-            what = f"{where}: {p.message}{assumed}"
-            alarm = Alarm(now, p.severity, p.code, f"ahead, {where}", what)
+            message = f"{where}: {p.message}{assumed}"
+            alarm = Alarm(now, p.severity, p.code, f"ahead, {where}", message)
             found.setdefault((p.code, p.line), alarm)
         near = report.clearance
         bound = self.machine.safety_margin_mm + NEAR_PART_MM
         if near and not near.collisions and (near.min_clearance_mm or bound) < bound:
             parts = " and ".join(near.min_clearance_pair or ())
-            what = f"{parts} come within {near.min_clearance_mm:.2f} mm{assumed}"
-            found["clearance", 0] = Alarm(now, "warning", "clearance", "ahead", what)
+            message = f"{parts} come within {near.min_clearance_mm:.2f} mm{assumed}"
+            found["clearance", 0] = Alarm(now, "warning", "clearance", "ahead", message)
         return tuple(found.values())
 
     # -- commands ----------------------------------------------------------------------------
@@ -309,8 +312,8 @@ class Follower:
             not (name in FIXED or self.machine.has(name))
             and find(name, argument) is not None
         ):
-            what = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
-            mirror = _alarm(mirror, now, "error", "unknown_axis", name, what)
+            message = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
+            mirror = _alarm(mirror, now, "error", "unknown_axis", name, message)
         if argument.lower() == "stop":
             mirror = replace(mirror, axes={n: a.at_rest for n, a in mirror.axes.items()})
         waiting = Waiting(heard, now, now)
@@ -426,8 +429,8 @@ class Follower:
         left = min(target - axis.lower, axis.upper - target)
         if left >= NEAR_LIMIT_DISTANCE or ("limit", name) in mirror.active:
             return mirror
-        what = f"{name} goes to {target:g} {axis.unit}, {left:g} from a limit"
-        return _alarm(mirror, now, "warning", "limit_near", name, what)
+        message = f"{name} goes to {target:g} {axis.unit}, {left:g} from a limit"
+        return _alarm(mirror, now, "warning", "limit_near", name, message)
 
     def _follow_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
         """Find the command in the script: advance, or raise an alarm.
@@ -468,8 +471,8 @@ class Follower:
             return replace(mirror, next_line=at + 1, began_s=began, due_s=due)
         if mirror.began_s is None or at >= len(lines):
             return mirror
-        what = f"{describe(command)!r} is not {self._next(mirror)}"
-        return _alarm(mirror, now, "warning", "off_script", "script", what)
+        message = f"{describe(command)!r} is not {self._next(mirror)}"
+        return _alarm(mirror, now, "warning", "off_script", "script", message)
 
     @cached_property
     def _bare(self) -> tuple[c.Command, ...]:
@@ -592,8 +595,8 @@ class Follower:
         if abs(there - meant) <= TARGET_TOLERANCE:
             return mirror
         unit = self.machine.axes[name].unit
-        what = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
-        return _alarm(mirror, now, "error", "offset", name, what)
+        message = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
+        return _alarm(mirror, now, "error", "offset", name, message)
 
     def _compare_limits(
         self, mirror: Mirror, name: str, motor: MotorReply, now: float
@@ -677,8 +680,8 @@ class Follower:
                 and not moved
             ):
                 stood = f"not at {seen.position:.6g}, and no move of it was heard"
-                what = f"{name} stands at {x:.6g} {unit}, {stood}"
-                mirror = _alarm(mirror, now, "error", "moved", name, what)
+                message = f"{name} stands at {x:.6g} {unit}, {stood}"
+                mirror = _alarm(mirror, now, "error", "moved", name, message)
             return mirror
         arrived = abs(x - path.target) <= TARGET_TOLERANCE
         passes = path.end if arrived else path.time_at(x)
@@ -699,19 +702,19 @@ class Follower:
                 return here
             return here.with_axis(name, passed_s=passes)
         if passes is None:
-            what = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
-            return _alarm(here, now, "error", "off_path", name, what)
+            message = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
+            return _alarm(here, now, "error", "off_path", name, message)
         least = now - heard.late_s - passes
         most = now - passes
         first = seen.behind_s or (least, most)
         if least > seen.delay_s + SLACK_S or least - first[1] > MAX_DRIFT_S:
-            what = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
-            here = _alarm(here, now, "error", "slow", name, what)
+            message = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
+            here = _alarm(here, now, "error", "slow", name, message)
         elif most + seen.begun_s < -SLACK_S or (
             most < 0.0 and first[0] - most > MAX_DRIFT_S
         ):
-            what = f"{name} is fast: {-most:.2f} s ahead of the predicted path at {x:.6g} {unit}"
-            here = _alarm(here, now, "error", "fast", name, what)
+            message = f"{name} is fast: {-most:.2f} s ahead of the predicted path at {x:.6g} {unit}"
+            here = _alarm(here, now, "error", "fast", name, message)
         promptest = min(first, (least, most), key=lambda behind: behind[1])
         return here.with_axis(name, behind_s=promptest, passed_s=passes)
 
@@ -734,8 +737,11 @@ class Follower:
         if took > waiting.most_s:
             longer = "more"
         bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
-        what = f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of {bounds}"
-        return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], what)
+        message = (
+            f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of "
+            f"{bounds}"
+        )
+        return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], message)
 
 
 def _alarm(

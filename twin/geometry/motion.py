@@ -92,8 +92,8 @@ class Motion:
             TwinError: another number of frames.
         """
         if len(poses) != len(self.values):
-            what = f"motion of {len(self.values)} frames for a scan of {len(poses)}"
-            raise TwinError(what, {"asked": len(self.values), "allowed": len(poses)})
+            message = f"motion of {len(self.values)} frames for a scan of {len(poses)}"
+            raise TwinError(message, {"asked": len(self.values), "allowed": len(poses)})
         d = dict.fromkeys(NAMES, np.zeros(len(poses))) | dict(
             zip(self.names, sign * self.values.T, strict=True)
         )

@@ -756,8 +756,8 @@ class Machine(_Frozen):
         for component in self.components:
             chain = self.chain(component)
             driving = self._motors_of(component.anchor)
-            what = f"motor of anchor {component.anchor!r}"
-            _require(chain, driving, f"components.{component.name}.axis", what)
+            message = f"motor of anchor {component.anchor!r}"
+            _require(chain, driving, f"components.{component.name}.axis", message)
             carrier = next(
                 (c for c in self.components if c.name == component.parent), None
             )

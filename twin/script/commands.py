@@ -66,8 +66,9 @@ class Command:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Fields of the command's own type, by name; those that all commands have
-        are left out."""
+        """Fields of the command's own type, name -> value; those that all commands have
+        (`Command`) are left out.
+        """
         return {
             f.name: getattr(self, f.name) for f in fields(self)[len(fields(Command)) :]
         }
@@ -214,24 +215,27 @@ class Custom(Command):
 
 
 def _all_commands(cls: type[Command] = Command) -> dict[str, type[Command]]:
-    """List a command type and its subclasses by class name."""
+    """Map class names to command types: a type and all its subclasses, abstract ones too."""
     below = {k: v for sub in cls.__subclasses__() for k, v in _all_commands(sub).items()}
     return {cls.__name__: cls, **below}
 
 
 def _to_json(command: Command) -> dict[str, Any]:
-    """Serialise a command to its fields and `command`, the name of its type."""
+    """Serialise a command to a dict of its fields in JSON types, and `command`, the name
+    of its type.
+    """
     fields = adapter_of(type(command)).dump_python(command, mode="json")
     return {"command": type(command).__name__, **fields}
 
 
 def _from_json(value: Any) -> Command:
-    """Read a command back from the form of `_to_json`; a Command passes unchanged.
+    """Read a command back from the mapping of `_to_json`; a Command passes unchanged.
 
-    Fields that do not fit raise pydantic's ValidationError, a ValueError.
+    `value` is not changed. Fields that do not fit raise pydantic's ValidationError, a
+    ValueError.
 
     Raises:
-        ValueError: an unknown command.
+        ValueError: no or an unknown `command`.
     """
     if isinstance(value, Command):
         return value
@@ -265,8 +269,8 @@ class Script:
 
     @classmethod
     def of(cls, commands: Iterable[Command]) -> Script:
-        """Make a script from commands in memory, without warnings; its lines are the last
-        command's line.
+        """Make a script from commands in memory, without warnings; `lines` is the
+        greatest line of a command, 0 without any.
         """
         made = tuple(commands)
         return cls(made, (), max((c.line for c in made), default=0))

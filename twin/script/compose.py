@@ -49,11 +49,11 @@ Zero offsets are of that kind, a machine built otherwise is not (assumed).
 def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> str:
     """Compose the text of a script for a requested scan.
 
-    The last attempt's error is raised. At the usual SOD without placements a second
-    placement is added where one is possible.
-
-    Distances that the request leaves out are the usual ones where the machine allows
-    them, else those at home.
+    Distances that the request leaves out are tried in the order of `_distances_to_try`:
+    the usual ones, then those at home; the first that the machine allows are taken, else
+    the last attempt's error is raised. Without placements there is one at that SOD; if it
+    is 600 mm a second one at 800 mm, or at home, is added where possible. Exposure is the
+    machine's if the request has none.
 
     Args:
         request: the scan; it is checked before anything is written.
@@ -119,14 +119,15 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
 def _distances_to_try(
     request: ScanRequest, places: MotorTargets
 ) -> Iterator[tuple[float, float, float]]:
-    """Yield SOD, SDD and height to try: as requested, else the usual ones, else
-    those at home [mm].
+    """Yield (SOD, SDD, height) to try [mm]: as requested, else the usual ones, then those
+    at home.
 
-    The usual are 600 and 1059 mm; every combination, SOD changing slowest.
+    The usual are 600 and 1059 mm, and the sample's height at home (the source's, where no
+    motor moves it). Every combination, SOD changing slowest.
     """
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
-        """Return the distance asked for alone, or (None) the usual ones, each once."""
+        """Return the requested value alone, or (None) the usual ones, each once."""
         if asked is None:
             return dict.fromkeys(usual)
         return (asked,)
@@ -158,7 +159,8 @@ class _Writer(MotorTargets):
     request: _Request
 
     def rows(self) -> Iterator[str]:
-        """Yield the rows: pause, output path, settings, moves, dark and flat images, scan,
+        """Yield the rows of the whole script: pause, output path, settings, moves with
+        the sample out of the beam, dark and flat images, scan of the request's kind,
         X-rays off.
         """
         w = self.request
@@ -182,8 +184,8 @@ class _Writer(MotorTargets):
         """Yield the rows that set tube and camera: voltage, power, mode, exposure and
         ROI.
 
-        Voltage and power are the machine's if the request has none; averages are not set
-        here.
+        Voltage and power are the machine's if the request has none; frames and averages
+        are not set here.
         """
         w = self.request
         m = self.machine
@@ -199,9 +201,11 @@ class _Writer(MotorTargets):
         yield _row("camera", "set ROI", str(camera.roi))
 
     def references(self) -> Iterator[str]:
-        """Yield dark images (X-rays off), then flat images, from where the motors stand.
+        """Yield one averaged dark image (X-rays off), then one averaged flat image, from
+        where the motors stand.
 
-        X-rays stay on afterwards.
+        Files are di000000.tif and io000000.tif; number of frames becomes 1. X-rays stay
+        on afterwards.
         """
         w = self.request
         yield _row("camera", "set number of frames", "1")
@@ -213,15 +217,21 @@ class _Writer(MotorTargets):
         yield from self.image("io000000.tif", w.flats)
 
     def fly(self) -> Iterator[str]:
-        """Yield one smooth turn of 360 degrees, the sample moved back into the beam before."""
+        """Yield the sample's move back into the beam, then one smooth turn of 360 degrees
+        with its run-up.
+        """
         yield from self.go(*self.aside)
         yield from self.turn(360.0, self.request.frames, 0)
 
     def step(self) -> Iterator[str]:
-        """Yield the rows of a turn that stops for every image, the sample taken out of
-        the beam before.
+        """Yield the sample's move back into the beam, then a turn of 360 degrees that
+        stops for every image.
 
-        Over 360 degrees, the last angle left out; the settings file is written before.
+        Image i of n is at i * 360 / n, the last angle left out; the settings file is
+        written before the first.
+
+        Raises:
+            LimitError: an angle outside the rotation's travel.
         """
         w = self.request
         name, rotation = self.rotation
@@ -236,11 +246,13 @@ class _Writer(MotorTargets):
             yield _row("camera", "save image", f"{w.folder}\\scan_{i:06d}.tif")
 
     def tiled(self) -> Iterator[str]:
-        """Yield one smooth turn for each tile, the detector moved by 0.9 of its width
-        between them.
+        """Yield a smooth turn for each tile, the detector moved by 0.9 of its image's
+        width between them, the sample into the beam before.
 
-        The tiles are centred; image numbers go on. Refused for a machine without
-        `detector_x`.
+        The tiles are centred about the beam's middle; numbers of images go on.
+
+        Raises:
+            LimitError: a machine without a motor for `detector_x`.
         """
         w = self.request
         camera = self.camera
@@ -252,7 +264,9 @@ class _Writer(MotorTargets):
             yield from self.turn(360.0, w.frames, k * w.frames)
 
     def calibration(self) -> Iterator[str]:
-        """Yield a smooth turn for each placement of the sample; image numbers go on."""
+        """Yield for each placement the sample's moves into the beam and to its SOD, and a
+        smooth turn; numbers of images go on.
+        """
         w = self.request
         for k, place in enumerate(w.placements):
             moved = ("object_y",) if "object_y" in self.drivers else ()
@@ -263,13 +277,13 @@ class _Writer(MotorTargets):
         """Yield the rows of several turns while source and detector rise at constant
         speed.
 
-        Motors that also move something else are refused.
-
-        They rise from before the trigger to after the end. Where no motors raise them,
-        the sample sinks. Speeds are set back at the end.
+        They rise by the request's `rise_mm` over all turns, beginning before the trigger
+        and ending after the last image. Where no motors raise them, the sample sinks.
+        Speeds are set back at the end.
 
         Raises:
-            LimitError: no motors for it, or a rise that is too fast for the run-up.
+            LimitError: no motors for it, motors that also move something else, or a rise
+                that is too fast for the run-up.
         """
         w = self.request
         m = self.machine
@@ -336,11 +350,16 @@ class _Writer(MotorTargets):
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def turn(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """Yield a smooth scan of `frames` images over `total` degrees from angle 0,
-        and its run-up.
+        """Yield a smooth scan of `frames` images over `total` degrees from angle 0, and
+        its run-up.
 
-        Afterwards speed and acceleration are the axis's own again; images are numbered
-        from `first`.
+        Run-up before and after. Afterwards speed and acceleration are the axis's own
+        again; images are numbered from `first`.
+
+        Args:
+            total: angle from first to last image [deg].
+            frames: number of images.
+            first: number in the first image's file name.
         """
         name, rotation = self.rotation
         yield from self.run_up(total, frames)
@@ -348,8 +367,13 @@ class _Writer(MotorTargets):
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def run_up(self, total: float, frames: int) -> Iterator[str]:
-        """Yield the move to the start of the run-up, the scan's speed and its
-        numbers of images."""
+        """Yield the rows before a sweep: the move to the start of the run-up, the scan's
+        speed, frames and averages, and the settings file.
+
+        Args:
+            total: angle from first to last image [deg].
+            frames: number of images.
+        """
         name, rotation = self.rotation
         begin = self.turned_to(-self.run_up_deg(total, frames), total)
         yield from self.drive(name, rotation.speed, rotation.acceleration)
@@ -360,11 +384,12 @@ class _Writer(MotorTargets):
         yield _row("scanner", "write settings file")
 
     def sweep(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """Yield the move over `total` degrees and the image sequence that it triggers.
+        """Yield the move from the run-up's start to its end after `total` degrees, and
+        the image sequence that it triggers at angle 0.
 
         Args:
-            total: angle from first to last image [deg]; a run-up follows.
-            frames: number of images, which decides the speed.
+            total: angle from first to last image [deg].
+            frames: number of images, which decides speed and run-up.
             first: number in the first image's file name.
         """
         name = self.rotation[0]
@@ -401,10 +426,13 @@ class _Writer(MotorTargets):
             ) from None
 
     def turn_speed(self, total: float, frames: int) -> float:
-        """Compute the rotation's speed for `frames` images over `total` degrees [deg/s].
+        """Compute the rotation's speed for `frames` images, first and last at the ends of
+        `total` degrees [deg/s].
+
+        An image takes exposure times averages. `frames` is at least 2.
 
         Raises:
-            LimitError: faster than the axis turns.
+            LimitError: faster than the axis turns (`max_speed`).
         """
         name, rotation = self.rotation
         speed = total / (frames - 1) / self.image_s
@@ -419,7 +447,9 @@ class _Writer(MotorTargets):
         return speed
 
     def run_up_deg(self, total: float, frames: int) -> float:
-        """Compute the length of the run-up [deg] for `frames` images over `total` degrees."""
+        """Compute the length of the run-up [deg] for `frames` images over `total`
+        degrees: acceleration and `MARGIN_IMAGES` images.
+        """
         speed = self.turn_speed(total, frames)
         return run_up(speed, self.rotation[1].acceleration, self.image_s)
 
@@ -428,8 +458,11 @@ class _Writer(MotorTargets):
     ) -> Iterator[str]:
         """Yield moves of the motors of `quantities` alone to their station.
 
+        Other motors are not moved.
+
         Args:
-            *quantities: such as object_y.
+            *quantities: such as object_y; each has a motor of its own (`driver`), else
+                LimitError.
             place: of the sample; None: the request's SOD.
             shift: of the detector sideways [mm].
         """
@@ -446,8 +479,10 @@ class _Writer(MotorTargets):
     ) -> dict[str, float]:
         """Compute the motor targets that put source, detector and sample in their places.
 
-        A quantity without a motor of its own may be off by rounding, across and up by a
-        share of the detector.
+        The middle of the camera's region goes into the beam's middle; where no motor
+        brings it there, the sample goes to the region. A quantity without a motor may be
+        off by rounding (`_ROUNDED_MM`), sideways and up by `MAX_LATERAL_SHARE` of the
+        field of view.
 
         Args:
             sod: source-object distance [mm].
@@ -458,7 +493,8 @@ class _Writer(MotorTargets):
             Motor -> target [mm, deg], within its travel.
 
         Raises:
-            LimitError: beyond a travel limit, or a quantity that no motor sets.
+            LimitError: beyond a travel limit, or a quantity that no motor brings to its
+                value.
         """
         w = self.request
         height = w.height_mm
@@ -501,19 +537,20 @@ class _Writer(MotorTargets):
             if abs(asked - only) <= slack:
                 continue
             self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
-            what = (
+            message = (
                 f"has no motor of its own for {QUANTITIES[quantity]}: {asked:g} mm were "
                 "asked for"
             )
-            it_is = f"{what}, it is {only:g} mm"
+            it_is = f"{message}, it is {only:g} mm"
             raise self.lacking(it_is, asked=asked, allowed=only, missing=quantity)
         return {
             name: check_target(self.machine, name, value) for name, value in found.items()
         }
 
     def out_of_beam(self) -> dict[str, float]:
-        """Compute the stage's targets for the flat image: beside the beam, to
-        the freer side."""
+        """Compute the target of the stage that takes the sample beside the beam, to the
+        freer side, for the flat image: motor -> [mm].
+        """
         station = self.station(self.request.sod_mm)
         return beside_beam(self.machine, self.profile, self.camera, station)[0]
 
@@ -524,8 +561,13 @@ class _Writer(MotorTargets):
         yield _row("camera", "save image", f"{self.request.folder}\\{file}")
 
     def moves(self, targets: dict[str, float]) -> Iterator[str]:
-        """Yield moves: several start together without waiting, then each is repeated to wait
-        for it.
+        """Yield the rows that move motors to targets and wait for all of them.
+
+        Several are first started together without waiting, then each move is repeated to
+        wait for it.
+
+        Args:
+            targets: motor -> target [mm, deg].
         """
         if len(targets) > 1:
             for name, value in targets.items():
@@ -565,17 +607,17 @@ class _Writer(MotorTargets):
 
     @property
     def rotation(self) -> tuple[str, Axis]:
-        """The motor that turns the sample.
+        """The motor that turns the sample, by name and axis.
 
         Raises:
-            LimitError: several do, or one that does not turn it degree by degree.
+            LimitError: several do, or one by another factor than 1 or -1.
         """
         factors = self.machine.geometry["angle"]
         name = next(iter(factors))
         if len(factors) > 1 or abs(factors[name]) != 1.0:
-            what = f"turns the sample by {factors}; flexdt writes scripts for one motor with a"
+            message = f"turns the sample by {factors}; flexdt writes scripts for one motor with a"
             raise self.lacking(
-                f"{what} factor of 1 or -1", asked=dict(factors), allowed=[1.0, -1.0]
+                f"{message} factor of 1 or -1", asked=dict(factors), allowed=[1.0, -1.0]
             )
         return name, self.machine.axis(name)
 
@@ -588,7 +630,8 @@ class _Writer(MotorTargets):
 def _check_counts(request: _Request) -> None:
     """Check the counts and distances of a request against their allowed ranges.
 
-    The first rule that fails is raised; values that are not finite fail.
+    The first rule that fails is raised; values that are not finite fail. A SOD greater
+    than the SDD is among them.
 
     Args:
         request: what the script is composed for.
@@ -617,11 +660,11 @@ def _check_counts(request: _Request) -> None:
     )
     for name, value, low, high in rules:
         if not (math.isfinite(value) and low <= value <= high):
-            what = f"{name} is {value:g}; allowed: {low:g} to {high:g}"
+            message = f"{name} is {value:g}; allowed: {low:g} to {high:g}"
             if name == "sod_mm" and value > high:
-                what += ", the sdd_mm: are the two swapped?"
+                message += ", the sdd_mm: are the two swapped?"
             raise LimitError(
-                what, {"setting": name, "asked": value, "allowed": [low, high]}
+                message, {"setting": name, "asked": value, "allowed": [low, high]}
             )
 
 

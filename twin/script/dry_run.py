@@ -38,7 +38,8 @@ def check_script(
     collision: CollisionCheck | None = None,
     physics: Physics = "poly",
 ) -> CheckReport:
-    r"""Parse, plan and check a script; unreadable lines are reported and the rest is planned.
+    r"""Parse, plan and check a script; unreadable lines are reported and the rest is
+    planned.
 
     Args:
         text: the script's text, bytes or path; or a script from `parse_script`.
@@ -51,13 +52,13 @@ def check_script(
             unchecked.
         physics: predicts whether the open beam saturates the panel.
 
+    Returns:
+        The report; problems of the script are in it and never raise.
+
     Example:
         >>> script = "camera\tset exposure\t100\t\tACK\t\t\r\n"
         >>> check_script(script).ok
         True
-
-    Returns:
-        The report; problems never raise.
     """
     problems: tuple[ScriptProblem, ...]
     if isinstance(text, c.Script):
@@ -84,13 +85,17 @@ def check_plan(
     start_known: bool = True,
     physics: Physics = "poly",
 ) -> CheckReport:
-    """Check a plan: problems, collisions, truncation, saturation and dose, as a report.
+    """Check a plan: collisions, truncation, open beam and dose, with its problems, as a
+    report.
+
+    A collision is an error; the sample's truncation, a beam that saturates or starves the
+    panel, and an unknown start are warnings.
 
     Args:
         plan: of a script or of poses.
         problems: of the text that it was made from, in addition to its own.
-        collision: see `check_script`.
-        text: that it was made from, for the page.
+        collision: finds collisions and clearances; None leaves them unchecked.
+        text: script that the plan was made from, for the page.
         start_known: whether the start was given; if not, motors that nothing moves before
             the first projection are a warning.
         physics: see `check_script`.
@@ -109,21 +114,25 @@ def check_plan(
         found += _start_problems(plan)
     if clearance is not None:
         for x in clearance.collisions:
-            what = f"{x.pair[0]} and {x.pair[1]} come within the safety margin at {x.time_s:.3f} s"
-            found.append(ScriptProblem("error", "collision", x.line, 1, what))
+            message = (
+                f"{x.pair[0]} and {x.pair[1]} come within the safety margin at "
+                f"{x.time_s:.3f} s"
+            )
+            found.append(ScriptProblem("error", "collision", x.line, 1, message))
     return CheckReport(
         plan, in_order(found), clearance, optics, _dose(plan), text, start_known
     )
 
 
 def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
-    """Warn if the first projection is taken with motors that nothing has moved before.
+    """Warn if motors that nothing has moved stand at an assumed place when the first
+    projection is taken.
 
     Args:
-        plan: of the script, from home or a stated start.
+        plan: of the script; positions of its start are those assumed.
 
     Returns:
-        At most one warning.
+        At most one warning, `default_assumed`; none without projections.
     """
     seen = [group for group in plan.groups if group.kind == "projection"]
     if not seen:
@@ -140,20 +149,25 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
     if not left:
         return []
     where = ", ".join(f"{name}={x:g}" for name, x in left.items())
-    what = f"nothing moves {', '.join(left)} before this image; home is assumed: {where}"
-    return [ScriptProblem("warning", "default_assumed", first.line, 1, what)]
+    message = (
+        f"nothing moves {', '.join(left)} before this image; home is assumed: {where}"
+    )
+    return [ScriptProblem("warning", "default_assumed", first.line, 1, message)]
 
 
 def _optics(view: View) -> Optics:
-    """Compute the figures of a view's images: distances [mm], magnification, voxel, field
-    and truncation.
+    """Compute the figures of a view's images: lines, distances [mm], magnification, voxel
+    [um], fields [mm] and truncation.
+
+    `turn_field_mm` is the width that stays within the image over a full turn.
 
     Args:
         view: images of one camera setting and kind.
 
     Returns:
-        Ranges (least, greatest) over the images; truncation None if the sample's size is
-        unknown.
+        Ranges (least, greatest) over the images; `truncation` is side -> the largest
+        number of pixels cut off, without top and bottom if the height is unknown, None if
+        the width is.
     """
     p = view.poses
     camera = view.camera
@@ -186,16 +200,17 @@ def _extent(values: FloatArray) -> tuple[float, float]:
 
 
 def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
-    """Warn if no image of the scan shows some part of the sample's width or height.
+    """Warn if no image of the scan shows some side of the sample's width or height.
 
-    Positions of several scans of one script (tiles, helical turns) make up for each
-    other.
+    Each side counts by the image that cuts off least of it, so positions of several scans
+    of one script (tiles, helical turns) make up for each other. Views with the sample
+    wholly outside, or of unknown size, are skipped.
 
     Args:
         seen: views of the projections.
 
     Returns:
-        At most one warning for each view.
+        At most one warning, `truncated`, for each view.
     """
     found = []
     for view in seen:
@@ -207,15 +222,18 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
             px for cut in cuts for px in np.min(cut, axis=0).tolist()
         ]  # NaN: height unknown
         if parts := cut_off(dict(zip(names, least, strict=True))):
-            what = f"the sample is cut off over the rotation: {parts}"
-            found.append(ScriptProblem("warning", "truncated", min(view.lines), 1, what))
+            message = f"the sample is cut off over the rotation: {parts}"
+            found.append(
+                ScriptProblem("warning", "truncated", min(view.lines), 1, message)
+            )
     return found
 
 
 def _dose(plan: ScanPlan) -> Dose:
-    """Sum up a plan's beam time [s], charge [mAs] and exposing time [s].
+    """Sum up a plan's time with X-rays on [s], charge [mAs] and exposing time [s].
 
-    Exposing counts images with X-rays on, all averages; beam below 1e-3 kV has no charge.
+    Exposing counts images with X-rays on, with all averages, saved or not; beam of 1e-3
+    kV or less has no charge.
     """
     exposing = sum(
         len(g) * g.camera.exposure_ms * g.camera.averages / 1000.0

@@ -20,12 +20,15 @@ def html_report(report: CheckReport, name: str = "script") -> str:
     Args:
         report: from `check_script`.
         name: title of the script.
+
+    Returns:
+        Text of the page.
     """
     return str(backend("dry-run pages").html_report(report, name))
 
 
 def against_summary(found: LogComparison) -> Facts:
-    """List the figures of a log comparison as (label, value).
+    """List the figures of a log comparison as (label, value), for people.
 
     Machine and timing source, executed and predicted time with its 90 % range, sum of
     absolute errors, lines in their range, and the assumed start.
@@ -55,10 +58,10 @@ def against_summary(found: LogComparison) -> Facts:
 
 
 def summary(report: CheckReport) -> Facts:
-    """List the figures of a report as (label, value).
+    """List the figures of a report as (label, value), for people.
 
-    Machine, duration and its parts, images, X-rays, sample, start, one group for each
-    camera setting, and collisions.
+    Machine and profile, duration and its parts, images, X-rays, sample, start, a group
+    for each camera setting, and collisions.
 
     Args:
         report: of `check_script`.
@@ -89,10 +92,11 @@ def summary(report: CheckReport) -> Facts:
 def _optics_facts(o: Optics) -> Facts:
     """List the figures of one camera setting as (label, value).
 
-    Pixels, distances, magnification, field of view, and truncation if it was computed.
+    Pixels and distances, magnification with voxel, field of view, and truncation if the
+    sample's size is known.
 
     Args:
-        o: of one camera setting.
+        o: of the images of one camera setting.
     """
     if o.lines[0] == o.lines[1]:
         where = f"line {o.lines[0]}"
@@ -120,10 +124,10 @@ def _optics_facts(o: Optics) -> Facts:
 
 
 def _collisions(report: CheckReport) -> str:
-    """Format the number of collisions, or "none" with the smallest clearance, or "not
-    checked".
+    """Format the number of collisions, or "none" with the least clearance and its pair,
+    or "not checked".
 
-    The clearance is given only without collisions and where it is known.
+    The clearance is given only where there are no collisions and it is known.
     """
     c = report.clearance
     if c is None:
@@ -140,9 +144,10 @@ def _collisions(report: CheckReport) -> str:
 
 
 def _sources(report: CheckReport) -> str:
-    """Describe how much of the steps' time is measured and how much assumed, and the source.
+    """Describe how much of the steps' assumed time is measured and how much not [s], and
+    the timing's source.
 
-    A kind with a spread counts as measured.
+    A kind with a spread counts as measured; parts of 0 s are left out.
     """
     timing = report.plan.machine.timing
     parts = {"measured": 0.0, "assumed": 0.0}
@@ -160,7 +165,8 @@ def between(found: Range | None) -> str:
 
 
 def _total(report: CheckReport) -> str:
-    """Describe the 90 % range of the duration, with a condition if the start is assumed.
+    """Describe the 90 % range of the duration [s], with a condition if the start is not
+    known.
 
     "unknown" if no time of the machine is measured.
     """
@@ -175,7 +181,7 @@ def _total(report: CheckReport) -> str:
 
 
 def _time(seconds: float) -> str:
-    """Format a duration, rounded to seconds, in (hours if any,) min and s."""
+    """Format a duration [s], rounded to seconds, as hours (left out if 0), min and s."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -83,8 +83,9 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
         data: the file's bytes, since replies are binary.
 
     Returns:
-        Lines in order, and problems: an error for each line that does not hold, a warning
-        for a last line that is cut off and for a motor's reply that is not as expected.
+        Lines in order, and problems in the order of lines: an error for each line that
+        cannot be read (it is left out), a warning for a last line that is cut off and for
+        a motor's reply that is not as expected.
 
     Example:
         >>> (line,), found = read_log(b"tube\txrayoff\t\t\tACK\t\t\t501\t\t09:36:31.952")
@@ -102,15 +103,18 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
             problems.append(ScriptProblem("error", error.code, number, 1, str(error)))
         start = stamp.end()
     if data[start:].strip(b"\0 \t\r\n\x1a"):
-        what = f"the last line is cut off before its moment and left out; {COLUMNS}"
-        problems.append(ScriptProblem("warning", "cut_off", number + 1, 1, what))
+        message = f"the last line is cut off before its moment and left out; {COLUMNS}"
+        problems.append(ScriptProblem("warning", "cut_off", number + 1, 1, message))
     return tuple(executed), in_order(problems)
 
 
 def _line(
     record: bytes, stamp: re.Match[bytes], number: int, problems: list[ScriptProblem]
 ) -> Executed:
-    """Read one line of a log; add a warning if the motor's reply does not fit its move.
+    """Read one line of a log; add a warning `reply` if a motor's reply does not fit its
+    move.
+
+    Only a move that waits (ACK) has its reply decoded.
 
     Args:
         record: the line without its moment.
@@ -123,7 +127,8 @@ def _line(
         the decoded reply or None.
 
     Raises:
-        ArgumentError: the line cannot be read.
+        ArgumentError: the line cannot be read, its own time is above `MAX_OWN_S`, or its
+            moment is no time of day.
     """
     wait = _WAIT.search(record)
     if wait is not None:
@@ -161,21 +166,23 @@ def _line(
         motor = motor_reply(reply)
         if motor is None or not _arrived(motor, command.target):
             motor = None
-            what = (
+            message = (
                 f"the reply of {shorten(command.component)} ({len(reply)} bytes) is left "
                 "out: it "
                 f"must begin with {_REPLY_DOUBLES} big-endian doubles (position near the "
                 "target, "
                 "limits twice)"
             )
-            problems.append(ScriptProblem("warning", "reply", number, 1, what))
+            problems.append(ScriptProblem("warning", "reply", number, 1, message))
     return Executed(command, own, 3600 * hour + 60 * minute + second, reply, motor)
 
 
 def _arrived(motor: MotorReply, target: float) -> bool:
-    """Return whether a reply is about a move to `target`, or to the limit before it.
+    """Return whether a reply is about a move to `target`, or to the motor's limit before
+    it.
 
-    The motor's target must agree to 1e-3 (relative above 1), its position to 1 more.
+    The motor's target must agree within 1e-3 (1 + its size), its position with that
+    within 1 more.
     """
     allowed = min(max(target, motor.lower), motor.upper)
     near = 1e-3 * (1.0 + abs(allowed))
@@ -190,12 +197,18 @@ def log_line(
 ) -> bytes:
     """Format one line of a log, as `read_log` reads it.
 
+    Blanks within the words become single spaces, unless a word has a NUL; own time is
+    written in whole ms.
+
     Args:
         words: component, command, argument 1, argument 2.
         wait: ACK, no wait, POS or RCV.
         own_s: how long the command took [s].
         reply: as it came.
         stamp: time of day at which it was sent, hh:mm:ss.mmm.
+
+    Returns:
+        The line with CRLF.
 
     Example:
         >>> made = log_line(("tube", "xrayoff", "", ""), "ACK", 0.5, b"", "09:36:31.952")
@@ -219,7 +232,8 @@ def reply_bytes(text: str) -> bytes:
 
 
 def motor_cluster(motor: MotorReply) -> bytes:
-    """Encode a motor's reply in the scanner's form; unknown bytes are zero.
+    """Encode a motor's reply in the scanner's form of `_REPLY_BYTES`; unknown bytes are
+    zero.
 
     Args:
         motor: position, target, rates and limits [mm, deg, mm/s, deg/s].
@@ -254,6 +268,11 @@ def motor_cluster(motor: MotorReply) -> bytes:
 
 def motor_reply(reply: bytes) -> MotorReply | None:
     """Decode a motor's reply; None if it is not one.
+
+    None if it is too short, has been saved as plain text (no byte from 0x80 on), or its
+    numbers are not a motor's: limits that are not repeated or in order, speed or
+    acceleration not above 0 or above their maxima, maxima above 1e6, a position more than
+    1 outside the limits.
 
     Args:
         reply: column 9: 17 big-endian doubles (0 position, 1 target, 2 speed, 4

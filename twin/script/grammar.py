@@ -86,7 +86,7 @@ def encode(text: str) -> bytes:
 
 
 def number(text: str, what: str, index: int = 0) -> float:
-    """Read a finite decimal number.
+    """Read a finite decimal number with a point, such as -1.5 or 2e3.
 
     Args:
         text: of the argument.
@@ -94,7 +94,7 @@ def number(text: str, what: str, index: int = 0) -> float:
         index: place of the argument, 0 or 1.
 
     Raises:
-        ArgumentError: missing, no number, or beyond `MAX_NUMBER`.
+        ArgumentError: missing, no number, or beyond `MAX_NUMBER`; code "value".
     """
     if _NUMBER.fullmatch(text):
         value = float(text)
@@ -118,6 +118,10 @@ def number(text: str, what: str, index: int = 0) -> float:
 def positive(text: str, what: str) -> float:
     """Read a number of at least `MIN_RATE`, below which no setting of a scanner goes.
 
+    Args:
+        text: of the argument.
+        what: name of the argument, for the message.
+
     Raises:
         ArgumentError: a lower number, or none.
     """
@@ -132,6 +136,10 @@ def positive(text: str, what: str) -> float:
 def not_negative(text: str, what: str) -> float:
     """Read a number from zero up.
 
+    Args:
+        text: of the argument.
+        what: name of the argument, for the message.
+
     Raises:
         ArgumentError: a negative number, or none.
     """
@@ -143,6 +151,12 @@ def not_negative(text: str, what: str) -> float:
 
 def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
     """Read a whole number from `low` to `high`; `1440.000000` is one too.
+
+    Args:
+        text: of the argument.
+        what: name of the argument, for the message.
+        low, high: least and greatest value allowed.
+        index: place of the argument, 0 or 1.
 
     Raises:
         ArgumentError: another number, or none.
@@ -157,7 +171,9 @@ def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
 
 
 def shorten(text: str, length: int = 60) -> str:
-    """Shorten a text for a message to at most `length` characters."""
+    """Shorten a text for a message to at most `length` characters, the last three then
+    dots.
+    """
     if len(text) <= length:
         return text
     return text[: length - 3] + "..."
@@ -169,7 +185,13 @@ def is_reserved(component: str) -> bool:
 
 
 def own_name(component: str, axes: Iterable[str]) -> str:
-    """Return the name as the scanner itself writes it; scripts do not distinguish case.
+    """Return the name of a component as the scanner itself writes it; scripts do not
+    distinguish case.
+
+    An unknown one is returned unchanged.
+
+    Args:
+        axes: names of the machine's axes.
 
     Example:
         >>> own_name("CAMERA", ()), own_name("rot", ("X", "Rot")), own_name("Pump", ())
@@ -185,9 +207,10 @@ def _nothing(_a: str, _b: str) -> dict[str, object]:
 
 
 def _text(field: str, what: str) -> Read:
-    """Make the reader of one required text for `field`; the second argument is ignored.
+    """Make the reader of one required text, as the keyword argument `field`; the second
+    argument is ignored.
 
-    An empty text raises ArgumentError; `what` is its name in the message.
+    The reader raises ArgumentError for an empty text; `what` is its name in the message.
     """
 
     def read(a: str, _b: str) -> dict[str, object]:
@@ -200,7 +223,7 @@ def _text(field: str, what: str) -> Read:
 
 
 def _keep(a: str, _b: str) -> dict[str, object]:
-    """Read TRUE or FALSE.
+    """Read TRUE or FALSE, in any case, as the keyword argument `keep`.
 
     Raises:
         ArgumentError: any other word.
@@ -213,8 +236,11 @@ def _keep(a: str, _b: str) -> dict[str, object]:
 def _roi(a: str, _b: str) -> dict[str, object]:
     """Read the four edges of a ROI from argument 1, as the keyword argument `roi`.
 
+    They are whole numbers from 0 to 1 000 000, separated by blanks, commas or semicolons;
+    their order is not checked.
+
     Raises:
-        ArgumentError: another number of edges, or no region.
+        ArgumentError: another number of them, or one that is none of these; code "roi".
     """
     parts = a.replace(",", " ").replace(";", " ").split()
     if len(parts) != 4:
@@ -229,7 +255,9 @@ def _roi(a: str, _b: str) -> dict[str, object]:
 
 
 def _sequence(a: str, b: str) -> dict[str, object]:
-    """Read the prefix and the first number (0 to 999 999; 0 if empty) of a sequence."""
+    """Read prefix (may be empty) and first number (0 to 999 999; 0 if empty) of a
+    sequence, as keyword arguments.
+    """
     first = 0
     if b:
         first = whole(b, "first number of the sequence", 0, 999_999, 1)
@@ -237,7 +265,9 @@ def _sequence(a: str, b: str) -> dict[str, object]:
 
 
 def _move(a: str, b: str) -> dict[str, object]:
-    """Read the target and the trigger position (None if empty) of a move."""
+    """Read the target and the trigger position (None if empty) of a move, as keyword
+    arguments; ArgumentError for others.
+    """
     trigger = None
     if b:
         trigger = number(b, "trigger position", 1)
@@ -332,7 +362,8 @@ def find(component: str, command: str) -> Spec | None:
 
 
 def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
-    """Find the longest command of `component` that `words` begin with.
+    """Find the longest command of `component`, of at most five words, that `words` begin
+    with.
 
     Returns:
         The command and its number of words, or None.
@@ -345,8 +376,12 @@ def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
 
 
 def bare_name(path: str) -> str:
-    r"""Return the last part of `path` (after \ or /), unsafe characters as `_`;
-    may be empty."""
+    r"""Return the last part of `path` (after \ or /) as a safe file name; may be empty.
+
+    Characters that some file system does not allow become `_`, blanks and dots at its
+    ends are dropped, it is cut to `MAX_NAME_CHARS`, and a device's name (con, nul, com1
+    ...) gets a `_` before it.
+    """
     name = re.split(r"[\\/]", path)[-1]
     name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME_CHARS]
     if _DEVICE.fullmatch(name):
@@ -355,9 +390,11 @@ def bare_name(path: str) -> str:
 
 
 def image_name(path: str) -> str | None:
-    """Return the file name of one image without its folder, ending in `.tif` or its own suffix.
+    """Return the file name of one image without its folder; `.tif` is added unless it
+    ends in .tif or .tiff.
 
-    None if the path ends without a name, or the name is only "tif" or "tiff".
+    Unsafe characters are replaced as by `bare_name`. None if the path ends without a
+    name, or the name is only "tif" or "tiff".
     """
     name = bare_name(path)
     if not name or name.lower() in ("tif", "tiff"):
@@ -368,9 +405,11 @@ def image_name(path: str) -> str | None:
 
 
 def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
-    """List `count` file names from number `first`: prefix without folder, six digits, `.tif`.
+    """List `count` file names from number `first`: prefix without folder, six digits,
+    `.tif`.
 
-    A prefix that ends with a slash is only a folder: names are numbers.
+    A prefix that ends with a slash is only a folder: the names are numbers. Unsafe
+    characters are replaced as by `bare_name`.
     """
     name = ""
     if not prefix.endswith(("\\", "/")):
@@ -379,10 +418,11 @@ def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
 
 
 def kind_of(name: str) -> ImageKind:
-    """Determine an image's kind by its name: di and digits dark, io and digits flat, else
-    projection.
+    """Determine an image's kind by its file name: "di" and digits is dark, "io" and
+    digits flat, anything else a projection.
 
-    Case, one `_` or `-` before the digits, and `.tif` do not count.
+    Case does not matter; one `_` or `-` before the digits and an ending .tif or .tiff are
+    allowed, digits may be missing.
     """
     if _DARK.fullmatch(name):
         return "dark"

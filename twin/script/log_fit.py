@@ -78,9 +78,11 @@ class Fit:
 
     @property
     def cross_validated_s(self) -> float:
-        """Sum of absolute errors [s], each line of a fitted kind predicted without itself.
+        """Sum of absolute errors [s] with each line of a fitted kind predicted by the
+        median of the kind's other lines.
 
-        Lines of other kinds count with their fitted error.
+        A line that is the only one of its kind is predicted by itself; lines of other
+        kinds count with their fitted error.
         """
         total = self.lines.sum_abs_error_s
         for kind, times in self.samples.items():
@@ -149,8 +151,9 @@ class LogRow:
 
     @property
     def inside(self) -> bool | None:
-        """Whether the real time is in the 90 % range, to the log's resolution;
-        None without one."""
+        """Whether the real time is in the 90 % range, widened by half the log's
+        resolution; None without a range.
+        """
         if self.p5_s is None or self.p95_s is None:
             return None
         half = 0.5 * RESOLUTION_S + 1e-9
@@ -179,7 +182,9 @@ class LogComparison:
 
     @classmethod
     def of(cls, log: Log, machine: Machine) -> LogComparison:
-        """Predict each line of `log` on `machine`."""
+        """Predict each line of `log` on `machine`, and warn of axes that are not the
+        machine's (`unlike`).
+        """
         return cls(machine, tuple(against_log(log, machine)), unlike(log, machine))
 
     @property
@@ -208,7 +213,8 @@ class LogComparison:
         return sorted(self.rows, key=lambda row: -abs(row.error_s))
 
     def table(self) -> list[tuple[str, ...]]:
-        """Format the lines as rows of text below `HEADER`, greatest error first.
+        """Format the lines as rows of text, with the columns of `HEADER`, greatest
+        absolute error first.
 
         Line, real, predicted, range (empty if unknown), error ("!" outside the range),
         command.
@@ -228,6 +234,9 @@ class LogComparison:
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `flexdt check --against`, the line with the
         greatest error first.
+
+        Keys are machine, timing_source, problems, lines, total_real_s, total_predicted_s,
+        total_range_s and sum_abs_error_s.
         """
         return {
             "machine": self.machine.name,
@@ -242,14 +251,15 @@ class LogComparison:
 
 
 def first_difference(script: Sequence[c.Command], log: Log) -> str | None:
-    """Describe the first command in which a script and a log differ, as one line of text.
+    """Describe the first command in which a script and a log differ, as one line of text;
+    None if they agree.
+
+    Lines, columns, time-outs and expected durations do not count; a command that only one
+    of them has does.
 
     Args:
         script: its commands.
         log: lines of the executed script.
-
-    Returns:
-        The description; None if the log is of that script.
     """
     for i in range(max(len(script), len(log))):
         if i >= len(script) or i >= len(log):
@@ -267,17 +277,21 @@ def first_difference(script: Sequence[c.Command], log: Log) -> str | None:
 def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
     """Fit a machine to executed scripts: limits and rates of axes, and times of commands.
 
+    The base gives everything that the logs do not contain. Axes are fitted to their
+    motors' replies (`_axis`), times of commands to the lines' own times (`_samples`,
+    `_timing`), twice, since better times tell better when motion without a wait ends.
+
     Args:
         logs: lines of each log, from `read_log`, the oldest first.
-        base: source of everything that the logs do not contain.
+        base: machine that the fit begins with.
         source: names the logs, for the machine file.
 
     Returns:
-        The machine, the times that it is fitted to, and how it agrees with the logs.
+        The machine, the times and replies that it is fitted to, time per frame of each
+        sequence, and all lines beside their predictions.
 
     Raises:
-        MachineFileError: no line at all, or an axis's replies do not fit the base
-            machine.
+        MachineFileError: no line at all, or a motor that the base machine lacks.
     """
     if not any(logs):
         raise MachineFileError(
@@ -311,10 +325,11 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
 
 
 def against_log(log: Log, machine: Machine) -> list[LogRow]:
-    """Compare each line of an executed script with its prediction, in the log's order.
+    """Simulate the commands of an executed script, from the machine's home; return each
+    line's time beside its prediction, in the log's order.
 
-    A row has real and predicted time [s] of the line itself; the 5 % to 95 % range is
-    None where unmeasured.
+    A row has real and predicted time [s] of the line itself; its 5 % to 95 % range is
+    None where no time of that kind is measured.
     """
     rows = []
     for x, step in zip(log, _plan(log, machine).steps, strict=True):
@@ -326,14 +341,15 @@ def against_log(log: Log, machine: Machine) -> list[LogRow]:
 
 
 def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
-    """Warn of each axis of a log that the machine lacks or that has other limits there.
+    """Warn of each axis of a log that the machine lacks, or whose motor has other limits
+    there.
 
     Args:
         log: an executed script.
         machine: that it is compared with.
 
     Returns:
-        One warning for each such axis.
+        One warning, `other_machine`, for each such axis, at its first line.
     """
     found: dict[str, ScriptProblem] = {}
     for x in log:
@@ -362,7 +378,7 @@ def _plan(log: Log, machine: Machine) -> Simulation:
 
 
 def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, ...]]:
-    """Collect the motors' replies of the logs by axis.
+    """Collect the motors' decoded replies of the logs by axis.
 
     Args:
         logs: executed scripts.
@@ -396,9 +412,12 @@ def _axis_of(command: c.Command, machine: Machine) -> str:
 
 
 def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command]) -> Axis:
-    """Fit an axis to replies: its limits and maxima are those that most replies give.
+    """Fit an axis to replies: its limits and maxima are the four that most replies give
+    together.
 
-    Speed and acceleration are those in force, unless a command in `own` has set them.
+    Speed and acceleration are those of the last such reply; where a command in `own` sets
+    them, the base's, at most the maximum. Home stays if it is within the limits, else it
+    is the last position.
 
     Args:
         axis: of the base machine.
@@ -441,17 +460,18 @@ def _axis(axis: Axis, replies: Sequence[MotorReply], own: Collection[c.Command])
 
 
 def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ...]]:
-    """Collect the time beyond motion, pause and exposures [s] by kind of command.
+    """Collect the time of commands beyond motion, pause and exposures [s], by kind.
 
-    Commands that do not wait (ACK) and a motor's first move are left out; a wait for
-    X-rays counts from X-rays on, if it was a real one.
+    Left out: commands that do not wait (ACK), and a motor's first move, whose start is
+    unknown. A wait for ready X-rays counts as the whole time since X-rays on; one of up
+    to `_MAX_READY_WAIT_S` is left out.
 
     Args:
         logs: executed scripts.
         machine: with which motion is computed.
 
     Returns:
-        Kind -> times [s].
+        Kind -> times [s], at least 0, in the order of the logs.
     """
     found: dict[str, list[float]] = {}
     for log in logs:
@@ -484,8 +504,8 @@ def _timing(
 ) -> Timing:
     """Fit the times of commands: medians, 90 % ranges and the common drift.
 
-    The drift is the common change from earlier to later times, shrunk by its uncertainty;
-    without later times 0.
+    The drift is the mean change from earlier to later times over the kinds, shrunk by its
+    uncertainty in the ranges; 0 where no kind has two times.
 
     Args:
         samples: kind of command -> times [s], oldest first.
@@ -535,8 +555,11 @@ def _log(time: float) -> float:
 
 
 def _later(times: Times) -> list[float]:
-    """Return the logarithms of the later half's times over the earlier
-    half's median, scaled."""
+    """Return the logarithms of the later half's times over the earlier half's median,
+    divided by sqrt(1 + 1/h) of h earlier times.
+
+    The later half is empty for a single time.
+    """
     half = (len(times) + 1) // 2
     middle = _log(median(times[:half]))
     scale = math.sqrt(1.0 + 1.0 / half)
@@ -546,6 +569,9 @@ def _later(times: Times) -> list[float]:
 def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
     """Estimate the 5 % and 95 % quantiles of the next time of a kind.
 
+    Own and common scale are averaged with weights n - 1 and `BORROWED_TIMES`. A drift
+    widens one end only.
+
     Args:
         times: of the kind [s].
         own: scale of the kind's logarithms.
@@ -553,7 +579,8 @@ def _spread(times: Times, own: float, common: float, shift: float) -> Spread:
         shift: drift of the logarithms until the next scan.
 
     Returns:
-        The quantiles [s], rounded outwards, and the number of times.
+        The quantiles [s], rounded outwards, from 0 to `MAX_TIME_S`, and the number of
+        times.
     """
     n = len(times)
     scale = (BORROWED_TIMES * common + (n - 1) * own) / (BORROWED_TIMES + n - 1)

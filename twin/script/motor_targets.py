@@ -47,8 +47,8 @@ class MotorTargets:
         return all(self.machine.geometry.get(quantity) for quantity in quantities)
 
     def constant(self, quantity: str) -> float:
-        """Sum up the parts of a quantity that motors do not change: zero offset, sample
-        height, fixed [mm].
+        """Sum up the parts of a quantity that no motor changes: the profile's zero
+        offset, the sample's height, and the machine's fixed part [mm].
         """
         p = self.profile
         offsets = {
@@ -66,8 +66,9 @@ class MotorTargets:
         return round(self.value(quantity, {}), 6)
 
     def value(self, quantity: str, positions: Mapping[str, float]) -> float:
-        """Compute a quantity with motors at `positions`, the others at home [mm]; linear in
-        each.
+        """Compute a quantity with motors at `positions`, the others at home [mm].
+
+        It is the constant part plus the sum of factor times position.
         """
         factors = self.machine.geometry.get(quantity, {})
         moved = (
@@ -79,7 +80,9 @@ class MotorTargets:
     def drivers(self) -> dict[str, str]:
         """Quantity -> the motor that sets it: the free one that moves it most.
 
-        No motor sets two quantities. The other motors of a quantity stay at home.
+        Quantities choose in the order of `QUANTITIES`; no motor sets two of them.
+        object_z has none where motors move the source's height. The other motors of a
+        quantity stay at home.
         """
         out: dict[str, str] = {}
         for quantity in QUANTITIES:
@@ -92,10 +95,19 @@ class MotorTargets:
         return out
 
     def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
-        """Solve for the motors that bring quantities to the `wanted` values [mm].
+        """Solve for the motors' positions that bring quantities to the `wanted` values
+        [mm].
+
+        One after the other in the order of `wanted`, each by its driver, with all other
+        motors at home. A quantity without a driver is not brought anywhere. Limits are
+        not checked.
+
+        Args:
+            wanted: quantity -> value [mm].
 
         Returns:
-            Motor -> position; motors that set none of these quantities are at home.
+            Motor -> position to six decimals, of all motors that move these quantities;
+            those that set none are at home.
         """
         geometry = self.machine.geometry
         moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))
@@ -119,6 +131,10 @@ class MotorTargets:
 
     def need(self, what: str, quantity: str) -> None:
         """Check that motors move a quantity.
+
+        Args:
+            what: purpose, for the message.
+            quantity: one of `QUANTITIES`.
 
         Raises:
             LimitError: names the quantity that no motor moves, and the purpose.
@@ -146,6 +162,9 @@ def beside_beam(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Find the targets that take the sample out of the beam, as far as its stage can.
 
+    The sample's stage moves it sideways, or up and down, until it is `BESIDE_BEAM_MM` and
+    its radius beside the field of view, at most to the ends of its travel.
+
     Args:
         machine: whose motors these are.
         profile: zero offsets.
@@ -154,7 +173,8 @@ def beside_beam(
         radius_mm: of the sample, if known.
 
     Returns:
-        Motor -> target, to either side of the beam, the freer one first.
+        Two dicts of one motor -> target (to six decimals), to either side of the beam,
+        the freer side first.
 
     Raises:
         LimitError: no motor takes the sample out of the beam.

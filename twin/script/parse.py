@@ -107,8 +107,8 @@ def decode(data: str | bytes) -> str:
 def is_utf16(data: str | bytes) -> bool:
     """Return whether a text seems saved as UTF-16, which no scanner writes.
 
-    By its byte order mark, or (4 bytes or more) zero bytes at all even or all odd places
-    of the first 40.
+    It does by a byte order mark, or if all bytes at even, or all at odd, places of the
+    first 40 are zero (of 4 bytes or more).
     """
     if isinstance(data, bytes):
         head = data[:40]
@@ -120,10 +120,12 @@ def is_utf16(data: str | bytes) -> bool:
 
 
 def is_binary(data: str | bytes) -> bool:
-    """Return whether a file is an image, an archive or the like: of its beginning, more than
-    `MAX_CONTROL_SHARE` are control characters.
+    """Return whether a file is an image, an archive or the like, by its control
+    characters.
 
-    The binary argument of one `set sample info` in a script of some lines is far less.
+    They are more than `MAX_CONTROL_SHARE` of its first `BINARY_HEAD_BYTES`. A text of
+    fewer than `MIN_BINARY_BYTES` never is. The binary argument of one `set sample info`
+    in a script of some lines is far less.
     """
     head = data[:BINARY_HEAD_BYTES]
     if isinstance(head, str):
@@ -150,10 +152,11 @@ def is_log(text: str | bytes) -> bool:
 
 
 def rows(data: str | bytes) -> Iterator[CodeLine]:
-    """Yield the rows of a script, without blank, wordless and comment lines.
+    """Yield the rows of a script as `CodeLine`, without blank lines and lines that are a
+    comment.
 
-    Rows without tabs have no columns (None); rows of binary data are divided in their own
-    way.
+    A row without tabs has no columns (None); one with the binary argument of `set sample
+    info` is divided in its own way (`_blob_columns`).
     """
     for number, text in _lines(decode(data)):
         if _BLOB.match(text) and "\t" in text:
@@ -169,8 +172,8 @@ def line_count(data: str | bytes) -> int:
 
 
 def _lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (number from 1, line); a binary argument that holds line ends stays in one
-    piece.
+    """Yield (number from 1, line without its end); a binary argument that contains line
+    ends stays in one piece, with the number of its first line.
     """
     parts = _END.split(text)
     ends = _END.findall(text)
@@ -189,9 +192,9 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
     """Find the part that ends the binary argument begun in part `first`.
 
-    It ends where a line ends with a wait column. Only in a file without CRLF, or where
-    the line end is a lone CR or LF, can an end of line be part of the data for sure; so
-    in a file with CRLF the search stops at the first CRLF.
+    It ends where a line ends with a wait column. In a file with CRLF the search stops at
+    the first CRLF, since an end of line within the data is a lone CR or LF there; it
+    never goes beyond `_MAX_BLOB_LINES` parts.
 
     Args:
         parts: pieces of the text between line ends.
@@ -200,7 +203,8 @@ def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
         crlf: whether the file has CRLF line ends.
 
     Returns:
-        Index of a piece; `first` if no end is found.
+        Index of the part, in a file with CRLF that of the first CRLF if no wait is found;
+        else `first`.
     """
     joined = ""
     for i in range(first, min(first + _MAX_BLOB_LINES, len(parts))):
@@ -216,8 +220,10 @@ def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
 
 
 def _columns(text: str) -> tuple[Field, ...]:
-    """Split a row at TABs into fields; drop a comment in its last columns, and empty
-    columns at the end.
+    """Split a row at TABs into fields with blanks stripped.
+
+    A comment from column 5 on is dropped with all that follows, and empty columns at the
+    end, but for the first.
     """
     fields: list[Field] = []
     start = 0
@@ -236,13 +242,16 @@ def _columns(text: str) -> tuple[Field, ...]:
 
 
 def _blob_columns(text: str) -> tuple[Field, ...]:
-    """Split a `set sample info` row; its last four columns are found from the right.
+    """Split a `set sample info` row: component, command, argument, then the columns from
+    one before the wait on, found from the right.
+
+    Without a wait it is split as any row (`_columns`).
 
     Args:
         text: the row.
 
     Returns:
-        Its columns; the argument may contain TABs.
+        Its columns; the argument keeps its blanks and may contain TABs.
     """
     pieces = text.split("\t")
     tail = next(
@@ -265,8 +274,16 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
 
 
 def _field(piece: str, start: int, *, keep: bool = False) -> Field:
-    """Make a field with blanks stripped, unless `keep`; `start` is the index of
-    its first character."""
+    """Make a field with blanks stripped, unless `keep`.
+
+    Args:
+        piece: its text.
+        start: index of the first character in the line.
+        keep: whether blanks stay.
+
+    Returns:
+        The field; its column, from 1, is that of the first character left.
+    """
     if keep or not piece:
         return Field(piece, start + 1)
     stripped = piece.strip(_BLANK)
@@ -277,16 +294,23 @@ def _field(piece: str, start: int, *, keep: bool = False) -> Field:
 
 
 def is_light(script: bytes) -> bool:
-    """Return whether a script is planned so fast that any thread may do it."""
+    """Return whether a script is planned so fast that any thread may do it.
+
+    It has at most `LIGHT_BYTES` and no number of five digits or with an exponent, which
+    may mean many images.
+    """
     return len(script) <= LIGHT_BYTES and _MANY_IMAGES.search(script) is None
 
 
 def parse_script(text: Source) -> c.Script:
-    """Read a script in either of its two forms.
+    """Read a script in either of its two forms; raise one error for all of its errors.
 
     Args:
         text: the file's text or, so that binary arguments survive, its bytes, or its
             path.
+
+    Returns:
+        The script, with its warnings.
 
     Raises:
         ScriptError: has all errors (and warnings), with line and column.
@@ -303,15 +327,17 @@ def parse_script(text: Source) -> c.Script:
 
 
 def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
-    r"""Read the commands of a script and every problem of its text, in line order; raises
-    nothing.
+    r"""Read the commands of a script and every problem of its text, in line order;
+    problems are not raised.
 
     Args:
-        text: text or bytes of a script.
+        text: text or bytes of a script, or the path of its file, which is read.
 
     Returns:
         The script of the lines that could be read, and all problems. A log, UTF-16 text
-        or a binary file gives an empty script and one error.
+        or a binary file gives an empty script and one error. A text without any command
+        is an error; of more than `FEW_PROBLEMS` problems of one the first are listed,
+        after an error that says so.
 
     Example:
         >>> script, problems = read_script("camera\tset exposure\tlong\t\tACK\t\t\r\n")
@@ -320,20 +346,22 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     """
     text = content(text)
     if is_utf16(text):
-        what = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
-        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
+        message = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
+        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, message),)
     problems: list[ScriptProblem] = []
     if is_log(text):
-        what = (
+        message = (
             "this is an executed script, a log: `flexdt machine fit` learns the machine "
             "from it, "
             "and `flexdt check SCRIPT --against` it compares; to run, a script has seven "
             "columns"
         )
-        return c.Script((), (), 0), (ScriptProblem("error", "executed_log", 0, 1, what),)
+        return c.Script((), (), 0), (
+            ScriptProblem("error", "executed_log", 0, 1, message),
+        )
     if is_binary(text):  # a log, above, holds binary replies
-        what = "the file holds binary data; allowed: the text of a scan script"
-        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, what),)
+        message = "the file holds binary data; allowed: the text of a scan script"
+        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, message),)
     commands: list[c.Command] = []
     for row in rows(text):
         command = read_row(row, problems)
@@ -341,12 +369,12 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
             commands.append(command)
     foreign = all(p.code in FOREIGN_CODES for p in problems)
     if foreign and not commands and len(problems) > FEW_PROBLEMS:
-        what = (
+        message = (
             f"no line is a command of a scan script; {FEW_PROBLEMS} of {len(problems)} "
             "problems are listed"
         )
         found = [*in_order(problems)[:FEW_PROBLEMS]]
-        problems = [ScriptProblem("error", "syntax", 0, 1, what), *found]
+        problems = [ScriptProblem("error", "syntax", 0, 1, message), *found]
     if not commands and not problems:
         problems.append(
             ScriptProblem("error", "syntax", 0, 1, "the script holds no command")
@@ -363,7 +391,7 @@ def read_row(row: CodeLine, problems: list[ScriptProblem]) -> c.Command | None:
 
 
 def content(text: Source) -> str | bytes:
-    """Return the text or bytes of a script as given; a path is read, as bytes."""
+    """Return the text or bytes of a script as given; read a path's file as bytes."""
     if isinstance(text, str | bytes):
         return text
     read: bytes = backend("scripts").read(text)
@@ -422,7 +450,7 @@ class _Line:
         """Read the row's command; add an error to `problems` and return None if it cannot
         be read.
 
-        An unknown component or command may be a custom one, with a warning.
+        An unknown component may be a custom one, with a warning (`_unknown`).
         """
         try:
             if not self.component.text:
@@ -441,10 +469,14 @@ class _Line:
     def _tabbed(self, columns: tuple[Field, ...]) -> _Parts | None:
         """Divide a row of TAB separated columns; None for an unknown command.
 
-        A row without a known command in its second column is divided at spaces instead.
+        A row without a known command in its second column is divided at blanks instead
+        (`_padded`), since the command's words may be in several columns.
 
         Args:
             columns: of the row.
+
+        Returns:
+            The columns, the missing ones empty; None for an unknown command.
 
         Raises:
             _Refused: text in a column beyond the seventh.
@@ -461,21 +493,23 @@ class _Line:
         rest = (*columns[2:], *[self.end] * 5)
         extra = next((field for field in rest[5:] if field.text), None)
         if extra is not None:
-            what = (
+            message = (
                 f"column 8 holds {shorten(extra.text)!r}; a line has seven columns: component, "
                 "command, argument 1, argument 2, wait, timeout, expected"
             )
-            raise _Refused("syntax", extra.column, what)
+            raise _Refused("syntax", extra.column, message)
         return _Parts(spec, *rest[:5])
 
     def _padded(self) -> _Parts | None:
-        """Divide a row padded with spaces; drop its comment.
+        """Divide a row at blanks into command, arguments, wait and times; drop its
+        comment.
 
         One number after the wait is the expected duration; two are time-out and expected
-        duration.
+        duration. In an argument that may have spaces, a comment mark before the wait is
+        text.
 
         Returns:
-            The columns; None for an unknown command.
+            The columns, the missing ones empty; None for an unknown command.
 
         Raises:
             _Refused: more words than the command has arguments.
@@ -510,6 +544,9 @@ class _Line:
     def _arguments(self, spec: Spec, body: Sequence[Field]) -> tuple[Field, Field]:
         """Divide the words between command and wait into two arguments.
 
+        An argument that may have spaces takes all words, but a last one of digits where
+        the command has two arguments.
+
         Args:
             spec: the command, with the number of its arguments.
             body: the words.
@@ -533,26 +570,31 @@ class _Line:
             allowed = ("no argument", "one argument", "at most two arguments")[
                 spec.arguments
             ]
-            what = f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}"
+            message = f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}"
             raise _Refused(
-                "syntax", extra.column, f"{what}, then ACK, no wait, POS or RCV"
+                "syntax", extra.column, f"{message}, then ACK, no wait, POS or RCV"
             )
         return body[0], body[1] if len(body) > 1 else none
 
     def _span(self, body: Sequence[Field]) -> Field:
-        """Join words into one field, with the blanks between them."""
+        """Join words of this line (at least one) into one field, with the text between
+        them.
+        """
         start = body[0].column
         last = body[-1]
         return Field(self.row.text[start - 1 : last.column - 1 + len(last.text)], start)
 
     def _unknown(self) -> c.Command:
-        """Read a row as a custom command with a warning, or refuse it with a suggestion.
+        """Read a row without a known command as a custom command with a warning, or
+        refuse it with a suggestion.
 
         Returns:
             The custom command, which has no effect.
 
         Raises:
-            _Refused: no command, or one that can be meant for a known component.
+            _Refused: a component of the scanner or a name like its motors', with an
+                unknown command or none; or a row without the form of a custom command
+                (`_custom_form`).
         """
         name = self.component.text
         fields = [f for f in (self.row.columns or self.row.words())[1:] if f.text]
@@ -592,7 +634,8 @@ class _Line:
         """Return whether the line can be for a component that the user added to the
         scanner.
 
-        A near miss of one of the scanner's own names with a command of its own is a slip.
+        It needs a name of letters and digits, two more fields and a wait. A name near one
+        of the scanner's own, with a command of that one, is a slip: False.
 
         Args:
             fields: of the row after the component.
@@ -612,6 +655,9 @@ class _Line:
         """Read arguments, wait and times into a typed command; add an error for each that
         cannot be read.
 
+        Errors: an argument too many, one that cannot be read, a wait or a time that is
+        none.
+
         Args:
             parts: columns of a known command.
 
@@ -628,8 +674,8 @@ class _Line:
         for i, argument in enumerate((parts.first, parts.second)):
             if argument.text and i >= parts.spec.arguments:
                 takes = ("no argument", "1 argument")[parts.spec.arguments]
-                what = f"{shorten(argument.text)!r} is not expected: the command takes {takes}"
-                self.error("syntax", argument.column, what)
+                message = f"{shorten(argument.text)!r} is not expected: the command takes {takes}"
+                self.error("syntax", argument.column, message)
         try:
             fields.update(parts.spec.read(parts.first.text, parts.second.text))
         except ArgumentError as error:
@@ -655,12 +701,15 @@ class _Line:
         """Read the wait and check it against the trigger position; problems are added to
         `problems`.
 
+        The wait POS is for moves with a trigger only (errors); a trigger without POS is a
+        warning.
+
         Args:
             parts: columns of a known command.
 
         Returns:
-            The wait; ACK (no wait for a move), with a warning, where none is written, and
-            ACK, with an error, for an unknown one.
+            The wait as written. Where none is: ACK, for a move "no wait", with a warning.
+            For an unknown one: ACK, with an error.
         """
         is_move = parts.spec.type is c.MoveAbsolute
         text = parts.wait.text
@@ -668,24 +717,24 @@ class _Line:
         trigger = parts.second
         if not text:
             assumed = c.Wait.NO_WAIT if is_move else c.Wait.ACK
-            what = f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed"
-            self.warn("wait_missing", column, what)
+            message = f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed"
+            self.warn("wait_missing", column, message)
             return assumed
         wait = grammar.WAITS.get(" ".join(text.lower().split()))
         if wait is None:
-            what = f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV"
-            self.error("wait", column, what)
+            message = f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV"
+            self.error("wait", column, message)
             return c.Wait.ACK
         if wait is c.Wait.POS and not is_move:
             self.error("wait", column, "POS is for moves only: it waits for a position")
         elif wait is c.Wait.POS and not trigger.text:
-            what = "POS needs the trigger position as argument 2 of the move"
-            self.error("trigger", trigger.column, what)
+            message = "POS needs the trigger position as argument 2 of the move"
+            self.error("trigger", trigger.column, message)
         elif is_move and trigger.text and wait is not c.Wait.POS:
-            what = (
+            message = (
                 f"the trigger position is used with POS only; the wait is {wait.value!r}"
             )
-            self.warn("trigger_unused", trigger.column, what)
+            self.warn("trigger_unused", trigger.column, message)
         return wait
 
 
@@ -701,7 +750,7 @@ def _until_comment(words: Sequence[Field]) -> list[Field]:
 
 
 def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
-    """Find the first wait that only numbers or a comment follow.
+    """Find the first wait that at most two numbers, or a comment, follow up to the end.
 
     Args:
         words: of a row.
