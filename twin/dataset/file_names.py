@@ -29,9 +29,9 @@ _DEVICE: Final = re.compile(
 
 
 def plain_name(name: str, what: str = "file") -> str:
-    """Return `name` if it is one plain path component.
+    """Return `name` unchanged if it is one plain path component.
 
-    The rules are those of `_reason`, Windows's device names included.
+    The rules are those of `_reason`.
 
     Args:
         name: as it came.
@@ -54,8 +54,9 @@ def plain_name(name: str, what: str = "file") -> str:
 def _reason(name: str) -> str | None:
     """Return the first rule that a name breaks, in words, or None if it is allowed.
 
-    Rules: not empty; at most `MAX_NAME` characters and 255 bytes; no forbidden character;
-    no dot at either end, no space around it; no device name of Windows.
+    Rules, in this order: not empty; at most `MAX_NAME` characters and 255 bytes in UTF-8;
+    no forbidden character; no dot at either end, no space around it; no device name of
+    Windows.
     """
     if not name:
         return "is empty"

@@ -186,18 +186,20 @@ class ScanRecord(ArrayValue):
         """Make the record of a plan that is about to run; `complete` is False.
 
         Camera and tube are those of the first projection, else of the settings. Previews
-        are no blocks; smooth if any projection is taken in motion.
+        and images without a file are in no block; `smooth` if any projection is taken in
+        motion.
 
-        Settings are those at `write settings file`, or, for a script without that
-        command, those at the first projection.
+        Positions and rates are those at `write settings file`. For a script without that
+        command the positions are those at the first projection (at time 0 without one),
+        the rates those at the start.
 
         Args:
             plan: of the scan.
             name: of the data set.
             started: date and time.
             sample: None takes the plan's size.
-            noise: seed and figures of the noise.
-            correction: in force.
+            noise: seed and figures of the noise; None: no noise.
+            correction: in force; None: none.
             operator, version: for the documents.
             predicted: exposures.
         """
@@ -266,12 +268,16 @@ class ScanRecord(ArrayValue):
         return sum(len(b) for b in self.blocks if b.kind == kind)
 
     def poses_of(self, block: FrameBlock) -> Poses:
-        """Compute nominal poses of a block's images."""
+        """Compute nominal poses of a block's images, without limits and correction
+        (`motor_poses`).
+        """
         return motor_poses(self.machine, self.profile, block.camera, block.positions)
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
-        """Compute the nominal geometry of all images, or of `blocks`, in order; no
-        correction applied.
+        """Compute the nominal geometry of all images, or of `blocks`, in order, without a
+        correction and a detector shape.
+
+        Empty blocks are skipped; GeometryError if none is left.
         """
         if blocks is None:
             chosen = self.blocks
@@ -282,22 +288,22 @@ class ScanRecord(ArrayValue):
         )
 
     def angles_deg(self) -> FloatArray:
-        """Stage angle of every projection [deg], not wrapped at 360; empty without projections."""
+        """Compute the stage angle of every projection [deg], (n,), not wrapped at 360;
+        empty without projections.
+        """
         parts = [np.degrees(self.poses_of(b).angle) for b in self.projections if len(b)]
         if parts:
             return np.concatenate(parts)
         return np.zeros(0)
 
     def sections(self) -> int:
-        """Count the sections of projections that the texts' one pose and one angle rule
+        """Count the sections of projections that one pose and one angle rule of the texts
         cannot join.
 
-        At least 1; at least 2 if they are not joined. A section ends where a motor other
-        than the rotation moves by `POSITION_TOLERANCE`.
-
-        With one section the texts alone give the geometry: all motors but the rotation
-        are where the settings file states, and image i of N is at first + i * (last -
-        first) / (N - 1).
+        1 if they can, or there is none: all motors but the rotation are where the
+        settings file states, and image i of N is at first + i * (last - first) / (N - 1),
+        within `POSITION_TOLERANCE`. Else at least 2: one more than the number of images
+        before which such a motor moves.
         """
         blocks = [b for b in self.projections if len(b)]
         if not blocks:
@@ -328,15 +334,15 @@ class ScanRecord(ArrayValue):
 def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
     """Find the linear motor that takes the sample out of the beam for the flats.
 
-    Compared are the first flat and the first projection; "" without either.
+    Compared are the first image of the first flat and of the first projection.
 
     Args:
         machine: whose turning motors do not count.
         blocks: images with their motor positions.
 
     Returns:
-        The motor that moves most between projections and flats; "" if none moves more
-        than 1 mm.
+        The motor that is farthest from its place then; "" if none is more than 1 mm off,
+        or flats or projections are missing.
     """
     flats = next((b for b in blocks if b.kind == "flat"), None)
     scans = next((b for b in blocks if b.kind == "projection"), None)
@@ -385,10 +391,8 @@ class FrameEntry(_Model):
 
     @classmethod
     def all_of(cls, record: ScanRecord, block: FrameBlock) -> Iterator[FrameEntry]:
-        """Yield an entry for each image of a block, with its positions and nominal
-        cone_vec.
-
-        With time, camera settings and whether X-rays are on; no correction is applied.
+        """Yield an entry for each image of a block, in order: file, kind, time, camera
+        settings, X-rays, positions and nominal cone_vec.
         """
         rows = record.poses_of(block).cone_vec().rows.tolist()
         times = np.asarray(block.times_s).tolist()
@@ -469,7 +473,8 @@ class PredictedEntry(_Model):
 
     @classmethod
     def of(cls, predicted: PredictedExposure) -> PredictedEntry:
-        """Make the document's entry of a predicted exposure; figures are rounded.
+        """Make the document's entry of a predicted exposure; shares are rounded to four
+        digits.
 
         The shares of saturated and starved pixels are None if they were not predicted.
         """
@@ -524,8 +529,8 @@ class DatasetDocument(_Model):
 
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:
-        """Make the document of a scan: machine, profile, settings, sample, correction,
-        predictions.
+        """Make the document of a scan: machine, profile, settings, sample, noise,
+        correction, predictions and frames.
 
         It has an entry for every planned image, saved yet or not; `detector` is the
         record's camera.
@@ -566,7 +571,9 @@ class DatasetDocument(_Model):
         )
 
     def to_json(self) -> str:
-        """Format the document as indented JSON, one line a frame, with a final newline."""
+        """Format the document as indented JSON with one line for each frame, in UTF-8
+        characters, with a final newline.
+        """
         head = self.model_dump(mode="json", by_alias=True, exclude={"frames"})
         text = json.dumps(head, indent=1, ensure_ascii=False)
         lines = [
@@ -581,9 +588,10 @@ class DatasetDocument(_Model):
         return ConeVec(np.array(rows, dtype=np.float64).reshape(-1, 12))
 
     def positions(self, kind: FrameKind = "projection") -> dict[str, FloatArray]:
-        """List the motor positions of the frames of one kind: motor -> (n,) [mm, deg].
+        """Collect the motor positions of the frames of one kind: motor -> (n,) [mm, deg].
 
-        The motors are those of the first such frame; {} if there is none.
+        The motors are those of the first such frame; {} if there is none. KeyError if a
+        later frame lacks one.
         """
         chosen = [f.positions for f in self.frames if f.kind == kind]
         return {
@@ -607,9 +615,10 @@ class DatasetDocument(_Model):
         return self._camera(frame).shape
 
     def _camera(self, entry: FrameEntry | DetectorEntry) -> CameraSettings:
-        """Make camera settings of an entry: mode, region, exposure, averages.
+        """Make camera settings of an entry: mode, region, exposure, averages, and the
+        machine's named modes.
 
-        The known modes are those of the document's machine, or none if it states none.
+        Without modes in the document's machine there are none.
         """
         detector = self.machine.get("detector")
         named = None
@@ -630,7 +639,7 @@ class DatasetDocument(_Model):
         """Compute nominal poses of the frames of one kind from their motor positions.
 
         The camera is each frame's; frames of one mode and region in a row must name the
-        same motors.
+        same motors. No correction is applied; limits are not checked.
 
         Args:
             machine: whose geometry and sensor are used.
@@ -682,7 +691,7 @@ class DatasetDocument(_Model):
 def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
     """Parse and validate the text of `flexdt.json`.
 
-    Another schema than this version's is refused first.
+    The schema is checked first; another than `SCHEMA` is refused.
 
     Args:
         text: its content.
@@ -707,9 +716,9 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
 
 
 def _validated(model: type[_M], content: object, file: str) -> _M:
-    """Validate content of `file` as a model, and return the model.
+    """Validate content of `file` as a model; return the model's value.
 
-    The message has one line for each.
+    The message has one line for each problem: key path, message, value.
 
     Args:
         model: its class.

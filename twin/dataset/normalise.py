@@ -50,7 +50,7 @@ class LineIntegrals:
     def of(cls, dark: Float32Array, flat: Float32Array) -> LineIntegrals:
         """Prepare the conversion from mean dark and flat images (rows, cols) [counts].
 
-        Pixels less than `MIN_FLAT` brighter are dead.
+        Pixels whose flat is not at least `MIN_FLAT` above the dark are dead, NaN too.
 
         Raises:
             DatasetFormatError: no pixel of the flat is brighter than the dark image.
@@ -65,10 +65,13 @@ class LineIntegrals:
         return cls(np.asarray(dark, dtype=np.float32), log_open, dead, *_neighbours(dead))
 
     def interpolating(self, mask: npt.NDArray[np.bool_]) -> LineIntegrals:
-        """Return a copy that interpolates more pixels (rows, cols), unless none would be
-        left.
+        """Return a conversion that interpolates more pixels.
 
-        Then the conversion itself is returned; pixels that are dead already stay so.
+        Pixels that are dead already stay so. If no pixel would be left, the conversion
+        itself is returned.
+
+        Args:
+            mask: (rows, cols), True for pixels to interpolate.
         """
         dead = self.dead | mask
         if dead.all():
@@ -79,7 +82,8 @@ class LineIntegrals:
         """Convert an image of counts to line integrals; dead pixels are interpolated in
         their row.
 
-        Counts are taken less the dark, at least `MIN_COUNTS`; `counts` is not changed.
+        Counts less the dark are taken as at least `MIN_COUNTS`; `counts` is not changed.
+        A dead pixel without a live one on both sides gets the nearest live pixel's value.
 
         Args:
             counts: (rows, cols).
@@ -105,7 +109,9 @@ def of_intensities(
     """Convert images that are not whole counts to line integrals.
 
     Such images are dark-subtracted, averaged or scaled, or transmissions with a flat
-    image of ones.
+    image of ones. The open beam counts as at least `LEAST_LIGHT` of the brightest flat
+    pixel, the light as at least float32's smallest normal number. No pixel is
+    interpolated.
 
     Args:
         images: (n, rows, cols), of any scale; noise may bring them below the dark image.
@@ -125,15 +131,18 @@ def of_intensities(
 def _neighbours(
     dead: npt.NDArray[np.bool_],
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], Float32Array]:
-    """Find the live pixels before and after each dead one in its row.
+    """Find the live pixels between which each dead one is interpolated: before and after
+    it in its row.
 
-    In order of the dead pixels; (d,) each, empty without any. The nearest is searched in
-    the whole image, with weight 0.
+    A pixel without a live one on both sides gets the nearest of the whole image twice,
+    with weight 0.
 
-    A row without a live pixel on one side uses the nearest one.
+    Args:
+        dead: (rows, cols), True for dead pixels; at least one is live.
 
     Returns:
-        flat indices of both, and the weight of the latter.
+        Flat indices of both, and the weight of the latter, (d,) each, in row order; empty
+        without dead pixels.
     """
     if not dead.any():
         none = np.empty(0, dtype=np.intp)
@@ -159,9 +168,10 @@ def _neighbours(
 def binned_mean(
     images: npt.NDArray[Any], factor: int | tuple[int, int]
 ) -> npt.NDArray[Any]:
-    """Average over blocks of pixels; surplus rows and columns are cut off.
+    """Average over blocks of pixels; surplus rows at the bottom and columns at the right
+    are cut off.
 
-    For a factor of 1 the type of `images` stays.
+    Sums are in float32.
 
     Args:
         images: (..., rows, cols).

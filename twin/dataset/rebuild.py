@@ -52,7 +52,8 @@ def angles_deg(settings: ScanSettings, count: int, file: str) -> FloatArray:
     """Compute stage angles of images 0 to count - 1 by the smooth-scan rule: i * (last -
     start) / (N - 1).
 
-    N is `count` where the texts state none; one image has the start angle.
+    N is `count` where the texts state none; the step is 0 for N up to 1. Images beyond N
+    continue the rule.
 
     Args:
         settings: gives N ("# projections"), start and last angle; rot_obj there is the
@@ -91,25 +92,25 @@ def rebuild(
 ) -> Rebuilt:
     """Compute poses of images 0 to count - 1 from the scanner's texts.
 
-    From the figures, heights come from motors and offsets where those are known.
-
-    Motors and a profile that reproduces the printed figures are used where possible, else
-    the figures alone.
+    Motors and a profile that reproduces the printed figures are used where possible. Else
+    the printed figures are the geometry, with heights from motors and offsets where those
+    are known. The detector is moved to its physical place first (`physical`).
 
     Args:
         settings: read from the texts.
         count: number of projections.
         shape: image (rows, cols), from the images.
-        machines: candidates; one alone is taken as it is.
-        profiles: candidates of any machine; one alone is taken as it is.
+        machines: candidates; one alone is taken as it is, whatever its name.
+        profiles: candidates of any machine; one alone is taken as it is, unchecked.
         file: for error messages.
 
     Returns:
-        Poses, machine and profile (None if unknown), motor positions, and notes on what
-        was assumed.
+        Poses; machine (None if unknown) and profile (None if the figures are the
+        geometry); motor positions; and notes on all that was assumed.
 
     Raises:
-        DatasetFormatError: neither machine and motors nor the figures suffice.
+        DatasetFormatError: no angles; ROI and mode that contradict the images' shape; or
+            neither machine and motors nor the figures suffice.
     """
     angles = np.radians(angles_deg(settings, count, file))
     settings, notes = physical(settings, file)
@@ -163,11 +164,8 @@ def rebuild(
 def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
     """Move the detector of the settings to its physical place, and note the changes.
 
-    Differences below 1e-6 mm do not count.
-
-    Some FleX-ray files have `mag_det_phys` as well as `mag_det`. Where the two differ,
-    the printed SDD and COR are for the wrong one, and SDD is longer by the difference (as
-    public corrections of such scans have it); the axis's shadow moves in proportion.
+    Differences of `mag_det_phys` and `mag_det` up to 1e-6 mm do not count, nor does one
+    of them alone.
 
     Args:
         settings: read from the texts; not changed.
@@ -212,17 +210,19 @@ def _profile(
     positions: Mapping[str, FloatArray],
     printed: Figures | None,
 ) -> tuple[Profile, str] | None:
-    """Choose the given profile, or the one that reproduces the printed figures.
+    """Choose the only profile given, or the first of this machine that reproduces the
+    printed figures.
 
-    The first that agrees, at the first image's positions; zero offsets are tried only for
-    a machine without a default profile.
+    Compared at the first image's positions (`_figures_agree`). Zero offsets are tried
+    last, only for a machine without a default profile.
 
     Args:
         machine: whose profiles count.
         profiles: candidates of any machine; one alone is taken as it is.
         camera: of the images.
         positions: motor -> (n,) positions [mm, deg].
-        printed: figures of the texts; None takes the machine's default profile.
+        printed: figures of the texts; None: the machine's default profile is taken,
+            unchecked.
 
     Returns:
         The profile and the reason for the choice; None if no profile fits.
@@ -245,13 +245,20 @@ def _profile(
 
 
 def named_machine(settings: ScanSettings, machines: Sequence[Machine]) -> Machine | None:
-    """Find the machine that the texts name or, without a name, whose motors they list.
+    """Find the machine that the texts name or, without a name, the only one whose motors
+    they all list.
 
-    By scanner name or type (also as the beginning of the stated one), in the given order;
-    a name that no machine has gives None.
+    Letter case, blanks and signs do not matter. The stated scanner name or type must be a
+    machine's scanner name, type or name, or begin with it; the first such machine is
+    taken.
+
+    Args:
+        settings: read from the texts.
+        machines: candidates, in order.
 
     Returns:
-        None if no machine fits, or several by their motors.
+        The machine; None if a stated name fits none, or, without a name, none or several
+        fit.
     """
     stated = {_word(settings.scanner_name), _word(settings.scanner_type)} - {""}
     for machine in machines:
@@ -278,12 +285,19 @@ def _word(text: str | None) -> str:
 def _positions(
     settings: ScanSettings, machine: Machine, angles: FloatArray
 ) -> tuple[dict[str, FloatArray], list[str]]:
-    """Compute motor positions in the script's sign, with the rotation by the angle rule.
+    """Compute motor positions in the script's sign from the texts, with the rotation by
+    the angle rule.
 
-    Motors that the texts lack are at home, with a note each.
+    A motor that turns the stage gets the angle over its factor. Other motors that the
+    texts lack are at home, with a note each.
+
+    Args:
+        settings: with the motors' lines, in the sign of the settings file.
+        machine: whose motors these are.
+        angles: stage angles (n,) [deg].
 
     Returns:
-        motor -> (n,) positions [mm, deg], and notes for the user.
+        Motor -> (n,) positions [mm, deg], and notes for the user.
     """
     notes = []
     out = {}
@@ -317,10 +331,10 @@ def _camera(
         settings: with ROI and mode.
         shape: of the images (rows, cols).
         file: for error messages.
-        modes: named modes of the machine.
+        modes: named modes of the machine: name, binning.
 
     Returns:
-        The settings; None if the texts do not state them.
+        The settings; None if the texts lack ROI or mode, or the mode is unknown.
 
     Raises:
         DatasetFormatError: ROI and mode give images of another shape.
@@ -345,7 +359,8 @@ def _figures_agree(ours: Figures, printed: Figures) -> bool:
     """Return whether figures agree with the printed ones, within `MATCH_MM`, `MATCH_PX`
     and 1e-5 mm of pitch.
 
-    SOD and SDD in mm, HC, VC and COR in pixels.
+    SOD and SDD are compared in mm, HC, VC and COR in pixels; every figure must differ by
+    less.
     """
     slack = {"sod_mm": MATCH_MM, "sdd_mm": MATCH_MM, "pixel_mm": 1e-5}
     return all(
@@ -358,7 +373,7 @@ def _default_profile(machine: Machine, profiles: Sequence[Profile]) -> Profile |
     """Find the default profile of a machine among `profiles`; zero offsets where it has
     none, None where it is missing.
 
-    Names of machine and profile must both agree.
+    Names of machine and profile must both agree; the first such one is taken.
     """
     if not machine.default_profile:
         return profile_of(machine)

@@ -67,7 +67,8 @@ class Entry:
 def _stated(
     kind: Kind, key: str, section: str = "", xre_key: str = "", *, separator: str = " : "
 ) -> Any:
-    """Make a field of `ScanSettings`, None by default, with its entry in the two settings texts.
+    """Make a field of `ScanSettings`, None by default, whose metadata has its `Entry` in
+    the two settings texts.
 
     Without `section` the XRE text has no such entry.
     """
@@ -153,8 +154,8 @@ class ScanSettings:
 
     @property
     def figures(self) -> Figures | None:
-        """SOD, SDD, HC, VC, COR and binned pixel as `Figures`; None if any of them is not
-        stated.
+        """SOD, SDD, HC, VC, COR and binned pixel as `Figures`; None if any of them is
+        None.
         """
         values = (
             self.sod_mm,
@@ -189,6 +190,9 @@ def settings_of(record: ScanRecord) -> ScanSettings:
 
     Args:
         record: of the scan; its settings pose gives the printed figures.
+
+    Returns:
+        All fields are set, in the file's signs and units.
     """
     camera = record.camera
     machine = record.machine
@@ -251,10 +255,11 @@ def settings_of(record: ScanRecord) -> ScanSettings:
 
 
 def motor_lines(record: ScanRecord) -> dict[str, MotorLine]:
-    """List the motors' lines of the settings file, virtual axes first, in the file's
-    sign.
+    """List the lines of the axes in the settings file, in the file's sign: virtual axes
+    first, then motors in the scanner's order.
 
-    A virtual axis has the rates of the motor that it reads.
+    A virtual axis has the rates of the motor that it reads. Motors that the scanner does
+    not have follow by name.
 
     Args:
         record: of the scan.

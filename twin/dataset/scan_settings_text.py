@@ -69,8 +69,8 @@ def parse_number(text: str) -> float:
     """Read a finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`,
     `874.6E-9`.
 
-    One comma without a point is the decimal sign; what follows a space is dropped.
-    Infinity and NaN are errors.
+    One comma without a point is the decimal sign; all after a space is dropped. Infinity,
+    NaN and underscores are errors.
 
     Raises:
         ValueError: it is not a number.
@@ -97,10 +97,10 @@ def _whole(text: str) -> int:
 def parse_roi(text: str) -> Roi:
     """Read four whole numbers, left, top, right, bottom, with any separators.
 
-    Decimals that are zero are allowed; order and sensor are not checked here.
+    Decimals that are zero are allowed; order and sensor are not checked.
 
     Raises:
-        ValueError: there are not four.
+        ValueError: there are not exactly four.
     """
     words = re.findall(r"-?\d+(?:\.0*)?", text)
     if len(words) != 4:
@@ -124,10 +124,14 @@ _KINDS: Final[Mapping[Kind, tuple[Callable[[Any], str], Callable[[str], object]]
 def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
     """Format `scan settings.txt` (CRLF) for a scan.
 
-    Lines are in the order of the fields, with the scanner's headings.
+    Lines are in the order of the fields, with the scanner's headings, which are there
+    even where their field is not.
 
     Args:
         scan: a record, or the settings themselves; fields that are None have no line.
+
+    Returns:
+        The text, with a CRLF at its end.
     """
     if isinstance(scan, ScanRecord):
         s = settings_of(scan)
@@ -164,7 +168,9 @@ def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
 
 
 def _date(moment: datetime) -> str:
-    """Format a moment as the scanner does: month/day/year, 12-hour time with AM or PM; no zone."""
+    """Format a moment as the scanner does: "date: month/day/year; time: h:mm:ss AM" (12
+    hours, AM or PM), without a zone.
+    """
     hour = 12
     if moment.hour % 12:
         hour = moment.hour % 12
@@ -176,7 +182,9 @@ def _date(moment: datetime) -> str:
 
 
 def _motor(name: str, motor: MotorLine) -> str:
-    """Format a motor's line: position and, each if known, speed and acceleration; six decimals."""
+    """Format a motor's line: position and, each if not None, speed and acceleration, with
+    six decimals.
+    """
     numbers = {
         name: motor.value,
         "speed": motor.speed,
@@ -190,7 +198,8 @@ def _motor(name: str, motor: MotorLine) -> str:
 def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
     """Read `scan settings.txt`.
 
-    Unknown lines are skipped; fields that are not there are None.
+    Unknown lines are skipped; fields that are not there are None. Of a field given twice
+    the first value counts.
 
     Args:
         text: its content.
@@ -223,7 +232,9 @@ def _read_line(
 ) -> None:
     """Read one line into `values` or `motors`; lines without anything known are skipped.
 
-    A date that cannot be read is skipped; "script cancelled" sets that field.
+    START and STOP take the next line that is not empty as their date; one that cannot be
+    read is skipped. A scan type may be on the next such line, unless that has a known
+    key. "script cancelled" sets that field.
 
     Args:
         line: without its end.
@@ -273,10 +284,13 @@ def _split(line: str) -> tuple[str | None, str]:
 
 
 def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
-    """Read a value into the field of `values`, unless it is there; a serial number is
-    split off the type.
+    """Read a value into `values[field]`, unless it is there; a serial number behind the
+    scanner type goes to `serial`.
 
     An empty value is skipped unless the field is a text.
+
+    Raises:
+        ValueError: the value is not of the field's form.
     """
     if field == "scanner_type" and _SERIAL in value:
         value, serial = value.split(_SERIAL, 1)
@@ -289,9 +303,8 @@ def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
 def _is_motor(key: str, value: str) -> bool:
     """Return whether a line describes a motor.
 
-    The name must be one word that `_MOTOR_WORD` allows.
-
-    It does if it has a speed, or a bare number after a name with an underscore.
+    Its key must be of letters, digits, `_` and blanks (`_MOTOR_WORD`). Its value must
+    have a speed, or, for a key with an underscore, be a bare number.
     """
     if _MOTOR_WORD.fullmatch(key) is None:
         return False
@@ -303,7 +316,9 @@ def _is_motor(key: str, value: str) -> bool:
 
 
 def _read_motor(value: str) -> MotorLine:
-    """Parse a motor's line: position and, where given, speed and acceleration (else None)."""
+    """Parse a motor's line: position and, where given, speed and acceleration (else
+    None); ValueError for no number.
+    """
     first, *others = value.split(";")
     named = dict(_split(part.strip()) for part in others)
     return MotorLine(
@@ -314,8 +329,8 @@ def _read_motor(value: str) -> MotorLine:
 
 
 def _moment(line: str) -> datetime | None:
-    """Parse a date line by the first form of `_DATE_FORMATS` that fits, without a zone; else
-    None.
+    """Parse a line "date: ...; time: ..." by the first of `_DATE_FORMATS` that fits,
+    without a zone; None if none does.
     """
     found = _DATE.match(line)
     if found is None:

@@ -64,10 +64,15 @@ class Figures:
 
 
 def figures_of(pose: Poses, shape: tuple[int, int]) -> Figures:
-    """Compute SOD, SDD [mm], HC, VC, COR [px, from the edge] and pixel of one pose (n = 1).
+    """Compute the figures of one nominal pose: SOD, SDD [mm], HC, VC, COR [px, from the
+    edge] and pixel [mm].
 
-    `shape` is (rows, cols). COR is the column of the rotation axis at the source's
-    height; the pixel is the pitch from column to column.
+    COR is the column of the rotation axis at the source's height; the pixel is the pitch
+    from column to column.
+
+    Args:
+        pose: one (n = 1).
+        shape: image (rows, cols).
     """
     cone = pose.cone_vec()
     hc, vc = (cone.piercing_points(shape)[0] + EDGE).tolist()
@@ -90,10 +95,8 @@ def poses_of(
     """Compute poses with these figures and an upright detector; the inverse of
     `figures_of`.
 
-    Pixels are square; the source is at y = 0.
-
-    The figures do not determine the scanner's origin and the sample's height, so those
-    are arguments.
+    Pixels are square; the source is at y = 0. The figures do not determine the scanner's
+    origin and the sample's height, so those are arguments.
 
     Args:
         figures: as printed.

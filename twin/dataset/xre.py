@@ -33,10 +33,9 @@ _TALL_MM: Final = 2000.0
 def format_xre(record: ScanRecord) -> str:
     """Format `data settings XRE.txt` (CRLF) for a scan: `data/texts/xre.txt`, filled in.
 
-    The flat's position is there only if its axis has a motor line.
-
     Values of the maker's reconstruction and of hardware the twin does not model are zero
-    or empty there, so that readers find every key.
+    or empty there, so that readers find every key. The flat's position is there only if
+    the flat's axis has a motor line.
 
     Args:
         record: of the scan.
@@ -98,7 +97,9 @@ class _Filled(string.Formatter):
     """Formatter of values for this file; mappings become lines."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Format a value: by its format, if given; a mapping as lines; else by its type."""
+        """Format a value: by its format specification, if given; a mapping as lines `key
+        = value`; else by its type (`_written`).
+        """
         if format_spec:
             return format(value, format_spec)
         if isinstance(value, Mapping):
@@ -107,8 +108,8 @@ class _Filled(string.Formatter):
 
 
 def format_settings(settings: ScanSettings) -> str:
-    """Write the fields of settings that `data settings XRE.txt` has a place for; None are
-    left out.
+    """Format the fields of settings that `data settings XRE.txt` has a place for, as
+    sections; None are left out.
     """
     sections: dict[str, dict[str, Value]] = {}
     for field, entry in ENTRIES.items():
@@ -120,9 +121,11 @@ def format_settings(settings: ScanSettings) -> str:
 
 
 def format_sections(sections: Sections) -> str:
-    """Format sections as text: `[name]` and one line an entry, a blank line between sections.
+    """Format sections as text with CRLF: `[name]`, one line for each entry, and an empty
+    line between sections.
 
-    Texts are quoted, truth values TRUE and FALSE, numbers `%d` and `%f`.
+    Texts are quoted, truth values TRUE and FALSE, whole numbers without decimals, others
+    with six.
     """
     blocks = [
         f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()
@@ -154,7 +157,8 @@ def points_of_interest(record: ScanRecord) -> Mapping[str, str]:
         record: of the scan.
 
     Returns:
-        Name -> entry: axis, piercing point, image, sample, source, world.
+        Name -> entry: COT (axis at the source's height), HCVC (piercing point), image,
+        object, TMV, the sample, projCOT (axis on the panel), world, and the tube.
     """
     pose = record.settings_pose()
     source = pose.source[0]
@@ -205,9 +209,16 @@ def _entry(
     track: bool = False,
     safe: bool = True,
 ) -> str:
-    """Format one position of source, detector or object with its three axes as one text.
+    """Format one place with its three axes, a radius and a height, as one text of the XRE
+    file.
 
     The movable range is always infinite.
+
+    Args:
+        place: (3,) [mm], world frame.
+        x, y, z: axes, (3,) each.
+        radius, height: of the thing there [mm]; -1: no height.
+        track, safe: switches of the entry.
     """
     return (
         f"WC{_triple(place)}dirX{_triple(x)}dirY{_triple(y)}dirZ{_triple(z)}radius[{radius:f}]"
@@ -222,16 +233,18 @@ def _word(name: str) -> str:
 
 
 def _triple(vector: Sequence[float] | FloatArray) -> str:
-    """Format a vector with up to four decimals, without trailing zeros and minus zero."""
+    """Format a vector as "[x;y;z]" with up to four decimals, without trailing zeros and
+    minus zero.
+    """
     texts = [f"{value:.4f}".rstrip("0").rstrip(".") for value in vector]
     return f"[{';'.join('0' if text in ('-0', '') else text for text in texts)}]"
 
 
 def _written(value: Value) -> str:
-    """Format one value as the XRE file has its type: TRUE, whole number, six decimals,
-    quoted text.
+    """Format one value by its type: TRUE or FALSE, whole number, six decimals, or quoted
+    text.
 
-    Quotes and backslashes in a text are escaped.
+    A text is reduced to one line; quotes and backslashes in it are escaped.
     """
     match value:
         case bool():

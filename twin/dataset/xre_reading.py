@@ -24,17 +24,18 @@ class XreSettings:
     sections: Mapping[str, Mapping[str, str]]
 
     def text(self, section: str, key: str) -> str | None:
-        """Return a value's text for a section and key in any case; None if absent or
-        empty.
+        """Return the text of the first entry with this section and key, in any case, that
+        is not empty; None if there is none.
         """
         return next(
             (v for k, v in self._entries(section) if k.lower() == key.lower() and v), None
         )
 
     def number(self, section: str, key: str) -> float | None:
-        """Return a value as a number; None if absent.
+        """Return an entry's value as a number (`parse_number`); None if it is absent or
+        empty.
 
-        Case of section and key does not count; an empty value is absent.
+        Case of section and key does not matter.
 
         Raises:
             DatasetFormatError: it is present and not a number.
@@ -51,11 +52,12 @@ class XreSettings:
     def settings(self) -> ScanSettings:
         """The corresponding content of `scan settings.txt`, as far as this file has it.
 
-        Missing entries are None. Cancelled if "Succeeded" is FALSE; the scan type is
-        smooth or unknown.
+        Missing entries are None. Numbers of counts are rounded. `cancelled` if
+        "Succeeded" is FALSE; the scan type is "smooth scan" or None. Motors have
+        positions only.
 
         Raises:
-            DatasetFormatError: a figure is not a number.
+            DatasetFormatError: a figure is not a number, or a ROI not four whole ones.
         """
         roi = self.text("Camera settings", "ROI")
         motors = {
@@ -100,7 +102,9 @@ class XreSettings:
         return sections is None or sections <= 1.0
 
     def _entries(self, section: str) -> list[tuple[str, str]]:
-        """List the (key, value) entries of all sections of that name; case does not count."""
+        """List the (key, value) entries of all sections of that name, case ignored, in
+        the file's order.
+        """
         return [
             entry
             for name, entries in self.sections.items()
@@ -119,7 +123,8 @@ def _wrong(section: str, key: str, text: str, allowed: str) -> DatasetFormatErro
 def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
     """Parse `data settings XRE.txt`; of a key given twice in a section the first counts.
 
-    Lines before the first section, and lines without `=` or `:`, are skipped.
+    A section that occurs twice is one. Lines before the first section, and lines without
+    `=` or `:`, are skipped.
 
     Args:
         text: its content.
@@ -145,7 +150,9 @@ def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
 
 
 def _unquoted(text: str) -> str:
-    """Strip a value; remove its quotes and escapes, or, if unquoted, semicolons at its end."""
+    """Strip a value; remove quotes around it with their escapes, or, if unquoted,
+    semicolons at its end.
+    """
     value = text.strip()
     if len(value) >= 2 and value[0] == '"' and value[-1] == '"':
         return re.sub(r'\\([\\"])', r"\1", value[1:-1])
