@@ -78,7 +78,8 @@ def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 def read_cil(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert CIL's arguments to a geometry.
 
-    The origin, a corner of the image, determines the signs of its rows and columns.
+    The origin of the data determines the signs of u and v along CIL's directions
+    (`ORIGINS`).
 
     Args:
         arrays: name -> array, as from `cil_arrays`.

@@ -48,17 +48,17 @@ _NUMBERS: Final[Mapping[str, Any]] = {
 
 
 def flexdata_text(geometry: ScanGeometry) -> str:
-    """Write the TOML file for images turned upside down.
+    """Write the TOML file of a geometry, for images turned upside down.
 
-    Refused: a bent panel, no circle, unequal angle steps (beyond `ROUNDED_MM` at the
-    object), or a source that is not before axis and detector. Only a known shape has
-    det_rows and det_cols.
+    Only a known shape gives det_rows and det_cols.
 
     Args:
         geometry: of the images before they are turned.
 
     Raises:
-        ExchangeError: the format cannot express the geometry.
+        ExchangeError: skew pixels or several sizes, no circle, unequal angle steps (each
+            beyond `ROUNDED_MM` at source and panel), or a source that is not before axis
+            and panel.
     """
     up = geometry.rows_up()
     pitch_u, pitch_v = g.require_panel(up.cone_vec, "flexDATA")
@@ -115,10 +115,14 @@ def flexdata_text(geometry: ScanGeometry) -> str:
 
 
 def _angles(axes: FloatArray) -> tuple[float, float, float]:
-    """Compute roll about y, then yaw about the turned z, then pitch about the turned x
-    [rad].
+    """Compute a panel's roll about y, yaw about the turned z and pitch about the turned x
+    [rad], in this order.
 
-    The columns of `axes` (3, 3) are x, y, z of the panel.
+    Args:
+        axes: (3, 3); columns are the panel's x, y and z.
+
+    Returns:
+        Roll, yaw, pitch.
 
     Raises:
         ExchangeError: the rows run along the beam.
@@ -141,7 +145,8 @@ def read_flexdata(
     """Read a `geometry.toml`; the result is for images as they are, with row 0 on top.
 
     `views` and `shape`, if given, count before the file's. Of the three distances two are
-    needed. Another version of the format is a note of the result, not an error.
+    needed; src2det counts only for one that is missing. Tuples in parentheses are read.
+    Another version of the format is a note of the result, not an error.
 
     Args:
         text: the file.
@@ -150,7 +155,8 @@ def read_flexdata(
         file: for messages.
 
     Raises:
-        ExchangeError: not such a file, or something of it that is not understood.
+        ExchangeError: not such a file, a number of `UNSUPPORTED` that is not 0, no number
+            of views, or distances that are not a scanner's.
     """
     # flexDATA writes tuples, which are no TOML, and repairs them itself on reading.
     repaired = text.lstrip("\ufeff").translate(str.maketrans("()", "[]"))
@@ -212,7 +218,8 @@ def read_flexdata(
 def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
     """Read one of `_NUMBERS` from a file, or its default if absent.
 
-    Needed are pixel, angle range, and whatever the file states.
+    A value that is wrong is an error if the file states it, or if it is pixel or angle
+    range.
 
     Args:
         name: of the value.
@@ -220,7 +227,8 @@ def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:
         file: for messages.
 
     Returns:
-        The numbers in the default's shape; NaN for one that was wrong and is not needed.
+        float64 in the default's shape; NaN for a value that the file does not state and
+        that has no default.
 
     Raises:
         ExchangeError: a wrong number of values, or one that is not finite.

@@ -53,10 +53,12 @@ class ScanGeometry:
     full_scale: int | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        """Check the lengths of `real` and of `files`, where given, and the detector's shape.
+        """Check the lengths of `real` and of `files`, where given, and the detector's
+        shape.
 
         Raises:
-            ExchangeError: one has not an entry for each view, or the shape has no pixel.
+            ExchangeError: one does not have an entry for each view, or the shape has no
+                pixel.
         """
         for what, count in (("real rows", self.real), ("files", self.files or None)):
             if count is not None and len(count) != len(self):
@@ -78,11 +80,11 @@ class ScanGeometry:
         return float(np.linalg.norm(first[6:9])), float(np.linalg.norm(first[9:12]))
 
     def rows_up(self) -> ScanGeometry:
-        """Return the detector with rows counted from the other side: v is negated.
+        """Return the geometry with rows counted from the other side: v is negated, in
+        `real` too.
 
-        Twice gives the same geometry; files, shape and notes stay.
-
-        It belongs to images that are turned upside down.
+        It belongs to images that are turned upside down. Twice gives the same geometry;
+        files, shape and notes stay.
         """
         down = np.repeat([1.0, -1.0], [9, 3])
         real = None
@@ -110,8 +112,8 @@ class CircularScan:
     v: FloatArray
 
     def cone_vec(self) -> ConeVec:
-        """Compute one view for each angle: the standing geometry, turned about the circle's
-        centre.
+        """Compute one view for each angle: source, detector, u and v turned about z by
+        the angle, about the circle's centre.
         """
         standing = np.concatenate([self.source, self.detector, self.u, self.v])
         return ConeVec(np.tile(standing, (len(self.angle), 1))).moved(
@@ -124,8 +126,9 @@ def circle_of(
 ) -> CircularScan:
     """Find the circle that `cone_vec` describes.
 
-    Centre coordinates below a tenth of `SAME_MM` are set to 0; the rest is the mean over
-    the views.
+    The axis is found by least squares; coordinates of it below a tenth of `SAME_MM` are
+    0, and views of one direction have it at the origin. Source, detector, u and v are
+    means over the views.
 
     Args:
         cone_vec: at least one view.
@@ -170,7 +173,8 @@ def circle_of(
 def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     """Return the pixel pitch (u, v) [mm] of a panel with rectangular pixels of one size.
 
-    Both within `SQUARE_TOLERANCE`; the pitches are means over the views.
+    Orthogonal, and of one length over the views, within `SQUARE_TOLERANCE`; u and v may
+    differ. The pitches are means over the views.
 
     Args:
         cone_vec: n views.
@@ -192,12 +196,15 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
 
 
 def require_each(what: str, off: FloatArray, most: float) -> None:
-    """Check a figure of every view, (n,).
+    """Check that a figure of every view, (n,), n > 0, is at most `most`.
 
-    At least one view is needed.
+    Args:
+        what: name of the figure, for the message.
+        off: (n,) the figure.
+        most: greatest value allowed.
 
     Raises:
-        ExchangeError: one is above `most`; names the view with the largest.
+        ExchangeError: one is above; names the view with the largest.
     """
     view = int(np.argmax(off))
     if off[view] > most:

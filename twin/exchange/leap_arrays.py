@@ -45,6 +45,9 @@ def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     Source and panel centre [mm], unit vectors of rows and columns, (n, 3) each; counts
     and pixel sizes are scalars.
 
+    Args:
+        geometry: with the detector's shape.
+
     Raises:
         ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
     """
@@ -60,7 +63,11 @@ def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 def read_leap(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert LEAP's arguments to a geometry.
 
-    The names of its arrays are those of `leap_arrays`; `file` is for messages.
+    Unit vectors are not required: directions are normalised.
+
+    Args:
+        arrays: name -> array, those of `NAMES`.
+        file: for messages.
 
     Raises:
         ExchangeError: an argument is missing or not valid.

@@ -35,8 +35,10 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 def vectors_text(geometry: ScanGeometry) -> str:
-    """Write ASTRA's cone_vec, twelve numbers a line in full precision; shape and files are
-    not in it.
+    """Format a geometry as ASTRA's cone_vec text, a line of twelve numbers for each view,
+    in full precision.
+
+    Shape and files are not in it.
     """
     return "".join(
         " ".join(map(repr, row)) + "\n" for row in geometry.cone_vec.rows.tolist()
@@ -44,13 +46,14 @@ def vectors_text(geometry: ScanGeometry) -> str:
 
 
 def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
-    """Read twelve numbers a line, between blanks, tabs, commas or semicolons; # is a
-    comment.
+    """Read a line of twelve numbers for each view, between blanks, commas or semicolons;
+    # begins a comment.
 
-    Blank lines are skipped; at least one view must be there.
+    Empty lines are skipped; at least one view must be there.
 
     Raises:
-        ExchangeError: names the line.
+        ExchangeError: another number of them, or one that is no finite number; names the
+            line or view.
     """
     rows = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -62,7 +65,7 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
 
 
 def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") -> ConeVec:
-    """Read ASTRA's cone_vec from an array (n, 12) of numbers.
+    """Read ASTRA's cone_vec from an array (n, 12) of integers or floats.
 
     Raises:
         ExchangeError: the shape or type is different.
@@ -74,11 +77,14 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
 
 
 def csv_text(geometry: ScanGeometry) -> str:
-    """Format a geometry as CSV, one line a view: frame, file, stage angle [deg], then the
-    twelve numbers [mm].
+    """Format a geometry as CSV with a header, one line a view: frame, file, stage angle
+    [deg], then the twelve numbers [mm].
 
     A comment with the detector's shape comes first if that is known; files are empty if
-    unknown.
+    unknown. Numbers are in full precision.
+
+    Raises:
+        GeometryError: a stage angle cannot be determined, since u is vertical.
     """
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
@@ -96,8 +102,8 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
     """Parse a table whose header names the twelve numbers, in any order; other columns
     are ignored.
 
-    Blank lines and lines that begin with # are skipped. A `file` column gives file names
-    if each row has one. Without the comment the shape is None.
+    Empty lines and lines that begin with # are skipped. A `file` column gives file names
+    if no row leaves it empty. Without a comment of the shape that is None.
 
     Args:
         text: of the table; a comment may state the detector's shape.
@@ -139,7 +145,7 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
 def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to the arguments of `ts.cone_vec`.
 
-    The shape is (rows, columns); the vectors are source, detector, v, u, in that order.
+    The names are those of `TOMOSIPO_NAMES`; the shape is (rows, columns).
 
     Args:
         geometry: with the detector's shape.
@@ -207,7 +213,8 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
         file: for messages.
 
     Raises:
-        ExchangeError: there are no rows, a number is not finite, or a panel has no size.
+        ExchangeError: there are no rows, a number is not finite, or u and v span no
+            panel; the first such view is named.
     """
     rows = np.asarray(numbers, dtype=np.float64).reshape(-1, 12)
     if not len(rows):
@@ -224,14 +231,12 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
 
 
 def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
-    """Parse the twelve numbers of a row.
-
-    Infinity and NaN pass here.
+    """Parse the twelve numbers of a row; infinity and NaN pass here.
 
     Args:
         words: the cells.
         file: for messages.
-        line: number of the line.
+        line: number of the line, for messages.
 
     Raises:
         ExchangeError: another number of cells, or one that is no number; names file and
@@ -250,7 +255,9 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
 
 
 def _real(array: npt.NDArray[np.generic]) -> bool:
-    """Return whether an array has floats or integers (truth values and complex numbers are not)."""
+    """Return whether an array has floats or integers; truth values and complex numbers
+    are neither.
+    """
     return np.issubdtype(array.dtype, np.floating) or np.issubdtype(
         array.dtype, np.integer
     )
@@ -311,7 +318,7 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
     """Parse and validate the project's JSON file of a geometry.
 
     Keys that are null count as absent, unknown keys are ignored; of rows and columns both
-    or none are given.
+    or neither is given.
 
     Args:
         text: of the file.
@@ -351,7 +358,7 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
 
 
 def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[str, Any]:
-    """Parse a JSON object; it and the objects inside it are of type `kind`.
+    """Parse a JSON object; it and all objects inside it become of type `kind`.
 
     A byte order mark is removed.
 

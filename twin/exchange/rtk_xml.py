@@ -54,7 +54,8 @@ _ROOT = "RTKThreeDCircularGeometry"
 
 
 def rtk_text(geometry: ScanGeometry) -> str:
-    """Format a geometry as RTK's XML, nine numbers and a matrix a view.
+    """Format a geometry as RTK's XML, with nine numbers and a projection matrix for each
+    view.
 
     The panel's pixel size and shape are not in it.
 
@@ -84,7 +85,8 @@ def parameters_of(row: FloatArray, view: int = 0) -> tuple[float, ...]:
     """Compute the nine numbers of one cone_vec row: three angles [deg], then six lengths
     [mm], in the order of `NAMES`.
 
-    The gantry angle is 0 to 360; of a horizontal panel the in-plane angle is set to 0.
+    The gantry angle is from 0 to below 360; a panel whose normal is RTK's y has an
+    in-plane angle of 0. Lengths of u and v do not enter.
 
     Args:
         row: (12,) [mm].
@@ -119,10 +121,8 @@ def matrix_of(values: tuple[float, ...]) -> FloatArray:
     """Compute RTK's projection matrix (3, 4), which maps RTK's (x, y, z, 1) to the panel
     [mm].
 
-    Angles in degrees, lengths in mm, in the order of `NAMES`.
-
     Args:
-        values: the nine numbers of a view.
+        values: the nine numbers of a view, in the order of `NAMES` [deg, mm].
     """
     gantry, out, turn = (math.radians(a) for a in values[:3])
     sid, sdd, sx, sy, px, py = values[3:]
@@ -232,11 +232,11 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
 def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:
     """Parse the number of one XML element and put it into `values`.
 
-    Elements of `_PASSED_OVER` are skipped.
+    Elements of `_PASSED_OVER`, and unknown ones that are 0, are skipped.
 
     Args:
-        entry: the element; some are skipped.
-        values: name -> number of a view, changed.
+        entry: the element.
+        values: name -> number of a view, changed in place.
         file: for messages.
 
     Raises:

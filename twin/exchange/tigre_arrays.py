@@ -51,7 +51,7 @@ ANGLES: Final = "angles"
 
 
 def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
-    """Convert a geometry to the attributes of TIGRE's `Geometry`, and `angles` [rad].
+    """Convert a geometry to the attributes of TIGRE's `Geometry`, with `angles` [rad].
 
     Arrays of two are (rows, columns), of three (z, y, x); angles are unwrapped, one a
     view.
@@ -102,10 +102,13 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
 
 def _once(values: FloatArray) -> FloatArray:
-    """Return one value, (1,) or (k,), if all views agree to `CONSTANT_TOLERANCE`, else all
-    values.
+    """Return one value, (1,) or (k,), if all views agree to `CONSTANT_TOLERANCE`, else
+    the values of all views.
 
     The first view's value stands for all; negative zeros become 0.
+
+    Args:
+        values: (n,) or (n, k).
     """
     still = np.ptp(values, axis=0).max() <= CONSTANT_TOLERANCE
     if values.ndim == 1:
@@ -118,10 +121,8 @@ def _once(values: FloatArray) -> FloatArray:
 def _turns(axes: FloatArray) -> FloatArray:
     """Find the turns about x, y and z [rad] whose product, Rz Ry Rx, is `axes`.
 
-    Each is above -pi and at most pi.
-
-    Two triples give the same product; the one whose turns about x and z are small is
-    taken.
+    Two triples give the same product; the one whose turns about x and z are smaller is
+    taken. Each turn is above -pi and at most pi.
 
     Args:
         axes: (n, 3, 3) rotations.
@@ -183,10 +184,20 @@ def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
 
 
 def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatArray:
-    """Return the value of each view, (views,) or (views, size), from an array of one or of all.
+    """Return the value of each view from an array with one value or one for each view.
 
-    `size` 0 is a single number a view. Raises: ExchangeError for another shape, as
-    `numbers_of`.
+    Args:
+        arrays: name -> array.
+        name: of the attribute.
+        size: length of a value; 0 for a single number.
+        file: for messages.
+        views: number of views.
+
+    Returns:
+        (views,) for a size of 0, else (views, size).
+
+    Raises:
+        ExchangeError: another shape, or a number that is not finite.
     """
     own: tuple[int, ...] = (size,) if size else ()
     single: tuple[int, ...] = (size,) if size else (1,)

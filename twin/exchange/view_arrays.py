@@ -30,9 +30,7 @@ def require_shape(geometry: ScanGeometry, format_name: str) -> tuple[int, int]:
 
 
 def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
-    """Check that each array is there.
-
-    Further arrays are allowed.
+    """Check that each of `names` is among the arrays; further ones are allowed.
 
     Raises:
         ExchangeError: names those that are missing.
@@ -44,12 +42,10 @@ def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
 
 
 def views_of(arrays: Arrays, name: str, file: str) -> int:
-    """Count the views of one array, (n, ...).
-
-    A scalar has none.
+    """Count the views of the array `name`, (n, ...).
 
     Raises:
-        ExchangeError: there are none.
+        ExchangeError: there are none, or it is a scalar.
     """
     shape = np.shape(arrays[name])
     if not shape or not shape[0]:
@@ -58,10 +54,13 @@ def views_of(arrays: Arrays, name: str, file: str) -> int:
 
 
 def vectors_of(arrays: Arrays, names: Sequence[str], file: str) -> list[FloatArray]:
-    """Read arrays (n, 3) of the same n.
+    """Read arrays (n, 3) of finite numbers, all with the n of the first.
+
+    Returns:
+        Arrays in the order of `names`, float64 (n, 3).
 
     Raises:
-        ExchangeError: an array has another shape or is not numeric.
+        ExchangeError: an array has no view, another shape or other content.
     """
     count = views_of(arrays, names[0], file)
     return [numbers_of(arrays, name, file, (count, SPACE)) for name in names]
@@ -70,10 +69,9 @@ def vectors_of(arrays: Arrays, names: Sequence[str], file: str) -> list[FloatArr
 def numbers_of(
     arrays: Arrays, name: str, file: str, shape: tuple[int, ...]
 ) -> FloatArray:
-    """Read one array of finite numbers.
+    """Read one array of finite numbers, as float64 of exactly `shape`.
 
-    Integers are converted; the result is float64 of exactly `shape`. Truth values are
-    refused.
+    Integers are converted; truth values are refused.
 
     Raises:
         ExchangeError: it has another shape or other content.
@@ -92,12 +90,12 @@ def numbers_of(
 def counts_of(
     arrays: Arrays, name: str, file: str, shape: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """Read one array of whole numbers above 0.
+    """Read one array of whole numbers above 0, as a flat tuple of ints.
 
-    Returned flat, as ints; floats that are whole are allowed.
+    Floats that are whole are allowed.
 
     Raises:
-        ExchangeError: it has other content.
+        ExchangeError: it has another shape or other content.
     """
     found = numbers_of(arrays, name, file, shape).ravel()
     if (found < 1).any() or (found % 1 != 0).any():
@@ -108,12 +106,10 @@ def counts_of(
 
 
 def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
-    """Read one array of numbers above 0.
-
-    Returns float64 of `shape`.
+    """Read one array of finite numbers above 0, as float64 of `shape`.
 
     Raises:
-        ExchangeError: it has other content.
+        ExchangeError: it has another shape or other content.
     """
     found = numbers_of(arrays, name, file, shape)
     if (found <= 0.0).any():
@@ -122,12 +118,11 @@ def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> Fl
 
 
 def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArray:
-    """Read an array (count, 3) of directions and normalise them.
-
-    Returns float64 unit vectors; the first view without a direction is named.
+    """Read an array (count, 3) of directions and normalise them to unit vectors, float64.
 
     Raises:
-        ExchangeError: it has other content, or a vector of length zero.
+        ExchangeError: it has another shape or other content, or a vector of length zero;
+            the first such view is named.
     """
     found = numbers_of(arrays, name, file, (count, SPACE))
     lengths = np.linalg.norm(found, axis=1, keepdims=True)
