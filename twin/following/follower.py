@@ -105,10 +105,13 @@ class Follower:
     collision: CollisionCheck | None = None
 
     def hear(self, mirror: Mirror, heard: Heard, now: float) -> Mirror:
-        """Update the mirror with a message: command, feedback, acknowledgement or error.
+        """Update the mirror with a message: a command, feedback, an acknowledgement, its
+        end or an error.
 
-        Feedback is a reading; RCV changes only when it was last heard; an end that was
-        not asked for may be of an unheard command.
+        A command is predicted (`_begin_command`), feedback is a reading
+        (`_compare_reading`), RCV only a sign of life, any other an end (`_end_command`).
+        The link counts as up; an alarm of silence about the command ends, and if it came
+        after more than `MAX_SILENCE_S` the server counts as one that does not speak.
 
         Args:
             mirror: before it.
@@ -116,8 +119,8 @@ class Follower:
             now: when it came [s].
 
         Returns:
-            The mirror after it, with new lines of the log and alarms; doubled and late
-            messages change nothing else.
+            The mirror after it, with new log lines and alarms; a doubled reply or one
+            after the end changes only when the machine was last heard.
         """
         mirror = replace(mirror, heard_s=now, lines=(), connected=True)
         mirror = mirror.cleared("link")
@@ -145,13 +148,14 @@ class Follower:
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """Update the mirror after time without a message: raise alarms for overdue and
-        silent commands.
+        silent commands and a late script.
 
-        Overdue commands are reported unless ends are known not to be heard; then they
-        are ended by prediction. Silent ones likewise. A late script is an error. An alarm
-        is raised once until its condition ends.
-
-        Commands without a sign of life for long are forgotten.
+        An overdue command (`most_s` and `SLACK_S`) is a warning, after which ends count
+        as not reported, unless one has been heard; a server that does not report ends has
+        its commands ended by prediction instead, and its arrivals judged. Silence of
+        `MAX_SILENCE_S` is a warning once, unless the server does not speak. Commands
+        silent for `FORGOTTEN_AFTER_S` (or `most_s`, if longer) are forgotten. An alarm is
+        raised once until its condition ends.
 
         Args:
             mirror: present state.
@@ -197,12 +201,16 @@ class Follower:
     def linked(
         self, mirror: Mirror, connected: bool, now: float, why: str = ""
     ) -> Mirror:
-        """Update the mirror after the link has come up or gone down, the latter of
-        which forgets commands under way.
+        """Update the mirror after the link has come up or gone down.
 
-        Coming up ends the alarms of the link and forgets nothing. Going down is an error
-        alarm with the reason `why`; motors count as at rest, and the next due time of the
-        script is dropped.
+        Coming up ends the alarms of the link and forgets nothing. Going down forgets the
+        commands under way, takes motors as at rest where they were heard last, drops the
+        script's due time, and raises an error alarm with the reason.
+
+        Args:
+            connected: whether the link is up.
+            now: moment [s].
+            why: reason for the loss.
         """
         if connected:
             return replace(mirror.cleared("link"), connected=True)
@@ -212,11 +220,11 @@ class Follower:
         return _alarm(mirror, now, "error", "lost", "link", message)
 
     def told(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
-        """Return the mirror with the alarms of `ahead`: new ones are added, those that
-        are over end.
+        """Return the mirror with the alarms of `ahead`: new ones are added, and those
+        that are over end.
 
-        Alarms whose subject does not begin with "ahead" stay; an active one is not added
-        again.
+        Active alarms whose subject begins with "ahead" end unless they are among
+        `alarms`; others stay. An active one is not added again.
         """
         found = tuple(alarms)
         still = {(a.kind, a.about) for a in found}
@@ -229,17 +237,18 @@ class Follower:
     def ahead(self, mirror: Mirror, now: float) -> tuple[Alarm, ...]:
         """Check the moves under way and the rest of the script, as `flexdt check` does.
 
-        Of one line and code only the first is kept; clearances only without collisions.
-
-        This takes as long as that. Motors without a reading are assumed at home, which
-        each alarm mentions.
+        Of one line and code only the first error is kept; clearances only without
+        collisions. It takes as long as such a check. Motors without a reading are assumed
+        at home, which each alarm mentions. Without components or a check function,
+        collisions are not checked.
 
         Args:
             mirror: the machine as it is known.
             now: time [s].
 
         Returns:
-            Errors, doubts about the exposure, and clearances below the bound, as alarms.
+            Alarms: errors of the plan, warnings about the open beam, and one for a least
+            clearance below the safety margin and `NEAR_PART_MM`.
         """
         under_way = [
             c.MoveAbsolute(component=name, target=axis.target)
@@ -284,11 +293,11 @@ class Follower:
         """Update the mirror with a command: prediction, place in the script, command
         under way.
 
-        A command whose end came first is applied at once. An unknown axis is an alarm; a
-        stop ends all predicted paths. At most `MAX_WAITING` are kept.
-
-        A command that was heard before changes nothing; one that another has waited for
-        ends those.
+        A command that was heard before changes nothing; one whose end was heard first is
+        applied at once. A command (no question) ends earlier ones of its component whose
+        time is over, and writes log lines of those that were not waited for. An unknown
+        axis is an alarm; a stop ends all predicted paths. At most `MAX_WAITING` are kept,
+        the newest.
 
         Args:
             mirror: present state.
@@ -324,11 +333,11 @@ class Follower:
         return replace(mirror, waiting={**kept, heard.identity: waiting})
 
     def _end_overdue(self, mirror: Mirror, component: str, now: float) -> Mirror:
-        """End the commands whose predicted time is over, and apply their settings.
+        """Mark commands whose predicted time is over as ended, and apply their settings.
 
-        A command without a prediction is over at once; each ends once: it is marked as
-        superseded, stays in `waiting`, and gets no line or alarm here. Lateness of the
-        message is added to its time.
+        A command without a prediction is over at once. Each ends once: it is marked as
+        superseded, stays in `waiting`, and gets no line or alarm here. Lateness of its
+        message is added to the time that has passed.
 
         Args:
             mirror: present state.
@@ -351,11 +360,12 @@ class Follower:
     def _predict(
         self, mirror: Mirror, waiting: Waiting, command: c.Command, now: float
     ) -> tuple[Mirror, Waiting]:
-        """Predict one command, from the machine as it is now, and raise alarms for its
-        problems.
+        """Predict one command, from the machine as it is now: paths and targets of its
+        motors, its duration and bounds; raise alarms for its problems.
 
-        Motors under way go on from their predicted paths; a trigger is ignored, as is
-        what depends on X-rays while it is unknown whether they are on.
+        Motors under way go on from their predicted paths; a trigger is ignored. Alarms of
+        an axis's last move end with its next. Problems are those of `_KIND_OF_PROBLEM`;
+        those about X-rays are left out while it is unknown whether they are on.
 
         Args:
             mirror: the machine.
@@ -419,11 +429,11 @@ class Follower:
         )
 
     def _near_limit(self, mirror: Mirror, name: str, target: float, now: float) -> Mirror:
-        """Return the mirror, with a warning (once) if a target is near a limit of its
-        motor.
+        """Return the mirror, with a warning `limit_near` if a target is less than
+        `NEAR_LIMIT_DISTANCE` from a limit of its motor.
 
-        Near is less than `NEAR_LIMIT_DISTANCE`; a target beyond it counts, too. Not if a
-        limit alarm is active.
+        A target beyond the limit counts, too; none if an alarm `limit` of the motor is
+        active.
         """
         axis = self.machine.axes[name]
         left = min(target - axis.lower, axis.upper - target)
@@ -433,11 +443,13 @@ class Follower:
         return _alarm(mirror, now, "warning", "limit_near", name, message)
 
     def _follow_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
-        """Find the command in the script: advance, or raise an alarm.
+        """Compare a command with the script's next line: advance and compute when the
+        following one is due, or raise a warning.
 
-        The first line after the end begins the script anew. A command that is not the
-        next line is a warning once the script has begun; before that, and without a
-        script, nothing.
+        Place, wait, times and trigger do not count (`_bare`). After the end, the first
+        line begins the script anew. Another command is a warning `off_script` once the
+        script has begun; before that, after its end, and without a script, it changes
+        nothing.
 
         Args:
             mirror: present state.
@@ -483,8 +495,8 @@ class Follower:
 
     @cached_property
     def _steps(self) -> tuple[PlanStep, ...]:
-        """Steps of the script simulated from the machine's home and default settings; ()
-        without one.
+        """Steps of the script, simulated from the machine's home and default settings; ()
+        without a script.
         """
         if self.script is None:
             return ()
@@ -505,15 +517,17 @@ class Follower:
     def _end_command(
         self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
     ) -> Mirror:
-        """Update the mirror with the end of a command: record, range, positions, settings.
+        """Update the mirror with the end of a command: log line, range of its time,
+        positions, settings.
 
-        An error is an alarm, and the motors count as at rest. A move that has passed its
-        trigger stays under way. A reading counts as such, other commands' settings as
-        made.
+        An error is an alarm `failed`, and the command's motors count as at rest. A move
+        that has passed its trigger stays under way, as superseded. A time outside its
+        bounds by more than `SLACK_S` is a warning `range`. The end of a move records its
+        arrival, that of a question is a reading, others' settings are applied.
 
         Args:
             mirror: present state.
-            heard: message that ends the command.
+            heard: message that ends the command, ACK or ERR.
             waiting: the command's record; None if its begin was not heard.
             now: moment [s].
         """
@@ -553,9 +567,11 @@ class Follower:
     def _record_arrival(
         self, mirror: Mirror, waiting: Waiting, heard: Heard, now: float
     ) -> Mirror:
-        """Update positions, limits and rates with the reply at the end of a move.
+        """Update positions, limits and rates with the reply at the end of a move; raise
+        an alarm if it is not at its target.
 
-        Without a readable position the motors are taken to be at their targets.
+        Motors that another move has sent on since keep their paths. Without a readable
+        position the others are taken to be at their targets.
 
         Args:
             mirror: present state.
@@ -583,7 +599,8 @@ class Follower:
     def _arrival(
         self, mirror: Mirror, name: str, there: float, meant: float, now: float
     ) -> Mirror:
-        """Return the mirror, with an alarm if a motor is not where its move led.
+        """Return the mirror, with an error alarm `offset` if a motor is more than
+        `TARGET_TOLERANCE` from where its move led.
 
         Args:
             mirror: present state.
@@ -603,8 +620,8 @@ class Follower:
     ) -> Mirror:
         """Compare limits and rates of a motor's reply with those of the machine file.
 
-        Speed and acceleration become the reply's; only limits and maxima are compared, to
-        1e-6.
+        Only limits and maxima are compared, to 1e-6 (relative above 1). The mirror's
+        speed and acceleration become the reply's.
 
         Args:
             mirror: present state.
@@ -613,7 +630,8 @@ class Follower:
             now: moment [s].
 
         Returns:
-            The mirror with the motor's rates, and an alarm for each difference.
+            The mirror with the motor's rates, and an error alarm (`limits`, `rates`) for
+            each difference.
         """
         axis = self.machine.axes[name]
         for what, theirs, ours in (
@@ -641,7 +659,12 @@ class Follower:
     ) -> Mirror:
         """Compare a reading of a motor's position with its predicted path.
 
-        Positions within `TARGET_TOLERANCE` of start or target are never off.
+        A reading of a motor without a path is its position; if it was elsewhere before
+        and no move explains it, that is an alarm `moved`. A path's delay is now less the
+        time at which the path passes the reading: more than the motor's `delay_s` and
+        `SLACK_S`, or growing by more than `MAX_DRIFT_S`, is `slow`; a lead of that size
+        `fast`; a position nowhere on it `off_path`. Positions within `TARGET_TOLERANCE`
+        of start or target are never off.
 
         Args:
             mirror: the machine.
@@ -650,8 +673,9 @@ class Follower:
             now: time [s].
 
         Returns:
-            The mirror with the reading, and an alarm for an axis that is off its path,
-            slow, fast, or moved by nobody; repeated and old readings change nothing.
+            The mirror with the reading and perhaps an error alarm. A text that is no
+            position, a repeated or old reading, and one of a move that another has
+            replaced change nothing.
         """
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
         axis = heard.words[0]
@@ -719,10 +743,10 @@ class Follower:
         return here.with_axis(name, behind_s=promptest, passed_s=passes)
 
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
-        """Return the motor that a reading of `axis` is of, and its position.
+        """Return the motor that a reading of `axis` is of, and that motor's position.
 
-        The reading of a virtual axis is converted to its motor; any other name is
-        returned as it is.
+        The reading of a virtual axis is converted to the motor that it reads; any other
+        axis is returned as it is.
         """
         virtual = self.machine.virtual_axes.get(axis)
         if virtual is None:
@@ -732,7 +756,9 @@ class Follower:
     def _outside(
         self, mirror: Mirror, waiting: Waiting, took: float, now: float
     ) -> Mirror:
-        """Return the mirror with the warning that a command took less or more than its range."""
+        """Return the mirror with a warning `range`: a command took `took` seconds, less
+        or more than its bounds.
+        """
         longer = "less"
         if took > waiting.most_s:
             longer = "more"
@@ -747,14 +773,18 @@ class Follower:
 def _alarm(
     mirror: Mirror, now: float, severity: Severity, kind: str, about: str, message: str
 ) -> Mirror:
-    """Add an alarm to a mirror."""
+    """Add an alarm to a mirror, unless one of this kind and subject is active
+    (`Mirror.alarmed`).
+    """
     return mirror.alarmed(Alarm(now, severity, kind, about, message))
 
 
 def _bounds(step: PlanStep, machine: Machine) -> Range:
-    """Compute bounds of a step's time that a healthy machine exceeds less than once a day [s].
+    """Compute bounds of a step's time that a healthy machine exceeds less than once a day
+    [s]: (least, most).
 
-    A time that is only assumed may be anything up to twice itself.
+    A measured time has its 90 % range, widened; an assumed one may be anything from
+    nothing to twice itself.
     """
     found = step_range(step, machine.timing)
     if found is None:
@@ -769,10 +799,8 @@ def _wider(found: Range) -> Range:
 
 
 def _rests(mirror: Mirror, waiting: Waiting | None) -> Mirror:
-    """Return the mirror with the motors of a move at rest, except those that another move
-    has sent on.
-
-    Unchanged for None.
+    """Return the mirror with the motors of a command's move at rest, except those that
+    another move has sent on; unchanged for None.
     """
     for name in () if waiting is None else waiting.targets:
         if waiting is not None and _stays(mirror, name, waiting):
@@ -788,10 +816,8 @@ def _stays(mirror: Mirror, name: str, waiting: Waiting) -> bool:
 
 
 def _bare(command: c.Command) -> c.Command:
-    """Strip a command of its place in the text, its wait, its times and the
-    case of its axis.
-
-    Of a move also the trigger position; for comparing commands.
+    """Return a command without its place in the text, wait, times and trigger, and its
+    axis in lower case, for comparing commands.
     """
     bare = replace(
         command, line=0, column=1, wait=c.Wait.ACK, timeout_ms=None, expected_ms=None
@@ -805,10 +831,10 @@ def _bare(command: c.Command) -> c.Command:
 
 def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
     """Add log lines for the commands that the sender has not waited for, now that another
-    follows.
+    follows; mark them as written.
 
-    Questions get none, and each command one only. A move with a trigger took the time
-    until now, with the wait POS; any other 0 s, with "no wait". They are marked as written.
+    Questions get none, and each command one only. A move with a trigger has the wait POS
+    and the time until now; any other "no wait" and 0 s.
 
     Args:
         mirror: present state.
@@ -830,9 +856,9 @@ def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
 
 
 def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, ...]:
-    """Format the log line of a command that a script can have, once; empty for others.
+    """Format the log line of a command that a script can have; () if it has one already
+    or is no command of the language.
 
-    Empty if a line is written already, or if the message is not a command of the language.
     A move under another name is written as "move absolute" with its target.
 
     Args:
@@ -840,6 +866,9 @@ def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, 
         wait: its wait.
         took: its own time [s].
         reply: of the machine.
+
+    Returns:
+        () or the one line.
     """
     command = waiting.heard.command
     words = waiting.heard.words
@@ -851,7 +880,9 @@ def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, 
 
 
 def _number(text: str) -> float | None:
-    """Parse a text as a finite number, spaces around it dropped; None if it is none."""
+    """Parse a text as a finite number (`grammar.number`), blanks around it dropped; None
+    if it is none.
+    """
     try:
         return number(text.strip(), "position")
     except ArgumentError:
@@ -861,11 +892,11 @@ def _number(text: str) -> float | None:
 def _apply_settings(
     mirror: Mirror, command: c.Command | None, machine: Machine, now: float
 ) -> Mirror:
-    """Apply the end of a command to the mirror's settings: camera, tube, X-rays or an
+    """Apply a command that has ended to the mirror's settings: camera, tube, X-rays or an
     axis's rates.
 
-    Rates of a virtual axis are set for its motors by their shares; a wait for X-rays
-    means that they are on and ready now.
+    Rates of a virtual axis are set for its motors by their shares. X-rays on are ready
+    after the machine's `xray_ready_s`; after a wait for them they are on and ready now.
 
     Args:
         mirror: present state.

@@ -65,8 +65,11 @@ class Heard:
         return self.key != " ".join(self.words[:2])
 
     def may_answer(self, command: Identity) -> bool:
-        """Return whether this can be a reply to a command, by its UUID, or else
-        by its words."""
+        """Return whether this message can be a reply to a command: by its key, and
+        without a UUID by its arguments, too.
+
+        Arguments of such a reply must be the command's or empty.
+        """
         same = self.words[2:] in (command[2][2:], ("", ""))
         return command[0] == self.key and (self.named or same)
 
@@ -222,7 +225,9 @@ class Mirror:
 
     @property
     def start(self) -> StartState:
-        """The mirrored state as the start of a plan: positions, rates, camera, tube, X-rays."""
+        """The mirrored state as the start of a plan: positions and rates of all motors,
+        camera, tube, X-rays (None: unknown).
+        """
         return StartState(
             self.positions,
             {n: a.speed for n, a in self.axes.items()},
@@ -234,15 +239,15 @@ class Mirror:
         )
 
     def asked(self, reply: Heard) -> Waiting | None:
-        """Find the waiting command that `reply` belongs to: the one of its key; None if
-        there is none.
+        """Find the waiting command that `reply` may answer; None if there is none.
 
-        Of several the one with the same first words, then the same tick.
+        Of several the one with the same component and command, then the same tick, is
+        taken; of equals the oldest.
         """
 
         def alike(asked: Waiting) -> tuple[bool, bool]:
-            """Rank a waiting command: first by agreement of the two first words, then of the
-            tick.
+            """Rank a waiting command for `max`: first by agreement of component and
+            command, then of the tick.
             """
             return asked.heard.words[:2] == reply.words[
                 :2
@@ -252,14 +257,20 @@ class Mirror:
         return max(found, key=alike, default=None)
 
     def with_waiting(self, asked: Waiting, **changes: object) -> Mirror:
-        """Return the mirror with fields of a waiting command changed; it is added if it does
-        not wait.
+        """Return the mirror with fields of a command changed; it is added to those that
+        wait if it is not among them.
         """
         changed = replace(asked, **changes)  # type: ignore[arg-type]
         return replace(self, waiting={**self.waiting, asked.heard.identity: changed})
 
     def finished(self, command: Heard, unheard: bool = False) -> Mirror:
-        """Move a command from waiting to ended; `unheard` if only its end was heard."""
+        """Move a command from waiting to ended; only the last `MAX_WAITING` ended ones
+        are kept.
+
+        Args:
+            command: that has ended.
+            unheard: whether only its end was heard.
+        """
         left = {i: w for i, w in self.waiting.items() if i != command.identity}
         kept = dict(list(self.ended.items())[1 - MAX_WAITING :])
         return replace(self, waiting=left, ended={**kept, command.identity: unheard})
@@ -281,7 +292,8 @@ class Mirror:
         return replace(self, axes=axes)
 
     def alarmed(self, alarm: Alarm) -> Mirror:
-        """Add an alarm, unless one of its kind about the same thing is active already.
+        """Add an alarm, unless one of its kind and subject is active already; it is
+        active from then on.
 
         Only the last `MAX_ALARMS` are kept; `raised` counts all.
         """
@@ -304,10 +316,11 @@ class Mirror:
         return self
 
     def to_dict(self, now: float) -> dict[str, object]:
-        """Return the JSON form at a moment: the public fields, and their ages [s].
+        """Return the JSON form at a moment: link, axes, tube, camera, commands under way,
+        script's place, alarms, and ages [s].
 
-        Age is None for what was never heard; `expected` is the predicted position at
-        `now`. Motors are in mm and deg.
+        An age is None where nothing was heard; an axis's `expected` is its position on
+        the predicted path at `now`. Axes are in mm and deg.
 
         Args:
             now: moment [s].
