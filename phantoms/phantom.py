@@ -28,7 +28,7 @@ from flexdt.phantoms.voxelise import as_volume, voxelise
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene
-from flexdt.twin.values import ArrayValue, adapter_of, told
+from flexdt.twin.values import ArrayValue, adapter_of, document_errors
 
 if TYPE_CHECKING:
     import trimesh
@@ -206,7 +206,7 @@ class Phantom(ArrayValue):
         try:
             phantom: Phantom = adapter_of(Phantom).validate_python(doc)
         except ValidationError as error:
-            raise PhantomError(*told("phantom", error)) from None
+            raise PhantomError(*document_errors("phantom", error)) from None
         return phantom
 
 

@@ -26,12 +26,9 @@ it."""
 
 
 def backend(subject: str) -> Any:
-    """Import the module that handles a subject.
+    """Import the module that handles a subject; return the module.
 
     Args:
-        subject: a key of `BACKENDS`.
-
-    Returns:
-        The module.
+        subject: a key of `BACKENDS`; KeyError for another one.
     """
     return import_module(BACKENDS[subject])

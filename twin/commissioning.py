@@ -119,17 +119,18 @@ class PastScan:
 
 def standing(scan: PastScan, machine: Machine) -> PastScan:
     """Return the scan with motor positions, camera and the zero offsets behind its
-    printed figures.
+    printed figures, from its settings text.
 
-    Zero offsets are chosen so that the machine's computed SOD, SDD, HC, VC and COR agree
-    with the text; roll stays 0.
+    c_obj and c_det are chosen so that the machine's computed SOD and SDD agree with the
+    text, then det_tan, src_ort and axs_tan so that HC, VC and COR do; roll is 0.
 
     Args:
         scan: with the content of its settings text.
         machine: whose motors and camera these are.
 
     Raises:
-        TwinError: its texts do not say them, or contradict themselves.
+        TwinError: its text lacks motors, camera mode, ROI or one of the figures, or
+            contradicts itself.
     """
     s = None
     if scan.settings is not None:
@@ -165,7 +166,9 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
 def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
     """Read the settings that a scan's script requests.
 
-    A script without projections has only the targets; times of day and waits are ignored.
+    A script without projections has only the targets, an empty one nothing; times and
+    waits are ignored. Targets are of motors only; of several `write settings file` the
+    first counts.
 
     Args:
         scan: with the commands of its script.
@@ -202,10 +205,13 @@ def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
 
 
 def _projections(command: c.TakeSequence | c.SaveImage, frames: int | None) -> int:
-    """Count the projections that a command saves; a sequence without a number of frames
-    has one.
+    """Count the projections that a command saves, by the names of its images.
 
     Names of dark and flat images, and paths without a name, count 0.
+
+    Args:
+        command: saves a sequence or an image.
+        frames: number of images of a sequence; None or 0 is one.
     """
     if isinstance(command, c.TakeSequence):
         names: Sequence[str | None] = sequence_names(
@@ -228,14 +234,16 @@ class Scanner(NamedTuple):
 def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
     """Identify the scanner of a scan: by its texts, or else by the limits of its motors.
 
-    By limits only if at least `MIN_SHARED_LIMITS` and half of the motors share theirs.
+    Only with at least `MIN_SHARED_LIMITS` and half of the log's motors sharing theirs; of
+    several machines the one with most.
 
     Args:
         scan: with its texts and log.
         known: machines that it may be of.
 
     Returns:
-        Name of the machine ("" if unknown), serial number, and what identified it.
+        Name of the machine ("" if unknown), serial number of the texts ("" if none), and
+        what identified it.
     """
     texts = [text for text in (scan.settings, scan.second) if text is not None]
     serial = next((text.serial for text in texts if text.serial), "")
@@ -256,10 +264,14 @@ def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
 
 
 def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
-    """Count the motors whose two limits are those of a machine file.
+    """Count the motors whose lower and upper limit are those of a machine file, within
+    `RELATIVE_TOLERANCE`.
 
-    They agree to `RELATIVE_TOLERANCE`; names are translated to the machine's own, unknown
-    ones do not count.
+    Names are translated to the machine's own; unknown ones do not count.
+
+    Args:
+        limits: motor -> (lower, upper).
+        machine: to compare with.
     """
     own = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(
@@ -272,10 +284,11 @@ def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
 
 
 def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
-    """List folders by scanner, in words, where they are of more than one; "" otherwise.
+    """List folders by scanner, as text for people, where they are of more than one; ""
+    otherwise.
 
-    Folders are grouped by machine and serial number; unknown ones do not count as
-    another.
+    There is more than one if two machines or two serial numbers are named; folders
+    without either do not count as another, but are listed.
 
     Args:
         scans: of which the folders are named.
@@ -304,16 +317,19 @@ def other_scanners(scans: Sequence[PastScan], known: Sequence[Machine]) -> str:
 def contradictions(
     scans: Sequence[PastScan], shipped: Machine, fitted: Machine
 ) -> Iterator[Finding]:
-    """Yield where texts, scripts, images and replies of the scans and the shipped machine
-    state things differently.
+    """Yield a finding for each quantity about which texts, scripts, images, replies and
+    the shipped machine disagree.
 
-    Lengths agree within `MATCH_MM`, others within a relative tolerance. Also yields
-    cameras that the shipped machine does not allow.
+    Lengths agree within `rebuild.MATCH_MM`, others within `RELATIVE_TOLERANCE`, words in
+    any case. The shipped machine is compared only in quantities that a scan states, and
+    in the signs of all axes. A camera mode or region that the shipped machine does not
+    allow is a finding, too.
 
     Args:
         scans: that are compared.
         shipped: machine of the file.
-        fitted: machine with the signs and limits that the scans show.
+        fitted: machine with the signs and limits that the scans show; by it the scans are
+            read.
     """
     statements: dict[str, list[tuple[Any, list[str]]]] = {}
     lengths = {*fitted.axes, *(f"{name} of the texts" for name in OFFSETS)}
@@ -367,10 +383,11 @@ def contradictions(
 
 
 def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
-    """Yield (name, value, who) of what a scan's own parts state of the same thing.
+    """Yield (name, value, source) of the same quantities in a scan's settings text,
+    script, images, XRE text, figures, and mode with ROI.
 
-    Empty and missing values are skipped; nothing without a settings text. Scripted
-    targets are cut to the travel.
+    Empty and missing values are skipped; nothing without a settings text. Positions are
+    in the script's sign; scripted targets are cut to the travel.
 
     Args:
         scan: with texts, script and images.
@@ -414,11 +431,11 @@ def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any
 
 
 def _common_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any]]:
-    """Yield (name, value) of what should be alike in all scans: scanner, pixel, rates,
-    limits, offsets.
+    """Yield (name, value) of quantities that should be alike in all scans: scanner,
+    pixel, rates, limits, offsets.
 
-    Values that are missing are skipped; rates not of rotations; limits are those of the
-    log's replies; the last of `OFFSETS` is left out.
+    Missing values are skipped. Rates are those of the text, without rotations; limits
+    those of the log's replies; offsets those of `scan.profile`, without the roll.
 
     Args:
         scan: with texts and log.
@@ -443,7 +460,9 @@ def _common_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, 
 
 
 def _of_machine(machine: Machine) -> Iterator[tuple[str, Any]]:
-    """Yield a machine's facts: its unbinned pixel [mm], then rates and limits of each motor."""
+    """Yield (name, value) of a machine's facts: its unbinned pixel [mm], then rates and
+    limits of each motor, named as in `_common_statements`.
+    """
     yield "original_pixel_mm", machine.detector.pitch_mm
     for name, axis in machine.axes.items():
         yield f"rates of {name}", (axis.speed, axis.acceleration)
@@ -458,8 +477,8 @@ def _limits(axis: Axis | MotorReply) -> tuple[float, ...]:
 
 
 def _agree(a: Any, b: Any, slack: tuple[float, float]) -> bool:
-    """Return whether two statements agree: numbers within `slack` (relative, absolute),
-    others as texts whatever their case.
+    """Return whether two statements agree: numbers and tuples within `slack` (relative,
+    absolute), others as texts, case ignored.
     """
     if isinstance(a, int | float | tuple) and isinstance(b, int | float | tuple):
         return bool(np.allclose(a, b, *slack))
@@ -472,7 +491,9 @@ def _plain(value: Any) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    """List the first three names and the number of others."""
+    """List at most the first three names, separated by commas, and the number of further
+    ones.
+    """
     return ", ".join(names[:3]) + (
         f" and {len(names) - 3} more" if len(names) > 3 else ""
     )
@@ -499,9 +520,9 @@ def zero_offsets(
     """Estimate zero offsets and their drift from all scans; scans that contradict the
     others are findings.
 
-    Only scans whose images give roll and axis column are fitted; drift only with scans of
-    `FOR_A_LINE` dates, and undated ones are then left out. Other offsets are the latest
-    text's, else `usual`.
+    Only scans whose images give roll and axis column are fitted. A drift is given only
+    with scans of `FOR_A_LINE` dates, and undated ones are then left out. Other offsets
+    are the latest text's, else `usual`.
 
     Args:
         scans: the oldest first, those without a date last.
@@ -509,8 +530,9 @@ def zero_offsets(
         usual: offsets where no text states any.
 
     Returns:
-        The profile, a line (value, sigma, drift) for each offset, the axis columns by
-        scan [px], findings, and questions that further scans would answer.
+        The profile, rounded to six decimals; a line (value, sigma, drift) for each
+        offset; the axis columns by scan [px]; findings, scans beyond `MAX_SIGMAS`; and
+        questions that further scans would answer.
     """
     base = next(
         (scan.profile for scan in reversed(scans) if scan.profile is not None), usual
@@ -529,10 +551,11 @@ def zero_offsets(
     def fitted(
         sides: FloatArray, rest: list[float], sigmas: list[float], *names: str
     ) -> tuple[FloatArray, FloatArray]:
-        """Fit the first name's line and the other's value, put them into `lines`, and
-        note scans that contradict.
+        """Fit offsets to all aligned scans, put them into `lines`, and add a finding for
+        each scan that contradicts.
 
-        A drift is stored only if it is determined; contradictions are above `MAX_SIGMAS`.
+        A drift is stored only for the first name, and only where there are enough dates;
+        contradictions are above `MAX_SIGMAS`.
 
         Args:
             sides: (scans + priors, k) design matrix; rows beyond those of the scans are
@@ -626,19 +649,20 @@ def zero_offsets(
 def _axis(
     machine: Machine, scan: PastScan, base: Profile, roll: float
 ) -> tuple[float, ...]:
-    """Compute the axis's column in the image, and how it depends on axs_tan and det_tan
-    (linearly).
+    """Compute the column of the rotation axis in the middle of the image, and its change
+    with axs_tan and det_tan.
 
-    Offsets along the beam are the scan's own, if it has a profile.
+    Offsets along the beam and height are the scan's own, if it has a profile; the camera
+    likewise, else the machine's.
 
     Args:
         machine: of the scan.
         scan: with positions and camera.
-        base: offsets.
+        base: offsets sideways.
         roll: of the detector [deg].
 
     Returns:
-        Column [px] with the offsets of `base`, and its two slopes [px/mm].
+        Column [px], and its two slopes [px/mm].
     """
     own = scan.profile or base
     camera = scan.camera or machine.detector.camera
@@ -661,11 +685,9 @@ def _fit(
     """Fit by weighted least squares of rows, of which the first `scans` belong to a scan
     each.
 
-    The covariance is enlarged where the residuals are above what the sigmas allow; enough
-    is `FOR_A_LINE` degrees of freedom.
-
-    The scan that contradicts the others most is left out while it does so by `MAX_SIGMAS`
-    sigmas and enough remain.
+    The scan that contradicts the others most is left out while it does so by more than
+    `MAX_SIGMAS` and at least `FOR_A_LINE` degrees of freedom are there. The covariance is
+    enlarged where the residuals are above what the sigmas allow.
 
     Args:
         sides: (m, k) design matrix.
@@ -674,7 +696,8 @@ def _fit(
         scans: number of rows that belong to scans.
 
     Returns:
-        Values (k,), covariance (k, k), and the residuals of all scans in sigmas.
+        Values (k,), covariance (k, k), and the residuals of all scans, also of those left
+        out, in sigmas.
     """
     a, b = sides / sigmas[:, None], values / sigmas
     kept = np.ones(len(b), dtype=bool)

@@ -32,13 +32,14 @@ class TwinError(ValueError):
 
     @classmethod
     def instead(cls, said: str, asked: object, allowed: object, **where: object) -> Self:
-        """Make the error whose message is `said` and what is allowed; returned, not
-        raised.
+        """Make the error whose message is `said`, then "; allowed: " and what is allowed;
+        returned, not raised.
 
         Args:
             said: the problem, in words.
             asked: value that is not allowed, for the data.
-            allowed: a value, or a list of values; its words end the message.
+            allowed: a value, or a list, tuple or dict whose members (keys) as texts end
+                the message.
             **where: further members of the data.
 
         Example:
@@ -63,8 +64,10 @@ class TwinError(ValueError):
     def of_shape(
         cls, what: str, got: Sequence[int], allowed: Sequence[int | str], more: str = ""
     ) -> Self:
-        """Make the error whose message is `what`, the shape it has and the one it must have,
-        and `more`.
+        """Make the error for an array's shape: its message is `what`, the shape it has
+        and the one it must have, and `more`; returned, not raised.
+
+        The data has `asked` and `allowed`, the shapes as lists.
 
         Example:
             >>> print(TwinError.of_shape("points", (4, 2), ("...", 3), " [mm]"))
@@ -100,6 +103,8 @@ def require_within(
     what: str, value: float, low: float, high: float, unit: str = ""
 ) -> None:
     """Check that a number is finite and from `low` to `high`.
+
+    Texts and other values that are no number fail, and NaN.
 
     Args:
         what: name of the number, for the message.
@@ -146,11 +151,10 @@ LONGEST_NAME: Final = 80
 
 
 def nearest_name(asked: str, names: Sequence[str]) -> str | None:
-    """Give the name that is most like the one asked for; None if none is.
+    """Return the name that is most like `asked`; None if none is near, or `asked` is
+    longer than `LONGEST_NAME`.
 
-    None also for a name longer than `LONGEST_NAME`.
-
-    Upper and lower case do not matter.
+    Case does not matter; of names that differ in case only, the first.
 
     Example:
         >>> nearest_name("Axes.Move", ["axes.move", "axes.home"])
@@ -174,7 +178,8 @@ class UnknownNameError(TwinError):
     """
 
     def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
-        """Make the error; append "did you mean" the allowed name nearest to the asked one.
+        """Make the error; append "; did you mean" and the allowed name nearest to the
+        asked one.
 
         Nothing is appended unless `data` has a text `asked` and a list `allowed` with a
         near name, or if the message has a suggestion already.
@@ -197,7 +202,10 @@ class UnknownNameError(TwinError):
     def among(
         cls, problem: str, asked: str, allowed: Iterable[str], more: str = ""
     ) -> Self:
-        """Make the error whose message is `problem`, a colon, the names there are, and `more`.
+        """Make the error whose message is `problem`, a colon, the allowed names, and
+        `more`; returned, not raised.
+
+        A near name is suggested at the end. The data has `asked` and `allowed`.
 
         Example:
             >>> print(UnknownNameError.among("no axis 'w'; there are", "w", ["x", "y"]))

@@ -11,11 +11,11 @@ BYTE_ORDER_MARK: Final = "\ufeff"
 def parse_json(text: str, kind: type[dict[str, Any]] = dict) -> Any:
     """Parse a JSON document, after an optional byte order mark; objects become `kind`.
 
-    `kind` is called with a list of pairs.
+    `kind` is called with each object's list of (name, value) pairs.
 
     Raises:
-        ValueError: with the reason: no JSON (JSONDecodeError), nested too deep, or too
-            long a whole number.
+        ValueError: with the reason: no JSON (JSONDecodeError), nested too deep, or a
+            whole number of thousands of digits.
     """
     try:
         return json.loads(text.removeprefix(BYTE_ORDER_MARK), object_pairs_hook=kind)

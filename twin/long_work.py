@@ -62,13 +62,17 @@ class Passes:
         self.advance: Advance = ignore
 
     def step(self) -> None:
-        """Count one more pass and report the fraction done, which approaches 1."""
+        """Count one more part and call `advance` with the fraction taken as done: n / (n
+        + 1) after n passes, below 1.
+        """
         self._seen += 1
         passes = self._seen / self._count
         self.advance(1.0 - 1.0 / (1.0 + passes))
 
     def counting(self, read: Callable[[int], Part]) -> Callable[[int], Part]:
-        """Wrap a function that reads a part by index: each call counts one step first."""
+        """Wrap a function that reads a part by index, so that each call counts one step
+        before it reads.
+        """
 
         def one(index: int) -> Part:
             """Count one step, then read the part of that index."""

@@ -78,8 +78,11 @@ class Kind(NamedTuple):
 def with_arguments_of(
     other: Callable[P, object],
 ) -> Callable[[Callable[..., Result]], Callable[P, Result]]:
-    """Make a decorator that gives a function the parameters of `other`, for `help` and type
-    checkers."""
+    """Make a decorator that gives a function the shown signature of `other`, for `help`
+    and type checkers; its own result type stays.
+
+    Calls are not checked; the function itself is changed and returned.
+    """
 
     def typed(function: Callable[..., Result]) -> Callable[P, Result]:
         """Give the function the other's parameters, with its own result, and return it itself.
@@ -95,11 +98,12 @@ def with_arguments_of(
 
 
 def with_options_of(declared: type) -> Callable[[Thing], Thing]:
-    """Make a decorator: a function's `**options` are the keys of a TypedDict, each None
-    by default.
+    """Make a decorator that replaces a function's `**options` by the keys of a TypedDict,
+    keyword-only and None by default.
 
-    They appear in its signature, and their descriptions in its docstring, in place of the
-    line `options: OPTIONS` of its arguments. The function itself is changed.
+    They appear in its shown signature, and their descriptions in its docstring, in place
+    of the line `options: OPTIONS` of its arguments. The function itself is changed; calls
+    are not checked.
 
     Args:
         declared: the TypedDict, whose docstring has a last section `Args:`.
@@ -113,7 +117,7 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
     ]
 
     def declaring(function: Thing) -> Thing:
-        """Replace `**options` in the function's signature and docstring, and return the
+        """Replace `**options` in the function's shown signature and docstring; return the
         function.
         """
         signature = inspect.signature(function)
@@ -127,7 +131,12 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
 
 
 def public(thing: Thing) -> Thing:
-    """Check calls of a function, or of a class and its methods (decorator).
+    """Make calls of a function, or of a class and its methods, check their arguments
+    (decorator).
+
+    Public methods of a class, class and static methods too, and its own `__init__` are
+    replaced in place; the class is returned. Calls may be made under the deprecated names
+    of `NAMES`.
 
     Args:
         thing: function, which is wrapped, or class, whose public methods are replaced.
@@ -168,16 +177,21 @@ def public(thing: Thing) -> Thing:
 
 
 def _checked(function: Thing, text: str) -> Thing:
-    """Wrap a function so that its arguments are checked; `text` is the docstring that
-    describes them.
+    """Wrap a function so that the arguments of each call are checked (`Known.checked`).
+
+    Args:
+        function: to be wrapped; its signature is read at the first call.
+        text: docstring that describes its arguments.
     """
     known = Known(function, text)
 
     @wraps(function)
     def call(*given: Any, **named: Any) -> Any:
-        """Check the arguments of a call (converted where allowed), then call the function.
+        """Check the arguments of a call, rename deprecated ones, then call the function
+        and return its result.
 
-        Types that were allowed together before are not checked again.
+        Types that were allowed together before are not checked again, where types alone
+        decide.
         """
         # Types that have been allowed together once are not looked at again.
         types_of = (*map(_type, given), *named, *map(_type, named.values()))
@@ -192,8 +206,11 @@ def _checked(function: Thing, text: str) -> Thing:
 
 
 def _type(value: Any) -> Any:
-    """Return the type that decides whether a value is allowed; None where its content does,
-    too."""
+    """Return what decides whether a value is allowed: its type, for an array (dtype,
+    ndim), for a tuple those of its members; None where the content decides, too.
+
+    That is so for mappings, lists, texts and arrays of one dimension.
+    """
     if type(value) is tuple:
         inner = tuple(map(_type, value))
         return None if None in inner else inner
@@ -227,7 +244,11 @@ class Known:
 
     @cached_property
     def kinds(self) -> dict[str, Kind]:
-        """What is allowed for each argument whose annotation states it; others are left out."""
+        """Kind of value allowed for each argument whose annotation states one; others are
+        left out.
+
+        Annotations given as texts are evaluated with the names of the function's module.
+        """
         names = Names(
             self.function.__globals__,
             npt=types.SimpleNamespace(ArrayLike=Array, NDArray=Array),
@@ -241,14 +262,17 @@ class Known:
         return {name: kind for name, kind in found.items() if kind is not None}
 
     def checked(self, given: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-        """Check the arguments of a call.
+        """Check the arguments of a call against names and annotations.
+
+        `*` arguments are not compared with their annotation; each of `**` is.
 
         Args:
             given: positional arguments.
             named: keyword arguments.
 
         Returns:
-            The keyword arguments, under the names that the signature has.
+            The keyword arguments, under the names that the signature has; values
+            unchanged.
 
         Raises:
             ArgumentError: arguments that the signature does not allow.
@@ -275,9 +299,13 @@ class Known:
         return named
 
     def _name_for(self, given: tuple[Any, ...]) -> str:
-        """Name the function as its caller does: a method by the class that it was called on.
+        """Name the function as its caller does: a method by the class of its first
+        argument, if that has the method's class as a base.
 
-        Without a known class the name it was defined with; `__init__` is left out.
+        Otherwise by the name it was defined with; `.__init__` is left out.
+
+        Args:
+            given: positional arguments of the call.
         """
         owner, dot, method = self.qualname.rpartition(".")
         if given and isinstance(given[0], type):
@@ -293,13 +321,18 @@ class Known:
         return [name for name in self.signature.parameters if name not in ("self", "cls")]
 
     def _renamed(self, where: str, named: dict[str, Any]) -> dict[str, Any]:
-        """Rename deprecated keyword arguments, with a DeprecationWarning.
+        """Rename deprecated keyword arguments (`NAMES`), with a DeprecationWarning, and
+        refuse unknown ones.
 
-        Functions with `**` arguments take all names unchanged.
+        Functions with `**` arguments take all names unchanged. A deprecated name beside
+        its new one is refused.
 
         Args:
             where: name of the function, for messages.
             named: keyword arguments.
+
+        Returns:
+            The keyword arguments under the signature's names.
 
         Raises:
             ArgumentError: a name that the function does not take; suggests the nearest
@@ -331,10 +364,12 @@ class Known:
     def _mistake(
         self, where: str, name: str, label: str, value: object, values: Mapping[str, Any]
     ) -> ArgumentError:
-        """Make the error for an argument of a wrong kind; returned, not raised.
+        """Make the error for an argument of a type that is not allowed; returned, not
+        raised.
 
-        It quotes the argument's description, and says if two arguments seem to be
-        swapped.
+        It quotes the first sentence of the argument's description. It asks if two
+        arguments are swapped, or, for a value of our own, if its attribute of that name
+        is meant.
 
         Args:
             where: name of the function.
@@ -392,7 +427,8 @@ def kind_of(annotation: Any) -> Kind | None:
         annotation: of a parameter, evaluated.
 
     Returns:
-        The kind, with its words and its test; None where the annotation allows anything.
+        The kind, with its words and its test; None where the annotation allows anything,
+        or is not understood.
 
     Example:
         >>> kind_of(float | None).words, kind_of(tuple[int, int]).holds((3, 4.5))
@@ -451,8 +487,8 @@ def kind_of(annotation: Any) -> Kind | None:
 
 
 def _is_number(value: Any) -> bool:
-    """Return whether a value is one real number: a scalar with a float value that is no
-    truth value.
+    """Return whether a value is one real number: a scalar (or array of no dimension) with
+    `__float__` that is no truth value.
     """
     alone = getattr(value, "ndim", 0) == 0 and hasattr(value, "__float__")
     return alone and not isinstance(value, bool) and getattr(value, "dtype", "") != "bool"
@@ -467,6 +503,9 @@ def _is_truth(value: Any) -> bool:
 def _is_numbers(value: Any) -> bool:
     """Return whether an array of numbers can be made of a value; memory on a device
     counts unread.
+
+    Truth values in arrays and lists are numbers, one by itself is not; texts and lists of
+    different lengths are not.
     """
     import numpy as np
 
@@ -494,12 +533,17 @@ def _is_numbers(value: Any) -> bool:
 
 
 def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False) -> bool:
-    """Return whether a value is a list whose members are of these kinds.
+    """Return whether a value is a list, or the like with a length, whose members are of
+    these kinds.
+
+    Texts, bytes, mappings and scalars are not. Only the first `MAX_CHECKED_MEMBERS` are
+    compared.
 
     Args:
         value: any.
         kinds: of the members, in order; None allows anything.
-        several: whether any number of members of the one kind is allowed.
+        several: whether any number of members of the one kind is allowed; else their
+            number is that of `kinds`.
     """
     if not (hasattr(value, "__len__") and hasattr(value, "__iter__")):
         return False
@@ -527,8 +571,11 @@ def _type_words(kind: type) -> str:
 
 
 def _value_words(value: object) -> str:
-    """Format a value for a message: a short one itself, an array's shape, or the name of
-    its type.
+    """Format a value for a message: an array by its shape, a short plain value itself,
+    any other by the name of its type.
+
+    Short is at most `MAX_SHOWN_CHARS`; plain are numbers, texts, lists, tuples, mappings
+    and None.
     """
     shape = getattr(value, "shape", None)
     if shape is not None and hasattr(value, "dtype"):

@@ -45,8 +45,8 @@ class ArrayValue:
     __hash__ = None  # type: ignore[assignment]
 
     def __eq__(self, other: object) -> bool:
-        """Compare all fields by content, arrays element by element; NotImplemented for
-        another type.
+        """Compare all fields by content, arrays exactly and element by element;
+        NotImplemented for another type.
         """
         if type(self) is not type(other):
             return NotImplemented
@@ -66,7 +66,7 @@ class JsonValue:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Read the value that `to_dict` wrote.
+        """Read a value from the document that `to_dict` wrote.
 
         Raises:
             TwinError: the document has another form; the message names each place.
@@ -74,13 +74,14 @@ class JsonValue:
         try:
             value: Self = adapter_of(cls).validate_json(json.dumps(document))
         except ValidationError as error:
-            raise TwinError(*told(cls.__name__, error)) from None
+            raise TwinError(*document_errors(cls.__name__, error)) from None
         return value
 
 
-def told(name: str, error: ValidationError) -> tuple[str, dict[str, object]]:
-    """Describe a document's errors (at most 10), place by place: an error's message and
-    its data.
+def document_errors(name: str, error: ValidationError) -> tuple[str, dict[str, object]]:
+    """Describe the errors of a document, place by place: (message of an error, its data).
+
+    At most 10, one line each, with `name` and the path of the place.
     """
     lines = [
         f"{name}: {'.'.join(map(str, e['loc'])) or 'document'}: {message_of(e)}"
@@ -96,14 +97,16 @@ def message_of(problem: Mapping[str, Any]) -> str:
 
 
 def adapter_of(cls: type[Any]) -> TypeAdapter[Any]:
-    """Return the converter of a dataclass; making one takes milliseconds, so each is kept."""
+    """Return pydantic's converter (TypeAdapter) of a type, made once for each and kept."""
     if cls not in _ADAPTERS:
         _ADAPTERS[cls] = TypeAdapter(cls)
     return _ADAPTERS[cls]
 
 
 def _same(a: object, b: object) -> bool:
-    """Compare two values by content: arrays, and mappings of them, at every level."""
+    """Compare two values by content: arrays exactly, mappings by keys and values at every
+    level, others with ==.
+    """
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return np.array_equal(a, b)  # type: ignore[arg-type]
     if isinstance(a, Mapping) and isinstance(b, Mapping):

@@ -192,7 +192,9 @@ class FollowSession:
                 self.message(message.data, message.at_s, message.late_s)
             if ahead and self._is_new():
                 self._take(
-                    self.follower.told(self.mirror, self.follower.ahead(self.mirror, now))
+                    self.follower.with_ahead(
+                        self.mirror, self.follower.ahead(self.mirror, now)
+                    )
                 )
 
     async def show_frames(self, folder: Path, beside: FramesBeside) -> None:
@@ -239,7 +241,7 @@ class FollowSession:
                 found = await asyncio.to_thread(
                     self.follower.ahead, self.mirror, self.clock()
                 )
-                self._take(self.follower.told(self.mirror, found))
+                self._take(self.follower.with_ahead(self.mirror, found))
 
     def _is_new(self) -> bool:
         """Determine whether targets or the next line have changed since the last call;

@@ -64,11 +64,14 @@ def _scattering() -> dict[str, FloatArray]:
 
 @lru_cache(maxsize=16)
 def cross_sections(substances: tuple[Substance, ...]) -> CrossSections:
-    """Compute the cross-sections of substances at their densities; the arrays are read-only.
+    """Compute the cross-sections of substances at their densities; the arrays are
+    read-only.
 
     Coherent and incoherent ones are integrals over the sphere: the Thomson or Klein-Nishina
     cross-section times the squared form factor or incoherent function of the atoms. Total
     ones are those of `Substance.attenuation`.
+
+    Results of the last 16 calls are kept.
 
     Args:
         substances: m materials, at least one.

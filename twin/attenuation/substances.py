@@ -79,10 +79,10 @@ def tables() -> Tables:
 
 
 def stored_arrays(file: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Load the arrays of a file of this package by name, numbers as float64, read-only.
+    """Load the arrays of a file of this package by name, read-only, numbers as float64;
+    texts stay texts.
 
-    Texts stay as they are. The entry "provenance" is parsed as JSON and left out of the
-    arrays.
+    The entry "provenance" is parsed as JSON and is not among the arrays.
 
     Args:
         file: its name in the package's folder `data`.
@@ -122,9 +122,10 @@ class Substance:
     density_g_cm3: float
 
     def __post_init__(self) -> None:
-        """Check density and mass fractions, which must add up to 1.
+        """Check density, mass fractions and elements.
 
-        The sum may be off by 0.002.
+        The density is above 0 and at most `MAX_DENSITY_G_CM3`; each fraction is above 0;
+        their sum may be off 1 by 0.002.
 
         Raises:
             LimitError: a value is not allowed.
@@ -154,7 +155,8 @@ class Substance:
 
     @classmethod
     def of(cls, name: str, formula: str, density_g_cm3: float) -> Substance:
-        """Make a chemical compound, e.g. Substance.of("water", "H2O", 1.0).
+        """Make a chemical compound from formula and density, e.g. Substance.of("water",
+        "H2O", 1.0).
 
         Raises:
             UnknownNameError: an element the table does not have.
@@ -184,8 +186,10 @@ class Substance:
 
     @classmethod
     def called(cls, text: str) -> Substance:
-        """Look up a substance by the name of a sample's material, such as
-        aluminium; a text with @ is parsed as FORMULA@DENSITY.
+        """Look up a substance by the name of a sample's material, such as aluminium; a
+        text with @ is parsed as FORMULA@DENSITY.
+
+        The text with @ is the substance's name then.
 
         Raises:
             UnknownNameError: lists the materials there are; or an element without a
@@ -211,17 +215,19 @@ class Substance:
         return self.mass_attenuation() * (self.density_g_cm3 / 10.0)
 
     def attenuation_at(self, energy_keV: float) -> float:
-        """Compute the linear attenuation coefficient at one energy [1/mm], on its
-        side of an edge."""
+        """Interpolate the linear attenuation coefficient at one energy [1/mm], within the
+        same absorption edges.
+        """
         mu = sum(part * _mass_at(row, energy_keV) for row, part in self.parts)
         return float(mu * self.density_g_cm3 / 10.0)
 
 
 def _mass_at(row: int, energy_keV: float) -> float:
-    """Interpolate mu/rho of an element, log-log from the two nearest bins with no edge between.
+    """Interpolate mu/rho of an element log-log from the two nearest bins that no
+    absorption edge separates from the energy.
 
-    The slope is `ABSORPTION_EXPONENT` if fewer than two bins have no edge between them and
-    the energy. Energies beyond the bins are extrapolated.
+    With one such bin the slope is `ABSORPTION_EXPONENT`; without any the nearest bin is
+    used, with that slope. Energies beyond the bins are extrapolated.
 
     Args:
         row: of the element in the tables.
@@ -245,7 +251,8 @@ def _mass_at(row: int, energy_keV: float) -> float:
 
 
 def parse_formula(formula: str) -> dict[str, float]:
-    """Parse a formula to symbol -> number of atoms. Parentheses and decimal counts are allowed.
+    """Parse a chemical formula to symbol -> number of atoms; parentheses and decimal
+    counts are allowed.
 
     Repeated elements are added up. An element or group without a count counts once. Counts
     must be above 0, parentheses closed and the formula not empty.

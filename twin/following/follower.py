@@ -126,7 +126,7 @@ class Follower:
         mirror = mirror.cleared("link")
         if heard.what == "SEND":
             return self._begin_command(mirror, heard, now)
-        waiting = mirror.asked(heard)
+        waiting = mirror.command_of(heard)
         if waiting is None and any(
             map(heard.may_answer, mirror.ended)
         ):  # doubled, or late
@@ -219,7 +219,7 @@ class Follower:
         message = f"the link is lost: {why}; positions are those heard last"
         return _alarm(mirror, now, "error", "lost", "link", message)
 
-    def told(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
+    def with_ahead(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
         """Return the mirror with the alarms of `ahead`: new ones are added, and those
         that are over end.
 

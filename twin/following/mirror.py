@@ -238,30 +238,30 @@ class Mirror:
             self.xrays_on,
         )
 
-    def asked(self, reply: Heard) -> Waiting | None:
+    def command_of(self, reply: Heard) -> Waiting | None:
         """Find the waiting command that `reply` may answer; None if there is none.
 
         Of several the one with the same component and command, then the same tick, is
         taken; of equals the oldest.
         """
 
-        def alike(asked: Waiting) -> tuple[bool, bool]:
+        def alike(waiting: Waiting) -> tuple[bool, bool]:
             """Rank a waiting command for `max`: first by agreement of component and
             command, then of the tick.
             """
-            return asked.heard.words[:2] == reply.words[
+            return waiting.heard.words[:2] == reply.words[
                 :2
-            ], asked.heard.tick == reply.tick
+            ], waiting.heard.tick == reply.tick
 
         found = (w for i, w in self.waiting.items() if reply.may_answer(i))
         return max(found, key=alike, default=None)
 
-    def with_waiting(self, asked: Waiting, **changes: object) -> Mirror:
+    def with_waiting(self, command: Waiting, **changes: object) -> Mirror:
         """Return the mirror with fields of a command changed; it is added to those that
         wait if it is not among them.
         """
-        changed = replace(asked, **changes)  # type: ignore[arg-type]
-        return replace(self, waiting={**self.waiting, asked.heard.identity: changed})
+        changed = replace(command, **changes)  # type: ignore[arg-type]
+        return replace(self, waiting={**self.waiting, command.heard.identity: changed})
 
     def finished(self, command: Heard, unheard: bool = False) -> Mirror:
         """Move a command from waiting to ended; only the last `MAX_WAITING` ended ones

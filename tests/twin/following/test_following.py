@@ -331,7 +331,7 @@ def test_the_rest_of_the_script_is_checked_from_where_the_machine_really_is() ->
     assert [a.kind for a in found] == ["collision"]
     assert "line 2" in found[0].message
     assert "tra_obj" in found[0].message, "says what is assumed"
-    twice = follow.told(follow.told(home, found), found)
+    twice = follow.with_ahead(follow.with_ahead(home, found), found)
     assert twice.raised == 1
 
 
