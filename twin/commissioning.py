@@ -168,7 +168,7 @@ def scripted(scan: PastScan, machine: Machine) -> dict[str, Any]:
 
     A script without projections has only the targets, an empty one nothing; times and
     waits are ignored. Targets are of motors only; of several `write settings file` the
-    first counts.
+    last before the first projection counts.
 
     Args:
         scan: with the commands of its script.
@@ -386,8 +386,9 @@ def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any
     """Yield (name, value, source) of the same quantities in a scan's settings text,
     script, images, XRE text, figures, and mode with ROI.
 
-    Empty and missing values are skipped; nothing without a settings text. Positions are
-    in the script's sign; scripted targets are cut to the travel.
+    Names are those of `scan_settings.ENTRIES`, motors, and `shape`; empty and missing
+    values are skipped. Nothing without a settings text. Positions are in the script's
+    sign; scripted targets are cut to the travel.
 
     Args:
         scan: with texts, script and images.

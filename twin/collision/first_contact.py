@@ -254,7 +254,8 @@ def clearance_trace(
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
     """Compute the least clearance of the scene at moments of a path.
 
-    inf and None where there is no pair; () without times.
+    inf and None where no pair is near enough to be a candidate
+    (`CollisionScene.candidates`); () without times.
 
     Args:
         scene: bodies and pairs.

@@ -110,8 +110,9 @@ class Follower:
 
         A command is predicted (`_begin_command`), feedback is a reading
         (`_compare_reading`), RCV only a sign of life, any other an end (`_end_command`).
-        The link counts as up; an alarm of silence about the command ends, and if it came
-        after more than `MAX_SILENCE_S` the server counts as one that does not speak.
+        The link counts as up; an alarm of silence about the command ends, and if there
+        was one, and the silence was longer than `MAX_SILENCE_S`, the server counts as one
+        that does not speak.
 
         Args:
             mirror: before it.
@@ -365,7 +366,8 @@ class Follower:
 
         Motors under way go on from their predicted paths; a trigger is ignored. Alarms of
         an axis's last move end with its next. Problems are those of `_KIND_OF_PROBLEM`;
-        those about X-rays are left out while it is unknown whether they are on.
+        those about X-rays are left out while it is unknown whether they are on. A target
+        near a limit is a warning.
 
         Args:
             mirror: the machine.
@@ -375,7 +377,7 @@ class Follower:
 
         Returns:
             The mirror, with the predicted paths of its axes, and the command with its
-            expected duration and bounds [s] and targets.
+            expected duration and bounds [s] and, for a move, the targets of its motors.
         """
         if isinstance(command, c.MoveAbsolute):
             command = replace(command, trigger=None)

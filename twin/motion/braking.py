@@ -176,7 +176,7 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
     """Compute the programme time [s] to which a stop along the path, begun at `at`,
     advances.
 
-    It is before the end of the programme that is left. Returns `at` if nothing moves
+    It is not after the end of the programme that is left. Returns `at` if nothing moves
     then.
 
     Args:

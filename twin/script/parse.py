@@ -296,8 +296,8 @@ def _field(piece: str, start: int, *, keep: bool = False) -> Field:
 def is_light(script: bytes) -> bool:
     """Return whether a script is planned so fast that any thread may do it.
 
-    It has at most `LIGHT_BYTES` and no number of five digits or with an exponent, which
-    may mean many images.
+    It has at most `LIGHT_BYTES` and no number of five digits or more, or with an
+    exponent, which may mean many images.
     """
     return len(script) <= LIGHT_BYTES and _MANY_IMAGES.search(script) is None
 
@@ -750,7 +750,8 @@ def _until_comment(words: Sequence[Field]) -> list[Field]:
 
 
 def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
-    """Find the first wait that at most two numbers, or a comment, follow up to the end.
+    """Find the first wait that at most two numbers, and perhaps a comment, follow up to
+    the end.
 
     Args:
         words: of a row.
