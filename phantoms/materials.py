@@ -97,7 +97,9 @@ class Material:
 
 @lru_cache
 def materials() -> Mapping[str, Material]:
-    """Load all bundled materials, name -> material; the file is read once."""
+    """Load all bundled materials from `data/materials.toml`, name -> material, in the
+    file's order; it is read once.
+    """
     text = (resources.files("flexdt.phantoms") / "data" / "materials.toml").read_text(
         "utf-8"
     )

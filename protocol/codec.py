@@ -43,8 +43,8 @@ def read_json(data: bytes | bytearray | memoryview) -> object:
     """Parse one JSON document; a leading byte order mark is dropped.
 
     Raises:
-        ValueError: names the problem and its place; a name that an object has twice is,
-            too.
+        ValueError: no JSON, invalid UTF-8, NaN or infinity, nesting above `MAX_DEPTH`, or
+            an object with one name twice; names the problem and, where known, its place.
     """
     raw = bytes(data).removeprefix(BYTE_ORDER_MARK)
     document = from_json(raw, allow_inf_nan=False)

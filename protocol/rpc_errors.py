@@ -149,7 +149,8 @@ def too_large(
         allowed: largest size, in `unit`.
         unit: unit of both.
 
-    Its data repeats the four arguments by name.
+    Returns:
+        The error; its data has the four arguments by name.
     """
     return RpcError(
         Code.TOO_LARGE,

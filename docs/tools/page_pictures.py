@@ -61,7 +61,7 @@ right."""
 @contextmanager
 def lab() -> Iterator[str]:
     """Start `flexdt up` on free ports with a temporary data folder, yield the address of
-    its page, and end it (30 s).
+    its page, and end it, which may take 30 s.
     """
     with tempfile.TemporaryDirectory() as folder:
         words = [

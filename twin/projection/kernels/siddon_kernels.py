@@ -362,9 +362,12 @@ def walk_jumps(flat, base, step_x, step_y, nx, ny, nz, sx, sy, sz, dx, dy, dz):
 def ends(total, length, d, jumps, moments):
     """Compute derivatives of the line integral by one coordinate of source and of pixel.
 
-    total: sum of values times ray parameter, so that the integral is total * length; d:
-    the ray's extent along this axis [mm]; jumps, moments: sums of J and of J t over its
-    planes.
+    Args:
+        total: sum of values times ray parameter; the integral is total * length.
+        length: of the ray [mm].
+        d: the ray's extent along this axis [mm]; with 0 the planes count nothing.
+        jumps: sum of J over the planes across this axis, see `walk_jumps`.
+        moments: sum of J t over them.
 
     Returns:
         The derivative by the source's coordinate, and by the pixel's [1/mm].
