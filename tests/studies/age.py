@@ -98,12 +98,16 @@ class Old:
     """
 
     def __init__(self, data: Path, requests: int) -> None:
+        """Start a projector with limited memory and a twin on the directory."""
         self.data, self.requests = data, requests
         self.rays = projector("--memory-limit", f"{PROJECTOR_MB}M")
         self.jobs = self.uploads = self.corrections = self.scans = self.probes = 0
         self.start()
 
     def start(self) -> None:
+        """Start the twin with room for many samples and corrections; `start_s` is what it
+        cost.
+        """
         room = [f"--limit={name}=30000" for name in ("max_samples", "max_corrections")]
         self.twin = twin(
             self.rays.port, self.data, "--sample", "empty", "--speed-up", "max", *room
@@ -115,6 +119,7 @@ class Old:
         self.twin.end()
 
     def upload(self, name: str, grey: int) -> None:
+        """Upload a small cube of one grey value under a name."""
         voxels = base64.b64encode(
             struct.pack("<f", 1e-3 * (1 + grey % 50)) * SIDE**3
         ).decode()
@@ -213,6 +218,9 @@ def written_bytes(process: Process) -> int:
 
 
 def main() -> int:
+    """Measure a young directory and twice an aged one; 1 if a figure grew by more than is
+    allowed.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--jobs", type=int, default=100_000)
     p.add_argument("--samples", type=int, default=10_000)

@@ -159,6 +159,7 @@ def cube(s: Scan, rng: Rng) -> None:
 
 @fault
 def plates(s: Scan, rng: Rng) -> None:
+    """The object is plates: two to six of them, or one at any height."""
     several = np.linspace(-16, 16, rng.integers(2, 7))
     heights = several if rng.random() < 0.5 else [rng.uniform(-15, 15)]
     s.object_is([], [[*rng.uniform(-2, 2, 2), z, 15, rng.uniform(8, 15), rng.uniform(0.3, 2), 0.02]
@@ -218,6 +219,7 @@ def holder(s: Scan, rng: Rng) -> None:
 
 @fault
 def table(s: Scan, rng: Rng) -> None:
+    """A table stands below the object and turns with it."""
     wide, z = rng.choice([12, 20, 30, 60]), rng.uniform(-28, -18)
     s.boxes_added(
         [*rng.uniform(-3, 3, 2), z - 50, wide, wide * rng.uniform(0.7, 1), 50, 0.02]
@@ -253,6 +255,7 @@ def rods_from_end_to_end(s: Scan, rng: Rng) -> None:
 
 @fault
 def wires(s: Scan, rng: Rng) -> None:
+    """One to four thin wires stand beside the object."""
     for _ in range(rng.integers(1, 5)):
         half = rng.uniform(0.3, 1)
         s.boxes_added([*aside(rng, 18, 32), rng.uniform(-15, 15), half, half, rng.uniform(2, 25),
@@ -261,6 +264,7 @@ def wires(s: Scan, rng: Rng) -> None:
 
 @fault
 def jar(s: Scan, rng: Rng) -> None:
+    """A weak jar or block surrounds the object, often wider than the image."""
     wide = rng.uniform(20, 90)
     add = s.ellipsoids_added if rng.random() < 0.5 else s.boxes_added
     add([*rng.uniform(-5, 5, 2), rng.uniform(-20, 20), wide * rng.uniform(0.7, 1), wide,
@@ -278,6 +282,7 @@ def foam(s: Scan, rng: Rng) -> None:
 
 @fault
 def still_table(s: Scan, rng: Rng) -> None:
+    """A table stands still behind the object while it turns."""
     x, y = rng.uniform(-10, 10, 2)
     wide, z, dense = (
         rng.uniform(10, 80),
@@ -289,6 +294,7 @@ def still_table(s: Scan, rng: Rng) -> None:
 
 @fault
 def still_strip(s: Scan, rng: Rng) -> None:
+    """A thin strip stands still, anywhere in front of or behind the object."""
     x, z, y = *rng.uniform(-25, 25, 2), rng.uniform(-100, 100)
     wide, high, dense = (
         rng.uniform(0.5, 3),
@@ -482,6 +488,7 @@ def tiles_apart(s: Scan, rng: Rng) -> None:
 
 @fault
 def near_the_source(s: Scan, rng: Rng) -> None:
+    """The object is close to the source: a wide cone, and the object scaled to its image."""
     sod = rng.uniform(60, 120)
     sdd = sod * rng.uniform(2.5, 3.5)
     size = SDD / SOD / (sdd / sod) * rng.uniform(0.5, 1)
@@ -492,6 +499,7 @@ def near_the_source(s: Scan, rng: Rng) -> None:
 
 @fault
 def part_of_the_panel(s: Scan, rng: Rng) -> None:
+    """Only few rows or few columns of the panel are read."""
     rows, cols = s.hidden.shape
     low = rng.random() < 0.5
     shape = (
@@ -534,6 +542,7 @@ def frame_of_another(s: Scan, rng: Rng) -> None:
 
 @fault
 def distance_wrong(s: Scan, rng: Rng) -> None:
+    """The geometry given has a distance to the panel that is wrong by 1 to 4 %."""
     by = 1 + rng.uniform(0.01, 0.04) * either(rng)
     s.nominal = lambda cone: fx.ConeVec.circular(
         sod=s.hidden.sod, sdd=s.hidden.sdd * by, angles=s.hidden.degrees(), shape=s.hidden.shape,
@@ -661,6 +670,14 @@ def tried(kinds: list[str], seed: int, per_frame: bool) -> dict[str, Any]:
 
 
 def main(words: list[str] | None = None) -> int:
+    """Align drawn scans with one fault or two, and print what comes of each kind.
+
+    Args:
+        words: of the command line; None for the process's own.
+
+    Returns:
+        1 where a value told is more sigmas off than allowed.
+    """
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)

@@ -38,6 +38,9 @@ class Ground:
     """The servers under attack."""
 
     def __init__(self, folder: Path) -> None:
+        """Start a projector and a twin in a folder, with another folder outside the data
+        directory.
+        """
         self.root = folder
         self.data = folder / "data"
         self.data.mkdir(parents=True)
@@ -103,6 +106,11 @@ def code_of(answer: bytes | dict[str, Any]) -> int:
 
 
 def refused(wire: Wire, method: str, **params: object) -> Refused:
+    """Call a method that has to be refused, and return the error.
+
+    Raises:
+        AssertionError: it was answered.
+    """
     try:
         result = wire.call(method, **params)
     except Refused as error:
@@ -111,6 +119,9 @@ def refused(wire: Wire, method: str, **params: object) -> Refused:
 
 
 def upload(wire: Wire, name: str, raw: bytes, **more: Plain) -> dict[str, Any]:
+    """Upload bytes as a sample, in parts of 6 MiB; the answer to the last part or the
+    first refused.
+    """
     answer: dict[str, Any] = {}
     for start in range(0, max(1, len(raw)), 6 << 20):
         part = raw[start : start + (6 << 20)]
@@ -147,6 +158,7 @@ def stl(faces: int, claimed: int | None = None) -> bytes:
 
 @attack("broken JSON")
 def broken_json(g: Ground) -> str:
+    """Lines that are no JSON get -32700, all on connections that go on."""
     codes = {
         code_of(g.raw(line + b"\n"))
         for line in (b"{", b"nonsense", b'{"a":1,}', b"\xff\xfe")
@@ -157,6 +169,9 @@ def broken_json(g: Ground) -> str:
 
 @attack("a line of 100 MB without an end, then with one")
 def huge_line(g: Ground) -> str:
+    """Send a line of 100 MB: an error, the next line is served, and memory grows by less
+    than 64 MB.
+    """
     before = g.twin.memory_mb()
     with socket.create_connection(("127.0.0.1", g.twin.port), timeout=30) as s:
         block = b"x" * 2**20
@@ -174,6 +189,7 @@ def huge_line(g: Ground) -> str:
 
 @attack("JSON nested 100 000 deep")
 def deep_json(g: Ground) -> str:
+    """Deeply nested lists and objects get -32700."""
     n = 100_000
     assert code_of(g.raw(b"[" * n + b"]" * n + b"\n")) == -32700
     assert code_of(g.raw(b'{"a":' * n + b"1" + b"}" * n + b"\n")) == -32700
@@ -182,6 +198,7 @@ def deep_json(g: Ground) -> str:
 
 @attack("MessagePack nested 100 000 deep, and lists that claim 4 billion members")
 def deep_msgpack(g: Ground) -> str:
+    """Deeply nested messages and false sizes get an error from both servers."""
     for port in (g.twin.port, g.projector.port):
         for body in (b"\x91" * 100_000 + b"\xc0", b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff",
                      b"\xc6\xff\xff\xff\xf0"):  # fmt: skip
@@ -197,6 +214,7 @@ def deep_msgpack(g: Ground) -> str:
 
 @attack("a MessagePack frame that claims 4 GB")
 def huge_frame(g: Ground) -> str:
+    """A second frame that claims 4 GB gets an error from both servers."""
     for port in (g.twin.port, g.projector.port):
         # The first byte chooses the codec; a second frame announces more than can be.
         body = b"\x00\x00\x00\x01\xc0" + struct.pack(">I", 0xFFFFFFF0) + b"x" * 1000
@@ -207,6 +225,7 @@ def huge_frame(g: Ground) -> str:
 
 @attack("half a frame, then gone; 300 times")
 def half_frames(g: Ground) -> str:
+    """Connections that end within a message leave no descriptors."""
     before = g.twin.descriptors()
     for i in range(300):
         with socket.create_connection(("127.0.0.1", g.twin.port)) as s:
@@ -219,6 +238,7 @@ def half_frames(g: Ground) -> str:
 
 @attack("a browser posting JSON lines to the loopback port")
 def browser(g: Ground) -> str:
+    """A browser's request ends its connection, and its body is not carried out."""
     body = b'{"jsonrpc":"2.0","id":1,"method":"safety.estop"}\n'
     head = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(body)
     got = g.raw(head + body)
@@ -229,6 +249,9 @@ def browser(g: Ground) -> str:
 
 @attack("1 000 connections at once")
 def many(g: Ground) -> str:
+    """Of 1 000 connections at most 512 are served, the others refused, and a later client
+    is served.
+    """
     ping = b'{"jsonrpc":"2.0","id":1,"method":"session.ping"}\n'
     open_ = [
         socket.create_connection(("127.0.0.1", g.twin.port), timeout=30)
@@ -259,6 +282,9 @@ def many(g: Ground) -> str:
 
 @attack("a subscriber of every topic that never reads")
 def deaf(g: Ground) -> str:
+    """A subscriber that never reads costs less than 100 MB; others are answered
+    meanwhile.
+    """
     s = socket.create_connection(("127.0.0.1", g.twin.port))
     s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     topics = ["state", "projection", "job", "log"]
@@ -326,6 +352,9 @@ def slowloris(g: Ground) -> str:
 
 @attack("listening beyond the loopback without a token")
 def open_bind(g: Ground) -> str:
+    """No server listens beyond the loopback without a token: exit code 2, and nothing is
+    written.
+    """
     env = {**os.environ, "FLEXDT_TOKEN": ""}
     started = {
         server: subprocess.Popen(
@@ -349,6 +378,9 @@ def open_bind(g: Ground) -> str:
 
 @attack("guessing the token")
 def guessing(g: Ground) -> str:
+    """Each guess of the token is refused, the right one still served, and the log does
+    not hold it.
+    """
     token = g.root / "token"
     token.write_text("a-long-secret-token-for-tests\n")
     server = twin(g.projector.port, g.root / "locked", "--token-file", token)
@@ -388,6 +420,7 @@ ESCAPES = ["../evil", "..", ".", "/tmp/evil", "\\\\host\\share\\evil", "C:\\evil
 
 @attack("names of data sets that lead elsewhere")
 def escape_names(g: Ground) -> str:
+    """Names of data sets lead nowhere outside the data directory."""
     wire = g.wire()
     text = fly_script(3)
     allowed = []
@@ -407,6 +440,7 @@ def escape_names(g: Ground) -> str:
 
 @attack("paths in scripts: drives, shares, parents")
 def escape_scripts(g: Ground) -> str:
+    """Paths in scripts lead nowhere outside the data set's folder."""
     wire = g.wire()
     for i, path in enumerate(["..\\..\\evil_", "E:\\..\\..\\evil_", "\\\\host\\share\\evil_",
                               "/etc/evil_", "../../../evil_", "a/b/../../../evil_"]):  # fmt: skip
@@ -422,6 +456,9 @@ def escape_scripts(g: Ground) -> str:
 
 @attack("links planted in the data directory")
 def links(g: Ground) -> str:
+    """Links in the data directory are neither written through nor followed to other
+    folders.
+    """
     wire = g.wire()
     (g.data / "linked").symlink_to(g.outside, target_is_directory=True)
     error = refused(wire, "script.submit", text=fly_script(3), name="linked")
@@ -441,6 +478,7 @@ def links(g: Ground) -> str:
 
 @attack("hostile STL: random bytes, a false count, not a number, huge coordinates")
 def hostile_stl(g: Ground) -> str:
+    """Broken STL files are refused, and no sample is left of them."""
     wire = g.wire()
     nan = bytearray(stl(12))
     nan[96:100] = struct.pack("<f", float("nan"))
@@ -488,6 +526,9 @@ def glb(count: int, nodes: int = 1, corners: int = 0, **accessor: Plain) -> byte
     "hostile GLB, PLY and OFF: counts without bytes, a mesh in 10 000 places, other files"
 )
 def hostile_meshes(g: Ground) -> str:
+    """Broken meshes are refused with less than 1 GB in their readers, and no sample is
+    left of them.
+    """
     ply = b"ply\nformat %s 1.0\nelement vertex 4000000000\nproperty float x\nend_header\n1\n"
     raws = [
         ("glb", glb(30_000_000)),
@@ -533,6 +574,9 @@ def hostile_meshes(g: Ground) -> str:
 
 @attack("a 100 MB text file as a mesh, while others ask")
 def big_mesh(g: Ground) -> str:
+    """A 100 MB text file is refused; how long another client waited meanwhile is told,
+    not limited.
+    """
     worst, done = 0.0, threading.Event()
 
     def watch() -> None:
@@ -568,6 +612,7 @@ def big_mesh(g: Ground) -> str:
 
 @attack("pickles as meshes and voxels")
 def pickles(g: Ground) -> str:
+    """Pickles sent as meshes or voxels are refused and not executed."""
     import pickle
 
     mark = g.root / "executed"
@@ -598,6 +643,7 @@ def retag(raw: bytearray, values: dict[int, int]) -> None:
 
 @attack("TIFF files: claims of 10^10 pixels, decompression bombs, cut off, rubbish")
 def hostile_tiff(g: Ground) -> str:
+    """Broken TIFF files are refused with less than 200 MB more memory of this process."""
     import io
     import resource
     import zlib
@@ -642,6 +688,7 @@ def hostile_tiff(g: Ground) -> str:
 
 @attack("scripts that plan half a terabyte, a billion frames, or a time without an end")
 def vast_scripts(g: Ground) -> str:
+    """Scripts without an end or room are refused with their problems, and nothing moves."""
     wire = g.wire()
     before = wire.call("state.get")["axes"]
     long = fly_script(360_001, roi="0 0 1943 1535")
@@ -703,6 +750,12 @@ def many_jobs(g: Ground) -> str:
 
 
 def main() -> int:
+    """Make the attacks named on the command line, or all; print a table of what came of
+    each.
+
+    Returns:
+        1 where one got through or a server logged an error that it did not handle.
+    """
     wanted = sys.argv[1:]
     failed = 0
     print(f"Attacks on a twin and a projector. {machine()}.\n")

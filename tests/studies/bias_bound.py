@@ -50,6 +50,7 @@ class Solid:
         return np.stack([c * x + s * y, c * y - s * x, z], -1) / self.half
 
     def inside(self, at: np.ndarray) -> np.ndarray:
+        """Whether points (..., 3) are inside."""
         at = self.local(at)
         if self.kind == "ellipsoid":
             return (at**2).sum(axis=-1) < 1.0
@@ -112,6 +113,7 @@ class Scan:
         return out.astype(np.float32)
 
     def truth(self, at: np.ndarray) -> np.ndarray:
+        """The attenuation [1/mm] at points (..., 3); of solids that overlap the sum."""
         return sum(
             (solid.mu * solid.inside(at) for solid in self.solids),
             np.zeros(at.shape[:-1]),

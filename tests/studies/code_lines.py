@@ -73,6 +73,9 @@ def by_folder(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, tuple[i
 
 
 def main() -> None:
+    """Print modules and lines of code of each folder of a clone, and the lines of
+    TypeScript.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

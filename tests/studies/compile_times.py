@@ -151,6 +151,7 @@ def run(case: str, cache: Path | None) -> None:
 
 
 def main() -> None:
+    """Time the cases named on the command line, or all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", choices=[*CASES, []], default=list(CASES))
     parser.add_argument("--keep", type=Path, help="the cache's folder, kept")

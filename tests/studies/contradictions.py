@@ -222,6 +222,7 @@ Verdict = tuple[Told, bool]
 
 
 def radians(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Angles in radians where degrees are asked for; the answer is to name radians."""
     end = float(rng.choice([2 * np.pi, np.pi, rng.uniform(2.5, 6.28)]))
     wrong = scan.geometry(angles=np.linspace(0, end, len(scan.angles), endpoint=False))
     told = method(rng, scan.integrals(), wrong, scan.grid)
@@ -229,6 +230,7 @@ def radians(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def degrees(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Degrees in an ASTRA geometry, which has radians; the answer is to name degrees."""
     span = float(rng.choice([360.0, 180.0, 200.0, 355.0, 720.0]))
     views = int(rng.choice([45, 72, 90, 180, 360, 361, 720]))
     angles = np.linspace(0, span, views, endpoint=bool(rng.integers(2)))
@@ -240,6 +242,9 @@ def degrees(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def panel_inside(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A panel between source and object is no mistake: the projection or the volume has
+    to be right.
+    """
     geometry = scan.geometry()
     part = float(rng.uniform(0.05, 1.0)) * scan.sod / scan.sdd
     beam = geometry.detector - geometry.source
@@ -255,6 +260,7 @@ def panel_inside(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def units(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A length in metres or micrometres; the answer is to name mm."""
     wrong = [{"pixel": 1000 * scan.pixel}, {"pixel": scan.pixel / 1000}, {"sod": scan.sod / 1000},
              {"sod": scan.sod / 1000, "sdd": scan.sdd / 1000}]  # fmt: skip
     given = wrong[int(rng.integers(len(wrong)))]
@@ -264,6 +270,9 @@ def units(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def distances(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Distances of which one is zero, negative, tiny, or both exchanged, by a file or a
+    call; they are to be named.
+    """
     sod, sdd = (
         (0.0, scan.sdd),
         (scan.sdd, scan.sod),
@@ -293,6 +302,7 @@ def distances(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def arc(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """An arc too short for the method; the answer is to name the directions."""
     span = float(rng.uniform(20, 150))
     short = scan.geometry(
         angles=rng.uniform(0, 360) + np.linspace(0, span, len(scan.angles))
@@ -303,6 +313,7 @@ def arc(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def laminography(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A tilted circle for FDK; the answer is to name laminography or iterative methods."""
     level = scan.geometry()
     slope = np.tan(np.radians(rng.uniform(12, 60)))
     source = level.source + [0, 0, -slope * scan.sod * rng.choice([-1, 1])]
@@ -318,6 +329,7 @@ def laminography(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def counts(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Counts where line integrals are asked for; the answer is to name counts."""
     beam = float(np.exp(rng.uniform(np.log(100), np.log(65_000))))
     kind = (np.float32, np.float64, np.uint16, np.int32, np.int64)[int(rng.integers(5))]
     images = np.minimum(rng.poisson(beam * np.exp(-scan.integrals())), 65535).astype(kind)
@@ -326,6 +338,9 @@ def counts(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def transmission(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Transmissions where line integrals are asked for; the answer is to name
+    transmission.
+    """
     noise = rng.normal(0.0, rng.uniform(0.0, 0.02), scan.integrals().shape)
     images = np.exp(-scan.integrals()) + noise
     if rng.integers(2):
@@ -338,6 +353,7 @@ def transmission(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def not_finite(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """NaN or infinities in images or in a volume; the answer is to name them."""
     bad = float(rng.choice([np.nan, np.inf, -np.inf]))
     if rng.integers(2):
         images = scan.integrals().astype(np.float32)
@@ -355,6 +371,7 @@ def not_finite(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def hounsfield(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A volume in Hounsfield units; the answer is to name them."""
     body = float(rng.uniform(800, 3000))
     volume = scan.volume(body, -1000.0)
     if rng.integers(2):
@@ -367,6 +384,7 @@ def hounsfield(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def whole(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Line integrals cut to whole numbers; the answer is to name fractions or counts."""
     images = rng.uniform(2, 20) * scan.integrals() / scan.integrals().max()
     cut = images.astype((np.int32, np.int64)[int(rng.integers(2))])
     if rng.integers(2):
@@ -377,6 +395,7 @@ def whole(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def steel(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Very thick objects are no mistake: the line integrals have to stay as they are."""
     images = rng.uniform(8, 60) * scan.integrals() / scan.integrals().max()
     told = ask(lambda: fx.DataSet.from_arrays(images, scan.geometry()))
     same = told.value is not None and np.allclose(
@@ -406,6 +425,7 @@ def numbers(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def duplicates(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A second file of one number, by another spelling; it has to be refused by its name."""
     names = [f"scan_{i:06d}.tif" for i in range(len(scan.angles))]
     twice = int(rng.integers(len(names)))
     other = str(rng.choice([f"scan_{twice}.tif", f"scan_{twice:06d}.tiff"]))
@@ -423,6 +443,7 @@ def duplicates(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def gap(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A number of the files is missing; the answer is to name it."""
     lost = int(rng.integers(1, len(scan.angles)))
     names = [f"scan_{i + (i >= lost):04d}.tif" for i in range(len(scan.angles))]
     written(folder, scan, names, rng)
@@ -431,6 +452,7 @@ def gap(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def other_name(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A file beside the frames with another name, which the answer is to name."""
     written(folder, scan, [f"X_{i:03d}.tif" for i in range(len(scan.angles))], rng)
     extra = str(
         rng.choice(["X_180deg.tif", "preview.tif", "X_007_bis.tif", "aX_001.tif"])
@@ -443,6 +465,7 @@ def other_name(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def blank(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """The last frames, or all, are zero; the answer is to say that nothing was recorded."""
     made = exposed(rng, scan)()
     some = int(rng.integers(1, len(scan.angles) + 1))
     if rng.integers(2):
@@ -464,6 +487,7 @@ def blank(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def flats(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Flat images that differ by 2.5 to 60 %; the answer is to name that."""
     apart = float(np.exp(rng.uniform(np.log(0.025), np.log(0.6)))) * rng.choice([-1, 1])
     levels = np.ones(int(rng.integers(2, 6)))
     levels[int(rng.integers(1, len(levels))) :] += apart
@@ -472,6 +496,9 @@ def flats(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def beam(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """An open beam that drifts, or is another than in the flat images; the answer is to
+    name it.
+    """
     fall = float(rng.uniform(0.05, 0.4))
     ramps = [np.linspace(1.0, 1.0 - fall, len(scan.angles)), 1.0 + fall,
              np.linspace(1.0, 1.0 + fall, len(scan.angles))]  # fmt: skip
@@ -498,6 +525,9 @@ def nexus(
 
 
 def nexus_angles(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Angles of a NeXus file that contradict the geometry given; the answer is to name
+    the cause.
+    """
     own, kind = scan.angles, int(rng.integers(4))
     wrong = [np.radians(own), own * float(rng.uniform(0.3, 0.9)), rng.permutation(own),
              own + rng.normal(0, 15, len(own))][kind]  # fmt: skip
@@ -508,6 +538,9 @@ def nexus_angles(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def nexus_pixel(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A pixel of a NeXus file that contradicts the geometry given; the answer is to name
+    it.
+    """
     magnified = scan.sdd / scan.sod
     factor = float(rng.choice([0.001, 1000.0, 2.0 * magnified, 0.5 / magnified]))
     nexus(folder / "a.nx", scan, scan.angles, factor * scan.pixel)
@@ -516,6 +549,7 @@ def nexus_pixel(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def nexus_keys(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """More or fewer image keys than images; the answer is to name them."""
     count = len(scan.angles) + int(rng.choice([-3, -1, 2, 5]))
     nexus(folder / "a.nx", scan, scan.angles, scan.pixel, np.array([1] + [0] * count))
     told = ask(lambda: fx.open(folder / "a.nx", geometry=scan.geometry()))
@@ -523,6 +557,7 @@ def nexus_keys(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def grid_aside(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A grid outside the field of view; the answer is to name that."""
     far = float(rng.uniform(3.0, 50.0)) * scan.view_mm
     place = far * np.array([[1, 0, 0], [0, -1, 0], [0.7, 0.7, 0]])[int(rng.integers(3))]
     grid = Grid((9, 9, 9), scan.radius / 8, tuple(place))
@@ -531,6 +566,7 @@ def grid_aside(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def voxel(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """Voxels wider than half the field of view; the answer is to name them."""
     made = exposed(rng, scan)()
     size = float(rng.uniform(0.6, 100)) * scan.view_mm
     told = ask(lambda: made.reconstruct("fdk", voxel=size, errors=False))
@@ -538,6 +574,9 @@ def voxel(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def nikon_lost(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A Nikon folder that lacks an image; it is to be named, and the others are to have
+    their angles.
+    """
     count = 36
     few = Scan(scan.sod, scan.sdd, scan.pixel, scan.shape, np.arange(count) * 10.0, scan.radius,
                scan.centre, scan.mu)  # fmt: skip
@@ -557,6 +596,9 @@ def nikon_lost(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
 
 
 def document(rng: np.random.Generator, scan: Scan, folder: Path) -> Verdict:
+    """A geometry file with a byte order mark, which is no mistake, or with 5000 digits,
+    to be named.
+    """
     path = folder / "scan.json"
     scan.geometry().save(path)
     text = path.read_text()

@@ -63,6 +63,11 @@ class Walk:
         return self._places[name]
 
     def _called(self, frame: FrameType, event: str, _: Any) -> None:
+        """Note a call of the product's code; the profiler calls this.
+
+        The caller is the next frame of the product; calls from tests and within a folder
+        cross nothing.
+        """
         if event != "call" or frame.f_code.co_name == "<module>":
             return
         file = self._place(frame.f_code.co_filename)

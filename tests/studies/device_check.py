@@ -97,6 +97,12 @@ class Check:
     """The document, and the time that is left."""
 
     def __init__(self, out: Path, budget_s: float) -> None:
+        """Begin an empty document with a time to keep.
+
+        Args:
+            out: where it is written.
+            budget_s: seconds from now.
+        """
         self._out, self._ends = out, time.monotonic() + budget_s
         self._budget_s = budget_s
         self.document: Document = {}

@@ -28,6 +28,7 @@ def seconds(report: Path) -> dict[str, dict[str, float]]:
 
 
 def main() -> None:
+    """Print the sum of each report, and the files above a limit with their longest test."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "reports", nargs="*", type=Path, default=sorted(FOLDER.glob("*.xml"))

@@ -230,6 +230,9 @@ def leap(folder: Path) -> Callable[[fx.ConeVec], float]:
 
 
 def main() -> None:
+    """Compare drawn scans with each library whose checkout is given, and print the
+    largest distance.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__.partition("\n\n")[0] if __doc__ else None
     )

@@ -191,6 +191,7 @@ class Writes:
     )
 
     def __init__(self, root: Path) -> None:
+        """Start a projector; the twins are started for each round."""
         self.root = root
         self.rays = projector(log=root / "projector.log")
         self.wrong = self.refused = self.unstarted = self.failed = 0
@@ -335,6 +336,9 @@ def writes(root: Path, count: int, rng: random.Random) -> int:
 
 
 def main() -> int:
+    """Run the campaign named on the command line in a folder of its own; 1 where
+    something was wrong.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("what", choices=["disk", "flips", "writes"])
     p.add_argument("--seed", type=int, default=1)

@@ -59,6 +59,7 @@ def opened(context: Any, url: str) -> tuple[float, float, float, float]:
 
 
 def main() -> None:
+    """Open the page once cold and twice warm, and print when it shows what."""
     from playwright.sync_api import sync_playwright
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -62,6 +62,7 @@ class Ports:
     """Where the servers listen, and their processes."""
 
     def __init__(self, servers: Servers) -> None:
+        """Read the ports of running servers and the ids of their processes."""
         ready: Any = servers.ready
         self.viewer = int(ready["viewer"]["port"])
         self.out, self.into = (

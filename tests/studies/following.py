@@ -57,6 +57,9 @@ class Bench:
     """A scanner and who follows it."""
 
     def __init__(self) -> None:
+        """Start the scanner's process and a session that collects alarms; nothing is
+        followed yet.
+        """
         self.pipe, theirs = mp.Pipe()
         self.process = mp.get_context("spawn").Process(
             target=scanner, args=(theirs,), daemon=True
@@ -125,6 +128,7 @@ async def ages(count: int, rng: random.Random) -> list[float]:
 
 
 async def wrong_limit(rng: random.Random) -> float:
+    """Answer with a limit lower than known; seconds until the alarm."""
     axis = FLEXRAY.axes["tra_obj"]
     at = rng.uniform(-50, 50)
     reply = MotorReply(
@@ -141,6 +145,7 @@ async def wrong_limit(rng: random.Random) -> float:
 
 
 async def offset(rng: random.Random) -> float:
+    """Answer with a position beside the target; seconds until the alarm."""
     async with Bench() as bench:
         words = ("tra_obj", "move absolute", "20.0")
         await bench.say(event(1, words))
@@ -150,6 +155,7 @@ async def offset(rng: random.Random) -> float:
 
 
 async def slow(rng: random.Random) -> float:
+    """Move slower than known; seconds from where it is 0.3 s behind until the alarm."""
     axis = FLEXRAY.axes["mag_obj"]
     moved = Motor(
         "mag_obj",
@@ -179,6 +185,7 @@ async def slow(rng: random.Random) -> float:
 
 
 async def lost(rng: random.Random, how: signal.Signals) -> float:
+    """End the scanner's process by a signal; seconds until the alarm."""
     async with Bench() as bench:
         await bench.say(event(1, ("tube", "xrayon")))
         await asyncio.sleep(rng.uniform(0.3, 0.8))

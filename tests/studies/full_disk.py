@@ -63,6 +63,12 @@ class SmallDisk:
     """A file system of its own for a data directory."""
 
     def __init__(self, folder: Path, *, ext4: bool) -> None:
+        """Make and mount a file system of SIZE_MB below a folder.
+
+        Args:
+            folder: an empty one.
+            ext4: in an image by a loop device, which needs root; otherwise tmpfs.
+        """
         self.root = folder / "disk"
         self.root.mkdir()
         if ext4:
@@ -181,6 +187,11 @@ def real(count: int, seed: int, *, ext4: bool) -> list[str]:
 
 
 def main() -> int:
+    """Live histories on a simulated full disk, and on a real one if asked; 1 where
+    something was wrong.
+
+    For a real disk the process starts itself again with mounts of its own.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--histories", type=int, default=20)
     p.add_argument("--real", type=int, default=0, help="twins on a real full disk")

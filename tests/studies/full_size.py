@@ -84,6 +84,13 @@ class Shadows:
         shape: tuple[int, int],
         body: tuple[float, float, float, float] = BODY,
     ) -> None:
+        """Views of a body and PINS, with one image of noise that all of them share.
+
+        Args:
+            scan: the geometry.
+            shape: rows and columns.
+            body: x, y, radius [mm] and attenuation [1/mm].
+        """
         self.scan, self.shape, self._things = scan, shape, (body, *PINS)
         self._noise = (
             np.random.default_rng(1).normal(0.0, NOISE, shape).astype(np.float32)
@@ -122,6 +129,9 @@ def sizes(fraction: float) -> tuple[int, int, int, float]:
 
 
 def scan_of_shadows(shadows: Shadows) -> DataSet:
+    """A data set whose frames are made when they are read; its dark is zero, its flat
+    OPEN.
+    """
     scan, shape = shadows.scan, shadows.shape
     frames = tuple(
         Frame(i, f"scan_{i:06d}.tif", None, True, shape) for i in range(len(scan))
@@ -132,6 +142,12 @@ def scan_of_shadows(shadows: Shadows) -> DataSet:
 
 
 def write(folder: Path, fraction: float) -> None:
+    """Write a scan to a folder, and print its size and the processor time.
+
+    Args:
+        folder: to make.
+        fraction: of the full size, in each direction.
+    """
     views, rows, cols, pixel = sizes(fraction)
     begun = time.process_time()
     scan_of_shadows(Shadows(scan_of(views, rows, cols, pixel), (rows, cols))).save(folder)
@@ -344,6 +360,9 @@ def by_rtk(
 
 
 def compare(fraction: float) -> None:
+    """Reconstruct by flexdt and by RTK, each in a process of its own, and print how far
+    they are apart.
+    """
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder, f"{who}.npy") for who in ("flexdt", "itk-rtk")]
         for file in files:
@@ -362,6 +381,9 @@ def again(*words: str) -> None:
 
 
 def main() -> None:
+    """Do what the command line asks: write, reconstruct, costs, plan or a comparison with
+    RTK.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

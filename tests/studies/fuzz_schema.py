@@ -126,6 +126,14 @@ class Found:
     def add(
         self, server: str, kind: str, messages: list[Any], told: object = None
     ) -> None:
+        """Keep a problem with its messages and print it; of each kind the first is kept.
+
+        Args:
+            server: by name.
+            kind: what went wrong.
+            messages: that led to it; one alone if it is known which.
+            told: what the server said.
+        """
         first = messages[0] if len(messages) == 1 else {}
         where = f"{first.get('method', '')}" if isinstance(first, dict) else ""
         key = f"{server} {kind} {where} {re.sub('[0-9]+', '#', str(told))[:80]}"
@@ -154,6 +162,7 @@ class Maker:
         names: dict[str, Callable[[], Any]],
         rng: random.Random,
     ) -> None:
+        """Weigh methods by what they cost: the costly ones are drawn less often."""
         self._schemas, self.methods, self.rng = schemas, methods, rng
         self._valid, self._names = valid, names
         self._order = [m for m in methods for _ in range(max(1, 200 // COSTLY.get(m, 1)))]
@@ -171,6 +180,12 @@ class Maker:
                 return said
 
     def _message(self) -> Said:
+        """Draw one message: a method with right parameters, of which most often something
+        is changed.
+
+        Returns:
+            The message, the places changed, and whether the schema allows it.
+        """
         rng = self.rng
         method = rng.choice(self._order)
         while self.held and method in HELD:
@@ -237,6 +252,9 @@ class Maker:
         }
 
     def _one(self, name: str, schema: Schema) -> Any:
+        """A value of a field: a known name if the schema allows it, else drawn from the
+        schema.
+        """
         if name in self._names and self._schemas.allows(
             schema, value := self._names[name]()
         ):
@@ -269,6 +287,9 @@ def _names(told: str, paths: tuple[Path, ...]) -> bool:
 
 
 def _readable(value: Any, depth: int) -> bool:
+    """Whether JSON can carry a value, and both ends read it: finite, without lone
+    surrogates, not deep.
+    """
     match value:
         case float():
             return math.isfinite(value)
@@ -289,6 +310,7 @@ def _packed(document: Any) -> bytes:
 
 
 def _line(document: Any) -> bytes:
+    """A document as a line of JSON, bytes as base64."""
     return (
         json.dumps(document, default=lambda b: base64.b64encode(b).decode()).encode()
         + b"\n"
@@ -302,6 +324,15 @@ class Sender:
     def __init__(
         self, server: str, port: int, maker: Maker, found: Found, *, frames: bool
     ) -> None:
+        """Begin without answers.
+
+        Args:
+            server: by name.
+            port: its port.
+            maker: of messages.
+            found: takes problems.
+            frames: MessagePack frames; otherwise JSON lines.
+        """
         self.server, self.port, self.maker, self.found = server, port, maker, found
         self.frames, self.tally = frames, Counter[str]()
         self.stuck: Callable[[], None] = lambda: None
@@ -395,6 +426,16 @@ class Sender:
         waiting: dict[int, Said],
         last: int,
     ) -> None:
+        """Count and judge an answer, and take its message off those that wait.
+
+        An answer without a message of this batch counts only as an internal error.
+
+        Args:
+            answer: the whole one.
+            batch: messages by their number.
+            waiting: those not answered yet; changed.
+            last: number of the question how the server is.
+        """
         self.tally[str(answer["error"]["code"]) if "error" in answer else "ok"] += 1
         id = answer.get("id")
         if not isinstance(id, int) or isinstance(id, bool) or not 0 <= id < len(batch):
@@ -413,6 +454,9 @@ class Sender:
 
 
 def _send(s: socket.socket, data: bytes) -> None:
+    """Send all bytes, whatever time it takes; a connection that is closed ends it without
+    an error.
+    """
     view = memoryview(data)
     while view:
         with contextlib.suppress(TimeoutError):
@@ -450,6 +494,7 @@ class Pages:
     """A page of the viewer: requests over a WebSocket."""
 
     def __init__(self, port: int, maker: Maker, found: Found) -> None:
+        """Begin without answers, for a viewer at a port."""
         self.port, self.maker, self.found = port, maker, found
         self.tally: Counter[str] = Counter()
         self.stuck: Callable[[], None] = lambda: None
@@ -482,6 +527,11 @@ class Pages:
             self.found.add("viewer", f"no answer: {error!r}", documents)
 
     def _hear(self, page: Any, batch: list[Said], waiting: dict[int, Said]) -> None:
+        """Take one message of the page's, and judge it if it is an answer.
+
+        Raises:
+            TimeoutError: there is none for HANGS_S.
+        """
         begun = time.monotonic()
         while True:
             try:
@@ -509,6 +559,11 @@ class Events:
     """A program at the gateway's sockets."""
 
     def __init__(self, ready: dict[str, Any], found: Found, rng: random.Random) -> None:
+        """Connect to the gateway and wait until it answers.
+
+        Raises:
+            RuntimeError: it does not for 30 s.
+        """
         import zmq
 
         from flexdt.clients.gateway.vocabulary import known_commands
@@ -587,6 +642,9 @@ class Events:
                 return
 
     def _answers_at_last(self) -> bool:
+        """Whether the gateway answers within HANGS_S; `stuck` is called each time that it
+        does not.
+        """
         for _ in range(int(HANGS_S / QUIET_S)):
             if self._ask_state(QUIET_S):
                 return True
@@ -611,6 +669,9 @@ class Lab:
     """
 
     def __init__(self, folder: File, seed: str, which: list[str]) -> None:
+        """Start the servers and make what attacks them; a failure ends those that have
+        started.
+        """
         self.found, self.rng = Found(), random.Random(seed)
         self.servers: dict[str, Process] = {}
         self.held = False
@@ -640,6 +701,9 @@ class Lab:
             raise
 
     def _senders(self, which: list[str]) -> list[Any]:
+        """Make the attackers of the servers named in `which`, from what the twin says of
+        its methods.
+        """
         port = self.servers["twin"].port
         document = self.watch.call("rpc.discover")
         scene = self.watch.call("scene.save")["document"]
@@ -674,6 +738,7 @@ class Lab:
                 self.watch = Wire(self.servers["twin"].port, timeout_s=HANGS_S)
 
     def _end_all(self) -> None:
+        """Take control, end all jobs and motion, and release it again unless it is held."""
         call = self.watch.call
         call("session.control", action="force")
         call("clock.set", speed_up="max")
@@ -1076,6 +1141,7 @@ def replay(file: File) -> int:
 
 
 def main() -> int:
+    """Fuzz or replay as the command line asks; 1 where a problem was found."""
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )

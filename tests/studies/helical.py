@@ -97,6 +97,7 @@ def measured(parts: list[Part], part: float, z: float, views: int) -> tuple[floa
 
 
 def main() -> None:
+    """Print the errors of drawn objects at some parts of the steepest rise."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--objects", type=int, default=6)
     parser.add_argument("--views", type=int, default=240)

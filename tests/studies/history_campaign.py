@@ -30,6 +30,12 @@ def one_machine(seed: int, number: int, runs: int, repeats: int, moves: int
 
 
 def main() -> int:
+    """Run histories on drawn machines until there are enough requests or the time is
+    over.
+
+    Returns:
+        1 where something was violated.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--requests", type=int, default=100_000, help="in histories, at least")
     p.add_argument("--seed", type=int, default=1)

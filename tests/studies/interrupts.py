@@ -149,6 +149,9 @@ def campaign(
 
 
 def main() -> int:
+    """Interrupt each command many times, and print a line for each; 1 where one ended
+    wrongly.
+    """
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--longest", type=float, default=6.0)

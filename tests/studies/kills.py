@@ -29,6 +29,7 @@ class Round:
     """Servers that are killed, and what was found."""
 
     def __init__(self, root: Path, rng: random.Random) -> None:
+        """Start a projector and a twin in a folder, with nothing counted yet."""
         self.root, self.rng, self.data = root, rng, root / "data"
         self.rays = projector(log=root / "projector.log")
         self.ray_port = self.rays.port
@@ -195,6 +196,11 @@ def ready(wire: Wire) -> None:
 
 
 def main() -> int:
+    """Kill servers during scans until there were so many kills, and print what was lost.
+
+    Returns:
+        1 where anything was lost, corrupt or different, or an error was not handled.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--kills", type=int, default=200)
     p.add_argument("--seed", type=int, default=1)

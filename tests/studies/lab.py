@@ -31,6 +31,18 @@ class Process:
     def __init__(
         self, module: str, *options: object, log: Path | None = None, env: Plain = None
     ) -> None:
+        """Start a server module and wait for its `ready` line.
+
+        Args:
+            module: run with -m.
+            options: of its command line.
+            log: takes what it writes to stderr; None for a file that goes with this
+                process.
+            env: added to the environment.
+
+        Raises:
+            RuntimeError: there is no line within STARTED_WITHIN_S, or it has ended.
+        """
         if log is None:
             number, name = tempfile.mkstemp(prefix="flexdt-", suffix=".log")
             os.close(number)
@@ -78,6 +90,7 @@ class Process:
         self.child.wait()
 
     def end(self) -> int:
+        """End it by SIGTERM, after 30 s by SIGKILL; the exit code."""
         if self.alive():
             self.child.terminate()
             try:
@@ -99,6 +112,7 @@ class Process:
         return out
 
     def memory_mb(self) -> float:
+        """Its resident memory [MiB], without children."""
         status = Path(f"/proc/{self.pid}/status").read_text()
         return (
             int(next(x for x in status.splitlines() if x.startswith("VmRSS")).split()[1])
@@ -133,6 +147,14 @@ def projector(*options: object, **kept: Plain) -> Process:
 
 
 def twin(projector_port: int, data: Path, *options: object, **kept: Plain) -> Process:
+    """Start a twin on a data directory.
+
+    Args:
+        projector_port: on this machine.
+        data: the directory.
+        options: more of its command line.
+        kept: of `Process`.
+    """
     return Process(
         "flexdt.server.twin.main", "--port", 0, "--projector", f"127.0.0.1:{projector_port}",
         "--data", data, *options, **kept,
@@ -143,6 +165,7 @@ class Refused(Exception):
     """The server's answer was an error."""
 
     def __init__(self, error: dict[str, Any]) -> None:
+        """Keep code, message and data of an answer's error."""
         super().__init__(f"{error['code']}: {error['message']}")
         self.code, self.message, self.data = (
             error["code"],
@@ -155,6 +178,7 @@ class Wire:
     """JSON lines over a socket; events are kept apart from answers."""
 
     def __init__(self, port: int, timeout_s: float = 60.0) -> None:
+        """Connect to a port of this machine; each read waits `timeout_s` at most."""
         self.socket = socket.create_connection(("127.0.0.1", port), timeout=timeout_s)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.file = self.socket.makefile("rb")
@@ -162,6 +186,9 @@ class Wire:
         self.events: list[dict[str, Any]] = []
 
     def ask(self, method: str, **params: object) -> dict[str, Any]:
+        """Send a request and return the whole answer, an error too; events before it are
+        kept.
+        """
         self.count += 1
         request = {"jsonrpc": "2.0", "id": self.count, "method": method, "params": params}
         self.socket.sendall(json.dumps(request).encode() + b"\n")
@@ -173,6 +200,11 @@ class Wire:
                 return answer
 
     def read(self) -> dict[str, Any]:
+        """Read the next message.
+
+        Raises:
+            ConnectionError: the server has closed the connection.
+        """
         line = self.file.readline()
         if not line:
             raise ConnectionError("the server has closed the connection")
@@ -180,12 +212,22 @@ class Wire:
         return answer
 
     def call(self, method: str, **params: object) -> Any:
+        """Send a request and return its result.
+
+        Raises:
+            Refused: the answer is an error.
+        """
         answer = self.ask(method, **params)
         if "error" in answer:
             raise Refused(answer["error"])
         return answer["result"]
 
     def wait(self, job: str, *states: str, timeout_s: float = 120.0) -> dict[str, Any]:
+        """Ask for a job's status until it has one of the states, and return it.
+
+        Raises:
+            AssertionError: it has not within `timeout_s`.
+        """
         until = time.monotonic() + timeout_s
         while time.monotonic() < until:
             status: dict[str, Any] = self.call("job.status", job=job)

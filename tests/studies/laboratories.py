@@ -99,6 +99,7 @@ def laboratories(count: int, seed: int) -> Iterator[Outcome]:
 
 
 def main() -> None:
+    """Read drawn laboratories, print each, then what was right of all."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--laboratories", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)

@@ -75,6 +75,9 @@ def rates(folder: Path) -> dict[str, float]:
 
 
 def main() -> None:
+    """Measure rates on this machine, and print how long a large volume would take on a
+    cluster.
+    """
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -43,6 +43,7 @@ GET = b'{"jsonrpc":"2.0","id":1,"method":"state.get"}\n'
 
 
 def line(method: str, params: bytes) -> bytes:
+    """A request as a line of JSON; params are JSON already."""
     return b'{"jsonrpc":"2.0","id":1,"method":"%b","params":%b}\n' % (
         method.encode(),
         params,
@@ -147,6 +148,7 @@ def poses(size: int) -> bytes:
 
 
 def script(size: int) -> bytes:
+    """A request that checks a script of `size` moves."""
     rows = "".join(
         f"rot_obj\tmove absolute\t{i % 360}\t\tACK\t\t\r\n" for i in range(size)
     )
@@ -236,6 +238,7 @@ class Ages:
     """Longest time without a new state at a subscriber [ms]."""
 
     def __init__(self, port: int) -> None:
+        """Start a process that subscribes at a port, and wait until it has."""
         ours, theirs = multiprocessing.Pipe()
         self._pipe = ours
         process = multiprocessing.Process(target=_watch, args=(port, theirs), daemon=True)
@@ -253,6 +256,7 @@ class Stalls:
     """How long the machine itself stood still: a real-time process that oversleeps [ms]."""
 
     def __init__(self) -> None:
+        """Start a process that sleeps; `known` says whether it could be real-time."""
         ours, theirs = multiprocessing.Pipe()
         self._pipe = ours
         multiprocessing.Process(target=_oversleep, args=(theirs,), daemon=True).start()
@@ -267,6 +271,9 @@ class Stalls:
 
 
 def _oversleep(pipe: Any) -> None:
+    """Sleep a millisecond at a time for ever; asked by the pipe, send the longest
+    oversleep since [ms].
+    """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         pipe.send(True)
@@ -284,6 +291,9 @@ def _oversleep(pipe: Any) -> None:
 
 
 def _watch(port: int, pipe: Any) -> None:
+    """Subscribe and read for ever; asked by the pipe, send the longest time without a
+    state [ms].
+    """
     sock = dial(port)
     sock.sendall(line("state.subscribe", b'{"topics":["state"],"max_rate_hz":100}'))
     sock.settimeout(0.002)
@@ -342,6 +352,12 @@ def _load(work: Callable[[int, float], int], port: int, seconds: float) -> None:
 
 
 def main() -> int:
+    """Measure E-stops beside each load, and print a table.
+
+    Returns:
+        1 where something was beyond its limit, a load failed, or an error was not
+        handled.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--seconds", type=float, default=10.0, help="of each load")
     p.add_argument("--loads", nargs="*", help="all, if left out")

@@ -30,6 +30,15 @@ is the server and not how busy a crowd of clients is with its events."""
 
 
 async def client(port: int, seconds: float, asks: bool, result: dict[str, Any]) -> None:
+    """Subscribe, ask now and then, and count what comes, for some seconds or until it is
+    cut off.
+
+    Args:
+        port: of the twin.
+        seconds: how long.
+        asks: whether it asks.
+        result: counts of all clients of this process; changed.
+    """
     reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1 << 22)
     writer.write(b'{"jsonrpc":"2.0","id":0,"method":"state.subscribe","params":'
                  b'{"topics":["state","job"],"max_rate_hz":20}}\n')  # fmt: skip
@@ -78,6 +87,8 @@ async def client(port: int, seconds: float, asks: bool, result: dict[str, Any]) 
 
 
 def crowd(port: int, count: int, seconds: float, asks: bool, pipe: Any) -> None:
+    """Run many clients in one process, and send their counts by the pipe."""
+
     async def main() -> dict[str, Any]:
         result: dict[str, Any] = {"events": 0, "disorder": 0, "lost": 0, "latency": []}
         clients = (client(port, seconds, asks, result) for _ in range(count))
@@ -107,6 +118,9 @@ def phase(server: Process, count: int, seconds: float) -> dict[str, Any]:
 
 
 def main() -> int:
+    """Measure many clients beside a scan in real time and one at full speed; 1 where one
+    missed events.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--clients", type=int, default=200)
     p.add_argument("--seconds", type=float, default=20.0)

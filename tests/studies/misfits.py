@@ -75,6 +75,7 @@ def backward(images, geometry, rng):
 
 
 def interlaced(images, geometry, rng):
+    """Order the images as two or three passes take them; the geometry stays."""
     passes = int(rng.integers(2, 4))
     order = np.concatenate(
         [np.arange(first, len(images), passes) for first in range(passes)]
@@ -98,6 +99,9 @@ def other_side(images, geometry, rng):
 
 
 def moving(images, geometry, rng):
+    """Shift the images aside by up to six columns, as a sample that sways; the geometry
+    stays.
+    """
     turn = np.arange(len(images)) / len(images) * 2.0 * np.pi
     columns = np.round(rng.uniform(3.0, 6.0) * np.sin(rng.integers(2, 6) * turn)).astype(
         int
@@ -130,6 +134,7 @@ def scattered(images, geometry, rng):
 
 
 def noisy(images, geometry, rng):
+    """Add the noise of few counts to the images; the geometry stays."""
     counts = 10.0 ** rng.uniform(2.3, 4.0)
     return -np.log(
         np.maximum(rng.poisson(counts * np.exp(-images)), 0.5) / counts

@@ -70,6 +70,7 @@ class Tally:
     least: float = np.inf
 
     def add(self, other: Tally) -> None:
+        """Add another batch: of each kind of violation the shorter history stays."""
         self.requests += other.requests
         self.episodes += other.episodes
         self.counts += other.counts
@@ -128,6 +129,11 @@ def wire_batch(machine: str, seed: int, requests: int, samples: Path) -> Tally:
 
 
 def main() -> int:
+    """Make random requests on all processors, then shorten what was found and print it.
+
+    Returns:
+        1 where something was violated.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--requests", type=int, default=100_000)
     p.add_argument("--seed", type=int, default=1)
@@ -193,6 +199,7 @@ def main() -> int:
 
 
 def report(tally: Tally, machines: list[str], seed: int, seconds: float) -> None:
+    """Print counts of all requests, the violations and how stops went."""
     print(f"{tally.requests} requests in {tally.episodes} episodes on {', '.join(machines)}, "
           f"seed {seed}, {seconds:.0f} s")  # fmt: skip
     used = [o for o in OUTCOMES if any(tally.counts[v, o] for v in VERBS)]

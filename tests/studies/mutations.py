@@ -195,6 +195,12 @@ class Traced:
     """A plugin: which test executes which lines of the files under mutation."""
 
     def __init__(self, file: str, folder: Path) -> None:
+        """Begin to measure the lines that are executed.
+
+        Args:
+            file: of the tests.
+            folder: the copy of the code.
+        """
         self.file, self.folder = file, folder
         self.coverage = coverage.Coverage(
             data_file=None,
@@ -209,6 +215,11 @@ class Traced:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """Note what one test executes and how long it takes; caches are cleared before
+        it.
+
+        After FILE_S of the processor's time the session stops.
+        """
         for module in list(
             sys.modules.values()
         ):  # what an earlier test left must run again
@@ -241,6 +252,12 @@ class Traced:
             self.failed.add(report.nodeid)
 
     def result(self) -> Lines:
+        """Stop, and return the digests of files used, the seconds of tests, and lines
+        with their tests.
+
+        Tests are bits of a hexadecimal number; the last stands for what no test alone
+        executed. Tests that failed are left out.
+        """
         self.coverage.stop()
         tests = [name for name in self.seconds if name not in self.failed]
         bit = {name: 1 << i for i, name in enumerate(tests)} | {
@@ -271,6 +288,13 @@ class Tests:
     """Which tests execute which lines of the code as it is."""
 
     def __init__(self, known: Path, copies: list[Copy], digests: dict[str, str]) -> None:
+        """Read what is known, and trace test files that are new or changed.
+
+        Args:
+            known: JSON file, written again after each test file.
+            copies: in which tests run.
+            digests: of the files under mutation.
+        """
         self.digests = digests
         entries: dict[str, Lines] = (
             json.loads(known.read_text()) if known.exists() else {}
@@ -404,6 +428,11 @@ def table(fates: dict[Mutant, str]) -> str:
 
 
 def main() -> int:
+    """Draw mutants, judge those not judged yet, and print the table.
+
+    Returns:
+        0 if at least WANTED of them are killed, or the draw is only printed.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=14)

@@ -574,6 +574,7 @@ def untold(*_: object) -> None:
 
 
 def main(words: list[str] | None = None) -> int:
+    """Align drawn scans of natural objects and print a summary; its exit code."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)

@@ -318,6 +318,9 @@ PARTS = {"load": load, "rest": rest, "scan": scan, "story": story}
 
 
 def main() -> None:
+    """Measure the parts of the page named on the command line, or all, each with servers
+    of its own.
+    """
     from playwright.sync_api import sync_playwright
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -76,6 +76,9 @@ class Answers:
         return self
 
     async def handle(self, method: Any, params: Any) -> Any:
+        """Answer as the projector would: an array, its processor time, or how much was
+        sent.
+        """
         if method.name == "project":
             return image.encode(ARRAYS[params.volume])
         if method.name == "health":
@@ -100,6 +103,11 @@ def shell(port: Any) -> None:
 
 
 async def main(turns: int) -> None:
+    """Time both links on each case, and print them.
+
+    Args:
+        turns: of ten requests on each link.
+    """
     found: Any = multiprocessing.Queue()
     ports = []
     for serve in (own_link, shell):

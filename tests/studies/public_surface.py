@@ -34,6 +34,9 @@ def library() -> Iterator[str]:
 
 
 def _lines(name: str, what: Any) -> Iterator[str]:
+    """The names of a module, class, function or value with their parameters, all inside
+    it included.
+    """
     if isinstance(what, ModuleType):
         for inner in sorted(what.__all__):
             yield from _lines(f"{name}.{inner}", getattr(what, inner))

@@ -102,6 +102,7 @@ class Scan:
         return out.reshape(self.views, rows, cols, FINE).mean(axis=3)
 
     def data(self, rng: np.random.Generator) -> fx.DataSet:
+        """Expose the scan and return it as a data set with the nominal circle."""
         flat = rng.poisson(self.photons, (20, *self.shape)).mean(axis=0) * 4
         counts = np.minimum(rng.poisson(self.photons * np.exp(-self.lines())) * 4, 65535)
         cone = fx.ConeVec.circular(
@@ -138,6 +139,7 @@ def ellipses(rng: np.random.Generator, tall: bool) -> np.ndarray:
 
 
 def drawn(kind: str, rng: np.random.Generator) -> Scan:
+    """Draw a scan of one of KINDS: few rows, symmetric bodies, or half a turn."""
     rows = int(rng.integers(1, 4)) if kind == "one_row" else 1
     half = kind == "half_turn" or rng.random() < 0.5
     cols = int(rng.choice([192, 256, 384]))
@@ -171,6 +173,10 @@ def untold(rng: np.random.Generator) -> Scan:
 
 
 def tried(kind: str, seed: int) -> dict[str, Any]:
+    """Align a drawn scan; its error and sigma in columns, or why it was refused.
+
+    The same kind and seed give the same scan.
+    """
     rng = np.random.default_rng([KINDS.index(kind), seed])
     scan = untold(rng) if kind == "untold" else drawn(kind, rng)
     with warnings.catch_warnings():
@@ -188,6 +194,12 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
 
 
 def main(words: list[str] | None = None) -> int:
+    """Align many scans of one kind and print the errors.
+
+    Returns:
+        1 where errors and sigmas do not fit, or anything was told of scans that allow
+        nothing.
+    """
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)

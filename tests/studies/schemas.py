@@ -122,6 +122,9 @@ class Schemas:
         return deepcopy(self._absurd(rng, schema))
 
     def _absurd(self, rng: random.Random, schema: Schema) -> Any:
+        """Draw a value that a schema mostly refuses: another type, an edge, a strange
+        number or text.
+        """
         kinds = [self.plain(one) for one in self.plain(schema).get("anyOf", [schema])]
         s = rng.choice(kinds)
         if rng.random() < 0.12:
@@ -169,6 +172,7 @@ def finite(value: Any) -> bool:
 
 
 def _number(schemas: Schemas, s: Schema, value: Any) -> bool:
+    """Whether a value is a finite number within the schema's limits; no bool is."""
     return (
         not isinstance(value, bool)
         and finite(value)
@@ -179,6 +183,7 @@ def _number(schemas: Schemas, s: Schema, value: Any) -> bool:
 
 
 def _text(schemas: Schemas, s: Schema, value: Any) -> bool:
+    """Whether a value is a text that the schema allows; bytes are if it has an encoding."""
     if isinstance(value, bytes):
         return "contentEncoding" in s
     if not isinstance(value, str) or re.search("[\ud800-\udfff]", value):
@@ -189,6 +194,7 @@ def _text(schemas: Schemas, s: Schema, value: Any) -> bool:
 
 
 def _array(schemas: Schemas, s: Schema, value: Any) -> bool:
+    """Whether a value is a list with as many and such members as the schema allows."""
     if not isinstance(value, list):
         return False
     if not s.get("minItems", 0) <= len(value) <= s.get("maxItems", len(value)):
@@ -202,6 +208,7 @@ def _array(schemas: Schemas, s: Schema, value: Any) -> bool:
 
 
 def _object(schemas: Schemas, s: Schema, value: Any) -> bool:
+    """Whether a value has the fields required and no field that the schema forbids."""
     if not isinstance(value, dict) or not all(
         name in value for name in s.get("required", ())
     ):

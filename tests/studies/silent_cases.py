@@ -259,6 +259,9 @@ def by_rtk(case: Case) -> FloatArray:
 
 
 def told(case: Case, layer: FloatArray | None, word: str) -> str:
+    """A case's errors in percent with a word for a warning; "refused" where there is no
+    layer.
+    """
     if layer is None:
         return "refused"
     mean, rms = case.errors(layer)

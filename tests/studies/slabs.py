@@ -47,6 +47,13 @@ class Cluster:
     """A scheduler and workers of one thread, each a process of its own that can be killed."""
 
     def __init__(self, folder: Path, workers: int, limit: int | None = None) -> None:
+        """Start a scheduler and workers.
+
+        Args:
+            folder: for the log and the workers' files.
+            workers: how many.
+            limit: of each process's memory [bytes]; None for none.
+        """
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -59,6 +66,11 @@ class Cluster:
         return f"tcp://127.0.0.1:{self.port}"
 
     def _scheduler(self) -> subprocess.Popen[bytes]:
+        """Start the scheduler and wait until it listens.
+
+        Raises:
+            RuntimeError: it ends before, or does not within WITHIN_S.
+        """
         child = self._start("scheduler", "--host", "127.0.0.1", "--port", str(self.port))
         until = time.monotonic() + WITHIN_S
         while child.poll() is None and time.monotonic() < until:
@@ -73,12 +85,14 @@ class Cluster:
         )
 
     def _worker(self) -> subprocess.Popen[bytes]:
+        """Start a worker of one thread without a nanny; it is not waited for."""
         return self._start(
             "worker", self.address, "--nthreads", "1", "--no-nanny",
             "--memory-limit", "0", "--local-directory", str(self.folder),
         )  # fmt: skip
 
     def _start(self, *words: str) -> subprocess.Popen[bytes]:
+        """Start a part of dask with limited memory; the log is shared."""
         with (self.folder / "dask.log").open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", "dask", *words, "--no-dashboard"],
@@ -115,6 +129,13 @@ def command(scan: Path, out: Path, side: int, *more: str) -> list[str]:
 def start(
     words: list[str], log: Path, limit: int | None = None
 ) -> subprocess.Popen[bytes]:
+    """Start a command in single threads, its output to a log.
+
+    Args:
+        words: the command.
+        log: overwritten.
+        limit: of its memory [bytes]; None for none.
+    """
     with log.open("wb") as file:
         return subprocess.Popen(
             words,
@@ -297,6 +318,9 @@ def memory(folder: Path, scan: Path, limit: int) -> bool:
 
 
 def main() -> int:
+    """Make a scan and study speed, kills or memory, as the command line says; 1 if it
+    failed.
+    """
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -52,6 +52,7 @@ class SlowLink:
     """
 
     def __init__(self, port: int, rate: float, delay_s: float) -> None:
+        """Start the proxy and wait until it listens; `port` is then its own."""
         self._port, self._rate, self._delay = port, rate, delay_s
         self._free = {"down": 0.0, "up": 0.0}
         self._ready = threading.Event()
@@ -60,6 +61,7 @@ class SlowLink:
         self._ready.wait()
 
     async def _run(self) -> None:
+        """Listen and serve for ever."""
         # A browser that leaves cuts its connections; nothing is to be said of that.
         asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
         listening = socket.create_server(("127.0.0.1", 0))
@@ -72,6 +74,9 @@ class SlowLink:
     async def _serve(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
+        """Connect to the server for one client, and pass bytes both ways until both ends
+        have closed.
+        """
         end = socket.socket()
         end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
         end.setblocking(False)
@@ -177,6 +182,7 @@ def study(rate: float, delay_s: float, seconds: float) -> dict[str, float]:
 
 
 def main() -> None:
+    """Measure the page over a slow link, and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rate", type=float, default=250e3, help="bytes a second")
     parser.add_argument("--delay", type=float, default=0.025, help="each way [s]")

@@ -78,6 +78,11 @@ def use(port: int, rng: random.Random, number: int) -> None:
 
 
 def main() -> int:
+    """Use a twin for many simulated hours, and compare its memory early and late.
+
+    Returns:
+        1 where memory or descriptors grew, or an error was not handled.
+    """
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--hours", type=float, default=24.0)
     p.add_argument("--uses", type=int, default=USES_AN_HOUR, help="an hour")

@@ -86,6 +86,11 @@ class Rig:
             self.times[kind] = (middle, rng.uniform(0.05, 0.5), rng.uniform(0.05, 0.4))
 
     def overhead(self, kind: str) -> float:
+        """Draw the seconds that a command of a kind takes beside its motion, by the rig's
+        family.
+
+        Each call counts as a line of the log; a drifting rig slows with them.
+        """
         middle, width, share = self.times[kind]
         self.lines += 1
         noise = math.exp(self.rng.gauss(0.0, 0.03))
@@ -122,6 +127,7 @@ class Rig:
         return middle * noise * (1.0 + 2.0 * width * self.lines / 300.0)
 
     def reply(self, axis: str, target: float) -> bytes:
+        """A motor's status after a move, in the scanner's bytes."""
         low, high, speed, acceleration = self.limits[axis]
         set_speed, set_acceleration = self.rates[axis]
         head = (target, target, set_speed, 0.0, set_acceleration, high, low, 0.4, speed, 0.001,
@@ -147,6 +153,14 @@ class Scan:
         self.exposure, self.averages, self.frames = 0.1, 1, 1
 
     def put(self, words: str, kind: str, length: float = 0.0, reply: bytes = b"") -> None:
+        """Write a line with its time, and let the clock go on by it.
+
+        Args:
+            words: component, command and arguments with | between them.
+            kind: of the overhead.
+            length: seconds beside it.
+            reply: the scanner's bytes.
+        """
         component, command, *rest = words.split("|")
         first, second = (*rest, "", "")[:2]
         own = round(1000.0 * (length + self.rig.overhead(kind)))
@@ -160,6 +174,9 @@ class Scan:
         self.rig.clock_ms += own
 
     def move(self, axis: str, target: float) -> None:
+        """Move an axis and write its line; a move to where it stands takes the overhead
+        of "standing".
+        """
         target = round(target, 3)
         time = travel(target - self.rig.at[axis], *self.rig.rates[axis])
         kind = "move" if target != self.rig.at[axis] else "standing"
@@ -183,6 +200,7 @@ class Scan:
         self.put(f"camera|save image|{name}", "save")
 
     def run(self) -> bytes:
+        """Write a drawn scan, from the settings to the last pause; the log."""
         rng, rig = self.rig.rng, self.rig
         if rig.family == DAILY:
             rig.day = math.exp(rng.gauss(0.0, 0.2))
@@ -313,6 +331,7 @@ def study(machines: int, seed: int, families: Sequence[str] = FAMILIES) -> dict[
 
 
 def main() -> None:
+    """Study drawn machines and print how often the ranges held."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--machines", type=int, default=50)
     parser.add_argument("--seed", type=int, default=17)

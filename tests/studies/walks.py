@@ -26,6 +26,7 @@ WAYS = ("along z", "along x", "along y", "ray by ray")
 
 
 def drawn(draw: np.random.Generator) -> tuple[Volume, ConeVec, tuple[int, int]]:
+    """Draw a volume, a view of it, and the panel's rows and columns."""
     sides = draw.integers(32, 257, 3)
     if draw.random() < 0.15:
         sides[draw.integers(3)] = draw.integers(1, 12)
@@ -64,6 +65,7 @@ def milliseconds(call: Callable[[], object]) -> float:
 
 
 def main() -> None:
+    """Time drawn views along each way, and print how good the choice was."""
     p = argparse.ArgumentParser(description=__doc__)
     p.add_argument("--count", type=int, default=150)
     p.add_argument("--seed", type=int, default=1)

@@ -20,6 +20,9 @@ if "FLEXDT_TEST_FAULT" in os.environ:
         """Leaves a mark when it has failed."""
 
         def _change(self, kind, path):  # type: ignore[no-untyped-def]
+            """Change as the disk does; where it fails, leave a mark beside the root and
+            raise.
+            """
             try:
                 return super()._change(kind, path)
             except OSError:

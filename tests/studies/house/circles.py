@@ -54,6 +54,7 @@ def circles(graph: Mapping[str, set[str]]) -> list[list[str]]:
 
 
 def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
+    """All nodes to which arrows lead from `start`; itself only if it is on a circle."""
     seen: set[str] = set()
     waiting = list(graph[start])
     while waiting:
@@ -65,6 +66,7 @@ def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
 
 
 def _targets(module: Module, known: set[str]) -> Iterator[str]:
+    """Names of known modules that a module imports, anywhere in it."""
     for node in module.nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in known)

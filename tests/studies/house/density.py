@@ -42,6 +42,7 @@ def _is_conditional(node: ast.AST) -> bool:
 
 
 def _nodes(modules: Sequence[Module], wanted: Callable[[ast.AST], bool]) -> Iterator[str]:
+    """Place and text of each node that is wanted."""
     for module in modules:
         for node in module.nodes:
             if wanted(node):
@@ -49,6 +50,7 @@ def _nodes(modules: Sequence[Module], wanted: Callable[[ast.AST], bool]) -> Iter
 
 
 def _lines(modules: Sequence[Module], wanted: Callable[[str], bool]) -> Iterator[str]:
+    """Place and text of each line that is wanted."""
     for module in modules:
         for number, line in enumerate(module.text.splitlines(), 1):
             if wanted(line):

@@ -75,6 +75,7 @@ def _used(node: ast.stmt) -> set[str]:
 
 
 def _late_constants(module: Module) -> Iterator[tuple[str, ast.stmt]]:
+    """Names assigned at a module's top after its first function or class."""
     defined = False
     for node in module.tree.body:
         defined = defined or isinstance(node, Definition)

@@ -32,6 +32,7 @@ def measure(modules: Sequence[Module]) -> list[Measure]:
 
 
 def _calls(module: Module) -> Iterator[str]:
+    """Calls that load a module by its name, but for those of other packages."""
     for node in module.nodes:
         if not isinstance(node, ast.Call) or not node.args:
             continue
@@ -49,6 +50,7 @@ def _is_foreign(argument: ast.expr) -> bool:
 
 
 def _texts(module: Module, wanted: Callable[[str], object]) -> Iterator[str]:
+    """Texts that are wanted, with their places; documentation is left out."""
     documentation = {
         id(node.value) for node in module.nodes if isinstance(node, ast.Expr)
     }

@@ -51,6 +51,7 @@ def begins_with_a_verb(docstring: str) -> bool:
 
 
 def _rates(modules: Sequence[Module]) -> list[Measure]:
+    """How often each of WORDS is in the prose, for 1000 words, with the places."""
     prose = [passage for module in modules for passage in passages(module)]
     count = sum(len(re.findall(r"[A-Za-z]+", text)) for _, text in prose) or 1
     rates = []
