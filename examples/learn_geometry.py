@@ -288,6 +288,7 @@ def race(task: Task, start: np.ndarray) -> dict[str, object]:
         ])  # fmt: skip
 
     def ours(values: np.ndarray) -> tuple[float, np.ndarray]:
+        """Compute half the sum of squared residuals, and its gradient by the parameters."""
         rest = task.residual(values)
         return 0.5 * float(np.sum(rest**2)), chain(
             values, task.operator(values).gradient(task.volume, rest)

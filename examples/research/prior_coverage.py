@@ -254,6 +254,9 @@ def scan(
     tracks += NOISE_PX * rng.normal(size=tracks.shape)
 
     def fitted(priors: Mapping[str, float]) -> FitResult:
+        """Fit the geometry to the tracks with these priors; no sigma is too large to be
+        told.
+        """
         return estimate_geometry(
             tracks,
             beads,

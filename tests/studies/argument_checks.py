@@ -103,6 +103,9 @@ def by_pydantic_alone(function: Callable[..., Any], text: str) -> Check:
     validated: Any = validate_call(config=ConfigDict(arbitrary_types_allowed=True))(shown)
 
     def check(given: tuple[Any, ...], named: dict[str, Any]) -> Arguments:
+        """Return the arguments as pydantic passes them on; ArgumentError with its text if
+        they do not fit.
+        """
         try:
             found: Arguments = validated(*given, **named)
         except ValidationError as error:
@@ -121,10 +124,14 @@ def by_pydantic(*, strict: bool) -> Callable[[Callable[..., Any], str], Check]:
     config = ConfigDict(arbitrary_types_allowed=True, strict=strict)
 
     def made(function: Callable[..., Any], text: str) -> Check:
+        """Make the check of one function; `text` is its documentation."""
         known = signatures.Known(function, text)
         validated: Any = validate_call(config=config)(resolved(function))
 
         def check(given: tuple[Any, ...], named: dict[str, Any]) -> Arguments:
+            """Return the arguments as pydantic passes them on; ArgumentError with a
+            sentence if they do not fit.
+            """
             try:
                 found: Arguments = validated(*given, **named)
             except ValidationError as error:

@@ -548,6 +548,7 @@ def hostile_meshes(g: Ground) -> str:
     worst, done = 0.0, threading.Event()
 
     def watch() -> None:
+        """Keep the most memory of the twin's children until all is done."""
         nonlocal worst
         while not done.is_set():
             worst = max(worst, g.twin.children_mb())
@@ -580,6 +581,7 @@ def big_mesh(g: Ground) -> str:
     worst, done = 0.0, threading.Event()
 
     def watch() -> None:
+        """Keep the longest time of a ping by another client until all is done."""
         nonlocal worst
         other = g.wire()
         while not done.is_set():

@@ -194,6 +194,7 @@ def looked(door: Callable[[], fx.DataSet]) -> Callable[[], fx.DataSet]:
     """The same data set, of whose images is warned as before a reconstruction."""
 
     def look() -> fx.DataSet:
+        """Make the data set, and warn of each doubt in its images."""
         made = door()
         for doubt in image_doubts(made):
             warnings.warn(doubt, stacklevel=2)

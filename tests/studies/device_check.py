@@ -145,6 +145,7 @@ def machine() -> Document:
     from flexdt.twin.projection import gpu
 
     def installed(name: str) -> str | None:
+        """The version of a package; None if it is not installed."""
         try:
             return version(name)
         except PackageNotFoundError:
@@ -293,6 +294,7 @@ def run(check: Check, sizes: Sizes) -> None:
     short, long = sizes.fdk_views
 
     def fdk_part(views: int, what: str, errors: bool, needs_s: float) -> Any:
+        """Time one reconstruction as a part of the check, if `needs_s` are left."""
         name = f"fdk {views} {what}{' with errors' if errors else ''}"
         return check.part(
             name, needs_s, partial(reconstruction, views, what, errors, sizes)

@@ -112,6 +112,9 @@ def cil(checkout: Path) -> Callable[[fx.ConeVec], float]:
     converter = loaded("converter", checkout / path)
 
     def compare(expected: fx.ConeVec) -> float:
+        """How far apart [pixels] the geometry is after CIL's own conversion to ASTRA's
+        vectors.
+        """
         geometry = expected.to_cil()
         assert [*geometry.shape] == [
             n for n in expected.shape if n > 1
@@ -152,6 +155,9 @@ def tigre(checkout: Path) -> Callable[[fx.ConeVec], float]:
     package.geometry = module.geometry  # type: ignore[attr-defined]
 
     def compare(expected: fx.ConeVec) -> float:
+        """How far apart [pixels] the geometry is by the functions of TIGRE's kernel, view
+        by view.
+        """
         geometry, angles = expected.to_tigre(fx.Grid((5, 6, 7), 0.5))
         assert isinstance(geometry, module.Geometry)
         geometry.check_geo(angles)
@@ -210,6 +216,10 @@ def leap(folder: Path) -> Callable[[fx.ConeVec], float]:
     rng = np.random.default_rng(0)
 
     def compare(drawn: fx.ConeVec) -> float:
+        """How far apart [pixels] LEAP's projections of drawn blobs are from ours.
+
+        A mirror image, or another scale of the values, raises AssertionError.
+        """
         volume, expected = blobs(rng), seen(rng)
         kept_as(drawn, drawn.to_leap())
         model = expected.to_leap(volume)

@@ -156,6 +156,9 @@ async def drags(ports: Ports) -> None:
     """Somebody drags the sample to and fro without an end."""
 
     def what(i: int) -> bytes:
+        """The i-th message of somebody who drags the object; the first one tells of a
+        camera.
+        """
         kinds = ("DragStart", "Update", "Update", "DragEnd")
         said: dict[str, Any] = {
             "type": f"TransformControls{kinds[i % 4]}Message",
@@ -173,6 +176,7 @@ async def rubbish(ports: Ports) -> None:
     """Bytes that are nothing, at a page, a view and the gateway."""
 
     async def events() -> None:
+        """Send bytes that are no message to the gateway, without an end."""
         async with program(ports) as (_, say):
             for i in itertools.count():
                 await say.send(b"\xff" * 100)
@@ -327,6 +331,7 @@ def strangers(port: int, seed: int, made: Any, alone: bool) -> None:
         real_time(0)  # else a busy machine makes the flood a small one
 
     async def work() -> None:
+        """Open A_MINUTE drawn connections a minute, without an end, and count them."""
         rng, open_ = random.Random(seed), set[asyncio.Task[bytes]]()
         begun = time.monotonic()
         for i in itertools.count(1):

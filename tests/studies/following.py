@@ -92,12 +92,14 @@ class Bench:
         return next(a for a in self.alarms if a.kind in kinds)
 
     async def __aenter__(self) -> Bench:
+        """Follow the scanner, and wait until the subscription holds."""
         self.task = asyncio.create_task(self.session.run(f"tcp://127.0.0.1:{self.port}"))
         await self.until(lambda: self.session.mirror.connected)
         await asyncio.sleep(0.3)  # the subscription follows the handshake
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        """End the session and the scanner's process."""
         self.task.cancel()
         await asyncio.gather(self.task, return_exceptions=True)
         self.process.kill()

@@ -97,6 +97,11 @@ class Shadows:
         )
 
     def __getitem__(self, index: int) -> np.ndarray:
+        """Counts (rows, cols) of one view, computed anew each time.
+
+        The last thing of PINS is seen on one half of the rows only. The noise is the
+        common image, shifted by the view's number.
+        """
         rows, cols = self.shape
         source, panel = self.scan.source[index], self.scan.detector[index]
         u, v = self.scan.u[index], self.scan.v[index]
@@ -172,6 +177,7 @@ def reconstruct(
     spoken = 0.0
 
     def told(done: float, whole: float) -> None:
+        """Print time, memory and reads each time that another TOLD of the whole is done."""
         nonlocal spoken
         if done - spoken >= TOLD * whole:
             spoken = done
@@ -258,6 +264,7 @@ def held(fraction: float, radius: float) -> None:
         )
 
     def parts() -> Iterator[np.ndarray]:
+        """Make the images of the scan, PART_IMAGES at a time."""
         for first in range(0, len(scan), PART_IMAGES):
             yield np.stack(
                 [image(number) for number in range(first, first + PART_IMAGES)]

@@ -880,6 +880,9 @@ def twin_maker(
     small = base64.b64encode(np.ones(8, "<f4").tobytes()).decode()
 
     def targets() -> dict[str, float]:
+        """Draw targets of one or two axes within 20 mm or deg of where they stand in the
+        scene.
+        """
         chosen = rng.sample(axes, rng.choice([1, 1, 2]))
         return {
             axis: round(scene["positions"][axis] + rng.uniform(-20, 20), 3)
@@ -887,6 +890,7 @@ def twin_maker(
         }
 
     def mesh() -> dict[str, Any]:
+        """Parameters that upload a small STL under one of three names."""
         size = len(base64.b64decode(STL))
         return {
             "name": rng.choice("mno"),
@@ -965,6 +969,7 @@ def projector_maker(port: int, rng: random.Random) -> Maker:
                 "data": np.ones(shape, "<f4").tobytes()}  # fmt: skip
 
     def grid() -> dict[str, Any]:
+        """Parameters of a grid that is in order."""
         return {
             "shape": [4, 4, 4],
             "voxel_mm": [1.0, 1.0, 1.0],

@@ -139,6 +139,7 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
     )
 
     def walk(voxel: Any) -> tuple[Any, ...]:
+        """The types of a walking kernel's arguments, for voxels of one type."""
         return (
             voxel[::1], *[int64] * 6, *[float64] * 3, table, int64, int64, float32[::1],
             *[int64] * 4, float64,

@@ -69,6 +69,9 @@ def pipeline(count: int, what: bytes = GET * 100) -> Callable[[int, float], int]
     """`count` connections that send without waiting for answers."""
 
     def load(port: int, seconds: float) -> int:
+        """Send the requests again and again on all connections, which read apart; the
+        bytes sent.
+        """
         until = time.monotonic() + seconds
         socks = [dial(port) for _ in range(count)]
         for sock in socks:
@@ -93,6 +96,7 @@ def flood(what: bytes) -> Callable[[int, float], int]:
     """Bytes that are no request, by a connection that is made anew whenever it is cut."""
 
     def load(port: int, seconds: float) -> int:
+        """Send on one connection, and on another whenever it is closed; the bytes sent."""
         until, sent = time.monotonic() + seconds, 0
         while time.monotonic() < until:
             with contextlib.suppress(OSError), dial(port) as sock:
@@ -111,10 +115,16 @@ def asking(
     """`count` connections that send these lines in turn, each after the answer to the last."""
 
     def load(port: int, seconds: float) -> int:
+        """Ask and wait for answers on all connections; the number of answers."""
         until = time.monotonic() + seconds
         done = [0]
 
         def one() -> None:
+            """Ask on a connection of its own until the time is over, at least each line
+            once.
+
+            An end of the connection raises AssertionError.
+            """
             sock = dial(port)
             file = sock.makefile("rb")
             while True:
@@ -168,6 +178,11 @@ def upload(size: int) -> Callable[[int, float], int]:
     """Voxels in MessagePack, 4 MiB a frame, again and again."""
 
     def load(port: int, seconds: float) -> int:
+        """Upload voxels of about `size` bytes in parts of 4 MiB, again and again; the
+        bytes sent.
+
+        The time is looked at before each upload.
+        """
         import msgpack
 
         until, sock, sent = time.monotonic() + seconds, dial(port), 0

@@ -47,6 +47,7 @@ async def client(port: int, seconds: float, asks: bool, result: dict[str, Any]) 
     until = time.monotonic() + seconds
 
     async def ask() -> None:
+        """Ask about twice a second, not in step with others, and note when."""
         number = 0
         await asyncio.sleep(random.uniform(0.0, 0.5))  # people do not ask in step
         while time.monotonic() < until:
@@ -90,6 +91,7 @@ def crowd(port: int, count: int, seconds: float, asks: bool, pipe: Any) -> None:
     """Run many clients in one process, and send their counts by the pipe."""
 
     async def main() -> dict[str, Any]:
+        """Run the clients, and return what they counted together."""
         result: dict[str, Any] = {"events": 0, "disorder": 0, "lost": 0, "latency": []}
         clients = (client(port, seconds, asks, result) for _ in range(count))
         await asyncio.gather(*clients)

@@ -68,6 +68,7 @@ def variants(node: ast.AST) -> list[ast.AST]:
     out: list[ast.AST] = []
 
     def changed(**values: object) -> None:
+        """Add a copy of the node with other values."""
         other = copy.copy(node)
         for name, value in values.items():
             setattr(other, name, value)

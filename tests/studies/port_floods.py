@@ -121,6 +121,9 @@ def flood(port: int, a_minute: int, made: Any, alone: bool) -> None:
         real_time(os.getpid())  # else a busy machine makes the flood a small one
 
     async def work() -> None:
+        """Open drawn connections at the rate asked, sockets and HTTP in turns, without an
+        end.
+        """
         rng, open_ = random.Random(port), set[asyncio.Task[bytes]]()
         begun = time.monotonic()
         for i in itertools.count(1):

@@ -45,6 +45,7 @@ def own_link(port: Any) -> None:
     tasks = set()
 
     async def serve(link: FrameLink, body: Any) -> None:
+        """Answer one request as the projector would."""
         asked: Any = frames.unpack(body)
         if asked.method == "project":
             answer: Any = image.encode(ARRAYS[asked.params["volume"]])
@@ -60,6 +61,7 @@ def own_link(port: Any) -> None:
         task.add_done_callback(tasks.discard)
 
     async def main() -> None:
+        """Listen on a free port, tell it, and serve without an end."""
         made = await asyncio.get_running_loop().create_server(
             lambda: FrameLink(on_frame, lambda *_: None, lambda *_: None), "127.0.0.1", 0
         )
@@ -93,6 +95,7 @@ def shell(port: Any) -> None:
     """Serve over the twin's shell."""
 
     async def main() -> None:
+        """Listen on a free port with the twin's shell, tell it, and serve without an end."""
         limits = ConnectionLimits(requests_per_s=None)
         app: Any = Answers()
         made = await tcp.serve(app.open, limits=limits, methods=PROJECTOR_METHODS)

@@ -103,6 +103,9 @@ def judged(seed: int, number: int) -> Outcome | None:
     uniform &= truth > 0.0
 
     def error(images: np.ndarray) -> float:
+        """Root mean square error of a reconstruction of the images, where the truth is
+        uniform [1/mm].
+        """
         volume = fdk_parts(
             lambda: [images.copy()],
             scan.geometry,

@@ -95,6 +95,7 @@ class SlowLink:
         )
 
         async def deliver() -> None:
+            """Write what comes at its time; empty data close the connection and end this."""
             while True:
                 due, data = await line.get()
                 await asyncio.sleep(max(0.0, due - time.monotonic()))

@@ -74,6 +74,7 @@ class Rig:
     day: float = 1.0
 
     def __post_init__(self) -> None:
+        """Draw the limits, rates and places of all axes and the times of all commands."""
         rng = self.rng
         for axis in AXES:
             low, high = -rng.uniform(100, 400), rng.uniform(500, 1500)

@@ -58,6 +58,7 @@ def launcher(
     """
 
     def launch() -> None:
+        """Compute the views, or add what they spread to the voxels."""
         pixels = images._ary.reshape(len(views), *shape)
         if not transposed:
             out = np.empty(pixels.shape, np.float32)

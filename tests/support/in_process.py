@@ -159,6 +159,7 @@ class Lab:
         self.options = {"speed_up": "max", **options}
 
     async def __aenter__(self) -> Lab:
+        """Start the twin server with the chiral phantom on the stage."""
         self.twin = TwinServer(M, P, self.projector, open_data(self.root), **self.options)
         await self.twin.start(Sample("chiral"))
         self.count = 0

@@ -395,6 +395,7 @@ class Subject:
         rng, m, out = self.rng, self.model, list[tuple[str, Callable[[], bool]]]()
 
         def move(axis: str, step: float) -> Callable[[], bool]:
+            """A request that moves an axis by a step."""
             return lambda: self.do(
                 f"move {axis} {step:.3g}",
                 lambda s: s.move({axis: step}, self.now, relative=True),
@@ -406,7 +407,12 @@ class Subject:
             )
 
         def halted(axis: str, step: float, part: float, verb: str) -> Callable[[], bool]:
+            """A request that moves an axis, and stops it by `verb` after a part of the
+            way's time.
+            """
+
             def ask() -> bool:
+                """Move and stop; whether the move was accepted. An E-stop is reset."""
                 name = f"{verb} in move {axis} {step:.3g}"
                 accepted = self.do(
                     name,
@@ -423,14 +429,20 @@ class Subject:
             return ask
 
         def correct(name: str, size: float) -> Callable[[], bool]:
+            """A request that adds `size` to one value of the correction."""
+
             def ask() -> bool:
+                """Change the correction; whether it was accepted."""
                 now = {**self.correction, name: self.correction.get(name, 0.0) + size}
                 return self.change(self.which, now)
 
             return ask
 
         def to_and_fro(other: int) -> Callable[[], bool]:
+            """A request that puts another sample on the stage and takes it back."""
+
             def ask() -> bool:
+                """Change the sample and back; false as soon as one change is refused."""
                 back, old = self.which, dict(self.correction)
                 return self.change(other, old) and self.change(back, old)
 
@@ -570,6 +582,7 @@ def profile(
     whole = 2.0 * rising + ((way - top * rising) / top if top > 0.0 else 0.0)
 
     def at(t: Array) -> Array:
+        """Positions at times from the begin [s]."""
         t = np.clip(t, 0.0, whole)
         late = whole - t
         middle = 0.5 * top * rising + top * (t - rising)

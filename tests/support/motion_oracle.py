@@ -1003,6 +1003,9 @@ class Watch:
         def report(
             kind: str, over: Array, value: Array, allowed: Array, slack: float
         ) -> None:
+            """Add a violation for each motor that is over by more than the slack; the
+            worst stretch tells.
+            """
             excess = over.max(axis=0)
             for j in np.flatnonzero(excess > slack * (1.0 + np.abs(allowed))).tolist():
                 i = int(np.argmax(over[:, j]))

@@ -217,6 +217,9 @@ class Disk:
             before = self._keep(target)
 
             def back() -> None:
+                """Take the renaming back: the new file gets its old name, and what was
+                replaced comes back.
+                """
                 if target.exists():
                     REAL["replace"](target, source)
                 if before is not None:

@@ -104,6 +104,9 @@ class Simulation:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Kill the server, if one runs, and leave the system's calls and the log to
+        themselves.
+        """
         try:
             self.kill()
         finally:

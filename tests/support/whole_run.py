@@ -67,6 +67,9 @@ def job(name: str) -> Step:
     """
 
     def step(run: Part) -> None:
+        """Wait for the job to be done, and let it go on where it waits or has ended
+        early.
+        """
         for _ in range(TRIES):
             for _ in range(2000):
                 jobs = run.sim.call(run.client, "job.list")["jobs"]

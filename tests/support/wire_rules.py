@@ -185,6 +185,9 @@ class WireEpisode:
         self._leases: list[tuple[float, str]] = []
 
     def __enter__(self) -> WireEpisode:
+        """Start the server, watch its scanner, and put motors and sample where the start
+        says.
+        """
         self.sim.__enter__()
         store.mesh_apart, self._apart = read_here, store.mesh_apart
         self._begin()
@@ -235,6 +238,7 @@ class WireEpisode:
 
         @functools.wraps(ask)
         def seen(*args: Any, **kwargs: Any) -> Any:
+            """Look, call the method, and judge or note what it has put on the stage."""
             self.look()
             now, stage = self._last, (scanner.sample, scanner.correction)
             try:

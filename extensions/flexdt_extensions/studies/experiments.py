@@ -162,6 +162,9 @@ def scenario(name: str, frames: int, variant: str = "printed") -> tuple[Poses, O
 def placement_scenario(setting: str, frames: int) -> tuple[list[Poses], Offsets]:
     """Make the poses of each placement of experiment 6.6 in a setting (1, 2 or 8
     placements), and the true offsets.
+
+    Raises:
+        KeyError: there is no such setting.
     """
     table = placements()
     poses, _ = scenario(table["scenario"], frames)
