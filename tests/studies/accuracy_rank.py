@@ -50,8 +50,16 @@ class Stated:
 
 
 def judged(seed: int, number: int) -> Stated | None:
-    """Compare what is stated of a drawn scan with the truth; None of too few uniform
-    regions."""
+    """Compare what is stated of a drawn scan's accuracy with its true errors in uniform
+    regions.
+
+    Args:
+        seed, number: of the draw; the same give the same scan.
+
+    Returns:
+        None for a scan that is cut off or refused, without an accuracy, or with fewer
+        than FEWEST_REGIONS regions.
+    """
     scan = replace(bias_bound.drawn(seed, number), counts=0.0)
     if " cut " in scan.said:
         return None

@@ -85,7 +85,15 @@ def arguments(text: str) -> Iterator[tuple[str, dict[str, object]]]:
 
 
 def followed(kind: str, seed: int) -> list[Followed]:
-    """Calibrate a drawn scan, and once more with each argument that is advised."""
+    """Calibrate a drawn scan, and once more with each argument that its findings advise.
+
+    Args:
+        kind: of scan.
+        seed: the same gives the same scan.
+
+    Returns:
+        One for each argument advised; a refusal counts as not offered.
+    """
     scan = drawn(kind, seed)
     first = calibrated(scan)
     before = worst_error(first, scan)[0] if first.identifiable else 0.0

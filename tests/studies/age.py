@@ -131,7 +131,15 @@ class Old:
         return str(self.wire.call("script.submit", text=text, name=name, seed=1)["job"])
 
     def age(self, jobs: int, uploads: int, corrections: int, scans: int) -> None:
-        """Add until there are so many."""
+        """Add to the directory until it has so many of each, and start the twin twice on
+        it.
+
+        The second start is the one whose time stays in `start_s`.
+
+        Args:
+            jobs, uploads, corrections, scans: how many there are to be; what there is
+                more stays.
+        """
         for i in range(self.uploads, uploads):
             self.upload(f"upload-{i}", i)
             if i % SHOWN_EACH == 0:
@@ -156,7 +164,9 @@ class Old:
         self.start()
 
     def _add_jobs(self, count: int) -> None:
-        """As an earlier version's state has them."""
+        """Add finished jobs to the state file, as an earlier version wrote them; no twin
+        may run.
+        """
         file = self.data / "state.json"
         state: dict[str, Any] = json.loads(file.read_text())
         made = state["jobs_made"]
@@ -172,7 +182,15 @@ class Old:
     def _each(
         self, ask: Callable[[int], object], count: int
     ) -> tuple[float, float, list[float]]:
-        """Processor time [ms] and bytes written a request, and latencies [ms]."""
+        """Make requests one after the other, from rest to rest.
+
+        Args:
+            ask: makes the i-th.
+            count: how many.
+
+        Returns:
+            Processor time [ms] and bytes written a request, and all latencies [ms].
+        """
         self._settle()
         used, written, times = self.twin.processor_s(), written_bytes(self.twin), []
         for i in range(count):
@@ -187,7 +205,7 @@ class Old:
         time.sleep(0.5)  # what is written later is written
 
     def measured(self) -> Figures:
-        """What it costs now."""
+        """Measure what requests cost now; each call uploads, scans and stores more."""
         call, n = self.wire.call, self.requests
         self.probes += 1
         new = f"probe-{self.probes}"

@@ -551,7 +551,15 @@ def distance_wrong(s: Scan, rng: Rng) -> None:
 
 
 def scan(kinds: list[str], seed: int) -> tuple[Scan, Rng]:
-    """An object and a scanner, with faults."""
+    """Draw an object and a scanner, and put faults into them.
+
+    Args:
+        kinds: of faults, by the names of their functions, in that order.
+        seed: the same kinds and seed give the same scan.
+
+    Returns:
+        The scan, and the generator for what is drawn next.
+    """
     rng = np.random.default_rng([seed, *(zlib.crc32(k.encode()) for k in kinds)])
     binning, n = int(rng.choice([4, 5, 6])), int(rng.integers(60, 121))
     plain = Hidden(n, (760 // binning, 956 // binning), PIXEL * binning)
@@ -573,7 +581,9 @@ def lines(s: Scan) -> np.ndarray:
 
 
 def seen(s: Scan, beyond: float) -> np.ndarray:
-    """Of a panel that is so many pixels further to the right."""
+    """Line integrals (views, rows, cols) on a panel that stands `beyond` pixels further
+    to the right.
+    """
     hidden, rays = s.hidden, s.rays
     rows, cols = hidden.shape
     out = np.empty((hidden.views, rows, cols), dtype=np.float32)
@@ -596,7 +606,11 @@ def seen(s: Scan, beyond: float) -> np.ndarray:
 
 
 def images(s: Scan, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Counts of all frames, and the flat image."""
+    """Expose the scan, with scatter, blur, lag and noise where it has them.
+
+    Returns:
+        Counts of all frames, and the flat image.
+    """
     rows, cols = s.hidden.shape
     g = lines(s)
     if s.swapped:
@@ -622,7 +636,16 @@ def images(s: Scan, rng: Rng) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tried(kinds: list[str], seed: int, per_frame: bool) -> dict[str, Any]:
-    """What was told of one scan: errors over sigmas, or why not."""
+    """Align one scan, and compare what is told with the truth.
+
+    Args:
+        kinds, seed: see `scan`.
+        per_frame: estimate a shift of each frame.
+
+    Returns:
+        Kinds, refusals, warnings, and errors over sigmas by name (none where nothing is
+        told).
+    """
     s, rng = scan(kinds, seed)
     counts, flat = images(s, rng)
     hidden, n = s.hidden, s.hidden.views
@@ -709,7 +732,15 @@ def untold(*_: object) -> NoReturn:
 
 
 def summary(runs: list[dict[str, Any]], sigmas: float) -> int:
-    """Prints a line for each kind; 1 where anything is too far off."""
+    """Print a line for each kind and one for each scan too far off.
+
+    Args:
+        runs: of `tried`.
+        sigmas: from where an error is too large.
+
+    Returns:
+        1 if any is, else 0.
+    """
     of_kind = defaultdict(list)
     for run in runs:
         of_kind[run["kinds"][0]].append(run)

@@ -92,7 +92,15 @@ def by_signatures(function: Callable[..., Any], text: str) -> Check:
 
 
 def by_pydantic_alone(function: Callable[..., Any], text: str) -> Check:
-    """Check by validate_call as it comes; its "should be" counts as "must be"."""
+    """Check by validate_call as it comes; its "should be" counts as "must be".
+
+    Args:
+        function: whose arguments they are.
+        text: its documentation, which is not used.
+
+    Returns:
+        The check; it raises `signatures.ArgumentError`.
+    """
     from pydantic import ConfigDict, ValidationError, validate_call
 
     def arguments(*given: Any, **named: Any) -> Arguments:
@@ -146,7 +154,10 @@ def by_pydantic(*, strict: bool) -> Callable[[Callable[..., Any], str], Check]:
 
 def resolved(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function with the same parameters that returns its arguments; annotations are
-    objects."""
+    objects.
+
+    Texts of annotations are evaluated among the function's own names.
+    """
     numpy_types = types.SimpleNamespace(
         ArrayLike=signatures.Array, NDArray=signatures.Array
     )
@@ -209,7 +220,16 @@ def _as_instance(kind: type, value: Any) -> Any:
 def sentence(
     function: Callable[..., Any], where: str, error: Any, call: Arguments
 ) -> str:
-    """What pydantic says of the first argument that does not hold, as one sentence."""
+    """What pydantic says of the first argument that does not hold, as one sentence.
+
+    An unknown argument comes before all others.
+
+    Args:
+        function: whose arguments they are.
+        where: its name for the user.
+        error: pydantic's.
+        call: the arguments given.
+    """
     takes = inspect.signature(function).parameters
     found = error.errors(include_url=False)
     unknown = (one for one in found if one["type"] == "unexpected_keyword_argument")
@@ -290,7 +310,15 @@ class Checks:
 
 
 def measured(way: str) -> dict[str, Any]:
-    """What a way answers, refuses and costs."""
+    """What a way answers, refuses and costs; it stays in place of the own checks for the
+    process.
+
+    Args:
+        way: one of WAYS.
+
+    Returns:
+        Counts, times and texts, for JSON.
+    """
     checks = Checks(WAYS[way]())
     signatures._checked = checks  # type: ignore[assignment]
     from tests.face import test_mistakes as mistakes

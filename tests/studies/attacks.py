@@ -55,7 +55,17 @@ class Ground:
         return Wire(self.twin.port)
 
     def raw(self, data: bytes, *, port: int | None = None, wait_s: float = 20.0) -> bytes:
-        """Send bytes, then read until a line, an end or a timeout."""
+        """Send bytes over a connection of its own, then read until a line, an end or a
+        timeout.
+
+        Args:
+            data: to send.
+            port: of the twin where it is None.
+            wait_s: for each part.
+
+        Returns:
+            What came, perhaps nothing.
+        """
         with socket.create_connection(
             ("127.0.0.1", port or self.twin.port), timeout=wait_s
         ) as s:

@@ -121,7 +121,11 @@ class Scan:
 
 
 def drawn(seed: int, number: int) -> Scan:
-    """A scan that somebody could make."""
+    """Draw a scan that somebody could make: angles, panel, solids, noise and drift.
+
+    Args:
+        seed, number: the same give the same scan.
+    """
     rng = np.random.default_rng([seed, number])
     rows, cols = int(rng.integers(32, 73)), int(rng.integers(56, 105))
     field = 20.0  # radius of the field of view of a panel in the middle [mm]

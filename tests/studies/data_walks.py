@@ -115,7 +115,11 @@ def move_to_image(walk: Walk) -> None:
 
 
 def script_to_files(walk: Walk) -> None:
-    """Submit a scan script, and wait until its data set is complete."""
+    """Submit a scan script, and wait until its data set is complete.
+
+    Raises:
+        SystemExit: the job ended otherwise.
+    """
     from flexdt.testing import twin
 
     lines = [

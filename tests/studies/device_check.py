@@ -114,7 +114,16 @@ class Check:
         return self._ends - time.monotonic()
 
     def part(self, name: str, needs_s: float, work: Callable[[], object]) -> Any:
-        """Run a part and write the document; None where it is not begun or fails."""
+        """Run a part and write the document, with the seconds that it took.
+
+        Args:
+            name: in the document.
+            needs_s: the part is not begun if less is left.
+            work: makes what is kept, which JSON has to hold.
+
+        Returns:
+            What it made; None if it is not begun or fails (then `failed` is set).
+        """
         found: Any = None
         if self.left_s < needs_s:
             self.document[name] = (
@@ -172,7 +181,12 @@ def machine() -> Document:
 
 
 def drawn_geometries(sizes: Sizes, left_s: float) -> Document:
-    """Forward and adjoint of drawn geometries against double precision."""
+    """Compare forward and adjoint of drawn geometries with double precision.
+
+    Args:
+        sizes: how many and how large.
+        left_s: seconds left; it takes GEOMETRIES_S at most.
+    """
     import gpu_geometries
 
     count, most = sizes.geometries
@@ -187,7 +201,16 @@ def drawn_geometries(sizes: Sizes, left_s: float) -> Document:
 
 
 def projections(name: str, sizes: Sizes) -> Document:
-    """Kernels of one volume beside ASTRA's and the bound; ms a view, but for `call_ms`."""
+    """Time the kernels of one volume beside ASTRA's and the bound, and measure their
+    errors.
+
+    Args:
+        name: of the volume.
+        sizes: of panel, volumes and numbers of views.
+
+    Returns:
+        By the number of views; ms a view, but for `call_ms` of a whole call.
+    """
     from flexdt.measuring import box_of, gpu, voxel_rays
     from flexdt.twin.projection import back, forward
     from flexdt_extensions.bench import device_page as page
@@ -238,7 +261,7 @@ def projections(name: str, sizes: Sizes) -> Document:
 
 
 def scanned(views: int, what: str, sizes: Sizes) -> np.ndarray[Any, Any]:
-    """Line integrals of one of `FDK_OBJECTS`, (views, rows, cols)."""
+    """Line integrals (views, rows, cols) of one of `FDK_OBJECTS`, with its noise."""
     from noise_cost import image_of
 
     radius_mm, sigma = FDK_OBJECTS[what]
@@ -253,7 +276,17 @@ def scanned(views: int, what: str, sizes: Sizes) -> np.ndarray[Any, Any]:
 
 
 def reconstruction(views: int, what: str, errors: bool, sizes: Sizes) -> Document:
-    """FDK of a cylinder from host to host [s], and what it found of it."""
+    """Time FDK of a cylinder from host to host, the least of FDK_ROUNDS, and its sigma.
+
+    Args:
+        views: how many.
+        what: one of FDK_OBJECTS.
+        errors: with an estimate of them.
+        sizes: of panel and grid.
+
+    Returns:
+        Seconds, the middle over its true value, and what was found beside the volume.
+    """
     from flexdt.twin.projection import Volume
     from flexdt.twin.reconstruction import fdk
     from flexdt_extensions.bench.benchmark import circle
@@ -286,7 +319,7 @@ def reconstruction(views: int, what: str, errors: bool, sizes: Sizes) -> Documen
 
 
 def run(check: Check, sizes: Sizes) -> None:
-    """All parts in order."""
+    """Do all parts in order; those for which the time is short are left out."""
     check.part("machine", 0.0, machine)
     check.part("geometries", 30.0, lambda: drawn_geometries(sizes, check.left_s - 20.0))
     check.part("C1", 20.0, lambda: projections("C1", sizes))

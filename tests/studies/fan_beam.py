@@ -72,7 +72,17 @@ def _spread(lines, pitch, size, voxel, out):  # type: ignore[no-untyped-def]
 
 
 def plain(lines: np.ndarray, pitch: float, size: int, voxel: float) -> np.ndarray:
-    """The slice (size, size) [1/mm]."""
+    """Reconstruct one row by filter and plain loop.
+
+    Args:
+        lines: line integrals (views, 1, cols) of a whole circle.
+        pitch: of the columns [mm].
+        size: pixels of the slice's side.
+        voxel: their width [mm].
+
+    Returns:
+        The slice (size, size) [1/mm].
+    """
     views, cols = lines.shape[0], lines.shape[2]
     scaled = pitch * SOD / SDD
     at = (np.arange(cols) - (cols - 1) / 2) * scaled

@@ -52,7 +52,15 @@ def undisturbed(root: Path) -> dict[str, tuple[Path | None, Part]]:
 
 
 def disk(root: Path, seeds: int) -> int:
-    """Every n, every way; returns how many runs went wrong."""
+    """Let each change of each part's files fail, in every way of WAYS.
+
+    Args:
+        root: an empty folder.
+        seeds: how many runs of each.
+
+    Returns:
+        How many runs went wrong; each is printed.
+    """
     parts = undisturbed(root / "right")
     runs, wrong, told = 0, 0, 0
     for seed in range(seeds):
@@ -94,7 +102,16 @@ def damaged(file: Path, rng: random.Random) -> str:
 
 
 def flips(root: Path, count: int, rng: random.Random) -> int:
-    """Damaged files, one at a time; returns how many servers did not start or answer."""
+    """Damage files of a data directory, one at a time, and start a server on it.
+
+    Args:
+        root: an empty folder.
+        count: how many.
+        rng: draws file and damage.
+
+    Returns:
+        How many servers did not start or answer; each is printed.
+    """
     parts = undisturbed(root / "right")
     # At the end of the run, and in the middle of a scan.
     whole = parts["abort"][1].sim.data
@@ -135,7 +152,16 @@ def flips(root: Path, count: int, rng: random.Random) -> int:
 
 
 def starts(folder: Path, seed: int) -> int:
-    """Start a server on it, ask it everything, resume what can be, scan; files set aside."""
+    """Start a server on a directory, ask it everything, resume what can be, scan, and
+    start again.
+
+    Returns:
+        How many files were set aside.
+
+    Raises:
+        AssertionError: the new scan is not done, or a traceback was logged.
+        Exception: a question was not answered.
+    """
     with Simulation(folder, seed, speed_up="max") as sim:
         sim.start()
         client = sim.client()
@@ -214,8 +240,14 @@ class Writes:
         )  # fmt: skip
 
     def scan(self, wire: Wire, *, full: bool = False) -> None:
-        """Submit the scan, or go on with it, to its end; on a disk that will stay full, until
-        the scan waits for room.
+        """Submit the scan, or go on with it, to its end.
+
+        Args:
+            wire: to the twin.
+            full: the disk will stay full: wait only until the scan waits for room.
+
+        Raises:
+            AssertionError: it does not come to that in 200 s.
         """
         jobs = [j for j in wire.call("job.list")["jobs"] if j["name"] == "scan"]
         if not jobs:
@@ -296,7 +328,7 @@ class Writes:
 
     @staticmethod
     def look(wire: Wire) -> dict[str, Any]:
-        """What is to survive."""
+        """What is to survive, as clients see it, by short names."""
         state, correction = (
             wire.call("state.get"),
             wire.call("calibration.get")["correction"],
@@ -316,7 +348,11 @@ CHANGES_OF_A_ROUND = 110
 
 
 def writes(root: Path, count: int, rng: random.Random) -> int:
-    """Drawn faults over real servers; returns what was wrong."""
+    """Let drawn file operations of real servers fail, and kill them.
+
+    Returns:
+        How many things were wrong afterwards.
+    """
     w = Writes(root)
     try:
         w.round(0, None)

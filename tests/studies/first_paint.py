@@ -29,7 +29,14 @@ PAINT = "performance.getEntriesByName('first-contentful-paint')[0].startTime"
 
 
 def opened(context: Any, url: str) -> tuple[float, float, float, float]:
-    """Seconds to paint, picture and live scene, and MB."""
+    """Open the page and wait for its live scene.
+
+    Returns:
+        Seconds to first paint, picture and live scene, and MB received.
+
+    Raises:
+        AssertionError: there is no scene in PATIENCE_S.
+    """
     page, size = context.new_page(), [0.0]
     network = context.new_cdp_session(page)
     network.send("Network.enable")

@@ -216,7 +216,11 @@ FLOODS: dict[str, tuple[str, Callable[[Ports], Awaitable[None]]]] = {
 
 @contextlib.asynccontextmanager
 async def program(ports: Ports) -> AsyncIterator[tuple[Any, Any]]:
-    """A program's two sockets."""
+    """A program's two sockets at the gateway; they are closed at the end.
+
+    Yields:
+        The one that hears, and the one that says.
+    """
     context = zmq.asyncio.Context()
     hear, say = context.socket(zmq.SUB), context.socket(zmq.PUB)
     hear.subscribe(b"")
@@ -282,7 +286,17 @@ def attack(ports: Ports, name: str) -> None:
 
 
 async def trial(ports: Ports, name: str, seconds: float) -> bool:
-    """One flood; prints what came of it, and whether all went well."""
+    """Flood a server for some seconds while somebody honest asks, and print what came of
+    it.
+
+    Args:
+        ports: of the servers.
+        name: one of FLOODS.
+        seconds: how long, after it has begun.
+
+    Returns:
+        Whether the servers live, no error was internal, and answers came.
+    """
     module, _ = FLOODS[name]
     honest = Honest()
     asks = honest.program if module == "flexdt.clients.gateway.main" else honest.page
@@ -326,7 +340,14 @@ lines."""
 
 
 def strangers(port: int, seed: int, made: Any, alone: bool) -> None:
-    """In a process of its own: connections at an even rate, counted, until it is killed."""
+    """In a process of its own: open connections at an even rate until it is killed.
+
+    Args:
+        port: of the twin.
+        seed: of what they say.
+        made: shared number; counts them.
+        alone: the machine is; then the process becomes real-time.
+    """
     if alone:
         real_time(0)  # else a busy machine makes the flood a small one
 
@@ -345,7 +366,12 @@ def strangers(port: int, seed: int, made: Any, alone: bool) -> None:
 
 
 async def client(port: int, source: str) -> dict[str, float]:
-    """A new client with the token: answer -> time from before it connected [ms]."""
+    """Connect with the token from an address; hello, ping and E-stop one after the other.
+
+    Returns:
+        Answer -> time from before it connected [ms]; those are missing that did not come
+        in PATIENCE_S or were errors.
+    """
     begun, times = time.perf_counter(), dict[str, float]()
     with contextlib.suppress(OSError, TimeoutError):
         async with asyncio.timeout(PATIENCE_S):
@@ -393,7 +419,18 @@ def real_time(pid: int) -> None:
 
 
 async def part(count: int, folder: Path, *, flood: bool, full: bool, alone: bool) -> bool:
-    """So many new clients of one twin; prints their times, returns whether all was well."""
+    """Let new clients come to one twin, print their times, and end it.
+
+    Args:
+        count: of clients.
+        folder: an empty one.
+        flood: with strangers beside.
+        full: all places are taken.
+        alone: the machine is; then processes become real-time.
+
+    Returns:
+        Whether all was well.
+    """
     secret = folder / "token"
     secret.write_text(TOKEN)
     limit = f"max_clients={PLACES}"
@@ -452,7 +489,14 @@ def logged(log: Path) -> int:
 
 
 async def connections(count: int, *, alone: bool) -> bool:
-    """New clients without the flood, beside it, and beside it with all places taken."""
+    """Let new clients come without the flood, beside it, and beside it with all places
+    taken.
+
+    A table is printed.
+
+    Returns:
+        Whether all was well.
+    """
     sound, stalls = True, Stalls()
     print("| connections a minute | places | clients from | | answered | beyond 100 ms | p50 | "
           "p99 | p99.9 | worst | processor | log in an hour |")  # fmt: skip

@@ -107,8 +107,9 @@ class Bench:
 
 
 async def ages(count: int, rng: random.Random) -> list[float]:
-    """From a published position to the mirror that has it, while the script's rest is
-    checked."""
+    """Times from a published position to the mirror that has it [s], while the script's
+    rest is checked.
+    """
     out = []
     async with Bench() as bench:
         await bench.say(event(1, ("mag_obj", "move absolute", "300")))

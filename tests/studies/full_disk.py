@@ -47,7 +47,16 @@ def one_history(seed: int) -> tuple[int, int, int, str]:
 
 
 def simulated(count: int, seed: int, jobs: int) -> list[str]:
-    """Live the histories; returns what was lost."""
+    """Live histories on a simulated full disk, in several processes.
+
+    Args:
+        count: how many.
+        seed: of the first.
+        jobs: processes.
+
+    Returns:
+        What was lost, a text for each history that lost something.
+    """
     begun = time.process_time()
     with ProcessPoolExecutor(jobs) as pool:
         found = list(pool.map(one_history, range(seed, seed + count)))
@@ -108,7 +117,15 @@ class SmallDisk:
 
 
 def fill_by_uploads(port: int) -> int:
-    """Upload as an observer until that is refused; returns how many bytes were taken."""
+    """Upload as an observer until that is refused for want of room.
+
+    Returns:
+        How many bytes were taken.
+
+    Raises:
+        Refused: an upload was refused for another reason.
+        AssertionError: 200 uploads were not refused.
+    """
     wire, taken = Wire(port), 0
     for number in range(200):
         voxels = {"shape": [64, 64, 64], "voxel_mm": [0.1, 0.1, 0.1], "kind": "voxels"}
@@ -171,7 +188,11 @@ def one_life(disk: SmallDisk, rng: random.Random) -> list[str]:
 
 
 def real(count: int, seed: int, *, ext4: bool) -> list[str]:
-    """Live so many lives; returns what went wrong."""
+    """Live so many lives of a twin on a real full disk.
+
+    Returns:
+        What went wrong, a text for each.
+    """
     wrong = []
     for number in range(count):
         with tempfile.TemporaryDirectory() as folder:

@@ -164,7 +164,17 @@ def write(folder: Path, fraction: float) -> None:
 def reconstruct(
     folder: Path, out: Path, memory: int | None, voxel: float | None
 ) -> dict[str, Any]:
-    """Reconstruct in this process, and say what it took."""
+    """Reconstruct a folder in this process, and tell of it meanwhile.
+
+    Args:
+        folder: the scan.
+        out: of the volume.
+        memory: [bytes] to keep to; None for what the machine has.
+        voxel: [mm]; None for the pixel at the axis.
+
+    Returns:
+        Times, memory, reads and accuracy, for JSON.
+    """
     reads, read = [0], image_set.read_image
 
     def counted(path: Path, shape: tuple[int, int] | None = None) -> np.ndarray:
@@ -286,6 +296,10 @@ def held(fraction: float, radius: float) -> None:
 def plan(fraction: float, memory: int) -> None:
     """Print slabs, bytes on disk and rows that slabs read, and the same of slabs of 512
     MiB.
+
+    Args:
+        fraction: of the full size, in each direction.
+        memory: to plan for [bytes].
     """
     views, rows, cols, pixel = sizes(fraction)
     scan, shape = scan_of(views, rows, cols, pixel), (rows, cols)
@@ -300,7 +314,9 @@ def plan(fraction: float, memory: int) -> None:
 
 
 def part_of(fraction: float) -> tuple[ConeVec, tuple[int, int], Grid, slice]:
-    """The scan, its shape, a slab in the middle and the rows in its shadow."""
+    """The scan, its rows and columns, the grid of a slab in the middle, and the rows in
+    its shadow.
+    """
     views, rows, cols, pixel = sizes(fraction)
     scan = scan_of(views, rows, cols, pixel)
     voxel = round(pixel * SOD_MM / SDD_MM, 4)
@@ -314,7 +330,14 @@ def part_of(fraction: float) -> tuple[ConeVec, tuple[int, int], Grid, slice]:
 
 
 def beside_rtk(who: str, fraction: float, out: Path) -> None:
-    """Make the slab in this process, and say what it took beside making the images."""
+    """Make the slab in this process, save it, and print time and memory beside making the
+    images.
+
+    Args:
+        who: "flexdt", or anything else for RTK.
+        fraction: of the full size, in each direction.
+        out: NumPy file.
+    """
     scan, shape, grid, rows = part_of(fraction)
     shadows = Shadows(scan, shape)
     images = np.empty((len(scan), rows.stop - rows.start, shape[1]), np.float32)
@@ -338,7 +361,19 @@ def beside_rtk(who: str, fraction: float, out: Path) -> None:
 def by_rtk(
     images: np.ndarray, scan: ConeVec, shape: tuple[int, int], grid: Grid, rows: slice
 ) -> np.ndarray:
-    """RTK's (x, y, z) is our (x, z, -y), and its detector rows grow upwards."""
+    """Reconstruct the slab by RTK.
+
+    RTK's (x, y, z) is our (x, z, -y), and its detector rows grow upwards.
+
+    Args:
+        images: of `rows` only.
+        scan, shape: the geometry, and rows and columns of whole images.
+        grid: the slab.
+        rows: which ones.
+
+    Returns:
+        The volume in our axes.
+    """
     import itk
     from itk import RTK as rtk
 

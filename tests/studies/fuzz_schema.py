@@ -212,7 +212,19 @@ class Maker:
     def _change(
         self, method: str, schema: Schema, params: dict[str, Any], name: str
     ) -> Path:
-        """Make one value below `name` absurd; returns where."""
+        """Make one value below the field `name` absurd, remove it, or add a field to it.
+
+        The field is drawn first if it is not there.
+
+        Args:
+            method: by name.
+            schema: of its parameters.
+            params: changed.
+            name: of the field.
+
+        Returns:
+            The place changed.
+        """
         rng = self.rng
         if name not in params:
             params[name] = self._one(name, schema["properties"][name])
@@ -237,7 +249,9 @@ class Maker:
         return tuple(path)
 
     def valid(self, method: str) -> dict[str, Any]:
-        """Parameters in order."""
+        """Draw parameters that are in order; optional fields are left out more often than
+        not.
+        """
         made = self._valid.get(method)
         if made:
             return copy.deepcopy(
@@ -263,7 +277,14 @@ class Maker:
 
 
 def fault(said: Said, answer: dict[str, Any]) -> str | None:
-    """What is wrong with an answer, if anything."""
+    """What is wrong with an answer, if anything.
+
+    A message that the schema forbids has to be refused with -32602 and the place named;
+    one that it allows may be refused otherwise, but not with an internal error.
+
+    Returns:
+        None if nothing is.
+    """
     error = answer.get("error")
     if error is None:
         return None if said.allowed else "accepted what its schema does not allow"
@@ -379,7 +400,11 @@ class Sender:
         return Said(said.document, broken=sent)
 
     def send(self, batch: list[Said]) -> None:
-        """Send them, read until each is answered."""
+        """Send a batch over a new connection, and read until each message is answered.
+
+        What stays unanswered is kept as a problem. `stuck` is called where nothing comes
+        for QUIET_S.
+        """
         encode = _packed if self.frames else _line
         parts, waiting = [], {}
         for i, said in enumerate(batch):
@@ -469,7 +494,12 @@ def _send(s: socket.socket, data: bytes) -> None:
 
 
 def _answers(buffer: bytearray, frames: bool) -> Iterator[dict[str, Any]]:
-    """Whole answers, taken out of the buffer."""
+    """Take whole answers out of the buffer; what is left waits for more bytes.
+
+    Args:
+        buffer: what has come; changed.
+        frames: MessagePack frames; otherwise JSON lines, of which events are left out.
+    """
     while True:
         if frames:
             size = (
@@ -836,7 +866,13 @@ ODD_CELLS = [
 
 
 def scripted(rng: random.Random, texts: list[str]) -> str:
-    """Some lines of a script, with cells that do not belong there."""
+    """Some lines of a script, with up to six changes: strange, missing, mixed cells,
+    repeated lines.
+
+    Args:
+        rng: draws all.
+        texts: scripts.
+    """
     lines = rng.choice(texts).splitlines()
     first = rng.randrange(len(lines))
     lines = lines[first : first + rng.randint(1, 25)]
@@ -875,7 +911,13 @@ def methods_of(document: dict[str, Any]) -> dict[str, Schema]:
 def twin_maker(
     document: dict[str, Any], scene: dict[str, Any], rng: random.Random
 ) -> Maker:
-    """Messages to the twin."""
+    """Make what draws messages to the twin.
+
+    Args:
+        document: the twin's OpenRPC document.
+        scene: a saved one, for axes and positions.
+        rng: draws all.
+    """
     axes = list(scene["positions"])
     small = base64.b64encode(np.ones(8, "<f4").tobytes()).decode()
 
@@ -955,7 +997,7 @@ def twin_maker(
 
 
 def projector_maker(port: int, rng: random.Random) -> Maker:
-    """Messages to the projector, whose methods it tells."""
+    """Make what draws messages to a projector; it is asked for its methods."""
     body = _packed({"jsonrpc": "2.0", "id": 1, "method": "rpc.discover"})
     with socket.create_connection(("127.0.0.1", port), timeout=HANGS_S) as s:
         s.sendall(body)
@@ -1006,7 +1048,14 @@ def projector_maker(port: int, rng: random.Random) -> Maker:
 def page_maker(
     document: dict[str, Any], scene: dict[str, Any], rng: random.Random
 ) -> Maker:
-    """Requests of pages: the viewer's own methods, and the twin's that pages may use."""
+    """Make what draws requests of pages: the viewer's own methods, and the twin's that
+    pages may use.
+
+    Args:
+        document: the twin's OpenRPC document.
+        scene: a saved one.
+        rng: draws all.
+    """
     from pydantic.json_schema import models_json_schema
 
     from flexdt.clients.viewer.page import HIDDEN
@@ -1041,7 +1090,18 @@ def page_maker(
 
 
 def fuzz(count: int, seed: str, which: list[str], out: File, most: int) -> int:
-    """Send `count` messages; returns how many kinds of problems there were."""
+    """Send messages to all servers until there are so many, or too many problems.
+
+    Args:
+        count: of messages.
+        seed: of all that is drawn.
+        which: servers.
+        out: file for the problems.
+        most: kinds of problems after which to end.
+
+    Returns:
+        How many kinds of problems there were.
+    """
     begun, done, next_look = time.monotonic(), 0, 0
     series: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -1114,7 +1174,14 @@ def fuzz(count: int, seed: str, which: list[str], out: File, most: int) -> int:
 
 
 def over_plateau(values: list[float]) -> str | None:
-    """What is beyond 10 % and 50 MB of the plateau, the median after the first fifth; [MB]."""
+    """What is beyond 10 % and 50 MB of the plateau, the median after the first fifth.
+
+    Args:
+        values: memory over time [MB].
+
+    Returns:
+        None if nothing is, or fewer than five values are left.
+    """
     after = values[len(values) // 5 :]
     if len(after) < 5:
         return None

@@ -71,7 +71,16 @@ def load_kernels(name: str) -> Any:
 
 
 def compiled(kernel: Any, signature: tuple[Any, ...], ptxas: Path) -> Code:
-    """Compile and assemble a kernel for compute capability 9.0."""
+    """Compile and assemble a kernel for compute capability 9.0.
+
+    Args:
+        kernel: numba's.
+        signature: types of its arguments.
+        ptxas: the assembler.
+
+    Raises:
+        subprocess.CalledProcessError: it is not assembled.
+    """
     from numba import cuda
 
     ptx, _ = cuda.compile_ptx(kernel.py_func, signature, cc=(9, 0))
@@ -92,7 +101,11 @@ def compiled(kernel: Any, signature: tuple[Any, ...], ptxas: Path) -> Code:
 
 def text_section(elf: bytes) -> list[tuple[int, int]]:
     """The machine code of an ELF file with one kernel: (low, high) words of each
-    instruction."""
+    instruction.
+
+    Raises:
+        ValueError: there is none.
+    """
     (table,) = struct.unpack_from("<Q", elf, 40)
     size, count, names = struct.unpack_from("<3H", elf, 58)
     sections = [
@@ -126,7 +139,7 @@ def innermost_loops(words: list[tuple[int, int]]) -> list[list[int]]:
 
 
 def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
-    """Every kernel with the types of its arguments."""
+    """Every kernel by name, with the types of its arguments."""
     from numba import boolean, float32, float64, int32, int64, types
 
     project = load_kernels("projection/kernels/gpu_kernels.py")
@@ -187,7 +200,7 @@ def all_kernels() -> dict[str, tuple[Any, tuple[Any, ...]]]:
 
 
 def faults(name: str, code: Code) -> list[str]:
-    """What is beyond the budget."""
+    """What of a kernel's code is beyond the budget, a text for each; empty if nothing is."""
     loop = code.busiest if code.loops else []
     found = []
     if code.registers > REGISTERS:

@@ -107,7 +107,13 @@ def drawn(numbers: range, seed: int, most: int) -> Iterator[Case]:
 
 
 def drawn_case(draw: Draw, kind: str, most: int) -> Case:
-    """One case of a kind."""
+    """Draw a case of a kind: volume, views and images.
+
+    Args:
+        draw: draws all.
+        kind: see `drawn_view`.
+        most: voxels of a side.
+    """
     counts = draw.integers(2, most + 1, 3)
     if draw.random() < 0.2:
         counts[draw.integers(3)] = draw.integers(1, 3)
@@ -130,7 +136,14 @@ def drawn_case(draw: Draw, kind: str, most: int) -> Case:
 
 
 def drawn_view(draw: Draw, kind: str, radius: float, shape: tuple[int, int]) -> Floats:
-    """A row of a geometry about the origin, for a volume within `radius` [mm]; (12,)."""
+    """Draw a row (12,) of a geometry about the origin.
+
+    Args:
+        draw: draws all.
+        kind: how the view lies; other names give a plain one.
+        radius: of a ball that holds the volume [mm].
+        shape: rows and columns.
+    """
     wide = math.radians(60)
     around, above = draw.uniform(0, 2 * np.pi), draw.uniform(-0.2, 0.2)
     if kind == "diagonal":

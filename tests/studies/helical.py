@@ -45,7 +45,12 @@ def thing(rng: np.random.Generator, height: float) -> list[Part]:
 
 
 def truth(parts: list[Part], z: float) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """A layer, and where it and its neighbours two voxels away are even."""
+    """A layer, and where it and its neighbours two voxels away are even.
+
+    Args:
+        parts: place, half axes and attenuation of ellipsoids.
+        z: of the layer [mm].
+    """
     at = (np.arange(CELLS) - (CELLS - 1) / 2) * 2.0 * FIELD / CELLS
     y, x = np.meshgrid(at, at, indexing="ij")
     value, even = np.zeros(x.shape), np.ones(x.shape, dtype=bool)
@@ -64,8 +69,14 @@ def truth(parts: list[Part], z: float) -> tuple[FloatArray, npt.NDArray[np.bool_
 
 
 def measured(parts: list[Part], part: float, z: float, views: int) -> tuple[float, float]:
-    """Mean error and rms of a layer, relative to MU, `part` of the steepest rise; 0 is a
-    circle."""
+    """Mean error and rms of a layer, relative to MU, where it is even.
+
+    Args:
+        parts: the object.
+        part: of the steepest rise; 0 is a circle at the layer's height.
+        z: of the layer [mm].
+        views: a turn.
+    """
     if part:
         turns = 7.0
         angles = np.linspace(0.0, 360.0 * turns, int(views * turns))

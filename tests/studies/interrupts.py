@@ -68,7 +68,14 @@ class End:
 
 
 def interrupted(words: Sequence[str], moment_s: float, folder: Path) -> End:
-    """Start a command, interrupt it after so long, and wait for its end."""
+    """Start a command, interrupt it after `moment_s`, and wait for its end; after
+    SILENCE_S it is killed.
+
+    Args:
+        words: of the command.
+        moment_s: when; a command that ends before is not interrupted.
+        folder: to run in.
+    """
     flexdt = Path(sys.executable).parent / "flexdt"
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     process = subprocess.Popen(
@@ -97,7 +104,13 @@ def interrupted(words: Sequence[str], moment_s: float, folder: Path) -> End:
 
 
 def kind_of(code: int, said: str, *, interrupted: bool) -> str:
-    """What an end was."""
+    """What an end was: told, done, early or wrong.
+
+    Args:
+        code: of the exit.
+        said: on stderr.
+        interrupted: whether the signal was sent.
+    """
     if "Traceback" in said or "KeyboardInterrupt" in said or code < 0:
         files = re.findall(r'File "([^"]+)"', said)
         ours = any("/flexdt/" in file or "flexdt_command" in file for file in files)
@@ -136,7 +149,17 @@ def in_a_folder() -> Iterator[Path]:
 def campaign(
     names: Sequence[str], count: int, longest_s: float, seed: int
 ) -> Iterator[tuple[str, float, End]]:
-    """Command, moment [s] and end, of each."""
+    """Interrupt commands at random moments of their time.
+
+    Args:
+        names: of COMMANDS.
+        count: for each.
+        longest_s: no moment is later.
+        seed: draws the moments.
+
+    Yields:
+        Command, moment [s] and end, of each.
+    """
     random = np.random.default_rng(seed)
     for name in names:
         with in_a_folder() as folder:

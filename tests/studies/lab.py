@@ -244,7 +244,15 @@ class Wire:
 def fly_script(
     frames: int, exposure_ms: float = 100.0, roi: str = "900 700 1027 827", steps: int = 0
 ) -> str:
-    """A fly scan of small images; speed and run-up follow the smooth-scan rule."""
+    """The text of a fly scan of small images; speed and run-up follow the smooth-scan
+    rule.
+
+    Args:
+        frames: at least two, over 360 deg.
+        exposure_ms: of each.
+        roi: left, top, right and bottom of the panel's region.
+        steps: not used.
+    """
     speed = 360.0 / (frames - 1) / (exposure_ms / 1000.0)
     run_up = speed * speed / (2 * 22.5) + 0.4 * speed
     rows = [

@@ -87,7 +87,15 @@ def judged(lab: Laboratory, found: Commissioned) -> Outcome:
 
 
 def laboratories(count: int, seed: int) -> Iterator[Outcome]:
-    """So many of them, one after the other."""
+    """Draw laboratories and commission from their folders, one after the other.
+
+    Args:
+        count: how many.
+        seed: of all.
+
+    Yields:
+        What was right of each, with the seconds that commissioning took.
+    """
     for k in range(count):
         with tempfile.TemporaryDirectory() as root:
             lab = Laboratory(1000 * seed + k)

@@ -332,7 +332,11 @@ def _watch(port: int, pipe: Any) -> None:
 
 def holds(port: int) -> tuple[dict[float, int], float]:
     """Turns of the loop up to each bound [s], and the longest since this was last asked
-    [ms]."""
+    [ms].
+
+    Args:
+        port: of the pages for monitoring.
+    """
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics") as page:
         text = page.read().decode()
     counts, worst = {}, 0.0

@@ -26,7 +26,17 @@ from flexdt.twin.script.scan_request import ScanRequest
 
 
 def measured(twin: fx.TwinClient, data: Path, side: int, frames: int) -> str:
-    """One scan with its slices, in words."""
+    """Scan while slices of the volume grow, and return the figures as a row of a table.
+
+    Args:
+        twin: client in control.
+        data: its data directory.
+        side: of the slices [voxels].
+        frames: of the scan.
+
+    Raises:
+        AssertionError: the slices met a problem, or the scan is not done.
+    """
     machine = builtin_machine("flexray")
     script = compose_script(
         ScanRequest(frames=frames), machine, profile_of(machine, None)

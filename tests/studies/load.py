@@ -101,7 +101,12 @@ def crowd(port: int, count: int, seconds: float, asks: bool, pipe: Any) -> None:
 
 
 def phase(server: Process, count: int, seconds: float) -> dict[str, Any]:
-    """A crowd for some seconds."""
+    """Let a crowd of processes subscribe for some seconds; ASKING of the clients also
+    ask.
+
+    Returns:
+        Sums of what they counted, and all latencies [s].
+    """
     workers = []
     rest = count - ASKING
     sizes = [ASKING, *(min(PER_PROCESS, rest - s) for s in range(0, rest, PER_PROCESS))]

@@ -199,7 +199,15 @@ def thing(scan: bias_bound.Scan, rng: np.random.Generator) -> bias_bound.Scan:
 
 
 def drawn(seed: int, number: int, *, right: bool) -> Case | None:
-    """A case; None where the drawn scan is not seen whole, or has views at random."""
+    """Draw a case.
+
+    Args:
+        seed, number: the same give the same case.
+        right: a change that is no mistake, without noise; otherwise one that is.
+
+    Returns:
+        None where the drawn scan is not seen whole, or its views are not along a circle.
+    """
     rng = np.random.default_rng([seed, number, 59])
     scan = bias_bound.drawn(seed, number)
     if " cut " in scan.said or not (right or scan.said.startswith(CIRCULAR)):
@@ -281,7 +289,12 @@ def main() -> int:
 
 
 def judged(case: Case, bias: Bias | None) -> tuple[str, bool]:
-    """What is told of a case, and whether that is as it should be."""
+    """What is told of a case, and whether that is as it should be.
+
+    Args:
+        case: the case.
+        bias: what was found of it; None if nothing.
+    """
     found = None if bias is None else bias.contradiction
     if found is not None and found.change is not None:
         return "not decided", True

@@ -107,7 +107,14 @@ def batch(machine: str, seed: int, requests: int) -> Tally:
 
 
 def wire_batch(machine: str, seed: int, requests: int, samples: Path) -> Tally:
-    """The same over the wire."""
+    """Make random requests over the wire, episode by episode, until there are so many.
+
+    Args:
+        machine: its name.
+        seed: of all.
+        requests: at least.
+        samples: see `data_with_samples`.
+    """
     logging.getLogger("flexdt").addHandler(logging.NullHandler())
     tally = Tally()
     with tempfile.TemporaryDirectory() as folder:

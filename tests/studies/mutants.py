@@ -120,7 +120,15 @@ def places(
     lines: range = range(1, 2),
     inside: bool = False,
 ) -> Iterator[Place]:
-    """Every expression and statement that runs, in order."""
+    """Yield every expression and statement that runs, in order; annotations and
+    decorators do not.
+
+    Args:
+        tree: to walk.
+        function: name of the function it is in.
+        lines: of the statement it is in.
+        inside: whether that is a function's body.
+    """
     if isinstance(tree, ast.Assign | ast.AnnAssign) and _is_type(tree):
         return
     for field, value in ast.iter_fields(tree):

@@ -123,7 +123,20 @@ def in_children(
     work: Callable[[Any, Copy], int],
     before: Callable[[Any, Copy], None] = lambda job, copy: None,
 ) -> Iterator[tuple[Any, Copy, int]]:
-    """Do each job, which should take some seconds, in a child; yields what `waitpid` says."""
+    """Do each job in a child process of its own, in a copy that no other has meanwhile.
+
+    A child that takes ten times its seconds is killed. All children are when this is
+    closed.
+
+    Args:
+        jobs: each with the seconds that it should take.
+        copies: as many children at a time.
+        work: does it; returns the exit status.
+        before: is called here, before the child begins.
+
+    Yields:
+        Job, copy and status of `waitpid`, as they end.
+    """
     free, live, left = list(copies), dict[int, tuple[Any, Copy, float]](), iter(jobs)
     try:
         while True:
@@ -329,7 +342,12 @@ class Tests:
 
     def of(self, mutant: Mutant, most_s: float) -> list[tuple[str, dict[str, float]]]:
         """The tests of a mutant by file, with their seconds, those likely to kill it soon
-        first."""
+        first.
+
+        Args:
+            mutant: which.
+            most_s: seconds of all together.
+        """
         ranked = []
         for file, entry in self.entries.items():
             lines, shared = (

@@ -69,7 +69,15 @@ class Solids:
         density: float,
         turn: np.ndarray | None = None,
     ) -> None:
-        """Add a body of half axes `half`, turned by a rotation (3, 3)."""
+        """Add a body.
+
+        Args:
+            kind: ELLIPSOID, CYLINDER or BOX.
+            centre: [mm].
+            half: half axes [mm].
+            density: [1/mm].
+            turn: rotation (3, 3); None for none.
+        """
         own = np.asarray(half, dtype=float)
         rotation = np.eye(3) if turn is None else turn
         self.kinds.append(kind)
@@ -117,7 +125,16 @@ def any_turn(rng: Rng) -> np.ndarray:
 def bubbles(
     rng: Rng, solids: Solids, count: int, wide: float, high: float, density: float
 ) -> None:
-    """Add balls in a cylinder that do not overlap."""
+    """Add balls in a cylinder that do not overlap; fewer where there is no room after 8
+    tries for each.
+
+    Args:
+        rng: draws all.
+        solids: is added to.
+        count: how many.
+        wide, high: radius and half height of the cylinder [mm].
+        density: of the balls.
+    """
     places: list[tuple[np.ndarray, float]] = []
     for _ in range(8 * count):
         r = float(rng.lognormal(math.log(wide * 0.13), 0.35))
@@ -480,7 +497,11 @@ def _slab(p, d):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy")
 def _chord(kind, px, py, pz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Give the part of t for which p + t d is in the unit ball (0), cylinder (1) or cube
-    (2)."""
+    (2).
+
+    It is 0 for a ball or cylinder that is missed, negative or 0 where the ends or the
+    cube are missed.
+    """
     low, high = -1e30, 1e30
     if kind != BOX:
         round_z = 1.0 if kind == ELLIPSOID else 0.0
@@ -540,7 +561,18 @@ def fan_of_wires(rng: Rng) -> Scan:
 def tried(
     kind: str, seed: int, gap: bool, fan: bool = False, near: bool = False
 ) -> dict[str, Any]:
-    """Align one scan, and say what is told and how far off."""
+    """Align one drawn scan, and say what is told and how far off.
+
+    Args:
+        kind: of object.
+        seed: the same arguments give the same scan.
+        gap: between two tiles of the panel.
+        fan: wires that fan out, instead.
+        near: the object is near the source.
+
+    Returns:
+        For JSON; "refused", or "error" and "sigma" in columns.
+    """
     ways = [1] if fan else [2] if near else []
     rng = np.random.default_rng([list(OBJECTS).index(kind), seed, gap, *ways])
     scan = fan_of_wires(rng) if fan else drawn(kind, rng, gap, near)
@@ -598,7 +630,16 @@ def main(words: list[str] | None = None) -> int:
 
 
 def summary(runs: list[dict[str, Any]], gaps: bool, near: bool = False) -> int:
-    """Print what went wrong, and a line for all; 1 where anything did."""
+    """Print what went wrong, and a line for all.
+
+    Args:
+        runs: of `tried`.
+        gaps: whether they have gaps.
+        near: near the source; then words about gaps are not judged.
+
+    Returns:
+        1 where anything was wrong, or more than SIGMAS off.
+    """
     wrong = [run for run in runs if (run["named"] != gaps and not near) or run["repeats"]]
     far = [run for run in runs if abs(run.get("pull", 0.0)) > SIGMAS]
     for run in [*wrong, *far]:

@@ -45,8 +45,9 @@ def image_of(radius: float, shape: tuple[int, int], pixel: float) -> Float32Arra
 def comparison_times(
     image: Float32Array, scan: fx.ConeVec, shape: tuple[int, int]
 ) -> tuple[str, str]:
-    """Processor seconds of a comparison: of images that fit, and of ones on a panel moved
-    aside."""
+    """Processor seconds of a comparison, the least of three, as texts: of images that fit
+    the geometry, and of ones on a panel moved aside by five pixels.
+    """
     pixel = float(np.linalg.norm(scan.u[0]))
     aside = fx.ConeVec.circular(
         sod=SOD,

@@ -181,7 +181,7 @@ def opened(context: Any, url: str, **query: str) -> Any:
 
 
 def load(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
-    """Print bytes of JavaScript and the seconds to the first pictures."""
+    """Print bytes of JavaScript and the seconds to the first pictures, cold and warm."""
     with browsing(play) as context:
         for visit in ("cold", "warm"):
             page = context.new_page()
@@ -233,7 +233,7 @@ def load(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
 
 
 def rest(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
-    """Print what the servers and the browser take while nothing moves."""
+    """Print what the servers and the browser take in REST_S while nothing moves."""
     with browsing(play) as context:
         page = opened(context, url)
         page.wait_for_timeout(SETTLING_MS)

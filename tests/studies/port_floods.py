@@ -116,7 +116,14 @@ def real_time(pid: int) -> None:
 
 
 def flood(port: int, a_minute: int, made: Any, alone: bool) -> None:
-    """In a process of its own: connections at an even rate, counted, until it is killed."""
+    """In a process of its own: open connections at an even rate until it is killed.
+
+    Args:
+        port: of the server.
+        a_minute: how many.
+        made: shared number; counts them.
+        alone: the machine is; then the process becomes real-time.
+    """
     if alone:
         real_time(os.getpid())  # else a busy machine makes the flood a small one
 
@@ -141,7 +148,16 @@ def flood(port: int, a_minute: int, made: Any, alone: bool) -> None:
 
 
 async def fetched(port: int, path: str, source: str, *more: str) -> tuple[int, str]:
-    """Status and head of an answer, read to its end."""
+    """Get a path from an address of this machine, and read the answer to its end.
+
+    Args:
+        port, path: what.
+        source: the client's address.
+        more: header lines.
+
+    Returns:
+        Status and head of the answer.
+    """
     reader, writer = await asyncio.open_connection(
         "127.0.0.1", port, local_addr=(source, 0)
     )
@@ -156,7 +172,7 @@ async def fetched(port: int, path: str, source: str, *more: str) -> tuple[int, s
 
 
 async def page(bench: Bench, source: str) -> dict[str, float]:
-    """A page is loaded and presses E-STOP."""
+    """Load a page and press E-STOP; milliseconds of both, none of what failed."""
     port, begun = bench.ports["viewer"], time.perf_counter()
     for path in ("/", "/main.js", "/style.css"):
         status, _ = await fetched(port, path, source, f"Cookie: {bench.cookie}")
@@ -185,7 +201,7 @@ async def until(shown: Any, mark: str) -> str:
 
 
 async def figures(bench: Bench, source: str) -> dict[str, float]:
-    """The pages for monitoring are read."""
+    """Read the pages for monitoring; milliseconds of each that answers."""
     begun, times = time.perf_counter(), dict[str, float]()
     for name, port in bench.ports.items():
         if name.startswith("pages"):
