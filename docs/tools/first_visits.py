@@ -1,12 +1,15 @@
 """What first visitors see: 32 pictures of the page, as contact sheets.
 
-    python docs/tools/first_visits.py --out DIR [--url http://127.0.0.1:8080/]
+    python docs/tools/first_visits.py --out DIR [--sizes 1366x768 390x844] [--theme dark]
+        [--url http://127.0.0.1:8080/]
 
-Four sizes of screen, two themes and four states of the page: just opened, X-rays on beside the
-Setup tab, a script in the Scan tab, and the story of the Calibrate tab. One sheet a size, with a
-row for each theme; the pictures lie beside the sheets. The page is opened anew, by a browser
-that has never been there, for each size and theme. Starts a lab of its own, unless it is given
-the address of one. Needs Debian's chromium, playwright and Pillow.
+Four desktop sizes, unless others are given, and eight states. Four are of a lab without data: just
+opened, four views with X-rays on, the beam's eye beside the Setup tab, a script in the Scan tab.
+Four are of a lab with a scan: its volume beside its truth, its images, the designer, the
+story of the Calibrate tab. A browser that has never been there opens the page anew for each size;
+the window of the visit with a scan is brought to each size. One sheet a size; the pictures lie
+beside the sheets. Starts a lab of its own, unless it is given the address of one. Needs Debian's
+chromium, playwright and Pillow.
 """
 
 from __future__ import annotations
@@ -24,57 +27,97 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from docs.tools.page_pictures import CHROMIUM, FADED_MS, FLAGS, PATIENCE_MS, lab
 
-SIZES = ((1440, 900), (1366, 768), (820, 1180), (390, 844))
+Size = tuple[int, int]
+Reach = Callable[[Any], None]
+
+SIZES: tuple[Size, ...] = ((1280, 800), (1366, 768), (1440, 900), (1920, 1080))
+"""Width and height of the window in pixels."""
 THEMES = ("light", "dark")
 SHEET_PX = 640
 """Width of a picture on its sheet."""
-SETTLING_MS = 2000
+SHEET_COLUMNS = 4
+SETTLING_MS = 2500
 """From a click to what it leads to."""
+
+
+DRAWN = "!document.querySelector('.view:not(.live)')"
+"""Each pane shows its scene."""
 
 
 def as_opened(page: Any) -> None:
     """Leave the page as it opens."""
 
 
-def x_rays_on(page: Any) -> None:
-    """Switch X-rays on, beside the Setup tab."""
-    page.click("#tabs [data-tab=setup]")
+def four_views(page: Any) -> None:
+    """Show four views, with X-rays on."""
     page.evaluate("flexdt.call('tube.set', {on: true})")
     page.locator("#beam", has_text="ON").wait_for()
+    page.get_by_role("button", name="Four views").click()
+    page.wait_for_timeout(FADED_MS)
+
+
+def beams_eye(page: Any) -> None:
+    """Show the beam's eye beside the Setup tab."""
+    page.get_by_role("button", name="Beam’s eye").click()
+    page.click("#tabs [data-tab=setup]")
+    page.wait_for_timeout(FADED_MS)
 
 
 def script_written(page: Any) -> None:
     """Switch X-rays off, compose a script in the Scan tab, and wait for its verdict."""
     page.evaluate("flexdt.call('tube.set', {on: false})")
+    page.get_by_role("button", name="Isometric").click()
     page.click("#tabs [data-tab=scan]")
     page.click("#compose")
     page.locator("#report .verdict").wait_for()
 
 
+def volume(page: Any) -> None:
+    """Show what stands on the stage, scanned by one button, beside its truth."""
+    if not page.locator("#volume-beside").is_visible():
+        page.click("#scan-it")
+        page.locator("#volume-beside").wait_for()
+
+
+def images(page: Any) -> None:
+    """Open the newest data set in the Data tab."""
+    page.click("#tabs [data-tab=data]")
+    page.locator(".data-set").first.click()
+    page.locator("#record-at", has_text="image").wait_for()
+
+
 def story_open(page: Any) -> None:
     """Open the story of the Calibrate tab."""
+    page.evaluate("flexdt.data.open(null).then(() => null)")
     page.click("#tabs [data-tab=calibrate]")
-    page.click("#story summary")
+    if page.get_attribute("#story", "open") is None:
+        page.click("#story summary")
 
 
-STATES: dict[str, Callable[[Any], None]] = {
+def designed(page: Any) -> None:
+    """Open the designer of the Scan tab."""
+    page.click("#tabs [data-tab=scan]")
+    if page.get_attribute("#designer", "open") is None:
+        page.click("#designer summary")
+    page.locator("#design-quality").wait_for()
+
+
+FRESH: dict[str, Reach] = {
     "opened": as_opened,
-    "x-rays": x_rays_on,
+    "four-views": four_views,
+    "beams-eye": beams_eye,
     "script": script_written,
+}
+WITH_DATA: dict[str, Reach] = {
+    "volume": volume,
+    "images": images,
     "story": story_open,
+    "designer": designed,
 }
 
 
-def visit(browser: Any, url: str, size: tuple[int, int], theme: str) -> list[Image.Image]:
-    """Return a picture of each of `STATES`, in order, from one visit by a browser that
-    has never been there.
-
-    Args:
-        browser: of playwright.
-        url: of the page.
-        size: of the window, (width, height) [px].
-        theme: of `THEMES`.
-    """
+def opened(browser: Any, url: str, size: Size, theme: str) -> Any:
+    """Open the page by a browser that has never been there."""
     width, height = size
     context = browser.new_context(viewport={"width": width, "height": height})
     page = context.new_page()
@@ -83,25 +126,61 @@ def visit(browser: Any, url: str, size: tuple[int, int], theme: str) -> list[Ima
     page.wait_for_function("window.flexdt?.store.image && flexdt.store.session")
     page.locator(".view.live").first.wait_for()
     page.wait_for_timeout(FADED_MS)
-    pictures = []
-    for reach in STATES.values():
+    return page
+
+
+def pictured(page: Any) -> Image.Image:
+    """Take a picture of the page once what was asked for is there."""
+    page.wait_for_timeout(SETTLING_MS)
+    page.wait_for_function(DRAWN)
+    page.locator("#veil").wait_for(state="hidden")
+    raw = io.BytesIO(page.screenshot())
+    return Image.open(raw).convert("RGB")
+
+
+def fresh(browser: Any, url: str, size: Size, theme: str) -> dict[str, Image.Image]:
+    """Return a picture of each state without data, from one visit."""
+    page = opened(browser, url, size, theme)
+    pictures = {}
+    for state, reach in FRESH.items():
         reach(page)
-        page.wait_for_timeout(SETTLING_MS)
-        raw = io.BytesIO(page.screenshot())
-        pictures.append(Image.open(raw).convert("RGB"))
-    context.close()
+        pictures[state] = pictured(page)
+    page.context.close()
     return pictures
 
 
-def sheet(rows: list[list[Image.Image]]) -> Image.Image:
-    """Put pictures of one size side by side, a row each, scaled to a width of `SHEET_PX`."""
-    width, height = rows[0][0].size
+def with_data(
+    browser: Any, url: str, sizes: list[Size], theme: str
+) -> dict[Size, dict[str, Image.Image]]:
+    """Return a picture of each state with data at each size, from one visit."""
+    page = opened(browser, url, sizes[0], theme)
+    pictures: dict[Size, dict[str, Image.Image]] = {size: {} for size in sizes}
+    for state, reach in WITH_DATA.items():
+        for width, height in sizes:
+            page.set_viewport_size({"width": width, "height": height})
+            reach(page)
+            page.wait_for_timeout(FADED_MS)
+            pictures[width, height][state] = pictured(page)
+    page.context.close()
+    return pictures
+
+
+def sheet(pictures: list[Image.Image]) -> Image.Image:
+    """Put pictures of one size side by side, SHEET_COLUMNS a row."""
+    width, height = pictures[0].size
     small = (SHEET_PX, round(SHEET_PX * height / width))
-    whole = Image.new("RGB", (small[0] * len(rows[0]), small[1] * len(rows)))
-    for row, pictures in enumerate(rows):
-        for column, picture in enumerate(pictures):
-            whole.paste(picture.resize(small), (column * small[0], row * small[1]))
+    rows = -(-len(pictures) // SHEET_COLUMNS)
+    whole = Image.new("RGB", (small[0] * SHEET_COLUMNS, small[1] * rows))
+    for place, picture in enumerate(pictures):
+        row, column = divmod(place, SHEET_COLUMNS)
+        whole.paste(picture.resize(small), (column * small[0], row * small[1]))
     return whole
+
+
+def size_of(text: str) -> Size:
+    """Parse a size, 1366x768."""
+    width, height = text.split("x")
+    return int(width), int(height)
 
 
 def main() -> None:
@@ -112,6 +191,8 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
+    parser.add_argument("--sizes", type=size_of, nargs="+", default=list(SIZES))
+    parser.add_argument("--theme", choices=THEMES, default=THEMES[0])
     parser.add_argument("--url", help="of a page that is served already")
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True, exist_ok=True)
@@ -120,14 +201,14 @@ def main() -> None:
         sync_playwright() as play,
     ):
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        for size in SIZES:
-            rows = [visit(browser, url, size, theme) for theme in THEMES]
+        first = {size: fresh(browser, url, size, chosen.theme) for size in chosen.sizes}
+        later = with_data(browser, url, chosen.sizes, chosen.theme)
+        for size in chosen.sizes:
             name = f"{size[0]}x{size[1]}"
-            for theme, pictures in zip(THEMES, rows, strict=True):
-                for state, picture in zip(STATES, pictures, strict=True):
-                    picture.save(chosen.out / f"{name}-{theme}-{state}.png")
-            sheet(rows).save(chosen.out / f"sheet-{name}.png")
-            print(name, flush=True)
+            pictures = {**first[size], **later[size]}
+            for state, picture in pictures.items():
+                picture.save(chosen.out / f"{name}-{state}.png")
+            sheet(list(pictures.values())).save(chosen.out / f"sheet-{name}.png")
         browser.close()
 
 

@@ -279,7 +279,12 @@ def open_page(
 
 
 def _matters(message: Any) -> bool:
-    gone = ("ERR_CONNECTION_REFUSED", "WebSocket connection to", "WebSocket is closed")
+    gone = (
+        "ERR_CONNECTION_REFUSED",
+        "ERR_CONNECTION_RESET",
+        "WebSocket connection to",
+        "WebSocket is closed",
+    )
     return message.type == "error" and not any(
         h in message.text for h in (*HARMLESS, *gone)
     )

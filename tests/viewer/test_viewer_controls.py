@@ -472,7 +472,7 @@ def test_people_have_names(
     other.click("#take")
     told = "Emmy #"
     page.locator(".note").filter(has_text=told).filter(
-        has_text="took control from Ada"
+        has_text="took control from you"
     ).wait_for()
     page.locator("#holder", has_text="held by Emmy").wait_for()
     page.reload()

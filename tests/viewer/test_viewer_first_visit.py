@@ -21,7 +21,6 @@ from typing import Any
 import pytest
 import trimesh
 
-from flexdt.phantoms import load_phantom
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import ScanRequest
@@ -137,11 +136,10 @@ def switch_x_rays_on(v: Visitor) -> None:
 
 
 def put_on_another_sample(v: Visitor) -> None:
-    """its size"""
-    v.tab("Setup")
-    v.choose("on the stage", "normal")
-    v.button("Put on stage")
-    v.sees(sized(*load_phantom("normal").size_mm))
+    """its radiograph"""
+    v.choose("Sample to scan", "normal")
+    shown = "flexdt.store.image?.origin?.sample"
+    until(lambda: v.page.evaluate(shown) == "normal", "its radiograph")
 
 
 def bring_a_mesh(v: Visitor) -> None:

@@ -260,7 +260,7 @@ def test_an_empty_edge_of_the_region_is_not_0(
     left = twin.state().camera.roi[0]
     page.fill("#roi-l", "")
     page.press("#roi-l", "Enter")
-    page.locator(".note.error", has_text="ROI l").first.wait_for()
+    page.locator(".note.error", has_text="left edge").first.wait_for()
     assert page.input_value("#roi-l") == str(left)
     assert "camera.set" not in asked()
 

@@ -148,6 +148,86 @@ def test_a_small_screen_shows_the_button_and_its_sample_beside_each_other(
     page.close()
 
 
+@pytest.mark.parametrize("size", [(1280, 800), (1366, 768), (1440, 900), (1920, 1080)])
+def test_the_close_up_is_a_quarter_of_each_pane_and_the_bar_is_whole(
+    open_page: Callable[..., Any], size: tuple[int, int]
+) -> None:
+    """Four fifths of it are the gear (`test_viewer_world.py`), a fifth of the pane's height."""
+    page = open_page(view="iso", size=size, fresh=True)
+    for views in ("Isometric", "Four views"):
+        page.get_by_role("button", name=views, exact=True).click()
+        for view in page.locator(".view:has(.inset)").all():
+            pane, inset = view.bounding_box(), view.locator(".inset").bounding_box()
+            assert inset["height"] > 0.25 * pane["height"]
+            assert view.locator(".inset").is_visible()
+    cut = page.locator("#bar > .pill, #view-switch").evaluate_all(
+        "all => all.filter((e) => e.scrollWidth > e.clientWidth + 1).map((e) => e.id)"
+    )
+    assert cut == []
+    page.close()
+
+
+def test_the_sample_beside_scan_it_is_what_stands_on_the_stage(
+    page: Any, twin: TwinClient
+) -> None:
+    """One quantity in two lists: whoever changes it, both say what the twin says."""
+    shown = lambda: {  # noqa: E731
+        page.input_value("#scan-it-sample"), page.input_value("#sample")
+    }  # fmt: skip
+    for name in ("square", "gear"):
+        page.select_option("#scan-it-sample", name)
+        until(lambda name=name: twin.state().sample.name == name, "it is put there")
+        until(lambda name=name: shown() == {name}, "both lists say so")
+    twin.control("force")
+    twin.set_sample("small")
+    until(lambda: shown() == {"small"}, "another's change")
+    page.select_option("#scan-it-sample", "gear")
+    page.locator("#notes", has_text="The sample stays").wait_for()
+    until(lambda: shown() == {"small"}, "a refused choice goes back")
+    assert twin.state().sample.name == "small"
+    twin.control("release")
+
+
+def test_what_is_typed_into_a_number_field_replaces_its_number(page: Any) -> None:
+    page.click("#tabs [data-tab=scan]")
+    field = page.locator("#wish-frames")
+    field.fill("73")
+    page.locator("#script").click()
+    field.click()
+    page.keyboard.type("13")
+    assert field.input_value() == "13"
+    field.click()
+    page.keyboard.press("End")
+    page.keyboard.type("7")
+    assert field.input_value() == "137"
+    field.fill("73")
+
+
+def test_a_script_of_another_wish_is_called_so(page: Any) -> None:
+    """A turn of 13 images without a stop is too fast: nothing is written, and the page says
+    that the script beside the fields is another one."""
+    page.click("#tabs [data-tab=scan]")
+    page.select_option("#wish-kind", "fly")
+    page.fill("#wish-frames", "73")
+    page.click("#compose")
+    page.locator("#report .verdict").wait_for()
+    note = page.locator("#wish-note")
+    assert not note.is_visible()
+    page.fill("#wish-frames", "13")
+    note.get_by_text("of 73 frames of").wait_for()
+    page.click("#compose")
+    note.get_by_text("step scan").wait_for()
+    assert "Not written: 13 frames" in note.inner_text()
+    assert "another one" in note.inner_text()
+    page.select_option("#wish-kind", "step")
+    page.click("#compose")
+    note.wait_for(state="hidden")
+    page.locator("#report", has_text="13 frames").wait_for()
+    page.select_option("#wish-kind", "fly")
+    page.fill("#wish-frames", "73")
+    page.fill("#script", "")
+
+
 def test_one_click_ends_with_a_volume_beside_its_truth(
     open_page: Callable[..., Any], twin: TwinClient
 ) -> None:

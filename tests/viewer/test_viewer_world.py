@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from contextlib import redirect_stdout
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -27,8 +28,9 @@ from flexdt.clients.viewer.scenes.layers import LAYERS, Shown
 from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.meshes.painted_meshes import glb
 from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
+from flexdt.clients.viewer.scenes.name_tags import names_of_image
 from flexdt.clients.viewer.scenes.sample_looks import MeshCache, SampleLook, Skin, fetch
-from flexdt.clients.viewer.scenes.views import beam_view, rim
+from flexdt.clients.viewer.scenes.views import Standpoint, beam_view, presets, rim
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
 from flexdt.clients.viewer.scrubbed_plan import (
     document,
@@ -43,6 +45,7 @@ from flexdt.protocol.state_model import SampleState, State
 from flexdt.twin.collision.convex_solids import UprightCylinder, hull
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import (
     builtin_machine,
@@ -190,6 +193,59 @@ def test_the_close_up_holds_what_turns_and_no_more(name: str) -> None:
     heights = vertices[:, 2] + world.sample.shift[2]
     assert around[:, 2].min() == pytest.approx(heights.min(), abs=1e-3)
     assert around[:, 2].max() == pytest.approx(heights.max(), abs=1e-3)
+
+
+def share_of_height(camera: Standpoint, points_m: FloatArray) -> float:
+    """Part of a picture's height from the lowest to the highest point."""
+    eye = np.array(camera.position)
+    ahead = np.array(camera.look_at) - eye
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, camera.up)
+    upright = np.cross(right / np.linalg.norm(right), ahead)
+    heights = (points_m - eye) @ upright / ((points_m - eye) @ ahead)
+    return float(np.ptp(heights) / (2.0 * math.tan(0.5 * camera.fov)))
+
+
+@pytest.mark.parametrize(
+    "mag_obj", [150.0, 250.0, 350.0, 450.0, 550.0, 650.0, 750.0, 800.0]
+)
+def test_only_the_close_up_shows_the_gear_a_fifth_of_a_panes_height(
+    mag_obj: float,
+) -> None:
+    """No camera that holds tube and panel whole shows it so large, from whichever side; the
+    close-up, a quarter of a pane's height (`test_viewer_task_controls.py`), does."""
+    look = MeshCache().look(SampleState(name="gear"))
+    at = {**AT, "tra_tube": 0.0, "ver_tube": 26.29, "mag_obj": mag_obj, "tra_obj": 0.0}
+    world = placed(MACHINE, PROFILE, CAMERA, {**at, "mag_det": 1000.0, "tra_det": 25.3})
+    around = rim(world, look.hulls_m)
+    assert around is not None
+    views = presets(world, look.radius_mm, around)
+    gear_m = 1e-3 * around
+    assert share_of_height(views["sample"].at(1.0), gear_m) > 0.8
+    rng = np.random.default_rng(int(mag_obj))
+    shares = []
+    for _ in range(150):
+        yaw, pitch = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, np.radians(60.0))
+        level = math.cos(pitch)
+        way = (math.sin(yaw) * level, math.cos(yaw) * level, -math.sin(pitch))
+        fov = math.radians(rng.uniform(10.0, 75.0))
+        whole = replace(views["iso"], ways=(way,), fov=fov)
+        shares.append(share_of_height(whole.at(rng.uniform(0.7, 1.8)), gear_m))
+    assert max(shares) < 0.2
+    assert share_of_height(views["iso"].at(0.73), gear_m) < 0.05
+
+
+def test_the_name_of_the_sample_stands_above_it() -> None:
+    """Against all vertices of the mesh."""
+    look = MeshCache().look(SampleState(name="lego"))
+    world = placed(MACHINE, PROFILE, CAMERA, {**AT, "rot_obj": 31.0})
+    around = rim(world, look.hulls_m)
+    assert around is not None
+    places = dict(names_of_image(world, float(around[:, 2].max())))
+    vertices_m = np.concatenate([s.vertices for s in look.skins]).astype(float)
+    top_m = (vertices_m @ world.sample.turn.T)[:, 2].max() + 1e-3 * world.sample.shift[2]
+    assert places["sample"][2] == pytest.approx(top_m, abs=1e-5)
+    assert places["sample"][:2] == pytest.approx(1e-3 * world.sample.shift[:2])
 
 
 def test_an_unknown_upload_is_a_box_of_its_size() -> None:

@@ -440,8 +440,8 @@ class _Writer(MotorTargets):
             raise LimitError(
                 f"{frames} frames of {self.image_s * 1000:g} ms over {total:g} deg need "
                 f"{speed:.4g} deg/s, but {name} turns at most {rotation.max_speed:g} "
-                "deg/s; raise "
-                "frames, exposure or averages",
+                "deg/s; raise frames, exposure or averages, or take a step scan, which "
+                "rests at each angle",
                 {"asked": speed, "allowed": rotation.max_speed, "axis": name},
             )
         return speed

@@ -1,6 +1,7 @@
 // The scan designer: bars for voxel and tube; what the wished scan will look like. A change of
 // the wish rewrites the script, unless somebody else's stands there.
 import { $input, bytes, el, fixed, seconds, setText, words } from "./dom.js";
+import { decades } from "./decades.js";
 import { differences, listed, only, sampleOf } from "./fingerprint.js";
 import { call, emit, on, store } from "./link.js";
 import { histogram } from "./plots.js";
@@ -54,7 +55,7 @@ const opened = () => {
 };
 const card = el("details", { id: "designer", ontoggle: opened });
 card.append(el("summary", {}, "Design a scan"), form, host, facts);
-const chart = histogram(host);
+const chart = histogram(host, "decades");
 export const place = (node) => node.append(card);
 function value(name) {
     const { low, high, log } = scales[name] ?? { low: 0, high: 1, log: false };
@@ -186,12 +187,12 @@ function best({ best: settings, asked: own }, asked) {
     const filter = first.filter ? `, ${first.filter}` : "";
     return `best at ${fixed(first.kV, 0)} kV${filter}: ${fixed(first.cnr ?? 0, 2)}`;
 }
-function draw({ edges, shares }) {
+function draw(transmission) {
     host.hidden = false;
-    const range = [edges[0], edges[edges.length - 1]];
+    const { counts, range } = decades(transmission);
     const colour = getComputedStyle(host).getPropertyValue("--warn");
-    const marks = [{ at: DARK_TRANSMISSION, colour, handle: false }];
-    chart.draw({ counts: shares, range, unit: "transmission", window: range, marks });
+    const marks = [{ at: Math.log10(DARK_TRANSMISSION), colour, handle: false }];
+    chart.draw({ counts, range, unit: "transmission", window: range, marks });
 }
 on("state", (s) => {
     if (!begun())

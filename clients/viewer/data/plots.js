@@ -40,8 +40,8 @@ function axis(host, more) {
     };
 }
 // An empty plot in its host; `units` are asked for whenever it is drawn.
-function plot(host, series, units, ranges, y, over = () => { }) {
-    const across = { label: units.x, size: X_AXIS_PX, space: X_TICKS_APART_PX };
+function plot(host, series, units, ranges, y, over = () => { }, ticks = {}) {
+    const across = { label: units.x, size: X_AXIS_PX, space: X_TICKS_APART_PX, ...ticks };
     const upright = { label: units.y, size: Y_AXIS_PX, space: Y_TICKS_APART_PX };
     return new uPlot({
         width: 1,
@@ -68,9 +68,19 @@ function fits(chart, host) {
     return true;
 }
 const apart = ([low, high]) => (high > low ? [low, high] : [low, low + 1e-9]);
-export function histogram(host) {
+// Whole powers of ten between two logarithms.
+function powers(low, high) {
+    const first = Math.ceil(low);
+    const count = Math.floor(high) - first + 1;
+    return Array.from({ length: Math.max(0, count) }, (_, k) => first + k);
+}
+export function histogram(host, places = "even") {
     let shown = null;
     let most = 1;
+    const ticks = {
+        splits: (_chart, _axis, low, high) => powers(low, high),
+        values: (_, splits) => splits.map((power) => written(10 ** power)),
+    };
     const bar = (tint) => ({
         paths: uPlot.paths.bars?.({ size: [1], gap: 1 }),
         fill: () => colour(host, "--accent") + tint,
@@ -84,7 +94,7 @@ export function histogram(host) {
         bwd: (drawn) => LINEAR_PERCENT * Math.expm1(drawn),
     };
     const percents = { splits: () => PERCENTS.filter((percent) => percent <= most) };
-    const chart = plot(host, [bar(""), bar(PALE)], { x: () => shown?.unit ?? "", y: () => "share [%]" }, { x: () => apart(shown?.range ?? [0, 1]), y: () => [0, most] }, { scale, axis: percents }, (drawn) => mark(drawn, shown?.marks ?? []));
+    const chart = plot(host, [bar(""), bar(PALE)], { x: () => shown?.unit ?? "", y: () => "share [%]" }, { x: () => apart(shown?.range ?? [0, 1]), y: () => [0, most] }, { scale, axis: percents }, (drawn) => mark(drawn, shown?.marks ?? []), places === "decades" ? ticks : {});
     return {
         area: chart.over,
         draw(counted) {

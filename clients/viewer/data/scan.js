@@ -7,7 +7,8 @@ import { differences, listed, only } from "./fingerprint.js";
 import { draw as drawTimeline } from "./timeline.js";
 import * as designer from "./designer.js";
 import { isOver } from "./job_words.js";
-import { wished } from "./scan_wish.js";
+import { effect } from "./signals.js";
+import { exposure_ms, frames, kind, sameWish, wished, wishWords, } from "./scan_wish.js";
 const text = $("#script");
 const gutter = $("#gutter");
 const ink = $("#paint div");
@@ -91,6 +92,7 @@ function outdated() {
     problems = [];
     marks();
     $("#report").textContent = "";
+    tellWish();
     forget();
     rememberScript(text.value);
 }
@@ -146,15 +148,49 @@ async function compose(keep = []) {
         return;
     }
     const params = { ...designer.wish(), ...wish, keep };
-    const answer = await command("viewer.compose", params, none);
-    if (!answer)
+    const answer = await call("viewer.compose", params).catch(words);
+    if (typeof answer === "string") {
+        emit("note", "error", none, answer);
+        refused = { wish, why: answer };
+        tellWish();
         return;
+    }
+    refused = null;
     setScript(answer.text);
     const mine = (made = text.value);
+    writtenFor = wish;
+    tellWish();
     await check();
     if (text.value === mine)
         offer(answer.moved, keep);
 }
+// What the written script was wished to be, and the last wish that gave no script: while another
+// one stands in the fields, the script beside them is not of it.
+let writtenFor = null;
+let refused = null;
+function tellWish() {
+    const wish = wished();
+    const note = $("#wish-note");
+    if (typeof wish === "string") {
+        setText(note, wish);
+    }
+    else if (refused && sameWish(refused.wish, wish)) {
+        const old = text.value ? " The script above is another one." : "";
+        setText(note, `Not written: ${refused.why}.${old}`);
+    }
+    else if (writtenFor && text.value === made && !sameWish(writtenFor, wish)) {
+        setText(note, `The script above is of ${wishWords(writtenFor)}: press Write for these.`);
+    }
+    else
+        setText(note, "");
+    note.hidden = !note.textContent;
+}
+effect(() => {
+    kind.get();
+    frames.get();
+    exposure_ms.get();
+    tellWish();
+});
 // The designer rewrites what was written here; a script of somebody's own stays until Write is
 // pressed.
 let made = "";
@@ -429,6 +465,18 @@ canvas.addEventListener("keydown", (e) => {
 });
 new ResizeObserver(redraw).observe(canvas);
 async function run() {
+    const button = $button("#run");
+    button.disabled = true;
+    setText(button, "Starting …");
+    try {
+        await submit();
+    }
+    finally {
+        setText(button, "Run");
+        marks();
+    }
+}
+async function submit() {
     const speed = $select("#speed-up").value;
     const params = {
         text: text.value,

@@ -67,6 +67,7 @@ function offer(job) {
         close: over,
         back: over && store.state !== null && moved(job, store.state.axes).length > 0,
     };
+    $("#scan-bar").toggleAttribute("data-over", over);
     for (const [name, visible] of Object.entries(shown))
         $button(`#job-${name}`).hidden = !visible;
     $button("#job-pause").disabled = job.state !== "running";

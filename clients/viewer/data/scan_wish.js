@@ -44,6 +44,8 @@ effect(() => {
 on("state", ({ camera }) => {
     cameraExposure_ms.set(camera.exposure_ms);
 });
+export const sameWish = (a, b) => a.kind === b.kind && a.frames === b.frames && a.exposure_ms === b.exposure_ms;
+export const wishWords = ({ kind: way, frames: count, exposure_ms: ms }) => `${count} frames of ${ms} ms (${way})`;
 // The wish; what is no number of images or no exposure is said in words instead.
 export function wished() {
     read();

@@ -38,6 +38,7 @@ from flexdt.clients.viewer.scenes.still import (
     placed,
     shape_of,
 )
+from flexdt.clients.viewer.scenes.views import rim
 from flexdt.clients.viewer.scenes.world import MM, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
@@ -270,7 +271,7 @@ class LabScene:
         """
         if "labels" not in shown:
             if "names" in shown:
-                return names_of_image(world)
+                return names_of_image(world, self._top_mm(world))
             return []
         first = _scale_mm(self.machine)
         out: list[Name] = [
@@ -280,6 +281,11 @@ class LabScene:
             end = first - [0.0, 2 * AXES_MM, 0.0] + 1.1 * AXES_MM * np.eye(3)[k]
             out.append((words, end * MM))
         return out + names_of_parts(self.machine, dict(self._sent))
+
+    def _top_mm(self, world: World) -> float | None:
+        """Compute the height of the sample's highest point; None without a sample."""
+        around = None if self._look is None else rim(world, self._look.hulls_m)
+        return None if around is None else float(around[:, 2].max())
 
     def _hull(
         self, node: str, mesh: Any, color: tuple[int, int, int], opacity: float

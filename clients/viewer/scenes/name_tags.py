@@ -96,17 +96,24 @@ def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> Floa
     return np.clip(anchor, corner, corner + size)
 
 
-def names_of_image(world: World) -> list[Name]:
+def names_of_image(world: World, top_mm: float | None = None) -> list[Name]:
     """List the names X-ray source, sample and detector with their places [m]; "detector"
     is beside the panel's centre.
 
-    The sample's place is its origin; "detector" is a quarter of the image's width to the
-    side.
+    The sample's place is above its origin, so that its name does not lie over it where the
+    camera is near; "detector" is a quarter of the image's width to the side.
+
+    Args:
+        world: the machine's pose.
+        top_mm: height of the sample's highest point; None is its origin's.
     """
+    sample = np.array(world.sample.shift)
+    if top_mm is not None:
+        sample[2] = top_mm
     image = world.detector + world.u * (0.25 * world.shape[1]) - world.normal
     named = (
         ("X-ray source", world.source),
-        ("sample", world.sample.shift),
+        ("sample", sample),
         ("detector", image),
     )
     return [(words, at * MM) for words, at in named]

@@ -175,8 +175,9 @@ async function datasets() {
   const box = $("#datasets");
   const chosen = new Set(ticked());
   box.textContent = "";
-  if (!answer.datasets.some((each) => each.present))
-    box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
+  const none = !answer.datasets.some((each) => each.present);
+  $button("#fit").disabled = none;
+  if (none) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
   for (const d of answer.datasets.filter((each) => each.present)) {
     const tick = el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) });
     box.append(

@@ -158,21 +158,26 @@ function develop(i: Shown) {
   pixels2d.putImageData(out, 0, 0);
 }
 
-// An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
+// An image taken with the beam off says so: it is dark, or drawn as though the beam were on. Line
+// integrals are drawn as though no pixel were saturated.
+const MANY_SATURATED = 0.001;
 const unlit = (i: Shown | null) => i !== null && !i.recorded && i.origin?.lit === false;
+function beamWords(i: Shown | null): string {
+  const state = store.state;
+  if (i === null || i.recorded || !state) return "";
+  const counts = i.kind === "counts";
+  if (!unlit(i)) {
+    const saturated = state.image?.saturated ?? 0;
+    if (counts || i.signed || saturated < MANY_SATURATED) return "";
+    return `${percent(saturated)} saturated: drawn as though none were`;
+  }
+  if (state.tube.on && !state.tube.ready) return "X-rays warming up";
+  return counts ? "X-rays off: dark image" : "X-rays off: drawn as though on";
+}
 function beam(i: Shown | null) {
-  const tube = store.state?.tube;
-  const off = unlit(i);
-  $("#film-beam").hidden = !off;
-  if (off)
-    setText(
-      $("#film-beam"),
-      tube?.on && !tube.ready
-        ? "X-rays warming up"
-        : i?.kind === "counts"
-          ? "X-rays off: dark image"
-          : "X-rays off: drawn as though on",
-    );
+  const words = beamWords(i);
+  $("#film-beam").hidden = !words;
+  setText($("#film-beam"), words);
 }
 // The part of the beam that comes through: from the thickest place (all but one in a hundred
 // let more through) on.
@@ -294,6 +299,7 @@ for (const end of ["pointerup", "pointercancel"])
     pulled?.dispatchEvent(new Event("change"));
     pulled = null;
   });
+let wasDark = false;
 const percent = (part: number) => `${(100 * part).toFixed(part && part < 0.1 ? 1 : 0)} %`;
 on("state", (s) => {
   for (const what of ["saturated", "starved"] as const)
@@ -303,7 +309,9 @@ on("state", (s) => {
         ? `${what}: not judged in a recorded image`
         : `${what} ${s.image ? percent(s.image[what]) : "–"}`,
     );
-  if ($("#film-beam").hidden === unlit(store.image)) ask(); // a dark image has no flags
+  const dark = unlit(store.image);
+  if (dark !== wasDark) ask(); // a dark image has no flags
+  wasDark = dark;
   beam(store.image);
 });
 

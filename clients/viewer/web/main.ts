@@ -2,6 +2,7 @@
 import { $, $button } from "./dom.js";
 import { call, connect, on, store } from "./link.js";
 import { known, tab } from "./tabs.js";
+import "./number_fields.js";
 import "./status.js";
 import "./warnings.js";
 import "./axes.js";

@@ -9,6 +9,13 @@ const NAME_LENGTH = 100;
 
 export const plain = (text: string): string => text.replace(DIRECTION_MARKS, SHOWN_INSTEAD);
 
+// A message of the twin with the reader's own session as "you".
+export function toYou(message: string, session: string | null): string {
+  if (!session) return message;
+  const literal = session.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
+  return message.replace(new RegExp(`(?<![\\w#])${literal}(?![\\w#])`, "g"), "you");
+}
+
 // The file's name without what names may not hold; neutral where nothing is left of it. A name
 // that had to be changed is never one that is taken, so nothing is overwritten by accident.
 export function sampleName(file: string, taken: string[]): string {

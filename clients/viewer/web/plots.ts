@@ -27,6 +27,8 @@ export interface Mark {
   colour: string;
   handle: boolean;
 }
+// Places along a histogram: values as they are, or base-10 logarithms of values.
+type Places = "even" | "decades";
 // How often values occur between two ends; those outside the window are pale.
 export interface Counted {
   counts: ArrayLike<number>;
@@ -82,8 +84,9 @@ function plot(
   ranges: { x: () => Pair; y: () => Pair },
   y: { scale?: uPlot.Scale; axis?: uPlot.Axis },
   over: (chart: uPlot) => void = () => {},
+  ticks: uPlot.Axis = {},
 ): uPlot {
-  const across = { label: units.x, size: X_AXIS_PX, space: X_TICKS_APART_PX };
+  const across = { label: units.x, size: X_AXIS_PX, space: X_TICKS_APART_PX, ...ticks };
   const upright = { label: units.y, size: Y_AXIS_PX, space: Y_TICKS_APART_PX };
   return new uPlot(
     {
@@ -113,9 +116,19 @@ function fits(chart: uPlot, host: HTMLElement): boolean {
 }
 const apart = ([low, high]: Pair): Pair => (high > low ? [low, high] : [low, low + 1e-9]);
 
-export function histogram(host: HTMLElement): Histogram {
+// Whole powers of ten between two logarithms.
+function powers(low: number, high: number): number[] {
+  const first = Math.ceil(low);
+  const count = Math.floor(high) - first + 1;
+  return Array.from({ length: Math.max(0, count) }, (_, k) => first + k);
+}
+export function histogram(host: HTMLElement, places: Places = "even"): Histogram {
   let shown: Counted | null = null;
   let most = 1;
+  const ticks: uPlot.Axis = {
+    splits: (_chart, _axis, low, high) => powers(low, high),
+    values: (_, splits) => splits.map((power) => written(10 ** power)),
+  };
   const bar = (tint: string): uPlot.Series => ({
     paths: uPlot.paths.bars?.({ size: [1], gap: 1 }),
     fill: () => colour(host, "--accent") + tint,
@@ -136,6 +149,7 @@ export function histogram(host: HTMLElement): Histogram {
     { x: () => apart(shown?.range ?? [0, 1]), y: () => [0, most] },
     { scale, axis: percents },
     (drawn) => mark(drawn, shown?.marks ?? []),
+    places === "decades" ? ticks : {},
   );
   return {
     area: chart.over,

@@ -32,7 +32,16 @@ import { differences, listed, only, type Fingerprint, type Quantity } from "./fi
 import { draw as drawTimeline, type Lanes } from "./timeline.js";
 import * as designer from "./designer.js";
 import { isOver } from "./job_words.js";
-import { wished } from "./scan_wish.js";
+import { effect } from "./signals.js";
+import {
+  exposure_ms,
+  frames,
+  kind,
+  sameWish,
+  type Wish,
+  wished,
+  wishWords,
+} from "./scan_wish.js";
 
 const text = $<HTMLTextAreaElement>("#script");
 const gutter = $("#gutter");
@@ -124,6 +133,7 @@ function outdated() {
   problems = [];
   marks();
   $("#report").textContent = "";
+  tellWish();
   forget();
   rememberScript(text.value);
 }
@@ -179,13 +189,44 @@ async function compose(keep: string[] = []) {
     return;
   }
   const params = { ...designer.wish(), ...wish, keep };
-  const answer = await command("viewer.compose", params, none);
-  if (!answer) return;
+  const answer = await call("viewer.compose", params).catch(words);
+  if (typeof answer === "string") {
+    emit("note", "error", none, answer);
+    refused = { wish, why: answer };
+    tellWish();
+    return;
+  }
+  refused = null;
   setScript(answer.text);
   const mine = (made = text.value);
+  writtenFor = wish;
+  tellWish();
   await check();
   if (text.value === mine) offer(answer.moved, keep);
 }
+// What the written script was wished to be, and the last wish that gave no script: while another
+// one stands in the fields, the script beside them is not of it.
+let writtenFor: Wish | null = null;
+let refused: { wish: Wish; why: string } | null = null;
+function tellWish() {
+  const wish = wished();
+  const note = $("#wish-note");
+  if (typeof wish === "string") {
+    setText(note, wish);
+  } else if (refused && sameWish(refused.wish, wish)) {
+    const old = text.value ? " The script above is another one." : "";
+    setText(note, `Not written: ${refused.why}.${old}`);
+  } else if (writtenFor && text.value === made && !sameWish(writtenFor, wish)) {
+    setText(note, `The script above is of ${wishWords(writtenFor)}: press Write for these.`);
+  } else setText(note, "");
+  note.hidden = !note.textContent;
+}
+effect(() => {
+  kind.get();
+  frames.get();
+  exposure_ms.get();
+  tellWish();
+});
 // The designer rewrites what was written here; a script of somebody's own stays until Write is
 // pressed.
 let made = "";
@@ -512,6 +553,17 @@ canvas.addEventListener("keydown", (e) => {
 new ResizeObserver(redraw).observe(canvas);
 
 async function run() {
+  const button = $button("#run");
+  button.disabled = true;
+  setText(button, "Starting …");
+  try {
+    await submit();
+  } finally {
+    setText(button, "Run");
+    marks();
+  }
+}
+async function submit() {
   const speed = $select("#speed-up").value;
   const params: ScriptInput = {
     text: text.value,

@@ -25,7 +25,12 @@ const SAME = 0.12;
 const sample = $select("#scan-it-sample");
 const go = $button("#scan-it");
 const note = $("#scan-it-note");
+const EMPTY = "empty";
 let mine: string | null = null;
+// From the press of the button until the scan has begun.
+let pressed = false;
+// Until the twin has answered to a choice.
+let exchanging = false;
 // From the press of the button until the volume stands beside its truth.
 let busy = false;
 // Until the first image: then the stage stands where it turns, and the camera goes there.
@@ -125,7 +130,8 @@ export async function turnOf(
 // Begins a scan of a sample, of the chosen one unless another is named, whose volume grows and
 // then stands beside its truth; its job, or null.
 export async function scanIt(named: string = sample.value): Promise<string | null> {
-  go.disabled = true;
+  pressed = true;
+  allow();
   try {
     mine = await turnOf(named);
     if (!mine) return null;
@@ -135,19 +141,39 @@ export async function scanIt(named: string = sample.value): Promise<string | nul
     emit("note", "good", "Scan it", `${named || "the sample"}: ${mine} has begun`);
     return mine;
   } finally {
-    go.disabled = false;
+    pressed = false;
+    allow();
   }
+}
+// Nothing is scanned of an empty stage.
+function allow(): void {
+  go.disabled = pressed || !store.state?.sample.name;
 }
 
 on("state", (state) => {
   const offered = [...$select("#sample").options].map((option) => option.value);
-  const names = [...new Set([state.sample.name ?? "", ...offered])].filter(Boolean);
+  const stands = state.sample.name ?? EMPTY;
+  const names = [...new Set([stands, ...offered])];
   const key = names.join("\n");
-  if (!busy) setText(note, told(state));
-  if (sample.dataset.names === key || document.activeElement === sample) return;
-  sample.dataset.names = key;
-  sample.replaceChildren(...names.map((name) => el("option", { value: name }, name)));
+  if (!busy && !exchanging) setText(note, told(state));
+  if (sample.dataset.names !== key && document.activeElement !== sample) {
+    sample.dataset.names = key;
+    sample.replaceChildren(...names.map((name) => el("option", { value: name }, name)));
+  }
+  if (!exchanging) sample.value = stands;
+  allow();
 });
+// The list is what stands on the stage, as that of the Setup tab: a choice puts it there.
+async function exchange(): Promise<void> {
+  exchanging = true;
+  setText(note, `${sample.value} is put on the stage …`);
+  try {
+    await command("sample.set", { name: sample.value }, "The sample stays");
+  } finally {
+    exchanging = false;
+    sample.value = store.state?.sample.name ?? EMPTY;
+  }
+}
 function told(state: State): string {
   const voxel_um = filling(state);
   if (!state.sample.name || voxel_um === null) return "The stage is empty: choose a sample.";
@@ -177,6 +203,4 @@ on("volume", (volume) => {
   if (mine === null && ended) busy = false;
 });
 clicks({ "scan-it": () => scanIt() });
-sample.addEventListener("change", () => {
-  setText(note, `${sample.value} is put on the stage first.`);
-});
+sample.addEventListener("change", () => void exchange());

@@ -54,6 +54,10 @@ export interface Wish {
   frames: number;
   exposure_ms: number;
 }
+export const sameWish = (a: Wish, b: Wish): boolean =>
+  a.kind === b.kind && a.frames === b.frames && a.exposure_ms === b.exposure_ms;
+export const wishWords = ({ kind: way, frames: count, exposure_ms: ms }: Wish): string =>
+  `${count} frames of ${ms} ms (${way})`;
 // The wish; what is no number of images or no exposure is said in words instead.
 export function wished(): Wish | string {
   read();

@@ -2,6 +2,7 @@
 // wrong.
 import { $, $$, $button, $dialog, $input, el, fixed, setText } from "./dom.js";
 import { listed, sampleOf } from "./fingerprint.js";
+import { toYou } from "./names.js";
 import type { ClockState, State } from "./viewer.js";
 import { command, imageMade, OLD_S, on, person, rename, store } from "./link.js";
 import { isDown, stopped } from "./warnings.js";
@@ -31,7 +32,11 @@ export function note(
 on("note", (kind, title, body) => note(kind, title, body));
 on("log", (entry) => {
   if (["warning", "error"].includes(entry.level))
-    note(entry.level === "error" ? "error" : "warning-note", "Twin", entry.message);
+    note(
+      entry.level === "error" ? "error" : "warning-note",
+      "Twin",
+      toYou(entry.message, store.session),
+    );
 });
 
 // How fast the twin's time runs: as measured, else as asked for.

@@ -1,9 +1,10 @@
-// Misalign: the thesis as a story in five steps. The scanner is told a wrong geometry, a
-// scan of a gear shows what that does to a volume, a short scan of the bead phantom tells the
+// Misalign: the thesis as a story in five steps. The reconstruction gets a wrong geometry, a
+// scan of a gear shows what that does to a volume, a short scan of the bead phantom measures the
 // right one, and a second scan of the gear is sharp again. Images are the same with a part that
 // is displaced and with a reconstruction that believes it displaced: so nothing is bent.
 import { $, clicks, el, fixed, setText, words } from "./dom.js";
 import { call, command, emit, on, store } from "./link.js";
+import { beliefWords, type Found } from "./belief.js";
 import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
 import { isUnfinished } from "./job_words.js";
@@ -23,7 +24,7 @@ const COMMENT = "misaligned by hand";
 // Offset -> what it is, its unit, the largest and the first value of its slider, what it
 // does to a volume.
 type Offset = [what: string, unit: string, most: number, first: number, does: string];
-const TRUTH: Record<string, Offset> = {
+const BELIEFS: Record<string, Offset> = {
   dO_x: ["axis aside", "mm", 1, 0.5, "edges double, balls become arcs"],
   det_roll: ["panel rolled", "°", 3, 1, "slices shear, worse away from the middle"],
   det_pitch: ["panel tilted", "°", 5, 0, "slices blur with their height"],
@@ -33,11 +34,16 @@ const STEPS: Array<[id: string, button: string, says: string]> = [
   [
     "story-bend",
     "1  Misalign",
-    "Choose how wrong the geometry is; a printed gear goes onto the stage.",
+    "The machine stays as it is. The sliders are what the reconstruction wrongly believes of it; " +
+      "a printed gear goes onto the stage.",
   ],
-  ["story-scan", "2  Scan it", "One turn, reconstructed with the wrong geometry."],
-  ["story-fit", "3  Calibrate", "A bead phantom turns once: its beads tell the geometry."],
-  ["story-apply", "4  Apply", "What was found comes into force."],
+  ["story-scan", "2  Scan it", "One turn, reconstructed with what the sliders say."],
+  [
+    "story-fit",
+    "3  Calibrate",
+    "A bead phantom turns once: its beads measure what the machine truly is.",
+  ],
+  ["story-apply", "4  Apply", "What the beads say takes the place of what the sliders said."],
   [
     "story-again",
     "5  Scan it again",
@@ -50,6 +56,7 @@ let dataset: string | null = null;
 let phantomJob: string | null = null;
 let found: { correction: Record<string, number>; source: string } | null = null;
 let waiting = false;
+let believed: Record<string, number> = {};
 const rms: number[] = [];
 
 const slider = (name: string) => $<HTMLInputElement>(`#story-${name}`);
@@ -58,7 +65,7 @@ const card = el(
   "details",
   { class: "card", id: "story" },
   el("summary", {}, "Misalign: what a wrong geometry does, in five steps"),
-  ...Object.entries(TRUTH).map(([name, [what, unit, most, start, does]]) =>
+  ...Object.entries(BELIEFS).map(([name, [what, unit, most, start, does]]) =>
     el(
       "div",
       { title: does },
@@ -84,12 +91,12 @@ const card = el(
     el("button", { id, class: "small", disabled: id !== first }, button),
   ),
   el("div", { id: "story-says", class: "small-text", "aria-live": "polite" }),
-  el("div", { id: "story-found", class: "small-text mono" }),
+  el("div", { id: "story-found", class: "small-text" }),
 );
 $("#tab-calibrate").prepend(card);
 
 function chosen(): Record<string, number> {
-  const names = Object.keys(TRUTH);
+  const names = Object.keys(BELIEFS);
   return Object.fromEntries(names.map((name) => [name, slider(name).valueAsNumber]));
 }
 function says(): void {
@@ -123,7 +130,8 @@ async function bend(): Promise<void> {
   step = 0;
   rms.length = 0;
   setText($("#story-found"), "");
-  const wrong = { parameters: chosen(), source: null, comment: COMMENT };
+  believed = chosen();
+  const wrong = { parameters: believed, source: null, comment: COMMENT };
   if (!(await command("sample.set", { name: OBJECT }, "The sample stays"))) return;
   if (!(await command("calibration.apply", wrong, "Not applied"))) return;
   next();
@@ -163,15 +171,11 @@ async function look(scanned: string): Promise<void> {
   tell(report.parameters);
   next();
 }
-// What was found beside what was told.
+// What the beads say beside what the sliders said when the geometry was bent.
 function tell(parameters: Record<string, unknown>): void {
-  const rows = Object.entries(TRUTH).map(([name, [what, unit]]) => {
-    const one = parameters[name] as { value: number; sigma: number | null } | undefined;
-    const seen = one
-      ? `found ${fixed(one.value, 3)} ± ${fixed(one.sigma, 3)} ${unit}`
-      : "not estimated: back to nominal";
-    const told = fixed(slider(name).valueAsNumber, 2);
-    return el("div", {}, `${what}: told ${told} ${unit}, ${seen}`);
+  const rows = Object.entries(BELIEFS).map(([name, [what, unit]]) => {
+    const found = parameters[name] as Found | undefined;
+    return el("div", {}, beliefWords(what, unit, believed[name], found));
   });
   $("#story-found").replaceChildren(...rows);
 }

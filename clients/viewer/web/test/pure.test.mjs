@@ -1,6 +1,8 @@
 // What the page's pure modules compute, as browsers get them; run by tests/viewer/test_page_units.py.
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { beliefWords } from "../../data/belief.js";
+import { decades } from "../../data/decades.js";
 import * as figures from "../../data/figures.js";
 import * as fp from "../../data/fingerprint.js";
 import * as job from "../../data/job_words.js";
@@ -287,4 +289,47 @@ test("an absurd size is called that, and a usual one is not", () => {
   assert.match(meshes.absurd([0.001, 0.001, 0.001], 0.04, 500), /1 µm, 0.025 voxels/);
   assert.match(meshes.absurd([3000, 2000, 4000], 0.04, 500), /2 m, beyond the source/);
   for (const mm of [1, 10, 60, 200]) assert.equal(meshes.absurd([mm, mm, mm], 0.04, 500), "");
+});
+
+test("a histogram over decades has each share where its values lie", () => {
+  for (let k = 0; k < 100; k++) {
+    const values = Array.from({ length: 200 }, () => 10 ** (-5 * random() ** 2) * 1.3);
+    const edges = [0, ...Array.from({ length: 41 }, (_, i) => 10 ** (-3.95 + 0.1 * i))];
+    const ends = [...edges.slice(1), Infinity];
+    const shares = edges.map(
+      (low, i) => values.filter((v) => v >= low && v < ends[i]).length / values.length,
+    );
+    const { counts, range: [low, high] } = decades({ edges, shares });
+    const step = (high - low) / counts.length;
+    counts.forEach((share, i) => {
+      const from = i === 0 ? 0 : 10 ** (low + i * step) * (1 + 1e-9);
+      const to = i === counts.length - 1 ? Infinity : 10 ** (low + (i + 1) * step) * (1 - 1e-9);
+      const inside = values.filter((v) => v > from && v < to).length / values.length;
+      assert.ok(Math.abs(share - inside) < 1e-9, `${i}: ${share}, not ${inside}`);
+    });
+  }
+});
+
+test("a belief that the beads contradict is called wrong, and one that they do not is not", () => {
+  for (let k = 0; k < 300; k++) {
+    const value = 4 * random() - 2;
+    const sigma = 0.01 + random();
+    const off = 8 * random() - 4;
+    if (Math.abs(Math.abs(off) - 3) < 0.06) continue;
+    const words = beliefWords("axis aside", "mm", value + off * sigma, { value, sigma });
+    assert.equal(words.includes("the slider was wrong"), Math.abs(off) > 3, words);
+    assert.equal(words.includes("the slider agrees"), Math.abs(off) < 3, words);
+    const sigmas = Number(/([\d.]+) sigmas/.exec(words)[1]);
+    assert.ok(Math.abs(sigmas - Math.abs(off)) < 0.051, words);
+  }
+  const none = beliefWords("panel tilted", "°", 1, undefined);
+  assert.match(none, /the slider said 1\.00 °; the beads do not tell it/);
+});
+
+test("the reader's own session is called you, and nobody else's", () => {
+  const told = names.toYou("E-stop by a visitor #8", "a visitor #8");
+  assert.equal(told, "E-stop by you");
+  assert.equal(names.toYou("E-stop by a visitor #81", "a visitor #8"), "E-stop by a visitor #81");
+  assert.equal(names.toYou("E-stop by A+B. #3", "A+B. #3"), "E-stop by you");
+  assert.equal(names.toYou("E-stop by Anna #2", null), "E-stop by Anna #2");
 });
