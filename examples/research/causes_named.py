@@ -4,7 +4,8 @@
 scans of drawn bead phantoms in the ways of `faults_drawn.KINDS`, calibrates each and says
 whether the cause was named right, vaguely or not at all, and how many sigmas the worst of an
 answer that was offered is off. More than four is a confident wrong answer, and the command
-fails.
+fails. `--json` prints a line as soon as a scan is judged, one scan of every kind before the
+second of any, and the sums last.
 
 Geometry and shadows come from `faults_drawn`; nothing of the fit or of its diagnoses is in
 them.
@@ -190,11 +191,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
-    all_of_them = [
-        scored(kind, args.seed + i)
-        for kind in args.kinds.split(",")
-        for i in range(args.each)
-    ]
+    kinds = args.kinds.split(",")
+    all_of_them = []
+    for seed in range(args.seed, args.seed + args.each):
+        for kind in kinds:
+            all_of_them.append(scored(kind, seed))
+            if args.json:
+                print(json.dumps(asdict(all_of_them[-1])), flush=True)
     wrong = [s for s in all_of_them if s.wrong]
     right = sum(s.verdict == "right" for s in all_of_them)
     offered = [s for s in all_of_them if s.offered]
@@ -206,7 +209,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "with_a_condition": max((s.worst for s in offered if s.conditional), default=math.nan),
     }  # fmt: skip
     if args.json:
-        print(json.dumps({**summary, "each": [asdict(s) for s in all_of_them]}))
+        print(json.dumps(summary))
         return 1 if wrong else 0
     for s in all_of_them:
         if s.verdict != "right" or s.wrong:
