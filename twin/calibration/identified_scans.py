@@ -13,7 +13,11 @@ import numpy as np
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.diagnose import Finding, listed
-from flexdt.twin.calibration.diagnose.data import WIDE_GATE_PX, explain_identification
+from flexdt.twin.calibration.diagnose.data import (
+    WIDE_GATE_PX,
+    convincing,
+    explain_identification,
+)
 from flexdt.twin.calibration.diagnose.fitted import OF_MOTION
 from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers, frame_numbers
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, nothing
@@ -116,7 +120,9 @@ def _numbers(
     Nothing is searched where the identification explains more than `MAX_BEAD_SHARE` of
     the spots of every frame of two or more. Tried are a clear identification
     (`CLEAR_PX`), both halves and the middle of the scan, then any identification, until
-    one below `NEAR_PX` gives numbers.
+    one below `NEAR_PX` gives numbers. Lost and repeated frames are claimed only if the
+    scan fits the phantom with its frames numbered anew: a stage that rests, or spots of
+    another phantom, fit some angle in each frame by chance.
 
     Args:
         found: identification of the scan, or None.
@@ -146,6 +152,17 @@ def _numbers(
         numbers = frame_numbers(
             detections, model.beads, scan.poses, base.parameters, spread
         )
-        if numbers is not None:
+        if numbers is None:
+            continue
+        if not numbers.renumbered or _fits_anew(numbers, detections, model, scan):
             return numbers
     return None
+
+
+def _fits_anew(
+    numbers: FrameNumbers, detections: Sequence[Detections], model: BeadModel, scan: Scan
+) -> bool:
+    """Check whether the spots of a scan fit the phantom at the angles that its frames show."""
+    shown = replace(scan.poses, angle=numbers.angles(scan.poses.angle))
+    found = attempt(detections, model, shown)
+    return found is not None and convincing(found)

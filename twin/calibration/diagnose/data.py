@@ -213,7 +213,7 @@ def explain_identification(
             f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
             "scale nor the angle",
         )
-    if found is not None and found.ambiguous and _convincing(found):
+    if found is not None and found.ambiguous and convincing(found):
         angles = [p.to_edge()["alpha"] % 360.0 for p in (found.parameters, *found.rivals)]
         listed = ", ".join(f"{a:.1f}" for a in angles)
         return error(
@@ -239,7 +239,7 @@ def explain_identification(
                 "bead: it "
                 "is elsewhere, or lost; the others are used",
             )
-        if _convincing(found):
+        if convincing(found):
             if found.explained > SOME_SPOTS or not _extra(found, counts):
                 return None
             return warning(
@@ -333,7 +333,7 @@ def _plausible(found: Identification) -> bool:
     return found.explained >= 0.85 and found.found >= 0.85 and found.rms_px < 4.0
 
 
-def _convincing(found: Identification) -> bool:
+def convincing(found: Identification) -> bool:
     """Check whether an identification explains and finds most spots (`GOOD_SHARE`),
     closely enough (`GOOD_RMS_PX`) to be believed.
     """
@@ -453,7 +453,7 @@ def _alternative(
         # closely: four of the LEGO phantom's five beads are a helix, which turns round into
         #     itself.
         off = (round(1.0 - other.explained, 1), other.rms_px)
-        if _convincing(other) and better and (best is None or off < best[:2]):
+        if convincing(other) and better and (best is None or off < best[:2]):
             best = (*off, code, text)
     if best is not None:
         return error(*best[2:])
@@ -540,7 +540,7 @@ def _in_parts(
             ("last", slice(n - n // share, n)),
         ):
             own = attempt(detections[part], model, poses[part])
-            if own is not None and _convincing(own):
+            if own is not None and convincing(own):
                 ends.setdefault(end, (part, own.parameters))
         if len(ends) > 1:
             break
@@ -589,7 +589,7 @@ def _other_turn(
     for factor in TURN_FACTORS:
         some = replace(poses, angle=poses.angle[0] + factor * turned)[:n]
         own = attempt(detections[:n], model, some, loose=TURN_WIDTH)
-        if own is not None and _convincing(own) and own.rms_px < best[0]:
+        if own is not None and convincing(own) and own.rms_px < best[0]:
             best = own.rms_px, factor * own.parameters.angle_scale
     if abs(best[1] - 1.0) < LEAST_TURN:
         return None
@@ -623,7 +623,7 @@ def _one_by_one(
         alone = slice(i, i + 1)
         own = attempt(detections[alone], model, poses[alone], search=Search(starts=36))
         if own is not None and len(detections[i]) >= 5:
-            good += _convincing(own) and own.explained > SOME_SPOTS
+            good += convincing(own) and own.explained > SOME_SPOTS
     if good < 0.7 * len(chosen):
         return None
     return error(

@@ -47,6 +47,20 @@ class FrameNumbers:
     shift: npt.NDArray[np.int64]
     fits: npt.NDArray[np.bool_]
 
+    def angles(self, angle: FloatArray) -> FloatArray:
+        """Compute the angle that each frame shows; beyond the ends, the first and the last
+        step go on.
+
+        Args:
+            angle: (n,) of the frames by their own numbers [rad], two at least.
+        """
+        n = len(angle)
+        shown = np.arange(n) + self.shift
+        inside = np.clip(shown, 0, n - 1)
+        beyond = shown - inside
+        step = np.where(beyond < 0, angle[1] - angle[0], angle[-1] - angle[-2])
+        return np.asarray(angle[inside] + beyond * step)
+
     @property
     def again(self) -> npt.NDArray[np.intp]:
         """Frames that show another angle, while the frames after them show their own."""
