@@ -24,9 +24,11 @@ import warnings
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NoReturn
+from unittest.mock import patch
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -711,8 +713,15 @@ def main(words: list[str] | None = None) -> int:
         "--json", action="store_true", help="one line for each scan as well"
     )
     o = parser.parse_args(words)
-    if o.column:
-        turn_planes.find_height = untold  # type: ignore[assignment]
+    with ExitStack() as column_only:
+        if o.column:
+            column_only.enter_context(patch.object(turn_planes, "find_height", untold))
+        runs = tried_in_turn(o)
+    return summary(runs, o.sigmas)
+
+
+def tried_in_turn(o: argparse.Namespace) -> list[dict[str, Any]]:
+    """Try `--count` scans, each with the next kind of trouble, at times with one more."""
     rng, runs = np.random.default_rng(o.seed), []
     names = sorted(o.only.split(",") if o.only else FAULTS)
     for k in range(o.count):
@@ -724,7 +733,7 @@ def main(words: list[str] | None = None) -> int:
         runs.append(tried(kinds, int(rng.integers(2**31)), k % 2 == 1 and not o.column))
         if o.json:
             print(json.dumps(runs[-1]), flush=True)
-    return summary(runs, o.sigmas)
+    return runs
 
 
 def untold(*_: object) -> NoReturn:

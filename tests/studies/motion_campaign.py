@@ -21,6 +21,7 @@ from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
@@ -159,8 +160,8 @@ def main() -> int:
     machines = options.machine or list(MACHINES)
     begun = time.monotonic()
     tally = Tally()
-    store.mesh_apart = read_here
     with (
+        patch.object(store, "mesh_apart", read_here),
         tempfile.TemporaryDirectory() as folder,
         ProcessPoolExecutor(options.jobs) as pool,
     ):

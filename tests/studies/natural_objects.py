@@ -30,6 +30,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
+from unittest.mock import patch
 
 import numba
 import numpy as np
@@ -578,7 +579,7 @@ def tried(
     scan = fan_of_wires(rng) if fan else drawn(kind, rng, gap, near)
     data = scan.data(rng)
     begun = time.process_time()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), patch.object(turn_planes, "find_height", untold):
         warnings.simplefilter("ignore")
         found = data.align()
     told: dict[str, Any] = {
@@ -618,7 +619,6 @@ def main(words: list[str] | None = None) -> int:
         "--json", action="store_true", help="one line for each scan as well"
     )
     o = parser.parse_args(words)
-    turn_planes.find_height = untold  # type: ignore[assignment]
     names = ["wires"] if o.fans else o.only.split(",") if o.only else list(OBJECTS)
     runs = []
     for k in range(o.count):

@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from in_process import Client, script
@@ -178,6 +179,7 @@ class WireEpisode:
         self.correction_names: list[str] = []
         self.scenes: list[Json] = []
         self.shapes = dict(SHAPES)
+        self._reading_here = patch.object(store, "mesh_apart", read_here)
         self._incoming: str | None = None
         """A name under which another file comes just now."""
         self._watch: Watch | None = None
@@ -189,7 +191,7 @@ class WireEpisode:
         says.
         """
         self.sim.__enter__()
-        store.mesh_apart, self._apart = read_here, store.mesh_apart
+        self._reading_here.start()
         self._begin()
         scanner = self.sim.twin.scanner
         scanner.place(self.start.positions, self.sim.twin.clock.now())
@@ -199,7 +201,7 @@ class WireEpisode:
         return self
 
     def __exit__(self, *_: object) -> None:
-        store.mesh_apart = self._apart
+        self._reading_here.stop()
         self.sim.__exit__(None, None, None)
         shutil.rmtree(self.root, ignore_errors=True)
 
