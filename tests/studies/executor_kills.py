@@ -46,7 +46,12 @@ def taking_arguments(pool: ProcessPoolExecutor, pid: int) -> Future[object]:
 
 
 def sending_a_result(pool: ProcessPoolExecutor, pid: int) -> Future[object]:
-    """Killed while its result goes."""
+    """Kill a worker by SIGKILL while its result is on the way, once READ bytes of it have
+    come.
+
+    Returns:
+        The future of that result.
+    """
     before = received()
     future: Future[object] = pool.submit(bytes, SIZE)
     while received() - before < READ:

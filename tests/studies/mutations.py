@@ -165,7 +165,12 @@ def in_children(
 
 
 def _child(copy: Copy, work: Callable[[], int]) -> None:
-    """Become a process that works in a copy and ends."""
+    """Become a process group of its own that works in a copy, and end the process; it
+    never returns.
+
+    Output goes to the copy's log; memory is limited to MEMORY. The exit status is what
+    `work` returns, 3 if it raises.
+    """
     code = 3
     try:
         os.setsid()
