@@ -145,8 +145,9 @@ def read_flexdata(
     """Read a `geometry.toml`; the result is for images as they are, with row 0 on top.
 
     `views` and `shape`, if given, count before the file's. Of the three distances two are
-    needed; src2det counts only for one that is missing. Tuples in parentheses are read.
-    Another version of the format is a note of the result, not an error.
+    needed; src2det counts only for one that is missing. Parentheses are read as brackets,
+    since flexDATA writes tuples. Another version of the format is a note of the result,
+    not an error.
 
     Args:
         text: the file.

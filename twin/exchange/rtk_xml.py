@@ -147,8 +147,8 @@ def read_rtk(
 ) -> ScanGeometry:
     """Read RTK's XML.
 
-    Parallel views are refused, and distances that contradict each other; numbers before
-    the views hold for all.
+    Numbers before the views hold for all. Distances are refused only if those of every
+    view are such as no scanner has.
 
     Args:
         text: the file.
@@ -157,7 +157,8 @@ def read_rtk(
         file: for messages.
 
     Raises:
-        ExchangeError: no such XML, another version, a curved detector.
+        ExchangeError: no such XML, another version, a number that is not finite, a
+            parallel view, or an unknown element that is not 0, such as a curved detector.
     """
     try:
         root = ElementTree.fromstring(text)

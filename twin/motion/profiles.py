@@ -152,7 +152,9 @@ class Trajectory:
 
     @property
     def top_speed(self) -> float:
-        """Largest absolute speed of the motion; each piece has it at one of its ends."""
+        """Largest absolute speed of the motion [mm/s, deg/s]; each piece has it at one of
+        its ends.
+        """
         ends = zip(
             self.pieces, (*[p.start for p in self.pieces[1:]], self.end), strict=True
         )
