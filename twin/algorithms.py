@@ -48,8 +48,8 @@ class Algorithm:
 
     def load(self) -> Callable[..., Any]:
         """Import the algorithm's module and return its function."""
-        found: Callable[..., Any] = getattr(import_module(self.home), self.function)
-        return found
+        function: Callable[..., Any] = getattr(import_module(self.home), self.function)
+        return function
 
 
 _ITERATIVE: Final = "flexdt.twin.reconstruction.iterative"

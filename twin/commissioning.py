@@ -152,14 +152,17 @@ def standing(scan: PastScan, machine: Machine) -> PastScan:
     sdd = float(built.poses.sdd[0])
     far = zero.model_copy(update={"c_obj": f.sod_mm - sod, "c_det": f.sdd_mm - sdd})
     at = motor_poses(machine, far, camera, built.positions)
-    own = stated_geometry.figures_of(at, camera.shape)
-    across = [(g.cor_px - g.hc_px) * own.pixel_mm * g.sod_mm / g.sdd_mm for g in (f, own)]
-    found = {
-        "det_tan": (own.hc_px - f.hc_px) * own.pixel_mm,
-        "src_ort": (own.vc_px - f.vc_px) * own.pixel_mm,
+    computed = stated_geometry.figures_of(at, camera.shape)
+    across = [
+        (g.cor_px - g.hc_px) * computed.pixel_mm * g.sod_mm / g.sdd_mm
+        for g in (f, computed)
+    ]
+    sideways = {
+        "det_tan": (computed.hc_px - f.hc_px) * computed.pixel_mm,
+        "src_ort": (computed.vc_px - f.vc_px) * computed.pixel_mm,
         "axs_tan": across[0] - across[1],
     }
-    profile = far.model_copy(update=found)
+    profile = far.model_copy(update=sideways)
     return replace(scan, positions=built.positions, camera=camera, profile=profile)
 
 
@@ -255,11 +258,11 @@ def scanner_of(scan: PastScan, known: Sequence[Machine]) -> Scanner:
     for x in scan.log:
         if x.motor is not None and isinstance(x.command, c.MotorCommand):
             limits[x.command.component] = x.motor.lower, x.motor.upper
-    found = max(known, key=lambda machine: _shared(limits, machine), default=None)
-    if found is not None and _shared(limits, found) >= max(
+    nearest = max(known, key=lambda machine: _shared(limits, machine), default=None)
+    if nearest is not None and _shared(limits, nearest) >= max(
         MIN_SHARED_LIMITS, len(limits) / 2
     ):
-        return Scanner(found.name, serial, "the motors' limits in its executed script")
+        return Scanner(nearest.name, serial, "the motors' limits in its executed script")
     return Scanner(serial=serial)
 
 
@@ -273,13 +276,13 @@ def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
         limits: motor -> (lower, upper).
         machine: to compare with.
     """
-    own = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
+    axes = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(
         axis is not None
         and bool(
             np.allclose(limits[name], (axis.lower, axis.upper), RELATIVE_TOLERANCE, 0.0)
         )
-        for name, axis in own.items()
+        for name, axis in axes.items()
     )
 
 
@@ -400,14 +403,14 @@ def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any
         return
     signs = {name: axis.settings_sign for name, axis in machine.axes.items()}
     read = {n: signs[n] * m.value for n, m in s.motors.items() if n in signs}
-    asked = scripted(scan, machine)
-    for name in asked.keys() & signs.keys():
-        asked[name] = min(
-            max(asked[name], machine.axes[name].lower), machine.axes[name].upper
+    requested = scripted(scan, machine)
+    for name in requested.keys() & signs.keys():
+        requested[name] = min(
+            max(requested[name], machine.axes[name].lower), machine.axes[name].upper
         )
     sources: dict[str, Mapping[str, Any]] = {
         "the text": {**vars(s), **read},
-        "the script": asked,
+        "the script": requested,
     }
     sources["the images"] = {"projections": scan.images or None, "shape": scan.shape}
     if scan.second is not None:
@@ -590,8 +593,8 @@ def zero_offsets(
                 for s in aligned
             ]
         )
-        found = [s.aligned.parameters for s in aligned if s.aligned]
-        rolls = [p["det_roll"] for p in found]
+        estimates = [s.aligned.parameters for s in aligned if s.aligned]
+        rolls = [p["det_roll"] for p in estimates]
         sides = np.vstack([np.column_stack([np.ones(len(aligned)), years]), [0.0, 1.0]])
         rest = [*(r.value - base.det_roll_deg for r in rolls), 0.0]
         fitted(
@@ -604,7 +607,7 @@ def zero_offsets(
             ]
         )
         sides = np.column_stack([seen[:, 1], seen[:, 1] * years, seen[:, 2]])
-        measured = [p["axis_column_px"] for p in found]
+        measured = [p["axis_column_px"] for p in estimates]
         rest = [
             *(m.value - at for m, at in zip(measured, seen[:, 0], strict=True)),
             0.0,
@@ -665,7 +668,7 @@ def _axis(
     Returns:
         Column [px], and its two slopes [px/mm].
     """
-    own = scan.profile or base
+    offsets = scan.profile or base
     camera = scan.camera or machine.detector.camera
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     column = []
@@ -675,7 +678,9 @@ def _axis(
             "det_tan": base.det_tan + det,
             "det_roll_deg": roll,
         }
-        poses = motor_poses(machine, own.model_copy(update=moved), camera, scan.positions)
+        poses = motor_poses(
+            machine, offsets.model_copy(update=moved), camera, scan.positions
+        )
         column.append(float(axis_in_image(poses, NOMINAL, middle)[0]))
     return column[0], column[1] - column[0], column[2] - column[0]
 
@@ -701,20 +706,20 @@ def _fit(
         out, in sigmas.
     """
     a, b = sides / sigmas[:, None], values / sigmas
-    kept = np.ones(len(b), dtype=bool)
+    used = np.ones(len(b), dtype=bool)
     while True:
-        inverse = np.linalg.inv(a[kept].T @ a[kept])
-        at = inverse @ (a[kept].T @ b[kept])
+        inverse = np.linalg.inv(a[used].T @ a[used])
+        at = inverse @ (a[used].T @ b[used])
         rest = b - a @ at
         leverage = np.einsum("ij,jk,ik->i", a, inverse, a)
-        spread = np.sqrt(np.maximum(np.where(kept, 1.0 - leverage, 1.0 + leverage), 1e-9))
+        spread = np.sqrt(np.maximum(np.where(used, 1.0 - leverage, 1.0 + leverage), 1e-9))
         pulls = (rest / spread)[:scans]
-        freedom = int(kept.sum()) - a.shape[1]
-        far = np.where(kept[:scans], np.abs(pulls), 0.0)
+        freedom = int(used.sum()) - a.shape[1]
+        far = np.where(used[:scans], np.abs(pulls), 0.0)
         if freedom < FOR_A_LINE or far.max() <= MAX_SIGMAS:
             return (
                 at,
-                max(1.0, float(rest[kept] @ rest[kept]) / max(freedom, 1)) * inverse,
+                max(1.0, float(rest[used] @ rest[used]) / max(freedom, 1)) * inverse,
                 pulls,
             )
-        kept[int(far.argmax())] = False
+        used[int(far.argmax())] = False

@@ -185,15 +185,15 @@ class UnknownNameError(TwinError):
         near name, or if the message has a suggestion already.
         """
         facts = dict(data or {})
-        asked = facts.get("asked")
+        unknown = facts.get("asked")
         allowed = facts.get("allowed")
         if (
-            isinstance(asked, str)
+            isinstance(unknown, str)
             and isinstance(allowed, Sequence)
             and SUGGESTION not in message
         ):
             near = nearest_name(
-                asked, [name for name in allowed if isinstance(name, str)]
+                unknown, [name for name in allowed if isinstance(name, str)]
             )
             message += "" if near is None else f"; {SUGGESTION} {near!r}?"
         super().__init__(message, facts)

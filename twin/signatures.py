@@ -253,13 +253,13 @@ class Known:
             self.function.__globals__,
             npt=types.SimpleNamespace(ArrayLike=Array, NDArray=Array),
         )
-        found = {}
+        kinds = {}
         for name, parameter in self.signature.parameters.items():
             annotation = parameter.annotation
-            found[name] = kind_of(
+            kinds[name] = kind_of(
                 eval(annotation, {}, names) if isinstance(annotation, str) else annotation
             )
-        return {name: kind for name, kind in found.items() if kind is not None}
+        return {name: kind for name, kind in kinds.items() if kind is not None}
 
     def checked(self, given: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
         """Check the arguments of a call against names and annotations.
@@ -341,17 +341,17 @@ class Known:
         takes = self.signature.parameters
         if any(one.kind is inspect.Parameter.VAR_KEYWORD for one in takes.values()):
             return named
-        found = {}
+        renamed = {}
         for name, value in named.items():
             other = next(
                 (b for pair in NAMES for a, b in (pair, pair[::-1]) if a == name), ""
             )
             if name in takes:
-                found[name] = value
+                renamed[name] = value
             elif other in takes and other not in named:
                 text = f"{where}: {name} is called {other} here"
                 warnings.warn(text, DeprecationWarning, stacklevel=4)
-                found[other] = value
+                renamed[other] = value
             else:
                 near = nearest_name(name, self._names())
                 hint = ""
@@ -359,7 +359,7 @@ class Known:
                     hint = f" (did you mean {near!r}?)"
                 problem = f"{where} has no argument {name!r}{hint}"
                 raise ArgumentError.instead(problem, name, self._names())
-        return found
+        return renamed
 
     def _mistake(
         self, where: str, name: str, label: str, value: object, values: Mapping[str, Any]

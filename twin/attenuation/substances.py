@@ -202,8 +202,8 @@ class Substance:
         """
         if "@" in text:
             return cls.parse(text)
-        found: Substance = backend("materials").material(text).substance
-        return found
+        substance: Substance = backend("materials").material(text).substance
+        return substance
 
     def mass_attenuation(self) -> FloatArray:
         """Compute mu/rho at the energies of the tables, (e,) [cm2/g]."""

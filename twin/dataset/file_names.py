@@ -62,9 +62,9 @@ def _reason(name: str) -> str | None:
         return "is empty"
     if len(name) > MAX_NAME or len(name.encode("utf-8", "surrogatepass")) > 255:
         return f"is {len(name)} characters long"
-    found = _FORBIDDEN.search(name)
-    if found is not None:
-        return f"contains {found.group()!r}"
+    forbidden = _FORBIDDEN.search(name)
+    if forbidden is not None:
+        return f"contains {forbidden.group()!r}"
     if name.startswith(".") or name != name.strip() or name.endswith("."):
         return "starts with a dot or ends with a dot or space"
     if _DEVICE.fullmatch(name):

@@ -128,11 +128,11 @@ def rebuild(
         positions, assumed = _positions(settings, machine, np.degrees(angles))
         notes = [*assumed, *notes]
         camera = _camera(settings, shape, file, machine.detector.camera.modes)
-        found = None
+        choice = None
         if camera is not None:
-            found = _profile(machine, profiles, camera, positions, figures)
-        if found is not None and camera is not None:
-            profile, why = found
+            choice = _profile(machine, profiles, camera, positions, figures)
+        if choice is not None and camera is not None:
+            profile, why = choice
             notes.append(f"profile {profile.name}{why}")
             nominal = motor_poses(machine, profile, camera, positions)
             return Rebuilt(nominal, machine, profile, positions, tuple(notes))
@@ -235,8 +235,8 @@ def _profile(
             return None
         return (chosen, ": the default, no figures to check it by")
     first = {n: v[:1] for n, v in positions.items()}
-    own = () if machine.default_profile else (profile_of(machine),)
-    for profile in (*profiles, *own):
+    zero = () if machine.default_profile else (profile_of(machine),)
+    for profile in (*profiles, *zero):
         if profile.machine == machine.name:
             ours = figures_of(motor_poses(machine, profile, camera, first), camera.shape)
             if _figures_agree(ours, printed):

@@ -262,11 +262,11 @@ def _read_line(
     key, value = _split(line)
     if key == "scan type":
         if value:
-            found = value
+            scan_type = value
         else:
-            found = next((other for other in rest if other), "")
-        if _split(found)[0] not in _BY_KEY:
-            values.setdefault("scan_type", found)
+            scan_type = next((other for other in rest if other), "")
+        if _split(scan_type)[0] not in _BY_KEY:
+            values.setdefault("scan_type", scan_type)
     elif key is not None and key in _BY_KEY:
         _read_field(_BY_KEY[key], value, values)
     elif key is not None and _is_motor(key, value):
@@ -332,10 +332,10 @@ def _moment(line: str) -> datetime | None:
     """Parse a line "date: ...; time: ..." by the first of `_DATE_FORMATS` that fits,
     without a zone; None if none does.
     """
-    found = _DATE.match(line)
-    if found is None:
+    match = _DATE.match(line)
+    if match is None:
         return None
-    text = f"{found['date'].strip()} {found['time'].strip()}"
+    text = f"{match['date'].strip()} {match['time'].strip()}"
     for form in _DATE_FORMATS:
         try:
             return datetime.strptime(text, form)

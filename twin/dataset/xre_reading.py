@@ -141,9 +141,9 @@ def parse_xre(text: str, file: str = XRE_SETTINGS) -> XreSettings:
         if header is not None:
             current = sections.setdefault(header[1].strip(), {})
             continue
-        found = re.fullmatch(r"([^=:]+?)\s*[=:]\s*(.*)", line)
-        if current is not None and found is not None:
-            current.setdefault(found[1], _unquoted(found[2]))
+        entry = re.fullmatch(r"([^=:]+?)\s*[=:]\s*(.*)", line)
+        if current is not None and entry is not None:
+            current.setdefault(entry[1], _unquoted(entry[2]))
     if not sections:
         raise DatasetFormatError(f"{file} holds no [section]", {"path": file})
     return XreSettings(sections)

@@ -167,9 +167,9 @@ def read_flexdata(
         raise ExchangeError(
             f"{file} is not valid TOML: {error}", {"path": file}
         ) from None
-    found = {name: _values(name, records, file) for name in _NUMBERS}
+    numbers = {name: _values(name, records, file) for name in _NUMBERS}
     for name in UNSUPPORTED:
-        if np.any(found[name]):
+        if np.any(numbers[name]):
             raise ExchangeError(
                 f"{file}: {name} is not zero: flexDATA tilts source and detector orbits about "
                 "different points then, which is not imitated",
@@ -184,30 +184,32 @@ def read_flexdata(
             f"{file} does not say how many views there are; it must be given"
         )
     if shape is None and "det_rows" in records and "det_cols" in records:
-        shape = (int(found["det_rows"]), int(found["det_cols"]))
-    sod, odd, sdd = (float(found[name]) for name in ("src2obj", "det2obj", "src2det"))
+        shape = (int(numbers["det_rows"]), int(numbers["det_cols"]))
+    sod, odd, sdd = (float(numbers[name]) for name in ("src2obj", "det2obj", "src2det"))
     sod, odd = (
         (sdd - odd if math.isnan(sod) else sod),
         (sdd - sod if math.isnan(odd) else odd),
     )
     if math.isnan(sod) or math.isnan(odd):
         raise ExchangeError(f"{file}: two of src2obj, det2obj and src2det are needed")
-    given = distance_findings(sod, sod + odd, found["det_pixel"], ("src2obj", "src2det"))
+    given = distance_findings(
+        sod, sod + odd, numbers["det_pixel"], ("src2obj", "src2det")
+    )
     settled(given, ExchangeError, file)
     roll, yaw, pitch = (
-        math.radians(found[f"det_{name}"]) for name in ("roll", "yaw", "pitch")
+        math.radians(numbers[f"det_{name}"]) for name in ("roll", "yaw", "pitch")
     )
     axes = rotation_y(roll) @ rotation_z(yaw) @ rotation_x(pitch)
-    axis = found["axs_tan"]
-    moved = found["vol_tra"]
-    sample = found["det_sample"]
+    axis = numbers["axs_tan"]
+    moved = numbers["vol_tra"]
+    sample = numbers["det_sample"]
     circle = g.CircularScan(
-        np.radians(np.linspace(found["ang_range"][0], found["ang_range"][1], count)),
+        np.radians(np.linspace(numbers["ang_range"][0], numbers["ang_range"][1], count)),
         np.array([-moved[1], -moved[2]]),
-        np.array([found["src_tan"] - axis, -sod, found["src_ort"]]),
-        np.array([found["det_tan"] - axis, odd, found["det_ort"]]),
-        axes[:, 0] * found["det_pixel"] * sample[1],
-        axes[:, 2] * found["det_pixel"] * sample[0],
+        np.array([numbers["src_tan"] - axis, -sod, numbers["src_ort"]]),
+        np.array([numbers["det_tan"] - axis, odd, numbers["det_ort"]]),
+        axes[:, 0] * numbers["det_pixel"] * sample[1],
+        axes[:, 2] * numbers["det_pixel"] * sample[0],
     )
     rows = circle.cone_vec().rows - np.array([0, 0, moved[0]] * 2 + [0.0] * 6)
     version = records.get("flextoml_version")

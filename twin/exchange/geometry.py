@@ -60,9 +60,9 @@ class ScanGeometry:
             ExchangeError: one does not have an entry for each view, or the shape has no
                 pixel.
         """
-        for what, count in (("real rows", self.real), ("files", self.files or None)):
+        for noun, count in (("real rows", self.real), ("files", self.files or None)):
             if count is not None and len(count) != len(self):
-                problem = f"{len(self)} views but {len(count)} {what}"
+                problem = f"{len(self)} views but {len(count)} {noun}"
                 raise ExchangeError.instead(problem, len(count), len(self))
         if self.shape is not None and min(self.shape) < 1:
             raise ExchangeError(
@@ -158,16 +158,16 @@ def circle_of(
     moved = cone_vec.moved(np.eye(3), np.array([-center[0], -center[1], 0.0]))
     world = moved.moved(rotation_z(-angle), np.zeros(3))
     middle = world.rows.mean(axis=0)
-    found = CircularScan(
+    circle = CircularScan(
         angle, center, middle[0:3], middle[3:6], middle[6:9], middle[9:12]
     )
-    miss = np.abs(found.cone_vec().rows - cone_vec.rows).max(axis=1)
+    miss = np.abs(circle.cone_vec().rows - cone_vec.rows).max(axis=1)
     message = (
         f"{format_name} knows one circle with everything else standing still; "
         "the distance [mm]"
     )
     require_each(f"{message} from it", miss, tolerance_mm)
-    return found
+    return circle
 
 
 def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:

@@ -220,13 +220,13 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
     if not len(rows):
         raise ExchangeError(f"{file} holds no view")
     area = np.linalg.norm(np.cross(rows[:, 6:9], rows[:, 9:12]), axis=1)
-    for wrong, what in (
+    for wrong, problem in (
         (~np.isfinite(rows).all(axis=1), "a number is not finite"),
         (area <= 0.0, "u and v span no panel"),
     ):
         if wrong.any():
             view = int(np.argmax(wrong))
-            raise ExchangeError(f"{file}: in view {view} {what}", {"row": view})
+            raise ExchangeError(f"{file}: in view {view} {problem}", {"row": view})
     return ConeVec(rows)
 
 
@@ -244,14 +244,14 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
     """
     where: dict[str, object] = {"line": line, "path": file}
     try:
-        found = [float(word) for word in words]
+        numbers = [float(word) for word in words]
     except ValueError as error:
         word = str(error).partition(": ")[2][:42]
         raise ExchangeError(f"{file}:{line}: {word} is no number", where) from None
-    if len(found) != 12:
-        problem = f"{file}:{line}: {len(found)} numbers"
-        raise ExchangeError.instead(problem, len(found), 12, **where)
-    return found
+    if len(numbers) != 12:
+        problem = f"{file}:{line}: {len(numbers)} numbers"
+        raise ExchangeError.instead(problem, len(numbers), 12, **where)
+    return numbers
 
 
 def _real(array: npt.NDArray[np.generic]) -> bool:
@@ -332,28 +332,28 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         message = f"{file}: kind {form[0]!r}, schema {form[1]!r}"
         raise ExchangeError.instead(message, list(form), f"{KIND!r}, schema {SCHEMA}")
     try:
-        found = _Document.model_validate(
+        content = _Document.model_validate(
             {k: v for k, v in document.items() if v is not None}
         )
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise ExchangeError(f"{file}: {where}: {first['msg']}", {"path": where}) from None
-    rows = found.detector.rows
-    columns = found.detector.columns
-    real = found.real_cone_vec
+    rows = content.detector.rows
+    columns = content.detector.columns
+    real = content.real_cone_vec
     if (rows is None) != (columns is None):
         raise ExchangeError(
             f"{file}: detector: rows and columns must be whole numbers above 0"
         )
     return ScanGeometry(
-        cone_vec_of(found.cone_vec, f"{file}: cone_vec"),
+        cone_vec_of(content.cone_vec, f"{file}: cone_vec"),
         None if rows is None or columns is None else (rows, columns),
         None if real is None else cone_vec_of(real, f"{file}: real_cone_vec"),
-        found.name,
-        found.files,
-        found.notes,
-        found.full_scale,
+        content.name,
+        content.files,
+        content.notes,
+        content.full_scale,
     )
 
 

@@ -138,12 +138,12 @@ def _turns(axes: FloatArray) -> FloatArray:
     both = np.stack([first, other])
     whole = both - 2.0 * np.pi * np.round(both / (2.0 * np.pi))
     nearer = np.abs(whole[:, :, [0, 2]]).sum(axis=2).argmin(axis=0)
-    found: FloatArray = whole[nearer, np.arange(len(axes))]
+    turns: FloatArray = whole[nearer, np.arange(len(axes))]
     # Half a turn either way is one pose; all views of a scan have the same sign.
     return np.where(
-        np.isclose(found, -np.pi, rtol=0.0, atol=CONSTANT_TOLERANCE),
-        found + 2.0 * np.pi,
-        found,
+        np.isclose(turns, -np.pi, rtol=0.0, atol=CONSTANT_TOLERANCE),
+        turns + 2.0 * np.pi,
+        turns,
     )
 
 
@@ -199,11 +199,11 @@ def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatA
     Raises:
         ExchangeError: another shape, or a number that is not finite.
     """
-    own: tuple[int, ...] = (size,) if size else ()
+    form: tuple[int, ...] = (size,) if size else ()
     single: tuple[int, ...] = (size,) if size else (1,)
     if np.shape(arrays[name]) == single:
-        return np.broadcast_to(numbers_of(arrays, name, file, single), (views, *own))
-    return numbers_of(arrays, name, file, (views, *own))
+        return np.broadcast_to(numbers_of(arrays, name, file, single), (views, *form))
+    return numbers_of(arrays, name, file, (views, *form))
 
 
 def _axes(turns: FloatArray) -> FloatArray:

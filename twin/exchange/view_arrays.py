@@ -37,8 +37,8 @@ def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
     """
     lost = [name for name in names if name not in arrays]
     if lost:
-        said = f"{file} lacks {', '.join(lost)}"
-        raise ExchangeError.instead(said, sorted(arrays), tuple(names), missing=lost)
+        problem = f"{file} lacks {', '.join(lost)}"
+        raise ExchangeError.instead(problem, sorted(arrays), tuple(names), missing=lost)
 
 
 def views_of(arrays: Arrays, name: str, file: str) -> int:
@@ -79,12 +79,12 @@ def numbers_of(
     array = np.asarray(arrays[name])
     if array.dtype.kind not in "iuf" or array.shape != shape:
         raise ExchangeError.of_shape(f"{file}: {name}", array.shape, shape, ", numbers")
-    found = array.astype(np.float64)
-    if not np.isfinite(found).all():
+    numbers = array.astype(np.float64)
+    if not np.isfinite(numbers).all():
         raise ExchangeError(
             f"{file}: {name} holds a number that is not finite", {"path": name}
         )
-    return found
+    return numbers
 
 
 def counts_of(
@@ -97,12 +97,12 @@ def counts_of(
     Raises:
         ExchangeError: it has another shape or other content.
     """
-    found = numbers_of(arrays, name, file, shape).ravel()
-    if (found < 1).any() or (found % 1 != 0).any():
+    counts = numbers_of(arrays, name, file, shape).ravel()
+    if (counts < 1).any() or (counts % 1 != 0).any():
         raise ExchangeError.instead(
-            f"{file}: {name}", found.tolist(), "whole numbers above 0"
+            f"{file}: {name}", counts.tolist(), "whole numbers above 0"
         )
-    return tuple(int(count) for count in found)
+    return tuple(int(count) for count in counts)
 
 
 def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
@@ -111,10 +111,10 @@ def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> Fl
     Raises:
         ExchangeError: it has another shape or other content.
     """
-    found = numbers_of(arrays, name, file, shape)
-    if (found <= 0.0).any():
-        raise ExchangeError.instead(f"{file}: {name}", found.tolist(), "above 0")
-    return found
+    sizes = numbers_of(arrays, name, file, shape)
+    if (sizes <= 0.0).any():
+        raise ExchangeError.instead(f"{file}: {name}", sizes.tolist(), "above 0")
+    return sizes
 
 
 def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArray:
@@ -124,12 +124,12 @@ def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArra
         ExchangeError: it has another shape or other content, or a vector of length zero;
             the first such view is named.
     """
-    found = numbers_of(arrays, name, file, (count, SPACE))
-    lengths = np.linalg.norm(found, axis=1, keepdims=True)
+    directions = numbers_of(arrays, name, file, (count, SPACE))
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     if (lengths == 0.0).any():
         view = int(np.argmin(lengths))
         raise ExchangeError(
             f"{file}: {name} has no direction in view {view}", {"row": view}
         )
-    unit: FloatArray = found / lengths
+    unit: FloatArray = directions / lengths
     return unit

@@ -227,11 +227,11 @@ class Follower:
         Active alarms whose subject begins with "ahead" end unless they are among
         `alarms`; others stay. An active one is not added again.
         """
-        found = tuple(alarms)
-        still = {(a.kind, a.about) for a in found}
-        kept = {k for k in mirror.active if not k[1].startswith("ahead") or k in still}
-        mirror = replace(mirror, active=frozenset(kept))
-        for alarm in found:
+        present = tuple(alarms)
+        still = {(a.kind, a.about) for a in present}
+        active = {k for k in mirror.active if not k[1].startswith("ahead") or k in still}
+        mirror = replace(mirror, active=frozenset(active))
+        for alarm in present:
             mirror = mirror.alarmed(alarm)
         return mirror
 
@@ -271,7 +271,7 @@ class Follower:
         assumed = ""
         if mirror.assumed:
             assumed = f" ({', '.join(mirror.assumed)} assumed at home)"
-        found: dict[tuple[str, int], Alarm] = {}
+        alarms: dict[tuple[str, int], Alarm] = {}
         exposures = [p for p in report.warnings if p.code in OPEN_BEAM_CODES]
         for p in (*report.errors, *exposures):  # of the contacts of one line, the first
             where = "the move under way"
@@ -279,14 +279,14 @@ class Follower:
                 where = f"line {p.line}"
             message = f"{where}: {p.message}{assumed}"
             alarm = Alarm(now, p.severity, p.code, f"ahead, {where}", message)
-            found.setdefault((p.code, p.line), alarm)
+            alarms.setdefault((p.code, p.line), alarm)
         near = report.clearance
         bound = self.machine.safety_margin_mm + NEAR_PART_MM
         if near and not near.collisions and (near.min_clearance_mm or bound) < bound:
             parts = " and ".join(near.min_clearance_pair or ())
             message = f"{parts} come within {near.min_clearance_mm:.2f} mm{assumed}"
-            found["clearance", 0] = Alarm(now, "warning", "clearance", "ahead", message)
-        return tuple(found.values())
+            alarms["clearance", 0] = Alarm(now, "warning", "clearance", "ahead", message)
+        return tuple(alarms.values())
 
     # -- commands ----------------------------------------------------------------------------
 
@@ -330,8 +330,8 @@ class Follower:
         if heard.command is not None:
             mirror = self._follow_script(mirror, heard.command, now)
             mirror, waiting = self._predict(mirror, waiting, heard.command, now)
-        kept = dict(list(mirror.waiting.items())[1 - MAX_WAITING :])
-        return replace(mirror, waiting={**kept, heard.identity: waiting})
+        newest = dict(list(mirror.waiting.items())[1 - MAX_WAITING :])
+        return replace(mirror, waiting={**newest, heard.identity: waiting})
 
     def _end_overdue(self, mirror: Mirror, component: str, now: float) -> Mirror:
         """Mark commands whose predicted time is over as ended, and apply their settings.
@@ -472,11 +472,11 @@ class Follower:
                 began = mirror.began_s
             steps = self._steps[: at + 1]
             holds = sum(s.holds_s for s in steps)
-            found = total_range(steps, holds, self.machine.timing)
-            if found is None:
+            total = total_range(steps, holds, self.machine.timing)
+            if total is None:
                 bounds = [_bounds(s, self.machine) for s in steps]
             else:
-                bounds = [_wider(found)]
+                bounds = [_wider(total)]
             high = sum(b[1] for b in bounds)
             due = None
             if at + 1 < len(lines):
@@ -539,8 +539,8 @@ class Follower:
         unheard = waiting is None and heard.what == "ACK"
         mirror = replace(mirror.finished(command, unheard), ends=True)
         if heard.what == "ERR":
-            what = f"{heard.text}: the machine says {heard.reply[:200]!r}"
-            mirror = _alarm(mirror, now, "error", "failed", heard.words[0], what)
+            message = f"{heard.text}: the machine says {heard.reply[:200]!r}"
+            mirror = _alarm(mirror, now, "error", "failed", heard.words[0], message)
             return _rests(mirror, waiting)
         mirror = mirror.cleared(heard.words[0], "failed")
         if waiting is None:
@@ -636,7 +636,7 @@ class Follower:
             each difference.
         """
         axis = self.machine.axes[name]
-        for what, theirs, ours in (
+        for kind, theirs, ours in (
             ("limits", (motor.lower, motor.upper), (axis.lower, axis.upper)),
             (
                 "rates",
@@ -649,11 +649,11 @@ class Follower:
                 for a, b in zip(theirs, ours, strict=True)
             ):
                 text = (
-                    f"{name}: the motor's own {what} are {theirs[0]:g} and "
+                    f"{name}: the motor's own {kind} are {theirs[0]:g} and "
                     f"{theirs[1]:g}, machine "
                     f"{self.machine.name} has {ours[0]:g} and {ours[1]:g}"
                 )
-                mirror = _alarm(mirror, now, "error", what, name, text)
+                mirror = _alarm(mirror, now, "error", kind, name, text)
         return mirror.with_axis(name, speed=motor.speed, acceleration=motor.acceleration)
 
     def _compare_reading(
@@ -788,10 +788,10 @@ def _bounds(step: PlanStep, machine: Machine) -> Range:
     A measured time has its 90 % range, widened; an assumed one may be anything from
     nothing to twice itself.
     """
-    found = step_range(step, machine.timing)
-    if found is None:
+    measured = step_range(step, machine.timing)
+    if measured is None:
         return (step.computed_s, step.holds_s + step.assumed_s)
-    return _wider(found)
+    return _wider(measured)
 
 
 def _wider(found: Range) -> Range:

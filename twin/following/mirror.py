@@ -253,8 +253,8 @@ class Mirror:
                 :2
             ], waiting.heard.tick == reply.tick
 
-        found = (w for i, w in self.waiting.items() if reply.may_answer(i))
-        return max(found, key=alike, default=None)
+        candidates = (w for i, w in self.waiting.items() if reply.may_answer(i))
+        return max(candidates, key=alike, default=None)
 
     def with_waiting(self, command: Waiting, **changes: object) -> Mirror:
         """Return the mirror with fields of a command changed; it is added to those that
@@ -272,8 +272,8 @@ class Mirror:
             unheard: whether only its end was heard.
         """
         left = {i: w for i, w in self.waiting.items() if i != command.identity}
-        kept = dict(list(self.ended.items())[1 - MAX_WAITING :])
-        return replace(self, waiting=left, ended={**kept, command.identity: unheard})
+        newest = dict(list(self.ended.items())[1 - MAX_WAITING :])
+        return replace(self, waiting=left, ended={**newest, command.identity: unheard})
 
     @property
     def under_way(self) -> tuple[str, ...]:
@@ -300,9 +300,9 @@ class Mirror:
         key = (alarm.kind, alarm.about)
         if key in self.active:
             return self
-        kept = (*self.alarms, alarm)[-MAX_ALARMS:]
+        newest = (*self.alarms, alarm)[-MAX_ALARMS:]
         return replace(
-            self, alarms=kept, raised=self.raised + 1, active=self.active | {key}
+            self, alarms=newest, raised=self.raised + 1, active=self.active | {key}
         )
 
     def cleared(self, about: str, *kinds: str) -> Mirror:

@@ -271,8 +271,8 @@ class ConeVec:
             >>> ConeVec.from_astra(astra).shape
             (1, 76, 96)
         """
-        found: ConeVec = _formats().from_astra(geometry, shape)
-        return found
+        converted: ConeVec = _formats().from_astra(geometry, shape)
+        return converted
 
     def to_astra(self) -> dict[str, Any]:
         """Convert to ASTRA's projection geometry of type `cone_vec`; needs
@@ -304,8 +304,8 @@ class ConeVec:
             >>> ConeVec.from_tomosipo(zyx).shape
             (1, 76, 96)
         """
-        found: ConeVec = _formats().from_tomosipo(geometry)
-        return found
+        converted: ConeVec = _formats().from_tomosipo(geometry)
+        return converted
 
     def to_tomosipo(self) -> Any:
         """Convert to tomosipo's `ts.cone_vec` geometry; needs tomosipo and
@@ -334,8 +334,8 @@ class ConeVec:
             TwinError: skew pixels, several pixel sizes, no shape, a horizontal panel, an
                 object that is not between source and panel; TIGRE is not installed.
         """
-        found: tuple[Any, FloatArray] = _formats().to_tigre(self, like)
-        return found
+        converted: tuple[Any, FloatArray] = _formats().to_tigre(self, like)
+        return converted
 
     def to_leap(self, like: Any = None, *, rows_up: bool = False) -> Any:
         """Make LEAP's model with this scan as its modular beam; needs LEAP and
@@ -428,8 +428,8 @@ class ConeVec:
             ...     ConeVec.load(f"{folder}/scan.npy", shape=(76, 96)) == scan
             True
         """
-        found: ConeVec = _formats().load(file, format, shape, pixel)
-        return found
+        loaded: ConeVec = _formats().load(file, format, shape, pixel)
+        return loaded
 
     def save(self, file: File, *, format: str | None = None) -> None:
         """Write a file that `load` reads; its ending determines the format unless

@@ -95,7 +95,7 @@ def new_machine_text(answers: Answers) -> str:
     rail: dict[str, object] = {}
     without = list(answers.without)
     limits = dict(answers.limits)
-    for quantity, what, distance in (
+    for quantity, distance_name, distance in (
         ("object_y", "SOD", answers.sod_mm),
         ("detector_y", "SDD", answers.sdd_mm),
     ):
@@ -109,8 +109,8 @@ def new_machine_text(answers: Answers) -> str:
             (motor, factor), *_ = motors.items()
             if motor in limits:
                 raise LimitError(
-                    f"the {what} and the travel of {motor} are both said, and {motor} sets the "
-                    f"{what}; say one",
+                    f"the {distance_name} and the travel of {motor} are both said, and "
+                    f"{motor} sets the {distance_name}; say one",
                     {"asked": list(limits[motor]), "axis": motor},
                 )
             ends = sorted((d - base.fixed.get(quantity, 0.0)) / factor for d in distance)
@@ -127,7 +127,7 @@ def new_machine_text(answers: Answers) -> str:
             }
         else:
             raise LimitError(
-                f"{answers.base} has no motor along the {what}, so it is one number; for "
+                f"{answers.base} has no motor along the {distance_name}, so it is one number; for "
                 "a range "
                 "begin with another machine (flexdt machine list)",
                 {"asked": list(distance), "base": answers.base},
@@ -197,7 +197,7 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
         base: machine that the file begins with.
     """
     pitch = answers.pitch_mm
-    own = base.detector
+    detector = base.detector
     out: dict[str, object] = {
         "columns": answers.columns,
         "rows": answers.rows,
@@ -206,8 +206,8 @@ def _detector(answers: Answers, base: Machine) -> dict[str, object]:
         "bits": answers.bits,
     }
     if answers.columns is not None or answers.rows is not None:
-        columns = answers.columns or own.columns
-        rows = answers.rows or own.rows
+        columns = answers.columns or detector.columns
+        rows = answers.rows or detector.rows
         out |= {
             "model": f"panel {columns} x {rows}",
             "roi": [0, 0, columns - 1, rows - 1],

@@ -281,20 +281,21 @@ def with_settings(
         ("speed", speed),
         ("acceleration", acceleration),
     )
-    for what, value in settings:
+    for quantity, value in settings:
         if value is None:
             continue
-        above = rate(machine, axis, what, value).messages
+        above = rate(machine, axis, quantity, value).messages
         if not above and all(value * share >= MIN_RATE for share in shares.values()):
             continue
         low = MIN_RATE / min(shares.values())
         axes = machine.axes
         high = min(
-            getattr(axes[name], f"max_{what}") / share for name, share in shares.items()
+            getattr(axes[name], f"max_{quantity}") / share
+            for name, share in shares.items()
         )
         raise LimitError(
-            f"{axis} {what} {value:g} is outside [{low:g}, {high:g}]",
-            {"axis": axis, "setting": what, "asked": value, "allowed": [low, high]},
+            f"{axis} {quantity} {value:g} is outside [{low:g}, {high:g}]",
+            {"axis": axis, "setting": quantity, "asked": value, "allowed": [low, high]},
         )
     for name, share in shares.items():
         drive = drives[name]

@@ -514,7 +514,7 @@ class _Writer(MotorTargets):
         for across, k in (("x", 0), ("z", 2)):
             if not self.has(f"detector_{across}") and f"object_{across}" in self.drivers:
                 wanted[f"object_{across}"] += self.region[k] * sod / w.sdd_mm
-        found = self.solved(wanted)
+        targets = self.solved(wanted)
         rows, cols = self.camera.shape
         pixel, row_pixel = self.camera.pixels_mm(self.machine.detector.pixels)
         if not self.has("detector_x"):
@@ -522,7 +522,7 @@ class _Writer(MotorTargets):
         if not self.has("detector_z"):
             wanted["detector_z"] = height
         for quantity, asked in wanted.items():
-            only = self.value(quantity, found)
+            only = self.value(quantity, targets)
             slack = _ROUNDED_MM
             if not self.has(quantity) and quantity not in ("object_y", "detector_y"):
                 if quantity.endswith("_z"):
@@ -544,7 +544,8 @@ class _Writer(MotorTargets):
             it_is = f"{message}, it is {only:g} mm"
             raise self.lacking(it_is, asked=asked, allowed=only, missing=quantity)
         return {
-            name: check_target(self.machine, name, value) for name, value in found.items()
+            name: check_target(self.machine, name, value)
+            for name, value in targets.items()
         }
 
     def out_of_beam(self) -> dict[str, float]:

@@ -108,19 +108,19 @@ def check_plan(
     clearance = None
     if collision is not None:
         clearance = collision(plan, plan.machine, plan.profile, plan.sample)
-    found = [*problems, *plan.problems, *_truncation_problems(seen)]
-    found += open_beam_problems(plan, physics)
+    findings = [*problems, *plan.problems, *_truncation_problems(seen)]
+    findings += open_beam_problems(plan, physics)
     if not start_known:
-        found += _start_problems(plan)
+        findings += _start_problems(plan)
     if clearance is not None:
         for x in clearance.collisions:
             message = (
                 f"{x.pair[0]} and {x.pair[1]} come within the safety margin at "
                 f"{x.time_s:.3f} s"
             )
-            found.append(ScriptProblem("error", "collision", x.line, 1, message))
+            findings.append(ScriptProblem("error", "collision", x.line, 1, message))
     return CheckReport(
-        plan, in_order(found), clearance, optics, _dose(plan), text, start_known
+        plan, in_order(findings), clearance, optics, _dose(plan), text, start_known
     )
 
 
@@ -212,7 +212,7 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
     Returns:
         At most one warning, `truncated`, for each view.
     """
-    found = []
+    warnings = []
     for view in seen:
         if view.outside.all() or not (view.right > view.left).any():
             continue
@@ -223,10 +223,10 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
         ]  # NaN: height unknown
         if parts := cut_off(dict(zip(names, least, strict=True))):
             message = f"the sample is cut off over the rotation: {parts}"
-            found.append(
+            warnings.append(
                 ScriptProblem("warning", "truncated", min(view.lines), 1, message)
             )
-    return found
+    return warnings
 
 
 def _dose(plan: ScanPlan) -> Dose:

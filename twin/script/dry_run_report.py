@@ -153,7 +153,7 @@ def _sources(report: CheckReport) -> str:
     parts = {"measured": 0.0, "assumed": 0.0}
     for s in report.plan.steps:
         parts["measured" if s.kind in timing.spread else "assumed"] += s.assumed_s
-    times = ", ".join(f"{t:.2f} s {what}" for what, t in parts.items() if t) or "none"
+    times = ", ".join(f"{t:.2f} s {origin}" for origin, t in parts.items() if t) or "none"
     return f"{times}; {report.plan.machine.name} timing: {timing.source}"
 
 

@@ -136,9 +136,9 @@ def _line(
     else:
         tail = []
     if wait is None or len(tail) < 3:
-        found = record.count(b"\t") + 2
+        columns = record.count(b"\t") + 2
         raise ArgumentError(
-            f"{found} columns, or no wait (ACK, no wait, POS, RCV); {COLUMNS}"
+            f"{columns} columns, or no wait (ACK, no wait, POS, RCV); {COLUMNS}"
         )
     script = record[: wait.end()] + b"\t" + b"\t".join(tail[:2])
     row = next(rows(script), None)
@@ -147,14 +147,16 @@ def _line(
     command = read_row(replace(row, line=number), problems)
     if command is None:
         raise ArgumentError("the command does not hold")
-    own = (
+    own_s = (
         grammar.not_negative(
             tail[2].decode("latin-1").strip(), "own time [ms] (column 8)"
         )
         / 1e3
     )
-    if own > MAX_OWN_S:
-        raise ArgumentError(f"own time (column 8) is {own:g} s; at most {MAX_OWN_S:g} s")
+    if own_s > MAX_OWN_S:
+        raise ArgumentError(
+            f"own time (column 8) is {own_s:g} s; at most {MAX_OWN_S:g} s"
+        )
     hour, minute, second = (float(x) for x in stamp.groups())
     if not (hour < 24 and minute < 60 and second < 60):
         raise ArgumentError(
@@ -174,7 +176,7 @@ def _line(
                 "limits twice)"
             )
             problems.append(ScriptProblem("warning", "reply", number, 1, message))
-    return Executed(command, own, 3600 * hour + 60 * minute + second, reply, motor)
+    return Executed(command, own_s, 3600 * hour + 60 * minute + second, reply, motor)
 
 
 def _arrived(motor: MotorReply, target: float) -> bool:
@@ -286,17 +288,17 @@ def motor_reply(reply: bytes) -> MotorReply | None:
     ):  # saved as plain text: every high byte became another one
         return None
     v = struct.unpack_from(f">{_REPLY_DOUBLES}d", reply)
-    found = MotorReply(v[0], v[1], v[2], v[4], v[6], v[5], v[8], v[10])
+    motor = MotorReply(v[0], v[1], v[2], v[4], v[6], v[5], v[8], v[10])
     copy = struct.unpack_from(">2d", reply, _LIMITS_COPY_BYTE)
-    sound = all(abs(x) <= 1e9 for x in vars(found).values())
+    sound = all(abs(x) <= 1e9 for x in vars(motor).values())
     rates = (
-        0 < found.speed <= found.max_speed
-        and 0 < found.acceleration <= found.max_acceleration
+        0 < motor.speed <= motor.max_speed
+        and 0 < motor.acceleration <= motor.max_acceleration
     )
-    if not sound or not rates or found.max_speed > 1e6 or found.max_acceleration > 1e6:
+    if not sound or not rates or motor.max_speed > 1e6 or motor.max_acceleration > 1e6:
         return None
-    if copy != (found.upper, found.lower) or not found.lower < found.upper:
+    if copy != (motor.upper, motor.lower) or not motor.lower < motor.upper:
         return None
-    if found.lower - 1 <= found.position <= found.upper + 1:
-        return found
+    if motor.lower - 1 <= motor.position <= motor.upper + 1:
+        return motor
     return None

@@ -300,9 +300,9 @@ def fit_machine(logs: Sequence[Log], base: Machine, source: str) -> Fit:
     replies = _replies(logs, base)
     commands = [x.command for log in logs for x in log]
     axes = dict(base.axes)
-    for name, found in replies.items():
+    for name, replies_of_axis in replies.items():
         of_axis = [k for k in commands if _axis_of(k, base) == name]
-        axes[name] = _axis(base.axes[name], found, of_axis)
+        axes[name] = _axis(base.axes[name], replies_of_axis, of_axis)
     start = base.timing.model_copy(update={"spread": {}, "sequence_overhead_s": None})
     machine = base.model_copy(update={"axes": axes, "timing": start})
     samples: dict[str, tuple[float, ...]] = {}
@@ -351,25 +351,28 @@ def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
     Returns:
         One warning, `other_machine`, for each such axis, at its first line.
     """
-    found: dict[str, ScriptProblem] = {}
+    warnings: dict[str, ScriptProblem] = {}
     for x in log:
         name = _axis_of(x.command, machine)
-        own = x.motor
-        what = ""
+        reply = x.motor
+        message = ""
         axis = machine.axes.get(name)
         if isinstance(x.command, c.MotorCommand) and not machine.has(name):
-            what = f"machine {machine.name} has no axis {name!r}; it has: {', '.join(machine.axes)}"
-        elif axis and own and (own.lower, own.upper) != (axis.lower, axis.upper):
-            what = (
-                f"{name} goes from {own.lower:g} to {own.upper:g} in the log, from "
+            message = (
+                f"machine {machine.name} has no axis {name!r}; it has: "
+                f"{', '.join(machine.axes)}"
+            )
+        elif axis and reply and (reply.lower, reply.upper) != (axis.lower, axis.upper):
+            message = (
+                f"{name} goes from {reply.lower:g} to {reply.upper:g} in the log, from "
                 f"{axis.lower:g} "
                 f"to {axis.upper:g} on machine {machine.name}"
             )
-        if what:
-            found.setdefault(
-                name, ScriptProblem("warning", "other_machine", x.line, 1, what)
+        if message:
+            warnings.setdefault(
+                name, ScriptProblem("warning", "other_machine", x.line, 1, message)
             )
-    return tuple(found.values())
+    return tuple(warnings.values())
 
 
 def _plan(log: Log, machine: Machine) -> Simulation:
@@ -390,7 +393,7 @@ def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, 
     Raises:
         MachineFileError: a motor that `base` lacks.
     """
-    found: dict[str, list[MotorReply]] = {}
+    by_axis: dict[str, list[MotorReply]] = {}
     for log in logs:
         for x in log:
             if x.motor is None or not isinstance(x.command, c.MotorCommand):
@@ -402,8 +405,8 @@ def _replies(logs: Sequence[Log], base: Machine) -> dict[str, tuple[MotorReply, 
                     f"{', '.join(base.axes)} (another machine is named with --base)",
                     {"asked": name, "allowed": list(base.axes), "line": x.line},
                 )
-            found.setdefault(name, []).append(x.motor)
-    return {name: tuple(replies) for name, replies in found.items()}
+            by_axis.setdefault(name, []).append(x.motor)
+    return {name: tuple(replies) for name, replies in by_axis.items()}
 
 
 def _axis_of(command: c.Command, machine: Machine) -> str:
@@ -473,7 +476,7 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
     Returns:
         Kind -> times [s], at least 0, in the order of the logs.
     """
-    found: dict[str, list[float]] = {}
+    times_by_kind: dict[str, list[float]] = {}
     for log in logs:
         moved: set[str] = set()
         since = 0.0
@@ -495,8 +498,8 @@ def _samples(logs: Sequence[Log], machine: Machine) -> dict[str, tuple[float, ..
                 since = 0.0
             # An axis's place before its first move is unknown.
             if command.wait is c.Wait.ACK and not first and math.isfinite(took):
-                found.setdefault(kind, []).append(took)
-    return {kind: tuple(times) for kind, times in found.items()}
+                times_by_kind.setdefault(kind, []).append(took)
+    return {kind: tuple(times) for kind, times in times_by_kind.items()}
 
 
 def _timing(
@@ -516,7 +519,7 @@ def _timing(
     Returns:
         A copy of `before` with the fitted times.
     """
-    shifts = [fmean(found) for times in samples.values() if (found := _later(times))]
+    shifts = [fmean(changes) for times in samples.values() if (changes := _later(times))]
     shift = fmean(shifts) if shifts else 0.0
     unsure = 0.0
     if len(shifts) > 1:

@@ -373,8 +373,8 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
             f"no line is a command of a scan script; {FEW_PROBLEMS} of {len(problems)} "
             "problems are listed"
         )
-        found = [*in_order(problems)[:FEW_PROBLEMS]]
-        problems = [ScriptProblem("error", "syntax", 0, 1, message), *found]
+        first = [*in_order(problems)[:FEW_PROBLEMS]]
+        problems = [ScriptProblem("error", "syntax", 0, 1, message), *first]
     if not commands and not problems:
         problems.append(
             ScriptProblem("error", "syntax", 0, 1, "the script holds no command")
@@ -515,10 +515,10 @@ class _Line:
             _Refused: more words than the command has arguments.
         """
         words = self.row.words()
-        found = grammar.match(self.component.text, [w.text for w in words[1:6]])
-        if found is None:
+        match = grammar.match(self.component.text, [w.text for w in words[1:6]])
+        if match is None:
             return None
-        spec, count = found
+        spec, count = match
         start = 1 + count
         at, width = _find_wait(words, start)
         if not spec.free or at == len(words):
@@ -606,25 +606,25 @@ class _Line:
                     "syntax", self.end.column, f"{name} without a command{knows}"
                 )
             if self.row.columns:
-                asked = fields[0].text
+                unknown = fields[0].text
             else:
-                asked = " ".join(f.text for f in fields[:3])
-            what = (
-                f"{name} does not know {shorten(asked)!r}{_meant(asked, allowed)}{knows}"
-            )
-            raise _Refused("unknown_command", fields[0].column, what)
+                unknown = " ".join(f.text for f in fields[:3])
+            message = f"{name} does not know {shorten(unknown)!r}{_meant(unknown, allowed)}{knows}"
+            raise _Refused("unknown_command", fields[0].column, message)
         if not self._custom_form(fields):
-            what = (
+            message = (
                 f"{shorten(name)!r} is not a component of the scanner"
                 f"{_meant(name, (*grammar.FIXED,))}; a custom component needs a name, a "
                 "command "
                 "and a wait"
             )
             raise _Refused(
-                "unknown_component" if fields else "syntax", self.component.column, what
+                "unknown_component" if fields else "syntax",
+                self.component.column,
+                message,
             )
-        what = f"{shorten(name)!r} is a custom component: allowed, without effect here"
-        self.warn("custom_component", self.component.column, what)
+        message = f"{shorten(name)!r} is a custom component: allowed, without effect here"
+        self.warn("custom_component", self.component.column, message)
         words = tuple(f.text for f in fields)
         return c.Custom(
             line=self.row.line, column=self.component.column, component=name, words=words
@@ -768,9 +768,9 @@ def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
             width = 2
         if width:
             tail = words[i + width : i + width + 3]
-            kept = _until_comment(tail)
-            numeric = all(w.text.replace(".", "", 1).isdigit() for w in kept)
-            if numeric and (len(kept) < 3 or len(kept) < len(tail)):
+            numbers = _until_comment(tail)
+            numeric = all(w.text.replace(".", "", 1).isdigit() for w in numbers)
+            if numeric and (len(numbers) < 3 or len(numbers) < len(tail)):
                 return i, width
     return len(words), 0
 

@@ -121,16 +121,18 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
     Returns:
         Warnings `sample_out_of_beam` and `sample_in_flat`, in the order of the views.
     """
-    found: list[ScriptProblem] = []
+    warnings: list[ScriptProblem] = []
     for view in views(plan):
         outside = view.outside
         if view.kind == "projection" and outside.any():
-            found.append(
+            warnings.append(
                 _aggregate(view, outside, "sample_out_of_beam", _outside_text(view))
             )
         if view.kind == "flat" and not outside.all():
-            found.append(_aggregate(view, ~outside, "sample_in_flat", _inside_text(view)))
-    return tuple(found)
+            warnings.append(
+                _aggregate(view, ~outside, "sample_in_flat", _inside_text(view))
+            )
+    return tuple(warnings)
 
 
 def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:

@@ -72,17 +72,17 @@ def lit_settings(
         (exposure, camera) -> the line that first uses it, and the indices of its images
         among all of the plan; in the order of first use.
     """
-    found: dict[Setting, tuple[int, list[int]]] = {}
+    settings: dict[Setting, tuple[int, list[int]]] = {}
     first = 0
     for group in plan.groups:
         saved = group.kind in kinds and group.files
         if saved and group.xrays_on and min(group.camera.shape) > 0:
             camera = replace(group.camera, frames=1, averages=1)
             exposure = ExposureSettings(group.kV, group.power_W, camera.exposure_ms)
-            _, indices = found.setdefault((exposure, camera), (group.line, []))
+            _, indices = settings.setdefault((exposure, camera), (group.line, []))
             indices.extend(range(first, first + len(group)))
         first += len(group)
-    return found
+    return settings
 
 
 def brightest_beam(

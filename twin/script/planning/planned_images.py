@@ -90,10 +90,10 @@ def infer(
     rotation = trigger.unit == "deg"
     notes: dict[str, str] = {}
     if averages is None:
-        found = _averages(trigger, exposure_s, frames, length)
-        if found is None:
+        inferred = _averages(trigger, exposure_s, frames, length)
+        if inferred is None:
             return None
-        averages, notes["averages"] = found
+        averages, notes["averages"] = inferred
     step = trigger.speed * exposure_s * averages
     if frames is None:
         steps = length / step
@@ -281,8 +281,8 @@ class ImageCollector:
                 self.images[self.last] = saved
             self._check_saved(saved)
             if self.moved:
-                what = f"{', '.join(self.moved)} still moves while {name} is taken"
-                self.findings.warn("moving", f"{what} (line {saved.line})")
+                message = f"{', '.join(self.moved)} still moves while {name} is taken"
+                self.findings.warn("moving", f"{message} (line {saved.line})")
         return self._keep_busy(now, 0.0, "save_image")
 
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> planned.Span:
@@ -312,11 +312,11 @@ class ImageCollector:
         if trigger is not None and inference is not None:
             starts, exact = self._fly_scan_times(trigger, inference, start, period)
         elif moving and frames > 1:
-            what = (
+            message = (
                 f"{', '.join(moving)} moves during the sequence without a trigger (POS)"
             )
             which = "where each image lies depends on the timing of commands"
-            self.findings.warn("no_trigger", f"{what}: {which}")
+            self.findings.warn("no_trigger", f"{message}: {which}")
         files = sequence_names(command.prefix, command.first, frames)
         draft = self._add_images(
             starts, start, step, command.line, kind_of(files[0]), files, exact
@@ -327,10 +327,10 @@ class ImageCollector:
         self.trigger = None
         length = float(starts[-1] - start) + period
         span = self._keep_busy(start, length, self.machine.timing.sequence)
-        what = f": {frames} images" + (
+        message = f": {frames} images" + (
             f" over {trigger.axis}" if trigger is not None else ""
         )
-        return replace(span, note=what)
+        return replace(span, note=message)
 
     # time ----------------------------------------------------------------------------------
 
@@ -429,27 +429,27 @@ class ImageCollector:
         frames = None
         if "frames" in camera.said:
             frames = camera.settings.frames
-        found = None
+        inferred = None
         if trigger is not None:
             exposure_s = camera.settings.exposure_ms / 1000.0
-            found = infer(trigger, exposure_s, frames, averages)
-            if found is None and averages is None:
-                found = infer(trigger, exposure_s, frames, camera.settings.averages)
-        if averages is None and found is not None and "averages" in found.notes:
-            self.inferred_averages = found.averages
-            camera.assume("averages", found.averages)
-            how = f"{found.averages} inferred ({found.notes['averages']})"
-            what = f"the number of averages is not set; {how}, and taken for images before this"
-            self.findings.warn("averages_unsaid", f"{what} line too")
+            inferred = infer(trigger, exposure_s, frames, averages)
+            if inferred is None and averages is None:
+                inferred = infer(trigger, exposure_s, frames, camera.settings.averages)
+        if averages is None and inferred is not None and "averages" in inferred.notes:
+            self.inferred_averages = inferred.averages
+            camera.assume("averages", inferred.averages)
+            how = f"{inferred.averages} inferred ({inferred.notes['averages']})"
+            message = f"the number of averages is not set; {how}, and taken for images before this"
+            self.findings.warn("averages_unsaid", f"{message} line too")
             self._reported.add("averages")
         if frames is None:
-            count = 1 if found is None else found.frames
+            count = 1 if inferred is None else inferred.frames
             how = "1 is assumed"
-            if found is not None:
-                how = f"inferred from {found.notes['frames']}"
+            if inferred is not None:
+                how = f"inferred from {inferred.notes['frames']}"
             self.findings.warn("frames_unsaid", f"the number of frames is not set; {how}")
             camera.assume("frames", count)
-        return found
+        return inferred
 
     def _fly_scan_times(
         self, trigger: planned.Trigger, found: Inference, start: float, period: float
@@ -482,9 +482,9 @@ class ImageCollector:
         count = np.arange(found.frames, dtype=np.float64)
         late = start - trigger.time
         if late > _TIME_TOLERANCE_S:
-            what = f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger"
+            message = f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger"
             where = f"{trajectory.position(start):.6g}, not {trigger.position:g} {unit}"
-            self.findings.warn("late_start", f"{what}: image 0 is at {where}")
+            self.findings.warn("late_start", f"{message}: image 0 is at {where}")
         if (
             abs(found.mismatch) > _MISMATCH_STEPS * found.increment
             and "frames" not in found.notes
@@ -509,13 +509,13 @@ class ImageCollector:
             if velocity < speed * (1 - 1e-9):
                 code = "run_up"
                 short = f"the run-up of {trigger.run_up:.4g} {unit} is too short"
-                what = f"passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: {short}"
+                message = f"passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: {short}"
             else:
                 code = "scan_overrun"
                 which = f"(from image {int(np.argmax(off))} on)"
-                what = f"slows down before the last of {len(off)} images {which}"
+                message = f"slows down before the last of {len(off)} images {which}"
             self.findings.warn(
-                code, f"{trigger.axis} {what}; images lie where the motor is"
+                code, f"{trigger.axis} {message}; images lie where the motor is"
             )
             starts = start + period * count
             exact = {}
@@ -540,10 +540,10 @@ class ImageCollector:
         if draft.kind == "dark" and draft.xrays_on:
             self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
         if draft.kind != "dark" and not draft.xrays_on:
-            what = "projections are"
+            message = "projections are"
             if draft.kind == "flat":
-                what = "a flat image is"
-            self.findings.warn("xrays_off", f"{what} taken with X-rays off")
+                message = "a flat image is"
+            self.findings.warn("xrays_off", f"{message} taken with X-rays off")
 
     def _warn_of_defaults(self, draft: ExposureGroup) -> None:
         """Warn, once each, of the settings that a saved image takes from the machine's

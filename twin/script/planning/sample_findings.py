@@ -198,7 +198,7 @@ def sample_problems(
         are not predicted.
     """
     explained = {(p.code, p.line) for p in known}
-    found = [
+    warnings = [
         ScriptProblem("warning", f"{name}_pixels", probe.line, 1, text)
         for probe, seen in zip(forecast.probes, forecast.shares, strict=True)
         for name, text in _sentences(seen)
@@ -206,9 +206,9 @@ def sample_problems(
     ]
     if forecast.unpredicted:
         line = min(probe.line for probe in forecast.probes)
-        what = f"{UNPREDICTED}: {forecast.unpredicted}"
-        found.append(ScriptProblem("warning", "unpredicted_pixels", line, 1, what))
-    return tuple(found)
+        message = f"{UNPREDICTED}: {forecast.unpredicted}"
+        warnings.append(ScriptProblem("warning", "unpredicted_pixels", line, 1, message))
+    return tuple(warnings)
 
 
 def _sentences(seen: CountShares | None) -> list[tuple[str, str]]:

@@ -259,8 +259,11 @@ class Simulation:
             The time that the command takes; a wait counts as assumed.
         """
         if not self.tube.on:
-            what = "waits until the X-rays are ready, but they are off: the script would hang here"
-            self.findings.error("xray_never_ready", what)
+            message = (
+                "waits until the X-rays are ready, but they are off: the script would "
+                "hang here"
+            )
+            self.findings.error("xray_never_ready", message)
             return self.timed("command")
         left = self.tube.ready_at - self.now
         if left <= 0.0:
@@ -353,14 +356,14 @@ class Simulation:
         what: Rate = "acceleration"
         if isinstance(command, c.SetSpeed):
             what = "speed"
-        asked = getattr(command, what)
-        found = rate(self.machine, command.component, what, asked)
+        requested = getattr(command, what)
+        limited = rate(self.machine, command.component, what, requested)
         note = ""
         shares = self.machine.moves(command.component)
-        self._report(found)
-        for motor, value in found.motors.items():
+        self._report(limited)
+        for motor, value in limited.motors.items():
             setattr(self.motors.all[motor], what, value)
-            if found.messages and value < asked * abs(shares[motor]):
+            if limited.messages and value < requested * abs(shares[motor]):
                 unit = (
                     f"{self.machine.axes[motor].unit}/{'s' if what == 'speed' else 's2'}"
                 )
@@ -393,13 +396,13 @@ class Simulation:
         if not self._axis(command):
             return self.timed("command", note=" (no effect)")
         name = command.component
-        asked = self.motors.targets(name, command.target, self.now)
-        found = arrival(self.machine, name, asked)
-        targets = found.motors
+        requested = self.motors.targets(name, command.target, self.now)
+        limited = arrival(self.machine, name, requested)
+        targets = limited.motors
         note = ""
-        self._report(found)
+        self._report(limited)
         for motor, target in targets.items():
-            if found.messages and target != asked[motor]:
+            if limited.messages and target != requested[motor]:
                 note += (
                     f" (limited to {motor} {target:g} {self.machine.axes[motor].unit})"
                 )
