@@ -336,7 +336,7 @@ class _Turn:
             body: that turns.
             side: -1 for a, +1 for b.
             path: all motors.
-            kept: segments that matter.
+            kept: segments that are evaluated; others are left out of the result.
         """
         angle = path.q[:-1] @ body.turns
         rate = path.v @ body.turns

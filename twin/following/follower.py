@@ -154,9 +154,11 @@ class Follower:
         An overdue command (`most_s` and `SLACK_S`) is a warning, after which ends count
         as not reported, unless one has been heard; a server that does not report ends has
         its commands ended by prediction instead, and its arrivals judged. Silence of
-        `MAX_SILENCE_S` is a warning once, unless the server does not speak. Commands
-        silent for `FORGOTTEN_AFTER_S` (or `most_s`, if longer) are forgotten. An alarm is
-        raised once until its condition ends.
+        `MAX_SILENCE_S` about a command is a warning, after which the server counts as one
+        that does not speak, unless it has; of such a server silence is expected. Commands
+        silent for `FORGOTTEN_AFTER_S` (or `most_s`, if longer) are forgotten. The script
+        is late `SLACK_S` after it was due. An alarm is raised once until its condition
+        ends.
 
         Args:
             mirror: present state.

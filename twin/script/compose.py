@@ -277,7 +277,8 @@ class _Writer(MotorTargets):
         """Yield the rows of several turns while source and detector rise at constant
         speed.
 
-        They rise by the request's `rise_mm` over all turns, beginning before the trigger
+        The sample is moved into the beam first. Source and detector rise by the request's
+        `rise_mm` over all turns, about their usual height, beginning before the trigger
         and ending after the last image. Where no motors raise them, the sample sinks.
         Speeds are set back at the end.
 
