@@ -188,6 +188,18 @@ def test_the_sample_beside_scan_it_is_what_stands_on_the_stage(
     twin.control("release")
 
 
+def test_a_plot_follows_the_width_of_its_column(page: Any) -> None:
+    """Without a new image: the machine stands still meanwhile."""
+    plot, drawn = page.locator("#histogram"), page.locator("#histogram .u-wrap")
+    before = plot.bounding_box()["width"]
+    until(lambda: drawn.bounding_box()["width"] == pytest.approx(before), "as wide")
+    page.set_viewport_size({"width": 1700, "height": 800})
+    until(lambda: plot.bounding_box()["width"] > 1.1 * before, "a wider column")
+    after = plot.bounding_box()["width"]
+    until(lambda: drawn.bounding_box()["width"] == pytest.approx(after), "as wide again")
+    page.set_viewport_size({"width": 1280, "height": 800})
+
+
 def test_what_is_typed_into_a_number_field_replaces_its_number(page: Any) -> None:
     page.click("#tabs [data-tab=scan]")
     field = page.locator("#wish-frames")

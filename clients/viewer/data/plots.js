@@ -67,6 +67,18 @@ function fits(chart, host) {
         chart.setSize({ width, height });
     return true;
 }
+// Draws again what was drawn last, where the host has another size than then.
+function kept(host, draw) {
+    let last = null;
+    new ResizeObserver(() => {
+        if (last !== null)
+            draw(last);
+    }).observe(host);
+    return (drawn) => {
+        last = drawn;
+        draw(drawn);
+    };
+}
 const apart = ([low, high]) => (high > low ? [low, high] : [low, low + 1e-9]);
 // Whole powers of ten between two logarithms.
 function powers(low, high) {
@@ -97,7 +109,7 @@ export function histogram(host, places = "even") {
     const chart = plot(host, [bar(""), bar(PALE)], { x: () => shown?.unit ?? "", y: () => "share [%]" }, { x: () => apart(shown?.range ?? [0, 1]), y: () => [0, most] }, { scale, axis: percents }, (drawn) => mark(drawn, shown?.marks ?? []), places === "decades" ? ticks : {});
     return {
         area: chart.over,
-        draw(counted) {
+        draw: kept(host, (counted) => {
             shown = counted;
             if (!fits(chart, host))
                 return;
@@ -112,7 +124,7 @@ export function histogram(host, places = "even") {
             const bright = shares.map((share, k) => (pale[k] ? null : share));
             const outside = shares.map((share, k) => (pale[k] ? share : null));
             chart.setData([middles, bright, outside]);
-        },
+        }),
     };
 }
 function mark(chart, marks) {
@@ -141,7 +153,7 @@ export function curve(host, filled = false) {
         y: () => apart(ends),
     }, {});
     return {
-        draw(line) {
+        draw: kept(host, (line) => {
             shown = line;
             if (!fits(chart, host))
                 return;
@@ -149,7 +161,7 @@ export function curve(host, filled = false) {
             ends = [filled ? 0 : Math.min(...known), Math.max(...known)];
             const values = line.values.map((v) => (Number.isFinite(v) ? v : null));
             chart.setData([line.places, values]);
-        },
+        }),
     };
 }
 // Places equally far apart, from 0 to a length.

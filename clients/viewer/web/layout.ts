@@ -50,7 +50,11 @@ $button("#film-large").addEventListener("click", () =>
   large(!document.body.classList.contains("large")),
 );
 on("tab", () => large(false));
-on("recorded", () => large(false));
+// An image of a data set is in view, though a volume was looked at before.
+on("recorded", (name) => {
+  large(false);
+  if (name !== null) $("#right").scrollTop = 0;
+});
 window.addEventListener(
   "keydown",
   (e) => {

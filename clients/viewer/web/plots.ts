@@ -114,6 +114,17 @@ function fits(chart: uPlot, host: HTMLElement): boolean {
   if (chart.width !== width || chart.height !== height) chart.setSize({ width, height });
   return true;
 }
+// Draws again what was drawn last, where the host has another size than then.
+function kept<T>(host: HTMLElement, draw: (drawn: T) => void): (drawn: T) => void {
+  let last: T | null = null;
+  new ResizeObserver(() => {
+    if (last !== null) draw(last);
+  }).observe(host);
+  return (drawn) => {
+    last = drawn;
+    draw(drawn);
+  };
+}
 const apart = ([low, high]: Pair): Pair => (high > low ? [low, high] : [low, low + 1e-9]);
 
 // Whole powers of ten between two logarithms.
@@ -153,7 +164,7 @@ export function histogram(host: HTMLElement, places: Places = "even"): Histogram
   );
   return {
     area: chart.over,
-    draw(counted) {
+    draw: kept(host, (counted) => {
       shown = counted;
       if (!fits(chart, host)) return;
       const counts = Array.from(counted.counts);
@@ -167,7 +178,7 @@ export function histogram(host: HTMLElement, places: Places = "even"): Histogram
       const bright = shares.map((share, k) => (pale[k] ? null : share));
       const outside = shares.map((share, k) => (pale[k] ? share : null));
       chart.setData([middles, bright, outside]);
-    },
+    }),
   };
 }
 function mark(chart: uPlot, marks: Mark[]): void {
@@ -205,14 +216,14 @@ export function curve(host: HTMLElement, filled = false): Curve {
     {},
   );
   return {
-    draw(line) {
+    draw: kept(host, (line) => {
       shown = line;
       if (!fits(chart, host)) return;
       const known = line.values.filter(Number.isFinite);
       ends = [filled ? 0 : Math.min(...known), Math.max(...known)];
       const values = line.values.map((v) => (Number.isFinite(v) ? v : null));
       chart.setData([line.places, values]);
-    },
+    }),
   };
 }
 // Places equally far apart, from 0 to a length.
