@@ -99,16 +99,21 @@ def other_side(images, geometry, rng):
 
 
 def moving(images, geometry, rng):
-    """Shift the images aside by up to six columns, as a sample that sways; the geometry
-    stays.
-    """
-    turn = np.arange(len(images)) / len(images) * 2.0 * np.pi
-    columns = np.round(rng.uniform(3.0, 6.0) * np.sin(rng.integers(2, 6) * turn)).astype(
-        int
-    )
-    return np.stack(
-        [np.roll(one, k, axis=1) for one, k in zip(images, columns, strict=True)]
-    ), geometry
+    """Object or panel swings, jumps once, or trembles, along rows or columns."""
+    count = len(images)
+    turn = np.arange(count) / count * 2.0 * np.pi
+    way = str(rng.choice(["swing", "swing", "jump", "tremble"]))
+    pixels = float(rng.uniform(3.0, 6.0))
+    if way == "swing":
+        moves = pixels * np.sin(rng.integers(2, 6) * turn)
+    elif way == "jump":
+        moves = np.where(turn < rng.uniform(1.5, 5.0), 0.0, pixels)
+    else:
+        moves = rng.uniform(-pixels, pixels, count)
+    axis = int(rng.choice([0, 1, 1, 1]))
+    rounded = np.round(moves).astype(int)
+    pairs = zip(images, rounded, strict=True)
+    return np.stack([np.roll(one, k, axis=axis) for one, k in pairs]), geometry
 
 
 TURN = frozenset({"direction", "columns", "turned"})
@@ -119,7 +124,7 @@ WRONG: dict[str, tuple[Wrong, frozenset[str]]] = {
     "alphabetical": (alphabetical, frozenset({"names", "interlaced", "span"})),
     "shifted": (shifted, frozenset({"offset", "middle", "sign"})),
     "other side": (other_side, frozenset({"sign", "columns", "turned", "offset"})),
-    "moving": (moving, frozenset()),
+    "moving": (moving, frozenset({"movement"})),
 }
 
 

@@ -99,9 +99,56 @@ def test_right_images_are_not_told_anything(kind: str, aside: float) -> None:
     assert looked_at(kind, aside).contradiction is None
 
 
-def test_motion_is_no_offset() -> None:
-    found = looked_at("moving").contradiction
-    assert found is None or not found.kinds
+def steps(kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Draw by how many pixels each image is moved along its rows and columns."""
+    step = np.zeros((len(TURN), 2), int)
+    late = len(TURN) * 2 // 5
+    if kind == "swing":
+        step[:, 0] = np.round(4.0 * np.sin(3.0 * np.radians(TURN)))
+    elif kind == "jump":
+        step[late:, 0] = 3
+    elif kind == "jitter":
+        step[:, 0] = rng.integers(-3, 4, len(TURN))
+    elif kind == "fall":
+        step[late:, 1] = 3
+    return step
+
+
+@pytest.mark.parametrize("kind", ["swing", "jump", "jitter", "fall"])
+def test_movement_between_views_is_named(kind: str) -> None:
+    scan = brick()
+    moves = steps(kind, np.random.default_rng(8))
+    images = np.stack(
+        [
+            np.roll(image, (down, along), (0, 1))
+            for image, (along, down) in zip(scan.images(), moves.tolist(), strict=True)
+        ]
+    )
+    case = misfits.Case(kind, images, scan.geometry, scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert bias.contradiction is not None
+    assert bias.contradiction.kinds == ("movement",)
+
+
+def test_movement_of_thin_wires_is_seen_by_their_centroids() -> None:
+    scan = brick()
+    wires = [
+        bias_bound.Solid("cylinder", np.array([x, y, 0.0]), np.array([1.0, 1.0, 8.0]), 0, 0.3)
+        for x, y in ((9.0, 2.0), (-3.0, 7.0), (-8.0, -6.0), (1.0, -4.0))
+    ]  # fmt: skip
+    scan = replace(scan, solids=wires, geometry=scan.geometry[::2])
+    images = scan.images()
+    still = misfits.Case("still", images, scan.geometry, scan, frozenset())
+    found = misfits.looked_at(still)
+    assert found is not None
+    assert found.contradiction is None
+    moves = np.round(3.0 * np.sin(5.0 * np.radians(TURN[::2]))).astype(int)
+    moved = np.stack([np.roll(a, k, 1) for a, k in zip(images, moves, strict=True)])
+    bias = misfits.looked_at(replace(still, images=moved))
+    assert bias is not None
+    assert bias.contradiction is not None
+    assert bias.contradiction.kinds == ("movement",)
 
 
 def drum(rod_mm: float) -> bias_bound.Scan:

@@ -30,6 +30,9 @@ better: right scans have 0.96 and more."""
 MAX_MUCH_BETTER_MISFIT: Final = 0.7
 """The same where the panel cuts the object off, whose outer parts no volume holds, and
 where the coarse volume shows no edges."""
+MAX_WANDER: Final = 5.0
+"""Largest distance of images' centroids from those of the volume's projections, over what
+the second reconstruction and noise explain (`wandering`): above it the object moved."""
 MIN_DOUBTFUL_MISFIT: Final = 1.4
 """Residual over that of the second reconstruction, below which an explanation counts
 only if its volume differs: more than half of right scans. Above it bounds grow in
@@ -45,9 +48,8 @@ result is given."""
 EQUAL_MISFIT_RATIO: Final = 1.05
 """Largest misfit of an equally good explanation, over the best one's."""
 UNEXPLAINED: Final = (
-    "No other direction, order, mirror or offset explains it; motion during the scan "
-    "does, images "
-    "in a wrong order, and images that are not line integrals of one object"
+    "No other direction, order, mirror, offset or shift of single images explains it; "
+    "images in a wrong order do, and images that are not line integrals of one object"
 )
 
 
@@ -107,8 +109,9 @@ def compared(scan: CoarseScan) -> Comparison | None:
     """Compare a scan's images with the projections of its volume.
 
     Some views and rows are tried first; all views if the expected residual of values or
-    edges is too large. Where the misfit is below `MIN_DOUBTFUL_MISFIT`, the comparison is
-    not `doubtful`, and is made once more with some views and at least `RIVALS_ROWS` rows.
+    edges is too large. The comparison is `doubtful` if the misfit is at least
+    `MIN_DOUBTFUL_MISFIT` or centroids wander (`MAX_WANDER`). Else it is made once more,
+    with some views and at least `RIVALS_ROWS` rows, and judged by that misfit.
 
     Args:
         scan: coarse.
@@ -123,11 +126,12 @@ def compared(scan: CoarseScan) -> Comparison | None:
     trial = Trial(thin)
     if not trial.telling.all() and len(thin.images) < len(scan.images):
         trial = Trial(scan.thinned(all_views=True))
-    if trial.excess >= MIN_DOUBTFUL_MISFIT:
+    if trial.excess >= MIN_DOUBTFUL_MISFIT or trial.wander > MAX_WANDER:
         return Comparison(trial, doubtful=True)
     if not trial.whole:
         return None
-    return Comparison(Trial(scan.thinned(least_rows=RIVALS_ROWS)), doubtful=False)
+    trial = Trial(scan.thinned(least_rows=RIVALS_ROWS))
+    return Comparison(trial, doubtful=trial.excess >= MIN_DOUBTFUL_MISFIT)
 
 
 class Comparison:
@@ -145,7 +149,7 @@ class Comparison:
 
         Not doubtful means that the scan fits. Unfit is only a whole scan of even steps
         whose misfit exceeds `MAX_MISFIT`. Panels far aside are tried only on an unfit
-        scan, mirrored images only if doubtful.
+        scan, mirrored images and movement only if doubtful.
 
         Args:
             trial: of the scan's stated geometry.
@@ -156,9 +160,13 @@ class Comparison:
         fits = not doubtful or trial.excess <= MAX_MISFIT
         self._unfit = trial.whole and trial.even and not fits
         self._tried: list[Tried] = []
+        self._movement: Tried | None = None
         if trial.telling.any():
             others = trial.others(far=self._unfit, mirrored=doubtful)
             self._tried = [trial.opposite(), *others]
+            if doubtful:
+                self._movement = trial.movement()
+                self._tried.append(self._movement)
 
     @property
     def widening(self) -> float:
@@ -175,8 +183,9 @@ class Comparison:
         An explanation is named if it changes the volume by more than `MIN_CHANGE`, fits
         clearly better than the stated geometry (score below `MAX_BETTER_MISFIT`, or
         `MAX_MUCH_BETTER_MISFIT` for truncated, uneven or partly unreliable scans) and
-        fits well (`MAX_MISFIT`); others as good are named with it. Else, if the scan does
-        not fit its own geometry, the result names no explanation.
+        fits well (`MAX_MISFIT`); others as good are named with it. If none is clearly
+        better, but centroids wander (`MAX_WANDER`), movement is named. Else, if the scan
+        does not fit its own geometry, the result names no explanation.
 
         Returns:
             None if there is no error, nothing was tried, or the scan is not doubtful.
@@ -188,15 +197,14 @@ class Comparison:
             better = MAX_BETTER_MISFIT
         else:
             better = MAX_MUCH_BETTER_MISFIT
-        other = [one for one in self._tried if one.change > MIN_CHANGE]
-        best = min(other, key=lambda one: one.score, default=None)
-        if (
-            best is not None
-            and best.score < better
-            and trial.excess_of(best) <= MAX_MISFIT
-        ):
+        best = self._best()
+        clear = best is not None and best.score < better
+        if best is not None and clear and trial.excess_of(best) <= MAX_MISFIT:
             return self._named(self._as_good_as(best), best.score)
-        if self._unfit:
+        wandering = trial.wander > MAX_WANDER
+        if self._movement is not None and wandering and not clear:
+            return self._named([self._movement], min(self._movement.score, 1.0))
+        if self._unfit or wandering:
             return Contradiction(trial.excess)
         return None
 
@@ -214,8 +222,8 @@ class Comparison:
                 `contradiction`.
 
         Returns:
-            None if the scan is truncated or each such explanation is contradicted by
-            `MIN_EVIDENCE_SIGMAS`. Else all that are as good as the best; `change` is the
+            None if the scan is truncated or each such explanation is excluded
+            (`_least_evidence_against`). Else all that are as good as the best; `change` is the
             largest of theirs, or None where the best is clearly better than the stated
             geometry of a doubtful scan.
         """
@@ -223,7 +231,7 @@ class Comparison:
         rivals = [
             one
             for one in self._tried
-            if one.evidence < MIN_EVIDENCE_SIGMAS
+            if one.evidence < _least_evidence_against(one)
             and not (sides_known and one.suspect.kind in SIDES)
             and one.change > claimed
             and trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
@@ -243,9 +251,32 @@ class Comparison:
             change = max(one.change for one in as_good)
         return self._named(as_good, best.score, change)
 
+    def _best(self) -> Tried | None:
+        """Return the explanation that changes the volume by more than `MIN_CHANGE` and
+        fits best; None without one.
+
+        Movement, which has two free numbers a view, is returned only if it is clearly
+        better than any other (`MAX_BETTER_MISFIT`).
+        """
+        other = [one for one in self._tried if one.change > MIN_CHANGE]
+        simple = [one for one in other if one.suspect.shifts is None]
+        best = min(simple, key=lambda one: one.score, default=None)
+        movement = self._movement
+        if movement is None or movement not in other:
+            return best
+        if best is None or movement.score < MAX_BETTER_MISFIT * best.score:
+            return movement
+        return best
+
     def _as_good_as(self, best: Tried) -> list[Tried]:
+        """Return the explanations that fit within `EQUAL_MISFIT_RATIO` as well as the
+        best: others without movement, or movement alone.
+        """
+        if best.suspect.shifts is not None:
+            return [best]
         most = EQUAL_MISFIT_RATIO * best.score
-        return [one for one in self._tried if one.score <= most]
+        simple = [one for one in self._tried if one.suspect.shifts is None]
+        return [one for one in simple if one.score <= most]
 
     def _named(
         self, as_good: list[Tried], score: float, change: float | None = None
@@ -262,3 +293,15 @@ class Comparison:
         kinds = tuple(figures)
         figure_texts = tuple(figures.values())
         return Contradiction(self._trial.excess, kinds, score, figure_texts, change)
+
+
+def _least_evidence_against(one: Tried) -> float:
+    """Return the evidence from which an explanation is excluded [standard errors].
+
+    One without shifts has to fit clearly worse than the stated geometry. Shifts, two free
+    numbers a view, fit any images a little better: they count only if they fit clearly
+    better.
+    """
+    if one.suspect.shifts is None:
+        return MIN_EVIDENCE_SIGMAS
+    return -MIN_EVIDENCE_SIGMAS

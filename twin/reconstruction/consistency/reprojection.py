@@ -12,6 +12,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.consistency.suspects import moved
 
 MEDIAN_OF_SQUARES = 0.4549
 """Median of the squares of standard normal deviates."""
@@ -47,6 +48,7 @@ class Reprojection:
         images: Float32Array,
         cone_vec: ConeVec,
         truncation: Truncation | None,
+        shifts: FloatArray | None = None,
     ) -> Reprojection | None:
         """Reconstruct images as of a geometry, and project the volume again coarsely; NaN
         voxels count as 0.
@@ -56,16 +58,21 @@ class Reprojection:
             images: (n, rows, cols).
             cone_vec: n views.
             truncation: object beyond their edges, or None.
+            shifts: (n, 2) by which each image is to the right and below [pixels]: images
+                are shifted back before the reconstruction, and its projections shifted as
+                the images; None for none.
 
         Returns:
             None where FDK cannot use the geometry.
         """
+        straight = images if shifts is None else shifted_back(images, shifts)
         try:
-            values = scan.fdk(images, cone_vec, truncation)
+            values = scan.fdk(straight, cone_vec, truncation)
         except GeometryError:
             return None
         shape = (images.shape[1], images.shape[2])
-        again = scan.projected(np.nan_to_num(values), cone_vec, shape, fine=False)
+        seen_from = cone_vec if shifts is None else moved(cone_vec, *-shifts.T)
+        again = scan.projected(np.nan_to_num(values), seen_from, shape, fine=False)
         return cls(images, values, again)
 
     def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
@@ -97,6 +104,16 @@ class Reprojection:
         return np.array(parts)
 
     @cached_property
+    def centroid_variance(self) -> float:
+        """Variance of the centroids of images along rows by their noise [pixels^2]."""
+        count, rows, cols = self.images.shape
+        along = np.arange(cols) - 0.5 * (cols - 1)
+        mass = float(np.maximum(self.images, 0.0).sum(dtype=np.float64)) / count
+        noise = max(_noise_of(self.images) - _noise_of(self.again), 0.0)
+        spread = rows * float(np.square(along).sum())
+        return float(noise * spread / max(mass**2, np.finfo(np.float64).tiny))
+
+    @cached_property
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean squares (2,) of residual, images and noise: first of the values, then of
         their changes along rows. Noise is the images' less the reprojection's, at least
@@ -112,6 +129,23 @@ class Reprojection:
             for values in (rest, self.images)
         )
         return residual, signal, noise * NOISE_OF_CHANGES
+
+
+def shifted_back(images: Float32Array, shifts: FloatArray) -> Float32Array:
+    """Shift images to the left and up, by cubic splines; pixels beyond an edge repeat the
+    edge's.
+
+    Args:
+        images: (n, rows, cols).
+        shifts: (n, 2) to the left and up [pixels].
+    """
+    from scipy.ndimage import shift
+
+    back = [
+        shift(image, (-up, -left), order=3, mode="nearest")
+        for image, (left, up) in zip(images, shifts.tolist(), strict=True)
+    ]
+    return np.array(back, np.float32)
 
 
 def _mean_square(values: Float32Array) -> float:

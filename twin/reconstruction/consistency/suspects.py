@@ -32,6 +32,7 @@ KINDS: Final = {
     "middle": "the panel has no offset",
     "height": "the panel's offset along the axis has the other sign",
     "offset": "the panel, or the axis, is moved:",
+    "movement": "object or scanner moved between views:",
 }
 """Kind of error -> its description."""
 
@@ -48,12 +49,15 @@ class Suspect:
         images: (n, rows, cols).
         cone_vec: n views.
         figure: the right value, in words; "" if the kind is enough.
+        shifts: (n, 2) by which each image is to the right and below [coarse pixels], or
+            None. Images are shifted back before they are reconstructed.
     """
 
     kind: str
     images: Float32Array
     cone_vec: ConeVec
     figure: str = ""
+    shifts: FloatArray | None = None
 
 
 def reversed_turn(scan: CoarseScan) -> Suspect:
@@ -117,15 +121,19 @@ def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
     return ConeVec.from_vectors(source, panel, about(views.u), about(views.v))
 
 
-def moved(cone_vec: ConeVec, along: float, down: float = 0.0) -> ConeVec:
+def moved(
+    cone_vec: ConeVec, along: float | FloatArray, down: float | FloatArray = 0.0
+) -> ConeVec:
     """Move panels along their rows and down their columns; the source stays.
 
     Args:
         cone_vec: n views.
-        along: by so many pixels along u.
-        down: by so many pixels along v.
+        along: by so many pixels along u, one number or (n,).
+        down: by so many pixels along v, one number or (n,).
     """
-    panel = cone_vec.detector + along * cone_vec.u + down * cone_vec.v
+    step = np.broadcast_to(along, len(cone_vec))[:, None] * cone_vec.u
+    step = step + np.broadcast_to(down, len(cone_vec))[:, None] * cone_vec.v
+    panel = cone_vec.detector + step
     return ConeVec.from_vectors(cone_vec.source, panel, cone_vec.u, cone_vec.v)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.consistency.movement import moving, wandering
 from flexdt.twin.reconstruction.consistency.reprojection import Reprojection
 from flexdt.twin.reconstruction.consistency.suspects import (
     Suspect,
@@ -88,7 +89,8 @@ class Trial:
 
         Sets `whole` (no row is cut off), `expected` (misfit (2,) of a second
         reconstruction), `telling` ((2,): for values and their changes, whether that is
-        below `MAX_RELIABLE_RESIDUAL`), `excess` (misfit over the expected one) and `even`
+        below `MAX_RELIABLE_RESIDUAL`), `excess` (misfit over the expected one), `wander`
+        (see `wandering`; 0 for a scan that is not whole) and `even`
         (`MIN_VIEWS_A_COLUMN` views a column, and no step above `MAX_ARC_RATIO` times the
         median).
 
@@ -101,7 +103,12 @@ class Trial:
         assert own is not None  # as a scan has a volume
         self.own = own
         self._seconds: dict[Tried, FloatArray] = {}
-        self.expected = self._expected(own, scan.cone_vec)
+        second = Reprojection.of(scan, own.again, scan.cone_vec, None)
+        self.expected = np.full(2, np.inf)
+        self.wander = 0.0
+        if second is not None:
+            self.expected = second.misfit()
+            self.wander = wandering(scan, own, second) if self.whole else 0.0
         self.telling = self.expected < MAX_RELIABLE_RESIDUAL
         self.excess = self._excess(own, self.expected)
         step = scan.circle.step
@@ -130,6 +137,10 @@ class Trial:
         chosen = [one for one in listed if mirrored or one.kind not in MIRRORED]
         return [*self._beside(far), *map(self._tried, chosen)]
 
+    def movement(self) -> Tried:
+        """Try shifts of single images: movement of object or scanner between views."""
+        return self._tried(moving(self.scan, self.own, self._shown))
+
     def excess_of(self, one: Tried) -> float:
         """Compute an explanation's misfit over that of its volume's second reconstruction
         (cached); infinite if FDK cannot use its geometry.
@@ -154,18 +165,23 @@ class Trial:
         reconstruction.
         """
         if one not in self._seconds:
-            self._seconds[one] = self._expected(shown, one.suspect.cone_vec)
+            suspect = one.suspect
+            second = self._expected(shown, suspect.cone_vec, suspect.shifts)
+            self._seconds[one] = second
         return self._seconds[one]
 
-    def _expected(self, shown: Reprojection, cone_vec: ConeVec) -> FloatArray:
+    def _expected(
+        self, shown: Reprojection, cone_vec: ConeVec, shifts: FloatArray | None = None
+    ) -> FloatArray:
         """Compute the misfit (2,) of a volume's second reconstruction: its projections,
         reconstructed and projected again; infinite where FDK cannot use the geometry.
 
         Args:
             shown: projections of the volume.
             cone_vec: n views.
+            shifts: (n, 2) of the projections, or None.
         """
-        again = Reprojection.of(self.scan, shown.again, cone_vec, None)
+        again = Reprojection.of(self.scan, shown.again, cone_vec, None, shifts)
         if again is None:
             return np.full(2, np.inf)
         return again.misfit()
@@ -193,8 +209,7 @@ class Trial:
             With the suspect alone (scores infinite) if FDK cannot use it or no measure is
             reliable.
         """
-        # The explanation of a scan also explains why it seemed cut off.
-        shown = Reprojection.of(self.scan, suspect.images, suspect.cone_vec, None)
+        shown = self._shown(suspect)
         if shown is None or not self.telling.any():
             return Tried(suspect, None)
         misfits = (shown.misfit() / self.own.misfit())[self.telling]
@@ -206,6 +221,17 @@ class Trial:
         residual = float(np.exp(each.mean()))
         change = self._change(suspect, shown)
         return Tried(suspect, shown, score, residual, evidence, change)
+
+    def _shown(self, suspect: Suspect) -> Reprojection | None:
+        """Reproject a suspect; None where FDK cannot use its geometry.
+
+        Shifted images are cut off as the scan's are. Any other explanation of a scan also
+        explains why it seemed cut off.
+        """
+        truncation = None if suspect.shifts is None else self.scan.truncation
+        return Reprojection.of(
+            self.scan, suspect.images, suspect.cone_vec, truncation, suspect.shifts
+        )
 
     def _change(self, suspect: Suspect, shown: Reprojection) -> float:
         """Compute the largest relative change of nine of ten uniform nodes.
