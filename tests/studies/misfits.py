@@ -119,7 +119,7 @@ def moving(images, geometry, rng):
 TURN = frozenset({"direction", "columns", "turned"})
 WRONG: dict[str, tuple[Wrong, frozenset[str]]] = {
     "mirrored": (mirrored, TURN),
-    "backward": (backward, TURN),
+    "backward": (backward, TURN | {"reversed"}),
     "interlaced": (interlaced, frozenset({"interlaced", "span", "names"})),
     "alphabetical": (alphabetical, frozenset({"names", "interlaced", "span"})),
     "shifted": (shifted, frozenset({"offset", "middle", "sign"})),

@@ -26,7 +26,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
-from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, NODES, CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import (
     Contradiction,
     compared,
@@ -167,29 +167,34 @@ def bias_of(
         None where a coarse scan cannot be reconstructed (any GeometryError), as of a
         steep helix or of neither a circle nor a helix.
     """
+
+    def copied(nodes: int) -> CoarseScan:
+        return CoarseScan.of(image, cone_vec, shape, truncation, nodes)
+
     try:
-        scan = CoarseScan.of(image, cone_vec, shape, truncation)
-        return _bias_of(scan, sides_known)
+        return _bias_of(copied, sides_known)
     except GeometryError:
         return None
 
 
-def _bias_of(scan: CoarseScan, sides_known: bool) -> Bias:
+def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     """Reconstruct a coarse scan and bound its errors, cause by cause.
 
     If images and geometry contradict each other, nothing else is bounded. Bounds are
     `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
     the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
     complete rows their level beside the object ("drift"). A whole scan whose images fit
-    another geometry as well has a contradiction besides its causes.
+    another geometry as well, also those of a finer copy, has a contradiction besides its
+    causes.
 
     Args:
-        scan: few views and pixels of the whole scan.
+        copied: makes a coarse copy of the whole scan, of so many nodes.
         sides_known: see `bias_of`.
 
     Returns:
         The bound, with the contradiction if there is one.
     """
+    scan = copied(NODES)
     values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
     data = np.nan_to_num(values)
     nodes = UniformNodes.of(values, scan.rim)
@@ -235,6 +240,11 @@ def _bias_of(scan: CoarseScan, sides_known: bool) -> Bias:
     if comparison is None or accuracy is None or accuracy.cut_off:
         return bias
     undecided = comparison.undecided(accuracy.most, sides_known=sides_known)
+    if undecided is not None and undecided.change is not None:
+        fine = copied(FINE_NODES)
+        if fine.binned != scan.binned:
+            finer = comparison.finer(undecided, fine)
+            undecided = finer.undecided(accuracy.most, sides_known=sides_known)
     return replace(bias, contradiction=undecided)
 
 

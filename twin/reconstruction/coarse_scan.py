@@ -35,6 +35,8 @@ from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 NODES: Final = 40
 """Largest number of columns, rows and voxels along the longest side: bias changes
 smoothly."""
+FINE_NODES: Final = 80
+"""The same of the copy on which explanations are tried that the first leaves undecided."""
 MIN_AXIS_COLUMNS: Final = 4.0
 """Least columns on either side of the axis, if the panel has so many: a narrow overlap
 stays one."""
@@ -75,6 +77,7 @@ class CoarseScan:
         truncation: object beyond the edges of these images.
         numbers: (n,) of these views among all of the scan.
         binned: rows and columns of the panel over which a pixel is the mean.
+        nodes: largest number of voxels along the longest side.
     """
 
     images: Float32Array
@@ -84,6 +87,7 @@ class CoarseScan:
     truncation: Truncation | None
     numbers: npt.NDArray[np.intp]
     binned: tuple[int, int]
+    nodes: int = NODES
 
     @classmethod
     def of(
@@ -92,8 +96,9 @@ class CoarseScan:
         cone_vec: ConeVec,
         shape: tuple[int, int],
         truncation: Truncation | None,
+        nodes: int = NODES,
     ) -> CoarseScan:
-        """Reduce a scan to at most `VIEWS` views and about `NODES` columns and rows, by
+        """Reduce a scan to at most `VIEWS` views and about `nodes` columns and rows, by
         choosing views and averaging pixels; images of repeated angles are averaged.
 
         A panel on its side is turned; a helix gets its outermost rows twice. Columns stay
@@ -105,6 +110,7 @@ class CoarseScan:
             cone_vec: of all views.
             shape: (rows, cols).
             truncation: of the scan; None if the object is not cut off.
+            nodes: columns, rows and voxels along the longest side.
 
         Raises:
             GeometryError: neither a circle nor a helix, or a panel that lies flat.
@@ -118,8 +124,9 @@ class CoarseScan:
         chosen = np.arange(0, len(at), -(-len(at) // VIEWS))
         low, high = panel_reach(circle, upright(cone_vec), shape[1])
         overlap = min(low, high) / (low + high) * shape[1]
-        across = min(-(-shape[1] // NODES), max(1, int(overlap / MIN_AXIS_COLUMNS)))
-        down = max(min(-(-shape[1] // NODES), shape[0] // 2), -(-shape[0] // NODES), 1)
+        wide = -(-shape[1] // nodes)
+        across = min(wide, max(1, int(overlap / MIN_AXIS_COLUMNS)))
+        down = max(min(wide, shape[0] // 2), -(-shape[0] // nodes), 1)
         rows = shape[0] // down
         cols = shape[1] // across
         part = window(cone_vec[at[chosen]], shape, (0, rows * down), (0, cols * across))
@@ -137,9 +144,15 @@ class CoarseScan:
             part.source, part.detector, part.u * across, part.v * down
         )
         numbers = at[chosen]
-        binned = (down, across)
         return cls(
-            images, scan, circle, circle.angle[numbers], truncation, numbers, binned
+            images,
+            scan,
+            circle,
+            circle.angle[numbers],
+            truncation,
+            numbers,
+            (down, across),
+            nodes,
         )
 
     def thinned(
@@ -198,11 +211,11 @@ class CoarseScan:
 
     @cached_property
     def grid(self) -> Volume:
-        """Grid of the field of view, zeros, about the rotation axis: at most `NODES`
+        """Grid of the field of view, zeros, about the rotation axis: at most `nodes`
         columns, in layers as high as rows.
 
         A helix, far higher than a panel, gets layers as high as its field of view over
-        their number: at least the panel's rows, at most `NODES`.
+        their number: at least the panel's rows, at most `nodes`.
         """
         x, y = self.circle.centre.tolist()
         scan = self.cone_vec
@@ -218,10 +231,10 @@ class CoarseScan:
         if (
             self.circle.rise
         ):  # far more than a panel's height, in layers as few as its rows
-            layers = min(max(layers, round(height / tall)), NODES)
+            layers = min(max(layers, round(height / tall)), self.nodes)
             tall = height / layers
         wide = 2.0 * max(self.ends)
-        across = round(wide / max(view.voxel_mm, wide / NODES))
+        across = round(wide / max(view.voxel_mm, wide / self.nodes))
         blank = np.zeros((layers, across, across), np.float32)
         return Volume(
             blank, (wide / across, wide / across, tall), (x, y, view.center_mm[2])

@@ -190,6 +190,36 @@ def test_accuracy_is_claimed_only_where_the_sense_of_rotation_is_told(
         assert "direction" in bias.contradiction.kinds
 
 
+@pytest.mark.parametrize("reversed_", [False, True])
+def test_what_the_coarse_copy_leaves_undecided_a_finer_one_tells(reversed_: bool) -> None:
+    """In a beam of 4.5 degrees 40 nodes do not tell the sense of rotation, 80 do."""
+    narrow = ConeVec.circular(sod=600, sdd=1200, angles=TURN, shape=SHAPE, pixel=1.6)
+    scan = replace(drum(3.0), geometry=narrow)
+    images = scan.images()
+    if reversed_:
+        images = images[np.r_[0, np.arange(len(images) - 1, 0, -1)]]
+    case = misfits.Case("", images, narrow, scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert (bias.accuracy(Grid((16, 30, 30), 1.0)) is None) == reversed_
+    if reversed_:
+        assert bias.contradiction is not None
+        assert bias.contradiction.kinds == ("direction",)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_reverse_order_of_uneven_views_is_named(seed: int) -> None:
+    """Some views are lost, so that the reverse order is no opposite rotation."""
+    kept = np.sort(np.random.default_rng(seed).choice(len(TURN), 80, replace=False))
+    scan = brick()
+    images = np.ascontiguousarray(scan.images()[kept][::-1])
+    case = misfits.Case("", images, scan.geometry[kept], scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert bias.contradiction is not None
+    assert "reversed" in bias.contradiction.kinds
+
+
 def test_a_mirrored_body_in_a_parallel_beam_is_not_decided() -> None:
     """No image tells the sense of rotation of parallel rays."""
     far = ConeVec.circular(sod=3e5, sdd=3.3e5, angles=TURN, shape=SHAPE, pixel=0.88)

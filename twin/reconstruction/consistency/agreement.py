@@ -40,6 +40,11 @@ proportion."""
 MIN_CHANGE: Final = 0.01
 """Least relative change of uniform regions by an explanation that is named: a tilted
 panel's images may fit mirrored rows better, whose volume is the same."""
+MIN_FINE_EVIDENCE_SIGMAS: Final = 3.0
+"""Least distance of two likelihoods on a finer copy, in standard errors, at which an
+explanation is excluded that the first copy left undecided: the second look of the two."""
+FOUND_BY_TRIALS: Final = frozenset({"offset", "movement"})
+"""Kinds whose figure is found by trials, which a finer copy would have to repeat."""
 RIVALS_ROWS: Final = 6
 """Least rows of a scan whose images fit, in which explanations are compared with it."""
 MIN_VIEWS: Final = 12
@@ -141,9 +146,18 @@ class Comparison:
         trial: of the scan's stated geometry.
         doubtful: the residual is larger than of most scans, so that explanations are
             named; else only those are that fit as well and change the volume.
+        kinds: see `__init__`.
+        excluded_from: see `__init__`.
     """
 
-    def __init__(self, trial: Trial, *, doubtful: bool) -> None:
+    def __init__(
+        self,
+        trial: Trial,
+        *,
+        doubtful: bool,
+        kinds: frozenset[str] = frozenset(),
+        excluded_from: float = MIN_EVIDENCE_SIGMAS,
+    ) -> None:
         """Try the opposite rotation and the other suspected geometries, unless no measure
         is reliable ("telling").
 
@@ -154,14 +168,20 @@ class Comparison:
         Args:
             trial: of the scan's stated geometry.
             doubtful: the residual is larger than of most scans.
+            kinds: explanations that are tried, none of `FOUND_BY_TRIALS`; all if empty.
+            excluded_from: least evidence against an explanation that excludes it
+                [standard errors].
         """
         self._trial = trial
         self._doubtful = doubtful
         fits = not doubtful or trial.excess <= MAX_MISFIT
         self._unfit = trial.whole and trial.even and not fits
+        self._excluded_from = excluded_from
         self._tried: list[Tried] = []
         self._movement: Tried | None = None
-        if trial.telling.any():
+        if kinds:
+            self._tried = trial.only(kinds)
+        elif trial.telling.any():
             others = trial.others(far=self._unfit, mirrored=doubtful)
             self._tried = [trial.opposite(), *others]
             if doubtful:
@@ -223,15 +243,15 @@ class Comparison:
 
         Returns:
             None if the scan is truncated or each such explanation is excluded
-            (`_least_evidence_against`). Else all that are as good as the best; `change` is the
-            largest of theirs, or None where the best is clearly better than the stated
+            (`_least_evidence_against`). Else all that are as good as the best; `change` is
+            the largest of theirs, or None where the best is clearly better than the stated
             geometry of a doubtful scan.
         """
         trial = self._trial
         rivals = [
             one
             for one in self._tried
-            if one.evidence < _least_evidence_against(one)
+            if one.evidence < self._least_evidence_against(one)
             and not (sides_known and one.suspect.kind in SIDES)
             and one.change > claimed
             and trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
@@ -268,6 +288,40 @@ class Comparison:
             return movement
         return best
 
+    def finer(self, found: Contradiction, scan: CoarseScan) -> Comparison:
+        """Compare a finer copy of the scan with the explanations that this one leaves
+        undecided, which are then excluded by `MIN_FINE_EVIDENCE_SIGMAS`.
+
+        Args:
+            found: of `undecided`.
+            scan: the finer copy.
+
+        Returns:
+            The comparison, with those explanations alone. This one where the finer copy
+            is not reliable, or an explanation has a figure that was found by trials.
+        """
+        kinds = frozenset(found.kinds)
+        trial = Trial(scan.thinned(least_rows=RIVALS_ROWS))
+        if kinds & FOUND_BY_TRIALS or not trial.telling.any():
+            return self
+        return Comparison(
+            trial,
+            doubtful=self._doubtful,
+            kinds=kinds,
+            excluded_from=MIN_FINE_EVIDENCE_SIGMAS,
+        )
+
+    def _least_evidence_against(self, one: Tried) -> float:
+        """Return the evidence from which an explanation is excluded [standard errors].
+
+        One without shifts has to fit clearly worse than the stated geometry. Shifts, two
+        free numbers a view, fit any images a little better: they count only if they fit
+        clearly better.
+        """
+        if one.suspect.shifts is None:
+            return self._excluded_from
+        return -MIN_EVIDENCE_SIGMAS
+
     def _as_good_as(self, best: Tried) -> list[Tried]:
         """Return the explanations that fit within `EQUAL_MISFIT_RATIO` as well as the
         best: others without movement, or movement alone.
@@ -293,15 +347,3 @@ class Comparison:
         kinds = tuple(figures)
         figure_texts = tuple(figures.values())
         return Contradiction(self._trial.excess, kinds, score, figure_texts, change)
-
-
-def _least_evidence_against(one: Tried) -> float:
-    """Return the evidence from which an explanation is excluded [standard errors].
-
-    One without shifts has to fit clearly worse than the stated geometry. Shifts, two free
-    numbers a view, fit any images a little better: they count only if they fit clearly
-    better.
-    """
-    if one.suspect.shifts is None:
-        return MIN_EVIDENCE_SIGMAS
-    return -MIN_EVIDENCE_SIGMAS

@@ -15,6 +15,8 @@ from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 
 INTERLACED_PASSES: Final = (2, 3, 4)
 """Numbers of passes of interlaced scans that are tried."""
+MAX_STEP_SCATTER: Final = 0.5
+"""Largest difference of the steps between views that counts as even, over their median."""
 CENTRE_TOLERANCE: Final = 0.25
 """Largest distance of the axis from the panel's middle that counts as zero [coarse
 pixels]."""
@@ -26,6 +28,7 @@ KINDS: Final = {
     "turned": "images are turned by 180 degrees",
     "listed": "images are in the order of their angles",
     "interlaced": "the scan was interlaced, its images in the order of exposure:",
+    "reversed": "images are in the reverse order",
     "names": "images are in the alphabetical order of their numbers (1, 10, 2)",
     "span": "the views span",
     "sign": "the panel is offset to the other side",
@@ -166,8 +169,9 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
 
     Yields:
         Kind, the view whose angle each image has (n,), and a description. For angles that
-        steadily grow or fall: interlaced in each of `INTERLACED_PASSES`, and the
-        alphabetical order of numbers; else only sorted by angle ("listed").
+        steadily grow or fall: interlaced in each of `INTERLACED_PASSES`, the alphabetical
+        order of numbers, and where steps are uneven the reverse order, with the first
+        view first and last; else only sorted by angle ("listed").
     """
     count = len(angle)
     listed = np.arange(len(angle))
@@ -178,6 +182,10 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
             yield "interlaced", order, f"in {passes} passes"
         names = np.array(sorted(range(count), key=str))
         yield "names", names, ""
+        if np.ptp(steps) > MAX_STEP_SCATTER * abs(float(np.median(steps))):
+            # With even steps they are the opposite rotation.
+            yield "reversed", listed[::-1], ""
+            yield "reversed", np.roll(listed[::-1], 1), ""
         return
     yield "listed", np.argsort(angle, kind="stable"), ""
 

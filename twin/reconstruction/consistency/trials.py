@@ -141,6 +141,13 @@ class Trial:
         """Try shifts of single images: movement of object or scanner between views."""
         return self._tried(moving(self.scan, self.own, self._shown))
 
+    def only(self, kinds: frozenset[str]) -> list[Tried]:
+        """Try the explanations of some kinds: of those that `suspects` lists, and the
+        opposite rotation.
+        """
+        listed = [reversed_turn(self.scan), *suspects(self.scan, whole=self.whole)]
+        return [self._tried(one) for one in listed if one.kind in kinds]
+
     def excess_of(self, one: Tried) -> float:
         """Compute an explanation's misfit over that of its volume's second reconstruction
         (cached); infinite if FDK cannot use its geometry.
