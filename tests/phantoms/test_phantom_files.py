@@ -131,6 +131,29 @@ def test_hostile_meshes_are_refused_readably(raw: bytes, kind: str) -> None:
     json.dumps(caught.value.data)
 
 
+@pytest.mark.parametrize("solids", [1, 2, 3, 5])
+def test_all_solids_of_a_text_file_are_read(solids: int) -> None:
+    """trimesh#1053, #1720: not the first alone."""
+    boxes = []
+    for number in range(solids):
+        box = trimesh.creation.box((1.0, 1.0, 1.0))
+        box.apply_translation((3.0 * number, 0.0, 0.0))
+        boxes.append(trimesh.exchange.stl.export_stl_ascii(box))
+    phantom = mesh_phantom("\n".join(boxes).encode(), file_type="stl")
+    assert phantom.mesh().volume == pytest.approx(solids)
+    assert phantom.size_mm[0] == pytest.approx(3.0 * solids - 2.0)
+
+
+@pytest.mark.parametrize("announced", [11, 13, 10**6])
+@pytest.mark.parametrize("trailing", [0, 1, 3])
+def test_a_head_that_counts_wrongly_is_told(announced: int, trailing: int) -> None:
+    """trimesh#1720: the sentence names both lengths."""
+    body = stl(trimesh.creation.box((1, 1, 1)))[84:] + b"\0" * trailing
+    said = f"announces {announced} triangles, .* it has {84 + len(body)} bytes"
+    with pytest.raises(PhantomError, match=said):
+        mesh_phantom(binary_stl(announced, body), file_type="stl")
+
+
 def test_an_obj_does_not_make_us_read_other_files(tmp_path: Path) -> None:
     """Were the material file opened, its bad content would show up; the mesh loads
     regardless."""

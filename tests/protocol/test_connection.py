@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import random
 import time
 from typing import Any
@@ -74,6 +75,19 @@ def test_whatever_is_sent_arrives_however_it_is_cut(
     assert got == sent
     assert receiver.codec is codec
     assert not receiver.mid_message
+
+
+@pytest.mark.parametrize("separator", ["\u2028", "\u2029", "\x85", "\x1c"])
+def test_only_a_line_feed_ends_a_line(separator: str) -> None:
+    """Characters that some readers take for ends of lines, raw and escaped (pi#1908, #1910)."""
+    name = f"a{separator}b"
+    asked = Request(1, "session.ping", {"name": name})
+    escaped = json.dumps(name)[1:-1]
+    raw = separator if ord(separator) >= 0x20 else escaped[1:-1]
+    for written in (escaped, f"a{raw}b"):
+        line = '{"jsonrpc":"2.0","id":1,"method":"session.ping","params":{"name":"%s"}}\n'
+        assert Connection().receive_data((line % written).encode()) == [asked]
+    assert Connection().receive_data(Connection().send(asked)) == [asked]
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(0, 10**6), max_size=8))
