@@ -42,7 +42,6 @@ from flexdt.twin.calibration.detect.sharpness import (
     rest_of_blur,
     seen_sharpness,
     sharpness,
-    spread,
 )
 from flexdt.twin.calibration.detect.windows import (
     Balls,
@@ -177,7 +176,7 @@ def measure_beads(
     )
     there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
     patches = replace(patches, entire=patches.entire[there])
-    sample = spread(patches.entire, SAMPLE)
+    sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
     first = centroids(patches, sample)
     patches = replace(patches, peaks=contrasts(first, patches))
     if known is None or not known.seen:

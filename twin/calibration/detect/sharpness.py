@@ -62,7 +62,9 @@ BODY_BLUR_PX = 0.18
 ALIKE = 1.1
 """Ratio of the contrasts of two beads below which they harden the beam alike."""
 CHECK_SAMPLE = 8
-"""Number of those spots that are rendered to check the method: without noise few decide."""
+"""Number of those spots that are rendered to check the method, where pixels integrate: without
+noise few decide. In single rays a rim is where the nearest ray is, which cancels in the same
+spots only."""
 PROFILES = 12
 """Number of spots from which a hardening is estimated."""
 SLIGHT_BLUR_PX = 0.45
@@ -185,7 +187,9 @@ def seen_sharpness(
     if not sharp.seen:
         return sharp, hardened_balls(sharp, patches, cone, model)[0]
     slight = sharp.blur < SLIGHT_BLUR_PX
-    few = spread(sample, CHECK_SAMPLE)
+    few = sample
+    if sharp.blur >= BODY_BLUR_PX:
+        few = _spread(sample, CHECK_SAMPLE)
     trial = replace(sharp, true=sharp.blur, size=1.0)
     for _ in range(MOST_ROUNDS):
         balls, blur = hardened_balls(trial, patches, cone, model)
@@ -211,7 +215,7 @@ def seen_sharpness(
     return replace(sharp, true=blur), balls
 
 
-def spread(index: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
+def _spread(index: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
     """Pick at most `most` of some indices, evenly from the first to the last."""
     places = np.linspace(0, len(index) - 1, min(most, len(index)))
     return np.asarray(index[places.astype(np.intp)])
@@ -240,7 +244,7 @@ def hardened_balls(
     groups = []
     for group in np.split(order, breaks):
         spots = patches.entire[np.isin(patches.entire % k, group)]
-        spots = spread(spots, PROFILES)
+        spots = _spread(spots, PROFILES)
         ball = Scene(tuple(solids[i] for i in group))
         groups.append((ball, _profiles_of(ball, sharp, patches, spots, cone)))
     variance = 0.0
