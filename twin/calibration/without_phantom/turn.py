@@ -16,8 +16,9 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter, median_filter
+from scipy.ndimage import gaussian_filter
 
+from flexdt.twin.calibration.repeated_frames import find_repeated
 from flexdt.twin.calibration.without_phantom.tile_gap import FRAMES, averaged_rows
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
@@ -32,12 +33,6 @@ DARKEST: Final = 8.0
 """Largest line integral in the model of noise; above it the noise is constant."""
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
 """Of one degree of freedom."""
-WHITE_SIGMAS: Final = 3.0
-"""Standard deviations of white noise's correlation up to which neighbouring pixels are
-independent. From twice that on they are not."""
-LOST_RATIO: Final = 2.5
-"""Ratio of a difference of frames to the usual one above which a frame may be missing:
-with one missing it is about four."""
 MIN_STEP_RATIO: Final = 5.0
 """Least ratio of a step between neighbours to the usual spread (assumed)."""
 MIN_LEAD_RATIO: Final = 1.5
@@ -154,7 +149,7 @@ def read_turn(
         noise = noise + weight[0] * np.exp(np.minimum(g, DARKEST))
     views = np.stack(thumbs)
     if not repeated:
-        again, jumps = (index[places].tolist() for places in _repeated(views, gaps))
+        again, jumps = (index[at].tolist() for at in find_repeated(views, gaps))
         if again:
             return read_turn(
                 image, angle, present, tuple(sorted(again)), tuple(jumps), source_row
@@ -294,57 +289,6 @@ def _thumb(image: Float32Array) -> Float32Array:
             f"{2 * factor} rows or more",
         )
     return np.asarray(binned_mean(image, factor), dtype=np.float32)
-
-
-def _repeated(views: Float32Array, gaps: FloatArray) -> tuple[list[int], list[int]]:
-    """Find frames that repeat the one before although the stage turned, and one after a
-    missing frame.
-
-    Two exposures of the same differ by noise alone, in which neighbouring pixels are
-    independent; the change by a turn spreads over several. A frame after a missing one
-    changes more than `LOST_RATIO` times the usual.
-
-    Args:
-        views: (n, rows, cols), sorted by angle.
-        gaps: after each, (n,) [rad].
-
-    Returns:
-        Places of both kinds: of missing ones at most one; none at all if more than a
-        quarter of the frames look repeated.
-    """
-    soft = gaussian_filter(
-        views, (0, 2, 2)
-    )  # less noise: a copy may have been exposed anew
-    rest = soft - np.roll(soft, 1, axis=0)
-    change, correlation = np.empty((2, len(views)))
-    for i, (down, right) in enumerate(zip(*np.gradient(soft, axis=(1, 2)), strict=True)):
-        # Frames that are shifted against each other change more than a turn makes them.
-        slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
-        shifted = slopes @ np.linalg.lstsq(slopes, rest[i].ravel(), rcond=None)[0]
-        change[i] = np.square(rest[i].ravel() - shifted).mean(dtype=np.float64)
-        own = views[i] - views[i - 1] - shifted.reshape(soft[i].shape)
-        correlation[i] = _neighbours_correlation(own)
-    # Usual for that part of the turn: a round body hardly changes where it turns back.
-    usual = median_filter(change, 5, mode="wrap")
-    turned = np.roll(gaps, 1) > 1e-6
-    ratio = change / np.maximum(usual, 1e-30)
-    limit = WHITE_SIGMAS / math.sqrt(views[0].size)
-    white = correlation <= limit
-    white &= median_filter(correlation, 5, mode="wrap") > 2.0 * limit
-    same = np.flatnonzero(white & (ratio <= np.quantile(ratio, 0.1)) & turned)
-    if len(same) > len(views) // 4:
-        return [], []
-    jump = np.where(np.roll(gaps, 1) < 1.5 * np.median(gaps), ratio, 0.0)
-    return same.tolist(), [int(jump.argmax())] if jump.max() > LOST_RATIO else []
-
-
-def _neighbours_correlation(image: FloatArray) -> float:
-    """Compute the correlation of neighbouring pixels along rows or columns, the larger
-    one; 0 of noise.
-    """
-    own = image - image.mean()
-    along = [(own[1:] * own[:-1]).mean(), (own[:, 1:] * own[:, :-1]).mean()]
-    return float(max(along)) / max(float(np.square(own).mean()), 1e-30)
 
 
 def _step(
