@@ -22,12 +22,15 @@ from flexdt.twin.calibration.without_phantom.conjugate_rays import (
     Step,
 )
 from flexdt.twin.calibration.without_phantom.hidden_gap import HiddenGap, hidden_gap
-from flexdt.twin.calibration.without_phantom.tile_gap import Gap, local_gaps
+from flexdt.twin.calibration.without_phantom.tile_gap import SIDE, Gap, local_gaps
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SIGMAS: Final = 3.0
 """Least width of a gap, in sigmas."""
+OWN_MIRROR_PX: Final = SIDE / 2 + 1
+"""Distance from the axis up to which a border is its own mirror image: what turns there
+cannot be compared with the other side, and single frames certify nothing."""
 ROUNDS: Final = 3
 """Number of times a gap is closed to measure its remainder."""
 
@@ -37,11 +40,15 @@ class GapFound(NamedTuple):
 
     Attributes:
         gap: the gap; None: no gap is reported.
-        hidden: possible gap near the axis; None: none is possible, or a gap is reported.
+        hidden: possible gap near the axis, which counts unless the gap is confirmed; None:
+            none is possible, or both ends of rays certify the gap.
+        values: parameters of the plane of symmetry by both ends of rays, the gap closed;
+            None without a gap.
     """
 
     gap: Gap | None
     hidden: HiddenGap | None
+    values: FloatArray | None = None
 
 
 def find_gap(
@@ -65,8 +72,8 @@ def find_gap(
         closed: columns of borders next to which the images are filled in.
 
     Returns:
-        The gap, None without; and the judgement of gaps that stay hidden, None with a
-        gap.
+        The gap and the plane behind it, None without; and the judgement of gaps that stay
+        hidden, None with a gap that both ends of rays certify.
 
     Raises:
         NotIdentifiableError: there are two gaps.
@@ -83,63 +90,98 @@ def find_gap(
         hidden = hidden_gap(frames, axis, profile, rays.smoothing)
     if profile is None:
         return GapFound(None, hidden)
-    seen = local_gaps(frames, axis, closed)
-    certified = [gap for gap in seen if _certified(gap, profile, axis, rays.smoothing)]
-    if not certified and hidden is not None and hidden.likely is not None:
-        certified = [hidden.likely]
-    step = profile.best()
-    if not certified and not step.significant:
-        return GapFound(None, hidden)
-    if certified:
-        first = certified[0]
-    else:
-        first = _from_step(step, axis)
-    gap = _refined(rays, values, first)
-    if not certified:  # the column is not known to the pixel
-        gap = gap._replace(sigma=max(gap.sigma, first.sigma))
-    if not certified and gap.width < SIGMAS * gap.sigma:
-        return GapFound(None, hidden)
-    others = [
-        one
-        for one in seen
-        if abs(one.column - first.column) > 2.0 * rays.smoothing
-        and not _refuted(one, profile, axis)
+    seen = [
+        gap
+        for gap in local_gaps(frames, axis, closed)
+        if abs(gap.column - 0.5 - axis) > OWN_MIRROR_PX
     ]
-    _require_one(rays, values, gap, others)
+    certified = [gap for gap in seen if _certified(gap, profile, axis)]
+    likely = None if certified or hidden is None else hidden.likely
+    gap = _measured(rays, values, [*certified, likely], profile.best(), axis)
+    if gap is None:
+        return GapFound(None, hidden)
+    closed_rays, behind = _closed(rays, values, gap.column, gap.width)
+    second, step = _left_behind(closed_rays, behind, gap, seen)
+    _require_one(gap, second)
+    if likely is not None and step is not None:
+        return GapFound(None, hidden)
+    _require_one(gap, step)
     inside = profile.at(abs(gap.column - 0.5 - axis))
-    return GapFound(gap._replace(beside_axis=not np.isfinite(inside.sigma)), None)
+    gap = gap._replace(beside_axis=not np.isfinite(inside.sigma))
+    return GapFound(gap, None if likely is None else hidden, behind)
 
 
-def _certified(gap: Gap, profile: Profile, axis: float, smoothing: float) -> bool:
-    """Check whether both ends of rays agree with a gap that single frames show: a step
-    (beyond `SIGMAS`) of its sign, or, within two smoothings of the axis, no step and too
-    little precision to see one.
+def _measured(
+    rays: ConjugateRays,
+    values: FloatArray,
+    known: Sequence[Gap | None],
+    step: Step,
+    axis: float,
+) -> Gap | None:
+    """Measure the width of a gap by both ends of rays: of the first one known, or else of
+    a significant step.
+
+    Args:
+        rays: of a turn.
+        values: parameters of the geometry.
+        known: gaps by single frames, the best first; None: none.
+        step: the most significant one of both ends of rays.
+        axis: its column [px].
+
+    Returns:
+        None if nothing is known, or if the width is below `SIGMAS`; a gap whose width
+        both ends of rays do not determine is returned as it is known.
+    """
+    first = next((gap for gap in known if gap is not None), None)
+    if first is not None:
+        gap = _refined(rays, values, first)
+    elif step.significant:
+        at_step = _from_step(step, axis)
+        gap = _refined(rays, values, at_step)
+        # The column is not known to the pixel.
+        gap = gap._replace(sigma=max(gap.sigma, at_step.sigma))
+    else:
+        return None
+    return gap if gap == first or gap.width >= SIGMAS * gap.sigma else None
+
+
+def _left_behind(
+    closed: ConjugateRays, values: FloatArray, gap: Gap, seen: Sequence[Gap]
+) -> tuple[Gap | None, Gap | None]:
+    """Find what looks like another gap once one is closed.
+
+    Args:
+        closed: both ends of rays, the gap closed.
+        values: parameters of the plane.
+        gap: the one that is closed.
+        seen: gaps that single frames show.
+
+    Returns:
+        One that single frames show and both ends of rays certify, and one by a
+        significant step alone; None each without.
+    """
+    profile = closed.profile(values)
+    if profile is None:
+        return None, None
+    axis = closed.scan.column(values, closed.row)
+    far = [one for one in seen if abs(one.column - gap.column) > 2.0 * closed.smoothing]
+    second = next((one for one in far if _certified(one, profile, axis)), None)
+    step = profile.best()
+    return second, _from_step(step, axis) if step.significant else None
+
+
+def _certified(gap: Gap, profile: Profile, axis: float) -> bool:
+    """Check whether both ends of rays agree with a gap that single frames show: a step of
+    its sign, beyond `SIGMAS`.
 
     Args:
         gap: column and width [px].
         profile: steps that both ends of rays show.
         axis: its column [px].
-        smoothing: of the profile [px].
     """
     beside = gap.column - 0.5 - axis
     step = profile.at(abs(beside))
-    if abs(step.width) > SIGMAS * step.sigma:
-        return bool(np.sign(step.width) == np.sign(beside))
-    return bool(abs(beside) < 2.0 * smoothing and SIGMAS * step.sigma > gap.width)
-
-
-def _refuted(gap: Gap, profile: Profile, axis: float) -> bool:
-    """Check whether both ends of rays leave less than half of the width of a gap that
-    single frames show, with `SIGMAS` to spare.
-
-    Args:
-        gap: column and width [px].
-        profile: steps that both ends of rays show.
-        axis: its column [px].
-    """
-    beside = gap.column - 0.5 - axis
-    step = profile.at(abs(beside))
-    return step.width * float(np.sign(beside)) + SIGMAS * step.sigma < gap.width / 2
+    return step.width * float(np.sign(beside)) > SIGMAS * step.sigma
 
 
 def _from_step(step: Step, axis: float) -> Gap:
@@ -151,9 +193,10 @@ def _from_step(step: Step, axis: float) -> Gap:
 def _closed(
     rays: ConjugateRays, values: FloatArray, column: int, width: float
 ) -> tuple[ConjugateRays, FloatArray]:
-    """Close a gap, and find the axis again."""
+    """Close a gap, and find the axis again; parameters stay where it is not found."""
     closed = rays.closed(column, width)
-    return closed, closed.column(values)[0]
+    moved, sigma = closed.column(values)
+    return closed, moved if np.isfinite(sigma) else values
 
 
 def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
@@ -184,32 +227,21 @@ def _refined(rays: ConjugateRays, values: FloatArray, gap: Gap) -> Gap:
     return gap
 
 
-def _require_one(
-    rays: ConjugateRays, values: FloatArray, gap: Gap, others: Sequence[Gap]
-) -> None:
-    """Check that no other gap between panel tiles is left when one is closed.
+def _require_one(gap: Gap, other: Gap | None) -> None:
+    """Check that there is no other gap.
 
     Args:
-        rays: both ends of rays of a turn.
-        values: parameters of the plane.
-        gap: to close.
-        others: further gaps seen in frames; any is one too many.
+        gap: the one that is closed.
+        other: another one; None: none.
 
     Raises:
-        NotIdentifiableError: there is another gap; names the columns of two.
+        NotIdentifiableError: there is another; names the columns of both.
     """
-    closed, again = _closed(rays, values, gap.column, gap.width)
-    profile = closed.profile(again)
-    step = profile.best() if profile else None
-    columns = [one.column for one in others]
-    if step is not None and step.significant:
-        axis = rays.scan.column(again, rays.row)
-        columns.append(_from_step(step, axis).column)
-    if columns:
-        both = sorted((gap.column, columns[0]))
-        raise NotIdentifiableError(
-            f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
-            "gaps between tiles of the panel, of which one can be found; calibrate with "
-            "a phantom, "
-            "and give that correction"
-        )
+    if other is None:
+        return
+    both = sorted((gap.column, other.column))
+    raise NotIdentifiableError(
+        f"from columns {both[0]} and {both[1]} on everything appears nearer, as behind two "
+        "gaps between tiles of the panel, of which one can be found; calibrate with "
+        "a phantom, and give that correction"
+    )

@@ -187,15 +187,17 @@ def find_plane(
     """
     first = _first_column(scan, random)
     _require_one_column(scan, first)
-    gap, hidden = _gap(scan, first, panel)
+    gap, hidden, behind = _gap(scan, first, panel)
     whole = first
     if gap is not None:
-        first = _with_gap(first, gap)
+        first = _with_gap(first, gap, behind)
     found = _fit(scan, first, gap)
     if gap is not None and _closes(found, gap):
         gap = None
         first = whole
         found = _fit(scan, first, gap)
+    if gap is not None:
+        hidden = None
     _require_symmetric(found, first.preface)
     plane = _plane(scan, first, found, GapFound(gap, hidden), panel)
     _require_precise(plane, first.preface)
@@ -344,16 +346,24 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
     return found.converged and precise and not found.values[-1] > SIGMAS * sigma
 
 
-def _with_gap(first: FirstColumn, gap: Gap) -> FirstColumn:
-    """Make the width of the gap between two panel tiles the last parameter, with its
-    prior; not if the gap lies beside the axis, where the plane does not determine it.
-    Errors begin with the gap's text in either case.
+def _with_gap(first: FirstColumn, gap: Gap, behind: FloatArray | None) -> FirstColumn:
+    """Start at the plane with the gap between two panel tiles closed: the mean's own axis
+    is off by half of its width.
+
+    The width becomes the last parameter, with its prior; not if the gap lies beside the
+    axis, where the plane does not determine it. Errors begin with the gap's text.
+
+    Args:
+        first: the start without a gap.
+        gap: its column and width.
+        behind: parameters of the plane with it closed; None: those of `first`.
     """
+    values = first.values if behind is None else behind
     if gap.beside_axis:
-        return replace(first, preface=f"{gap.text}; ")
+        return replace(first, values=values, preface=f"{gap.text}; ")
     return replace(
         first,
-        values=np.append(first.values, gap.width),
+        values=np.append(values, gap.width),
         scales=np.append(first.scales, 1.0),
         priors=np.append(first.priors, gap.sigma),
         preface=f"{gap.text}; ",
@@ -435,7 +445,7 @@ def _plane(
     """
     turn = first.turn
     scales = first.scales
-    gap, hidden = gap_found
+    gap, hidden, _ = gap_found
     values = found.values.copy()
     covariance = found.covariance.copy()
     if gap is not None and turn is not None:
