@@ -134,16 +134,16 @@ def test_movement_between_views_is_named(kind: str) -> None:
 def test_movement_of_thin_wires_is_seen_by_their_centroids() -> None:
     scan = brick()
     wires = [
-        bias_bound.Solid("cylinder", np.array([x, y, 0.0]), np.array([1.0, 1.0, 8.0]), 0, 0.3)
+        bias_bound.Solid("cylinder", np.array([x, y, 0.0]), np.array([0.4, 0.4, 8.0]), 0, 0.3)
         for x, y in ((9.0, 2.0), (-3.0, 7.0), (-8.0, -6.0), (1.0, -4.0))
     ]  # fmt: skip
-    scan = replace(scan, solids=wires, geometry=scan.geometry[::2])
+    scan = replace(scan, solids=wires, geometry=scan.geometry[::3])
     images = scan.images()
     still = misfits.Case("still", images, scan.geometry, scan, frozenset())
     found = misfits.looked_at(still)
     assert found is not None
     assert found.contradiction is None
-    moves = np.round(3.0 * np.sin(5.0 * np.radians(TURN[::2]))).astype(int)
+    moves = np.round(3.0 * np.sin(5.0 * np.radians(TURN[::3]))).astype(int)
     moved = np.stack([np.roll(a, k, 1) for a, k in zip(images, moves, strict=True)])
     bias = misfits.looked_at(replace(still, images=moved))
     assert bias is not None

@@ -275,8 +275,10 @@ class Comparison:
         """Return the explanation that changes the volume by more than `MIN_CHANGE` and
         fits best; None without one.
 
-        Movement, which has two free numbers a view, is returned only if it is clearly
-        better than any other (`MAX_BETTER_MISFIT`).
+        Movement, which has two free numbers a view, is returned if no other is clearly
+        better than the stated geometry, or if it is clearly better than any other
+        (`MAX_BETTER_MISFIT`) and centroids wander (`MAX_WANDER`), which no offset, mirror
+        or order in itself makes them do.
         """
         other = [one for one in self._tried if one.change > MIN_CHANGE]
         simple = [one for one in other if one.suspect.shifts is None]
@@ -284,7 +286,10 @@ class Comparison:
         movement = self._movement
         if movement is None or movement not in other:
             return best
-        if best is None or movement.score < MAX_BETTER_MISFIT * best.score:
+        if best is None or best.score >= MAX_BETTER_MISFIT:
+            return movement
+        better = movement.score < MAX_BETTER_MISFIT * best.score
+        if better and self._trial.wander > MAX_WANDER:
             return movement
         return best
 
