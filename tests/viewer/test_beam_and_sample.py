@@ -18,7 +18,9 @@ DISTANCES_MM = (300.0, 200.0, 250.0, 350.0, 450.0, 550.0, 650.0, 800.0)
 """Of the sample from the source; the first is drawn in CI, the others in the campaign."""
 LEAST_KEPT = 0.9
 """Share of the sample's pixels that are still the sample's with X-rays on."""
-LEAST_PX = 30
+LEAST_PX = 15
+"""Pixels of the sample in every view, without which a share means nothing: viser draws with
+fewer pixels where pictures are slow (65 or 26 in the side view)."""
 
 
 @pytest.fixture(scope="module")
