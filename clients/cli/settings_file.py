@@ -204,7 +204,8 @@ def _require_known(
         where: beginning of the message.
         given: keys.
         known: the allowed ones.
-        tables: names of tables that are allowed, too.
+        tables: names of tables, which the error lists beside `known`; as keys they are
+            refused.
 
     Raises:
         CommandError: an unknown key; lists keys and tables.

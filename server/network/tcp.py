@@ -884,8 +884,9 @@ class _Link(asyncio.BufferedProtocol):
         return self._load >= self.limits.max_waiting or ahead > limit_bytes
 
     def _relax(self) -> None:
-        """Resume reading once messages and bytes that wait are at most half of their
-        limits.
+        """Resume reading once messages that wait, urgent ones in service included, and
+        bytes are at most half of their limits: of bytes, `READ_AHEAD_BYTES`, before
+        admission too.
 
         Bytes count only beside a whole message.
         """

@@ -85,11 +85,12 @@ class SampleStore:
         room: DiskRoom | None = None,
         memory_limit: int | None = None,
     ) -> None:
-        """List the uploads stored in a folder, and delete files that belong to none of
-        them.
+        """List the uploads stored in a folder; delete temporary files, and bytes (.bin)
+        of no known upload.
 
-        Descriptions that cannot be read are renamed and logged. Names of shipped phantoms
-        and of the empty stage are skipped. Phantoms are loaded when used.
+        Descriptions that cannot be read are renamed and logged, and their bytes stay. Names
+        of shipped phantoms and of the empty stage are skipped. Phantoms are loaded when
+        used.
 
         Args:
             folder: of the uploads.

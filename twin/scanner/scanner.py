@@ -617,8 +617,9 @@ class ScannerTwin:
         paces and moves.
 
         The change is prepared and judged again for `now` (see `StageChange.renewed`).
-        Motion that is not free of the new stage is halted, if halting is free; such a
-        halt counts as a stop and as a blocked attempt. The moves of the change begin.
+        Motion under way that is not free of the new stage is halted, if the change has no
+        moves of its own and halting is free; such a halt counts as a stop and as a blocked
+        attempt. The moves of the change begin.
 
         Args:
             change: with its verdict.
@@ -629,8 +630,9 @@ class ScannerTwin:
             was halted.
 
         Raises:
-            CollisionError: a pair is too near, a move of the change would collide, or not
-                even halting is free of the new stage; nothing changes.
+            CollisionError: a pair is too near, a move of the change would collide, motion
+                under way is not free and the change has moves, or not even halting is free
+                of the new stage; nothing changes.
             SafetyError: the stage was changed meanwhile; motion was stopped meanwhile and
                 the change has targets; motors coast; or a long programme has begun.
                 Nothing changes.

@@ -507,14 +507,15 @@ def _timing(
 ) -> Timing:
     """Fit the times of commands: medians, 90 % ranges and the common drift.
 
-    The drift is the mean change from earlier to later times over the kinds, shrunk by its
-    uncertainty in the ranges; 0 where no kind has two times.
+    The drift is the mean relative change from earlier to later times over the kinds
+    (changes are of logarithms), without its sign, shrunk by its uncertainty in the ranges
+    and stretched by 1 + 1/`logs` to the next scan; 0 where no kind has two times.
 
     Args:
         samples: kind of command -> times [s], oldest first.
         before: times of the base machine.
         source: names the logs.
-        logs: number of logs.
+        logs: number of logs, from which the drift to the next scan follows.
 
     Returns:
         A copy of `before` with the fitted times.

@@ -42,8 +42,9 @@ def laid_out(
 ) -> FloatArray:
     """Place the names' boxes.
 
-    From top to bottom, each at the place that covers fewest points; then names are
-    exchanged so that leaders do not cross. Places are on rings around a point
+    From top to bottom, each near its point at a place that covers few others: a covered
+    point weighs as much as four rings farther away. Then names are exchanged so that
+    leaders do not cross. Places are on rings around a point
     (`RINGS_PX`, `WAYS` directions), inside the area and `GAP_PX` from other boxes; nearer
     and higher ones are preferred. All boxes are treated as large as the largest.
 

@@ -412,15 +412,19 @@ def timed(
 ) -> Entry:
     """Make an entry of the call named flexdt and those of the others.
 
+    Contestants are called in turn; the first call of each is not counted.
+
     Args:
         name: of the case.
         views: of each call.
-        calls: contestant -> call; one is "flexdt".
+        calls: contestant -> call; one is "flexdt". A call that returns a float has timed
+            itself [s].
         what: description of the case.
         once: contestants that are called one time only.
 
     Returns:
-        The entry, with times [ms per view] and ratios peer / flexdt.
+        The entry, with least and median times [ms per view] and ratios peer / flexdt of
+        both.
     """
     timing = interleaved(calls, once=once)
     ours = timing.pop("flexdt")

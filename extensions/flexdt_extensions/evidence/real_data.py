@@ -375,13 +375,16 @@ def c_arm(files: list[Path]) -> Iterator[Told]:
     """Compare two views of a C-arm by their matrices: planes through both sources have
     one integral.
 
-    The shifted matrix must not agree, which shows that the check can fail.
+    Points are projections of random points by flexdt's geometry against the matrix itself:
+    they agree within 1e-6 px for both matrices. Planes agree within 2 % as stored; for a
+    matrix shifted by 5 px they must differ by more than 10 %, which shows that the check
+    can fail.
 
     Args:
         files: of the two images, with matrices.
 
     Yields:
-        Points and planes, as stored and for a matrix shifted by 5 px.
+        Points and planes, as stored and for the shifted matrix.
     """
     matrices = []
     images = []

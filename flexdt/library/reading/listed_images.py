@@ -38,7 +38,8 @@ def in_order(
         views: number of views of the geometry.
 
     Returns:
-        The names in order, and doubts about them as sentences.
+        The names in order, a repeated one once, and doubts about them as sentences: names
+        of another form, names that are left out, gaps in the numbers.
 
     Raises:
         DatasetFormatError: two have one number.

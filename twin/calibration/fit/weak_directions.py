@@ -171,10 +171,11 @@ def weak_direction(
         scale: (columns,) column norms per edge unit: change = vector * sigma / scale.
         names: of the columns.
         sigma: along the vector, scaled units; inf where it is not determined.
-        beads: beads seen.
+        beads: number of beads seen, from which the advice follows.
 
     Returns:
-        With its sigma in the lead's edge unit; inf where it is not determined.
+        With its sigma in the lead's edge unit (inf where it is not determined) and advice
+        on data that would determine it.
     """
     order = np.argsort(-np.abs(vector))
     involved = [int(i) for i in order if abs(vector[i]) > 0.1 * abs(vector[order[0]])]

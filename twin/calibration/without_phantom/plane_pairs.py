@@ -175,6 +175,10 @@ class PlanePairs:
         """Compute sums of squared differences between both views, without offsets common
         to all bins (air that is not 0); bins that are not valid do not count.
 
+        Each coarser level adds up neighbouring bins and pairs before it squares, and gives
+        each pair the mean of its group. A group counts only its bins that are valid in all
+        of its pairs, and is 0 with fewer than `FEWEST_BINS` of them.
+
         Args:
             at: arguments of `views`.
             sums: of other images, laid out as `self.sums`.

@@ -111,7 +111,8 @@ class Contradiction:
 
 
 def compared(scan: CoarseScan) -> Comparison | None:
-    """Compare a scan's images with the projections of its volume.
+    """Compare a scan's images with the projections of its volume, and with those of other
+    geometries (`Comparison`), which takes most of the time.
 
     Some views and rows are tried first; all views if the expected residual of values or
     edges is too large. The comparison is `doubtful` if the misfit is at least
