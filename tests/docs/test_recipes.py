@@ -195,7 +195,7 @@ def test_a_format_of_geometry_is_added_by_its_recipe(copy: Path) -> None:
              '        Format("added", (".added",), _write_added, read=_read_added),\n'),
         ),
         "twin/geometry/cone_vec.py": (
-            ("csv.\n            shape: detector", "added, "),
+            ("csv; None:", "added, "),
             (".csv, .xml (RTK)", ".added, "),
         ),
         "docs/exchange.md": (

@@ -202,11 +202,10 @@ class Comparison:
         """Find the error of the scan's geometry.
 
         An explanation is named if it changes the volume by more than `MIN_CHANGE`, fits
-        clearly better than the stated geometry (score below `MAX_BETTER_MISFIT`, or
-        `MAX_MUCH_BETTER_MISFIT` for truncated, uneven or partly unreliable scans) and
-        fits well (`MAX_MISFIT`); others as good are named with it. If none is clearly
-        better, but centroids wander (`MAX_WANDER`), movement is named. Else, if the scan
-        does not fit its own geometry, the result names no explanation.
+        clearly better than the stated geometry (`_clear_score`) and fits well
+        (`MAX_MISFIT`); others as good are named with it. If none is clearly better, but
+        centroids wander (`MAX_WANDER`), movement is named. Else, if the scan does not fit
+        its own geometry, the result names no explanation.
 
         Returns:
             None if there is no error, nothing was tried, or the scan is not doubtful.
@@ -214,12 +213,8 @@ class Comparison:
         trial = self._trial
         if not self._tried or not self._doubtful:
             return None
-        if trial.whole and trial.even and trial.telling.all():
-            better = MAX_BETTER_MISFIT
-        else:
-            better = MAX_MUCH_BETTER_MISFIT
         best = self._best()
-        clear = best is not None and best.score < better
+        clear = best is not None and best.score < self._clear_score
         if best is not None and clear and trial.excess_of(best) <= MAX_MISFIT:
             return self._named(self._as_good_as(best), best.score)
         wandering = trial.wander > MAX_WANDER
@@ -263,7 +258,7 @@ class Comparison:
         as_good = [one for one in self._as_good_as(best) if one in rivals]
         decided = (
             best.evidence < -MIN_EVIDENCE_SIGMAS
-            and best.score < MAX_BETTER_MISFIT
+            and best.score < self._clear_score
             and self._doubtful
         )
         if decided:
@@ -271,6 +266,17 @@ class Comparison:
         else:
             change = max(one.change for one in as_good)
         return self._named(as_good, best.score, change)
+
+    @property
+    def _clear_score(self) -> float:
+        """Score below which an explanation is clearly better than the stated geometry:
+        `MAX_BETTER_MISFIT`, or `MAX_MUCH_BETTER_MISFIT` for truncated, uneven or partly
+        unreliable scans.
+        """
+        trial = self._trial
+        if trial.whole and trial.even and trial.telling.all():
+            return MAX_BETTER_MISFIT
+        return MAX_MUCH_BETTER_MISFIT
 
     def _best(self) -> Tried | None:
         """Return the explanation that changes the volume by more than `MIN_CHANGE` and
