@@ -240,7 +240,7 @@ def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     if comparison is None or accuracy is None or accuracy.cut_off:
         return bias
     undecided = comparison.undecided(accuracy.most, sides_known=sides_known)
-    if undecided is not None and undecided.change is not None:
+    if undecided is not None and undecided.finer_copy_decides:
         fine = copied(FINE_NODES)
         if fine.binned != scan.binned:
             finer = comparison.finer(undecided, fine)

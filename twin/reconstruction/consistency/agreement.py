@@ -32,7 +32,7 @@ MAX_MUCH_BETTER_MISFIT: Final = 0.7
 where the coarse volume shows no edges."""
 MAX_WANDER: Final = 5.0
 """Largest distance of images' centroids from those of the volume's projections, over what
-the second reconstruction and noise explain (`wandering`): above it the object moved."""
+the second reconstruction and noise explain (`wandering`): above it a scan does not fit."""
 MIN_DOUBTFUL_MISFIT: Final = 1.4
 """Residual over that of the second reconstruction, below which an explanation counts
 only if its volume differs: more than half of right scans. Above it bounds grow in
@@ -97,6 +97,13 @@ class Contradiction:
         if not self.kinds:
             return f"{sentence}. {UNEXPLAINED}"
         return f"{sentence}, {100.0 * self.better:.0f} % of it if {self._explanations}"
+
+    @property
+    def finer_copy_decides(self) -> bool:
+        """True if a finer copy may decide: the images of the coarse one do not, and no
+        explanation has a figure that was found by trials on it (`FOUND_BY_TRIALS`).
+        """
+        return self.change is not None and not FOUND_BY_TRIALS.intersection(self.kinds)
 
     @property
     def _explanations(self) -> str:
@@ -284,8 +291,7 @@ class Comparison:
 
         Movement, which has two free numbers a view, is returned if no other is clearly
         better than the stated geometry, or if it is clearly better than any other
-        (`MAX_BETTER_MISFIT`) and centroids wander (`MAX_WANDER`), which no offset, mirror
-        or order in itself makes them do.
+        (`MAX_BETTER_MISFIT`) and centroids wander (`MAX_WANDER`).
         """
         other = [one for one in self._tried if one.change > MIN_CHANGE]
         simple = [one for one in other if one.suspect.shifts is None]
@@ -305,21 +311,20 @@ class Comparison:
         undecided, which are then excluded by `MIN_FINE_EVIDENCE_SIGMAS`.
 
         Args:
-            found: of `undecided`.
+            found: of `undecided`, with `finer_copy_decides`.
             scan: the finer copy.
 
         Returns:
-            The comparison, with those explanations alone. This one where the finer copy
-            is not reliable, or an explanation has a figure that was found by trials.
+            The comparison, with those explanations alone; this one where the finer copy
+            is not reliable.
         """
-        kinds = frozenset(found.kinds)
         trial = Trial(scan.thinned(least_rows=RIVALS_ROWS))
-        if kinds & FOUND_BY_TRIALS or not trial.telling.any():
+        if not trial.telling.any():
             return self
         return Comparison(
             trial,
             doubtful=self._doubtful,
-            kinds=kinds,
+            kinds=frozenset(found.kinds),
             excluded_from=MIN_FINE_EVIDENCE_SIGMAS,
         )
 

@@ -109,9 +109,8 @@ class Reprojection:
         count, rows, cols = self.images.shape
         along = np.arange(cols) - 0.5 * (cols - 1)
         mass = float(np.maximum(self.images, 0.0).sum(dtype=np.float64)) / count
-        noise = max(_noise_of(self.images) - _noise_of(self.again), 0.0)
         spread = rows * float(np.square(along).sum())
-        return float(noise * spread / max(mass**2, np.finfo(np.float64).tiny))
+        return float(self._noise * spread / max(mass**2, np.finfo(np.float64).tiny))
 
     @cached_property
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -120,15 +119,19 @@ class Reprojection:
         0, times `NOISE_VARIANCE_RATIO`.
         """
         rest = self.again - self.images
-        # Differences between neighbours in both are the object's.
-        noise = NOISE_VARIANCE_RATIO * max(
-            _noise_of(self.images) - _noise_of(self.again), 0.0
-        )
         residual, signal = (
             np.array([_mean_square(values), _mean_square(_changes(values))])
             for values in (rest, self.images)
         )
-        return residual, signal, noise * NOISE_OF_CHANGES
+        noise = NOISE_VARIANCE_RATIO * self._noise * NOISE_OF_CHANGES
+        return residual, signal, noise
+
+    @cached_property
+    def _noise(self) -> float:
+        """Variance of white noise in the images, at least 0: differences between
+        neighbours that the reprojection has as well are the object's.
+        """
+        return max(_noise_of(self.images) - _noise_of(self.again), 0.0)
 
 
 def shifted_back(images: Float32Array, shifts: FloatArray) -> Float32Array:

@@ -104,11 +104,10 @@ class Trial:
         self.own = own
         self._seconds: dict[Tried, FloatArray] = {}
         second = Reprojection.of(scan, own.again, scan.cone_vec, None)
-        self.expected = np.full(2, np.inf)
+        self.expected = _misfit_of(second)
         self.wander = 0.0
-        if second is not None:
-            self.expected = second.misfit()
-            self.wander = wandering(scan, own, second) if self.whole else 0.0
+        if self.whole and second is not None:
+            self.wander = wandering(scan, own, second)
         self.telling = self.expected < MAX_RELIABLE_RESIDUAL
         self.excess = self._excess(own, self.expected)
         step = scan.circle.step
@@ -189,9 +188,7 @@ class Trial:
             shifts: (n, 2) of the projections, or None.
         """
         again = Reprojection.of(self.scan, shown.again, cone_vec, None, shifts)
-        if again is None:
-            return np.full(2, np.inf)
-        return again.misfit()
+        return _misfit_of(again)
 
     def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
         """Compute the misfit relative to the expected one: of changes along rows if those
@@ -312,6 +309,11 @@ class Trial:
                     break
                 at *= 2.0
         return list(tried.values())
+
+
+def _misfit_of(shown: Reprojection | None) -> FloatArray:
+    """Return the misfit (2,) of a reprojection; infinite without one."""
+    return np.full(2, np.inf) if shown is None else shown.misfit()
 
 
 def _lowest(known: dict[float, float]) -> float:
