@@ -129,6 +129,10 @@ def test_movement_between_views_is_named(kind: str) -> None:
     assert bias is not None
     assert bias.contradiction is not None
     assert bias.contradiction.kinds == ("movement",)
+    words = bias.contradiction.figures[0].split()
+    along, below = float(words[3]), float(words[8])
+    assert (below > along) == (kind == "fall")
+    assert 1.0 < max(along, below) < 6.0
 
 
 def test_movement_of_thin_wires_is_seen_by_their_centroids() -> None:

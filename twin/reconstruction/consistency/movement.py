@@ -46,8 +46,7 @@ def moving(
 
     Returns:
         The scan with the shifts found in `MOVEMENT_ROUNDS` registrations, or before
-        `shown` gives None. `figure` is the largest shift along rows, in pixels of the
-        panel.
+        `shown` gives None.
     """
     shifts = np.zeros((len(scan.angles), 2))
     latest: Reprojection | None = own
@@ -167,7 +166,10 @@ def without_placement(
 
 
 def _suspect(scan: CoarseScan, shifts: FloatArray) -> Suspect:
-    """Make the suspect of a scan whose images are shifted by (n, 2) coarse pixels."""
-    largest_px = float(np.abs(shifts[:, 0]).max(initial=0.0)) * scan.binned[1]
-    figure = f"by up to {largest_px:.1f} px along rows"
+    """Make the suspect of a scan whose images are shifted by (n, 2) coarse pixels along
+    rows and columns; its figure is the largest shift along each, in pixels of the panel.
+    """
+    down, across = scan.binned
+    along, below = np.abs(shifts).max(axis=0, initial=0.0) * (across, down)
+    figure = f"by up to {along:.1f} px along rows and {below:.1f} px along columns"
     return Suspect("movement", scan.images, scan.cone_vec, figure, shifts)
