@@ -31,6 +31,7 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
 from flexdt.twin.reconstruction.acquisition.truncation import ACCURACY, Truncation
 from flexdt.twin.reconstruction.feldkamp.backprojection import OnProcessor
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
+from flexdt.twin.reconstruction.white_noise import noise_of
 
 NODES: Final = 40
 """Largest number of columns, rows and voxels along the longest side: bias changes
@@ -192,6 +193,11 @@ class CoarseScan:
             numbers=self.numbers[chosen],
             binned=(self.binned[0] * down, self.binned[1]),
         )
+
+    @cached_property
+    def noise(self) -> float:
+        """Variance of white noise in the images."""
+        return noise_of(self.images)
 
     @cached_property
     def level(self) -> ConeVec:

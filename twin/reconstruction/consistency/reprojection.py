@@ -13,9 +13,8 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.suspects import moved
+from flexdt.twin.reconstruction.white_noise import noise_of
 
-MEDIAN_OF_SQUARES = 0.4549
-"""Median of the squares of standard normal deviates."""
 ARCS = 12
 """Arcs of a scan's views in which residuals are compared: at least one view each."""
 NOISE_VARIANCE_RATIO = 1.5
@@ -35,11 +34,13 @@ class Reprojection:
         images: (n, rows, cols) line integrals.
         values: of the volume, (nz, ny, nx), NaN where no data cover it [1/mm].
         again: line integrals through the volume, (n, rows, cols).
+        image_noise: variance of white noise in the images.
     """
 
     images: Float32Array
     values: Float32Array
     again: Float32Array
+    image_noise: float
 
     @classmethod
     def of(
@@ -73,7 +74,8 @@ class Reprojection:
         shape = (images.shape[1], images.shape[2])
         seen_from = cone_vec if shifts is None else moved(cone_vec, *-shifts.T)
         again = scan.projected(np.nan_to_num(values), seen_from, shape, fine=False)
-        return cls(images, values, again)
+        known = images is scan.images
+        return cls(images, values, again, scan.noise if known else noise_of(images))
 
     def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
         """Compute the root mean square of the residual, less noise, over that of the
@@ -131,7 +133,7 @@ class Reprojection:
         """Variance of white noise in the images, at least 0: differences between
         neighbours that the reprojection has as well are the object's.
         """
-        return max(_noise_of(self.images) - _noise_of(self.again), 0.0)
+        return max(self.image_noise - noise_of(self.again), 0.0)
 
 
 def shifted_back(images: Float32Array, shifts: FloatArray) -> Float32Array:
@@ -159,26 +161,3 @@ def _changes(images: Float32Array) -> Float32Array:
     """Return the changes between neighbouring columns of smoothed rows."""
     smooth = 0.25 * images[..., :-2] + 0.5 * images[..., 1:-1] + 0.25 * images[..., 2:]
     return np.diff(smooth, axis=-1)
-
-
-def _noise_of(images: Float32Array) -> float:
-    """Estimate the variance of white noise in images.
-
-    The smaller of two estimates: from mixed second differences of neighbouring rows and
-    columns (of columns alone with one row), and from second differences of neighbouring
-    views, whichever show less of the object.
-
-    Args:
-        images: (n, rows, cols).
-    """
-    if images.shape[1] > 1:
-        mixed = np.diff(np.diff(images, axis=2), axis=1)
-        terms = 4.0
-    else:
-        mixed = np.diff(images, n=2, axis=2)
-        terms = 6.0
-    beside = float(np.median(np.square(mixed), axis=0).mean()) / terms
-    between = (
-        float(np.median(np.square(np.diff(images, n=2, axis=0)), axis=0).mean()) / 6.0
-    )
-    return min(beside, between) / MEDIAN_OF_SQUARES
