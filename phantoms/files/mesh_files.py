@@ -147,7 +147,8 @@ def filled_mesh(
 ) -> Phantom:
     """Make a phantom filled with one material inside a closed mesh that has been read already.
 
-    A convex mesh becomes a solid, any other a surface. A shell inside another that is
+    A convex mesh of at most `MAX_PLANES` planes becomes a solid, any other a surface. A
+    shell inside another that is
     turned outwards changes nothing; a warning counts such shells. The largest extent must
     be above 0 and at most `MAX_EXTENT_MM`.
 
@@ -556,7 +557,7 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
     """Merge vertices, check that the mesh is closed, and wind it outwards.
 
     Triangles without area and unused vertices are removed. Closed means that each edge
-    has two triangles.
+    has two triangles. All are turned if the volume is negative.
 
     Args:
         mesh: changed in place.

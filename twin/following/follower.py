@@ -109,7 +109,8 @@ class Follower:
         end or an error.
 
         A command is predicted (`_begin_command`), feedback is a reading
-        (`_compare_reading`), RCV only a sign of life, any other an end (`_end_command`).
+        (`_compare_reading`) and the sign of a server that speaks, unless it counts as one
+        that does not, RCV only a sign of life, any other an end (`_end_command`).
         The link counts as up; an alarm of silence about the command ends, and if there
         was one, and the silence was longer than `MAX_SILENCE_S`, the server counts as one
         that does not speak.
@@ -151,10 +152,11 @@ class Follower:
         """Update the mirror after time without a message: raise alarms for overdue and
         silent commands and a late script.
 
-        An overdue command (`most_s` and `SLACK_S`) is a warning, after which ends count
+        Only commands with a prediction that are not superseded can be overdue or silent.
+        An overdue one (`most_s` and `SLACK_S`) is a warning, after which ends count
         as not reported, unless one has been heard; a server that does not report ends has
         its commands ended by prediction instead, and its arrivals judged. Silence of
-        `MAX_SILENCE_S` about a command is a warning, after which the server counts as one
+        `MAX_SILENCE_S`, before it is overdue, is a warning, after which the server counts as one
         that does not speak, unless it has; of such a server silence is expected. Commands
         silent for `FORGOTTEN_AFTER_S` (or `most_s`, if longer) are forgotten. The script
         is late `SLACK_S` after it was due. An alarm is raised once until its condition
@@ -453,7 +455,8 @@ class Follower:
         Place, wait, times and trigger do not count (`_bare`). After the end, the first
         line begins the script anew. Another command is a warning `off_script` once the
         script has begun; before that, after its end, and without a script, it changes
-        nothing.
+        nothing. To advance ends the script's alarms. The next line is due when all lines
+        so far have taken their longest; none after the last.
 
         Args:
             mirror: present state.
@@ -527,7 +530,8 @@ class Follower:
         An error is an alarm `failed`, and the command's motors count as at rest. A move
         that has passed its trigger stays under way, as superseded. A time outside its
         bounds by more than `SLACK_S` is a warning `range`. The end of a move records its
-        arrival, that of a question is a reading, others' settings are applied.
+        arrival, that of a question is a reading, others' settings are applied. Without a
+        record, settings and reading are taken alone. Ends count as reported from now on.
 
         Args:
             mirror: present state.
@@ -668,7 +672,8 @@ class Follower:
         time at which the path passes the reading: more than the motor's `delay_s` and
         `SLACK_S`, or growing by more than `MAX_DRIFT_S`, is `slow`; a lead of that size
         `fast`; a position nowhere on it `off_path`. Positions within `TARGET_TOLERANCE`
-        of start or target are never off.
+        of start or target are never off. A motor's full reply also has its limits and
+        rates compared (`_compare_limits`).
 
         Args:
             mirror: the machine.
