@@ -321,12 +321,6 @@ def move(
     Raises:
         ValueError: speed or acceleration is not positive.
 
-    Velocity is continuous. A motor that is too fast to stop in time, or runs the wrong
-
-    way, brakes to rest first and then comes back; one that is faster than `speed` brakes
-
-    to it first.
-
     Example:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
         >>> m.end, m.position(m.end)
@@ -409,10 +403,6 @@ def jog(
 
     Raises:
         ValueError: the acceleration is not positive.
-
-    If the lease is shorter than the ramp, the motor brakes from the velocity reached by
-
-    then.
 
     Example:
         >>> jog(0.0, 0.0, wanted=2.0, lease=1.0, acceleration=4.0, time=0.0).end

@@ -35,8 +35,8 @@ def placement_findings(
     Stops at the first of: the source in a part's box, no view sees the sample, the panel
     in the sample's box (only if `exposed`). Otherwise may yield several "units" warnings:
     magnification above `MOST_MAGNIFIED`, a shadow smaller than a pixel, or one over
-    `MOST_OVERSIZE` times a panel of at least `FEWEST_PIXELS` rows and columns. Nothing
-    without boxes or views.
+    `MOST_OVERSIZE` times a panel of at least `FEWEST_PIXELS` rows and columns in every
+    view, all before the source. Nothing without boxes or views.
 
     Args:
         cone_vec: the views.

@@ -42,7 +42,8 @@ def grid_findings(
     Yields at most one finding: a refusal if no view sees any of it, or a warning if more
     than `MOST_UNSEEN` of its points are seen in fewer than `SELDOM` of the views (on a
     helix, of the views of the best seen point); the warning's figure is the unseen share.
-    Nothing without views or for panels of one pixel.
+    Points behind the panel count as seen only if none before it is, and one is in `BEHIND`
+    of the views (a virtual panel). Nothing without views or for panels of one pixel.
 
     Args:
         cone_vec: n views.

@@ -401,8 +401,9 @@ def _fit_truncation(
     """Fit the object beyond the edges of upright panels; see `truncation_of`.
 
     Bands of rows are fitted from the strongest to the weakest, each starting from the
-    last prism found. Bands of a helix, and those whose means vary by less than
-    `ACCURACY`, get no prism.
+    last prism found. Bands that are not cut off at an edge that counts, those of a helix,
+    and those whose means vary by less than `ACCURACY`, get no prism; the best prism that
+    does not explain a band is kept among the others.
 
     Args:
         images: line integrals of some views.
