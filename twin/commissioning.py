@@ -526,7 +526,8 @@ def zero_offsets(
 
     Only scans whose images give roll and axis column are fitted. A drift is given only
     with scans of `FOR_A_LINE` dates, and undated ones are then left out. Other offsets
-    are the latest text's, else `usual`.
+    are the latest text's, else `usual`. Drifts have a prior of `DRIFT_PRIOR_PER_YEAR`,
+    det_tan one of the machine's usual width.
 
     Args:
         scans: the oldest first, those without a date last.
@@ -535,8 +536,9 @@ def zero_offsets(
 
     Returns:
         The profile, rounded to six decimals; a line (value, sigma, drift) for each
-        offset; the axis columns by scan [px]; findings, scans beyond `MAX_SIGMAS`; and
-        questions that further scans would answer.
+        offset; by scan the axis column measured, that of the line and its sigma [px];
+        findings, scans beyond `MAX_SIGMAS`; and questions that further scans would
+        answer.
     """
     base = next(
         (scan.profile for scan in reversed(scans) if scan.profile is not None), usual

@@ -423,6 +423,10 @@ class Names(dict[str, Any]):
 def kind_of(annotation: Any) -> Kind | None:
     """Find the kind of value that an annotation allows.
 
+    An annotated type also allows a mapping, a protocol whatever has its methods, an array
+    whatever an array of numbers can be made of; a union with a member that allows
+    anything does, too.
+
     Args:
         annotation: of a parameter, evaluated.
 
