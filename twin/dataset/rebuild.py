@@ -162,7 +162,8 @@ def rebuild(
 
 
 def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]]:
-    """Move the detector of the settings to its physical place, and note the changes.
+    """Move the detector of the settings to its physical place (mag_det, and as far as
+    stated SDD and COR), and note the changes.
 
     Differences of `mag_det_phys` and `mag_det` up to 1e-6 mm do not count, nor does one
     of them alone.

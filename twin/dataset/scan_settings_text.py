@@ -125,7 +125,7 @@ def format_scan_settings(scan: ScanRecord | ScanSettings) -> str:
     """Format `scan settings.txt` (CRLF) for a scan.
 
     Lines are in the order of the fields, with the scanner's headings, which are there
-    even where their field is not.
+    even where their field is not. The serial number is on the scanner type's line.
 
     Args:
         scan: a record, or the settings themselves; fields that are None have no line.

@@ -59,8 +59,9 @@ def fdk(
         views see, above or below the panel, are NaN.
 
     Raises:
-        GeometryError: no circle and no helix, too short a scan, too steep a helix, or shapes
-            that do not fit.
+        GeometryError: no circle and no helix, too short a scan, too steep a helix, shapes
+            that do not fit, values that are not finite, or a doubt that is a refusal, such
+            as counts in place of line integrals.
         UnknownNameError: no such window.
 
     Warns:

@@ -383,8 +383,9 @@ def scatterer_of(
 
     A voxel that attenuates as much as one of the materials is taken for it; one between
     two of them, or between one and air, for a mixture. Line integrals are straightened
-    (beam hardening) as those of the material named first. Rounds are simulated less
-    exactly than the settings say.
+    (beam hardening) as those of the material named first. The grid is the field of view,
+    in at most about `FINER` times the settings' voxels. Rounds are simulated less exactly
+    than the settings say.
 
     Args:
         line_integrals: float32 (n, rows, cols); coarse ones are enough.

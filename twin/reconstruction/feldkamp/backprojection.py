@@ -383,10 +383,10 @@ class OnDevice:
         """Reserve device memory for filtered columns, with undefined content.
 
         One piece of memory is shared by all calls, and replaced by a larger one where too
-        small.
+        small; each call thus overwrites the result of the one before.
 
         Returns:
-            (n, cols, rows) on the device.
+            float32 (n, cols, rows) on the device.
         """
         from numba import cuda
 

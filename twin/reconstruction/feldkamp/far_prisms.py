@@ -38,7 +38,13 @@ class NearColumns:
 
     @classmethod
     def of(cls, views: Views) -> NearColumns | None:
-        """Find them; None where whole rows take hardly longer."""
+        """Find the columns of some views, from the first to the last that is kept, on the
+        panel, or fading out, and shorten the filter's response to them.
+
+        Returns:
+            None if no columns beyond the panel go into the filter, or if the shorter
+            transform is longer than `MAX_LENGTH_SHARE` of whole rows' transform.
+        """
         if not views.wider:
             return None
         fading = np.flatnonzero(views.beyond.fade)
@@ -53,7 +59,15 @@ class NearColumns:
         return cls(slice(first, last), response)
 
     def far(self, views: Views) -> Float32Array:
-        """Filter the bands' prisms in all other columns, (n, bands, columns that are kept)."""
+        """Weigh the bands' prisms in all other columns (0 in the near ones) and filter them
+        with the response of whole rows.
+
+        Args:
+            views: n views with whole rows, before they are cut to the near columns.
+
+        Returns:
+            float32 (n, bands, columns that are kept), to be added to the rows by bands.
+        """
         lengths = views.prism_lengths()
         n, bands, wide = lengths.shape
         weighed = np.zeros((n, bands, padded_length(views.response)), np.float32)

@@ -85,8 +85,12 @@ class Views:
         )
 
     def within(self, columns: slice, response: Float32Array) -> Views:
-        """Select columns of those that go into the filter, the panel's among them; responses
-        are those of a filter for so many.
+        """Cut rows to some of the columns that go into the filter; images, rows and the
+        volume's table stay.
+
+        Args:
+            columns: the panel's and those that are kept are among them.
+            response: of a filter for rows of so many columns; replaces the present one.
         """
         return replace(
             self,

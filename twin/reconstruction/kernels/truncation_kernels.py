@@ -86,7 +86,20 @@ def _continue_side(
     """Fill the columns of a row on one side of the panel: the prisms, and the rest at the edge
     fading out, times the columns' factors over the rays' lengths, if these are wanted.
 
-    All arrays are of these columns. near: first and last in which some of the rest is left.
+    All arrays are of these columns.
+
+    Args:
+        out: filled.
+        near: first column in which some of the rest is left, and the one after the last;
+            used for weighed rows only.
+        lower, upper: prisms' lengths of the row's two bands.
+        share: how much the upper band counts.
+        across: squares of the ray's horizontal part.
+        high: square of its vertical part.
+        rest: residual of the prisms at the panel's edge.
+        fade: part of it that is left in each column.
+        factors: of the columns, used for weighed rows only.
+        weighed: multiply by factors over the rays' lengths.
     """
     # Counted from 0, an index needs no check for a negative one, and loops are vectorised.
     if not weighed:
