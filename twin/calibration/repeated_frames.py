@@ -95,9 +95,16 @@ def measure_changes(views: Float32Array, gaps: FloatArray) -> Changes:
     """Measure the change of each frame from the one before it, apart from shifts of the
     image and of its level.
 
+    The change is compared with that of its smoothed neighbours on either side, times the
+    gap's share of theirs. The first frame follows the last.
+
     Args:
         views: (n, rows, cols), sorted by angle.
         gaps: after each, (n,) [rad].
+
+    Returns:
+        The share of that change which each frame has, with sigma and reliability, the
+        smoothness of what is left, and whether the frame equals the one before; (n,) each.
     """
     n = len(views)
     soft = gaussian_filter(views, (0, SMOOTHING_PX, SMOOTHING_PX)).astype(np.float64)

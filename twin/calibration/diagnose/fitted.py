@@ -85,8 +85,9 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
     """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a
     repeated image.
 
-    A frame is bad if most of its spots are 5 px or more from every prediction, or most of
-    its positions had to be left out of the fit. Of one scan, wrong frame numbers come
+    A frame is bad if most of its complete spots are 5 px or more from every prediction, or
+    most of its positions had to be left out of the fit; frames of fewer than two spots and
+    repeated ones have no spots to judge. Of one scan, wrong frame numbers come
     first. Otherwise a block of frames at an end, with no drift but the angle's, is an
     error ("angle_step"); else "frames_inconsistent": an error for more than 30 % of the
     frames, else a warning. At most 12 frames are listed, a block as first to last.
@@ -301,7 +302,8 @@ def explain_residuals(
 
     A single displaced bead is left out rather than all beads fitted. If the residuals
     exceed the limit, or too many positions were left out, a factor on the angles is
-    tried; then, beyond the limit, a motion, else the error "misfit" is given.
+    tried; then, beyond the limit, a motion, else the error "misfit" is given, beside which
+    only lost beads are reported.
 
     Args:
         fit: to be judged; nothing is judged if it is not identifiable.
