@@ -103,8 +103,8 @@ def measure_changes(views: Float32Array, gaps: FloatArray) -> Changes:
         gaps: after each, (n,) [rad].
 
     Returns:
-        The share of that change which each frame has, with sigma and reliability, the
-        smoothness of what is left, and whether the frame equals the one before; (n,) each.
+        Of each frame its part of that change with sigma and reliability, the smoothness of
+        its change without shifts, and whether it equals the frame before.
     """
     n = len(views)
     soft = gaussian_filter(views, (0, SMOOTHING_PX, SMOOTHING_PX)).astype(np.float64)
