@@ -131,7 +131,7 @@ def detect_beads(
     Candidates are found in an image averaged by 4 or 2 if the smallest radius allows,
     then measured at full resolution. Spots unlike a ball, too faint or unlike most others
     are dropped; those cut by the image's edge are fitted. NaN counts as 0, infinity as 16
-    or 0.
+    or 0. With the setting `intensities` the image is converted to line integrals first.
 
     Args:
         image: (rows, cols) line integrals.

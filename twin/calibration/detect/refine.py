@@ -133,7 +133,8 @@ def measure_beads(
 
     Complete, free spots get their centroid (a fit in noisy, blurred images), cut ones a
     fit if at least `MIN_SHARE` of them is inside. The phantom's body is subtracted if the
-    images show it. Blur, sizes and contrasts are estimated from the spots.
+    images show it. Blur, sizes and contrasts are estimated from the spots. The error of
+    rendering with finite rays (`rendering_error`) is added to the covariances.
 
     Args:
         images: (n, k, side, side) line integrals from `crop`; not changed.

@@ -182,7 +182,8 @@ def seen_sharpness(
 
     Returns:
         The corrected estimate, and the beads as they attenuate; `sharp` itself if nothing was
-        seen or can be measured in the rendered spots, or after `MOST_ROUNDS`.
+        seen, `sharp` with the blur of `hardened_balls` if nothing can be measured in the
+        rendered spots or after `MOST_ROUNDS`.
     """
     if not sharp.seen:
         return sharp, hardened_balls(sharp, patches, cone, model)[0]
@@ -264,7 +265,14 @@ def hardened_balls(
 
 
 def _slight_blur(groups: Sequence[Profiles]) -> float:
-    """Return the variance of a slight blur with which rendered beads fit best [px^2]."""
+    """Find the variance of a slight blur with which rendered beads fit best [px^2].
+
+    The best of `SLIGHT_BLURS` variances up to `MOST_VARIANCE_PX2`, and the vertex of a
+    parabola about it where that opens upwards.
+
+    Args:
+        groups: profiles of alike beads; their misfits are added up. Without any it is 0.
+    """
     if not groups:
         return 0.0
     tried = np.linspace(0.0, MOST_VARIANCE_PX2, SLIGHT_BLURS)
@@ -283,7 +291,8 @@ def _profiles_of(
     spots: npt.NDArray[np.intp],
     cone: ConeVec,
 ) -> Profiles | None:
-    """Collect the light behind alike beads in some of their spots.
+    """Collect the light behind alike beads in some of their spots, from pixels within 1.15
+    radii and 2 px that have a value, over the open beam beside each spot.
 
     Args:
         ball: the beads, for one energy.
