@@ -146,7 +146,8 @@ def solve(
     """Minimise the robust reprojection error, first with a Huber loss, then by least
     squares without the positions that are far off, in up to four rounds.
 
-    Ends when the same positions are used again, or when too few would be left.
+    Ends when the same positions are used again, when fewer than half as many as columns
+    would be left, or, without a limit to trim by, after one round.
 
     Args:
         problem: the data and columns.

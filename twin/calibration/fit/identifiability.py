@@ -123,7 +123,9 @@ def identifiability(
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
 
     Returns:
-        Predicted sigmas, rank, directions not determined, and suggestions.
+        Predicted sigmas, rank, directions not determined, and suggestions, best first:
+        changes that lower the worst sigma, over its tolerance, by a fifth; none for a plan
+        whose directions are all determined within their tolerances.
 
     Raises:
         TwinError, UnknownNameError: as `estimate_geometry`.

@@ -594,7 +594,7 @@ def build_problem(
         centre: kind of the positions, or bias factors that broadcast to (n, k).
         bead_tolerance_mm: sigma of the stated bead positions, if they are free; inf: no
             prior.
-        priors: sigma of each offset; see `fit_geometry`. Widths of 0 have no column.
+        priors: sigma of each offset; see `estimate_geometry`. Widths of 0 have no column.
         prior_centre: means of the priors; `start` of the first group without.
         panel: distortion of the panel to estimate.
         strain: distortion of the phantom to estimate, with its prior; (0, 0): none.
