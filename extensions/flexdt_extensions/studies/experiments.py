@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration import EIGHT, SIX
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -83,9 +83,11 @@ def _text(name: str) -> str:
 SHAPE: Final = (760, 956)
 """Detector (rows, cols) of the thesis's experiments."""
 PIXEL_MM: Final = 0.1496
-FIDELITIES: Final = ("points", "noisy", "clean", "images")
-"""Exact points; points with noise; rendered images without noise; rendered noisy images. In
-both kinds of images the beads' identities are unknown."""
+RENDERED: Final = ("clean", "images")
+"""Rendered images without noise; rendered noisy images. The beads' identities are unknown in
+both."""
+FIDELITIES: Final = ("points", "noisy", *RENDERED)
+"""Exact points; points with noise; rendered images."""
 NOISE_PX: Final = 0.1
 """Noise of `noisy` points [px]."""
 EXPERIMENTS: Final = ("beads", "phantoms", "damping", "detector")
@@ -123,6 +125,35 @@ class WorkUnit:
     seed: int
     limit: float
     variant: str = "printed"
+
+
+def require_counts(counts: Sequence[int], rendered: bool) -> None:
+    """Check numbers of projections before a study runs.
+
+    Args:
+        counts: numbers of projections of the runs.
+        rendered: the largest number is rendered, and every so many of these images serve
+            the smaller ones, which divide it for that.
+
+    Raises:
+        LimitError: no count, one below 1, or some that do not divide the largest of
+            rendered images; names the divisors.
+    """
+    asked = list(counts)
+    if not asked or min(asked) < 1:
+        raise LimitError(
+            f"counts {asked}: allowed are one or more numbers of projections from 1 on",
+            {"asked": asked, "allowed": ">= 1"},
+        )
+    most = max(asked)
+    uneven = [n for n in asked if most % n]
+    if rendered and uneven:
+        divisors = [n for n in range(1, most + 1) if most % n == 0]
+        raise LimitError(
+            f"counts {uneven} are no even part of the {most} images that are rendered; "
+            f"allowed beside {most}: {', '.join(map(str, divisors[:-1]))}",
+            {"asked": uneven, "allowed": divisors},
+        )
 
 
 def unity_poses(
@@ -191,12 +222,14 @@ def tasks(
     Args:
         experiment: one of EXPERIMENTS.
         fidelity: one of FIDELITIES.
-        counts: numbers of projections; None is the thesis's fourteen.
+        counts: numbers of projections; None is the thesis's fourteen. Of rendered images
+            each divides the largest.
         seed: of all noise.
         variant: one of VARIANTS; `detector` is printed in both.
 
     Raises:
         UnknownNameError: an experiment, fidelity or variant that does not exist.
+        LimitError: counts that no run can have.
     """
     for value, allowed, what in (
         (experiment, EXPERIMENTS, "experiment"),
@@ -211,6 +244,7 @@ def tasks(
         n = projection_counts()
     else:
         n = tuple(counts)
+    require_counts(n, fidelity in RENDERED)
     scenarios = tuple(thesis()["scenarios"])
 
     def six(setting: str, phantom: str, damping: float) -> list[WorkUnit]:

@@ -39,7 +39,7 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection import Scene, project_scene
-from flexdt_extensions.studies.experiments import SHAPE, WorkUnit
+from flexdt_extensions.studies.experiments import SHAPE, WorkUnit, require_counts
 from flexdt_extensions.studies.runs import Run, attempted, geometry_of, run_of
 
 COUNTS = 5000.0
@@ -277,9 +277,13 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
         model: the beads.
         scene: the phantom.
 
-    The images of the largest N are made once; smaller N take every so many of them, as
-    far as they divide it (the thesis's do), with the same noise.
+    The images of the largest N are made once; smaller N take every so many of them, with
+    the same noise.
+
+    Raises:
+        LimitError: some N do not divide the largest.
     """
+    require_counts(task.counts, rendered=True)
     most = max(task.counts)
 
     def solve(n: int) -> Run:
@@ -287,12 +291,7 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
 
         They are spread evenly; offsets have no prior. A run with errors has no problem to
         judge.
-
-        Raises:
-            ValueError: `n` does not divide the largest number.
         """
-        if most % n:
-            raise ValueError(f"{n} projections are no even part of {most}")
         everything, truth = geometry_of(task, most)
         chosen = list(range(0, most, most // n))
         scans = [

@@ -33,7 +33,7 @@ from flexdt.twin.calibration import (
 )
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.identify import identify
-from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.errors import LimitError, TwinError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -49,6 +49,7 @@ from flexdt_extensions.studies.experiments import (
     VARIANTS,
     WorkUnit,
     author,
+    require_counts,
     scenario,
     tasks,
 )
@@ -259,7 +260,8 @@ def run_study(
         out: folder for summary.json, tables and heat maps; None writes nothing.
         jobs: processes; None is one for each core.
         scheduler: address of a dask scheduler to use instead of own processes.
-        counts: numbers of projections; None is the thesis's. basin has one.
+        counts: numbers of projections; None is the thesis's. Each divides the largest
+            where images are rendered; basin has one.
         seed: of all noise.
         variant: phantoms and scenarios of beads, phantoms and damping as the thesis
             prints them (printed), or as its author's public code has them (author).
@@ -270,6 +272,7 @@ def run_study(
 
     Raises:
         UnknownNameError: no such experiment, or it has no such fidelity or variant.
+        LimitError: counts that no run can have; nothing was run.
         TwinError: counts were given for basin; dask.distributed is not installed; `out`
             was given and matplotlib is not installed.
         CommandError: the scheduler cannot be reached.
@@ -429,7 +432,12 @@ def _real(
     Returns:
         The runs, and `assumed`, `logs_source`, `truths`, `curves` and `explained` of the
         document.
+
+    Raises:
+        LimitError: no counts, or some below 1.
     """
+    if used is not None:
+        require_counts(used, rendered=False)
     model = bead_model(load_phantom("lego"))
     truths = [real.physical_truth(group, model) for group in real.GROUPS]
     names = real.scan_names()
@@ -521,9 +529,19 @@ def real_images_runs(
 
     Returns:
         The runs, and `beads_off_truth_mm` of the document.
+
+    Raises:
+        LimitError: no counts, or some below 1 or above `frames`.
     """
     phantom = load_phantom("lego")
     model = bead_model(phantom)
+    require_counts(counts, rendered=False)
+    if max(counts) > frames:
+        raise LimitError(
+            f"counts {[n for n in counts if n > frames]}: a scan has {frames} images; "
+            f"allowed are 1 to {frames}",
+            {"asked": list(counts), "allowed": [1, frames]},
+        )
     found, _ = real.first_scan("Scan1", phantom.scene, model, lego_beam(), seed, frames)
     truth = real.hidden_phantom(phantom.scene, model, seed)[1]
     names = real.scan_names() if scans is None else scans

@@ -12,7 +12,7 @@ import pytest
 from flexdt.clients.cli.command_tree import run as command
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
-from flexdt.twin.errors import UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt_extensions.studies import runs as solved_runs
 from flexdt_extensions.studies.experiment_4 import hidden_phantom, off_truth
 from flexdt_extensions.studies.experiments import (
@@ -116,6 +116,27 @@ def test_an_experiment_in_images_runs_to_its_end(experiment: str) -> None:
             assert row["success"] >= (row["runs"] if few > 2 else row["runs"] - 2), row[
                 "setting"
             ]
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_counts_that_no_run_can_have_are_refused_before_the_first_run(
+    experiment: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thesis's counts are allowed in every experiment and fidelity."""
+    monkeypatch.setattr("flexdt_extensions.studies.study.run_task", pytest.fail)
+    rng = np.random.default_rng(581)
+    for fidelity in ("clean", "images"):
+        assert tasks(experiment, fidelity)
+        most = int(rng.integers(5, 400))
+        uneven = int(rng.choice([n for n in range(2, most) if most % n]))
+        with pytest.raises(LimitError, match=f"the {most} images") as refused:
+            run_study(experiment, fidelity, counts=(uneven, most), jobs=1)
+        assert refused.value.data["asked"] == [uneven]
+        for n in refused.value.data["allowed"]:
+            assert tasks(experiment, fidelity, counts=(n, most))
+    for counts in ((), (0, 12), (-3,)):
+        with pytest.raises(LimitError, match="from 1 on"):
+            run_study(experiment, "points", counts=counts, jobs=1)
 
 
 def test_a_run_that_raises_is_a_row_with_its_reason(
