@@ -292,15 +292,10 @@ def expose(
             "step", sod, sdd, frames=2, exposure_ms=camera.exposure_ms
         )
         plan = _plan_of(distances, scanner, profile, start)
-    if plan is not None:
-        source_mm, panel_mm = _distances(plan)
-        sod = sod or source_mm
-        sdd = sdd or panel_mm
-    assert sod is not None
-    assert sdd is not None
+    source_mm, panel_mm = _scan_distances(sod, sdd, plan)
     cone = ConeVec.circular(
-        sod=sod,
-        sdd=sdd,
+        sod=source_mm,
+        sdd=panel_mm,
         angles=SIMULATED_VIEWS,
         shape=camera.shape,
         pixel=camera.pixel_mm(spec.pixels),
@@ -315,7 +310,7 @@ def expose(
         tuple(paths[:, view, row, col].tolist()), float(flux[row, col]), float(flux.max())
     )
     other = ray.with_detail(wanted, [part.material.substance for part in parts])
-    seen = _SeenDetail(layers, camera, ray, other, sod, images)
+    seen = _SeenDetail(layers, camera, ray, other, source_mm, images)
     low, high = _voltages(scanner)
     if len(tried) > 1:
         kVs = tried
@@ -417,6 +412,31 @@ def _plan_of(
     offsets = profile or profile_of(machine)
     text = compose_script(request, machine, offsets)
     return plan_script(text, machine, offsets, start=start)
+
+
+def _scan_distances(
+    sod: float | None, sdd: float | None, plan: ScanPlan | None
+) -> tuple[float, float]:
+    """Return SOD and SDD [mm]: as given, or else those of the planned scan.
+
+    Args:
+        sod, sdd: as given; None: not given.
+        plan: of a scan of the machine; None: none was composed, as a start was given
+            without a kind of scan.
+
+    Raises:
+        LimitError: neither gives both.
+    """
+    if sod is not None and sdd is not None:
+        return sod, sdd
+    if plan is None:
+        raise LimitError(
+            f"start without a kind of scan gives no distances: sod is {sod}, sdd is {sdd}; "
+            "allowed: both of them in mm, a kind, or no start",
+            {"asked": {"sod": sod, "sdd": sdd}, "allowed": ["sod and sdd", "kind"]},
+        )
+    source_mm, panel_mm = _distances(plan)
+    return source_mm if sod is None else sod, panel_mm if sdd is None else sdd
 
 
 def _distances(plan: ScanPlan) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from flexdt.clients.cli.command_tree import run
 from flexdt.library.expose import exposure_of
 from flexdt.twin.attenuation.substances import tables
 from flexdt.twin.physics.image_quality import AIR, compton_share, mass_energy_transfer
+from flexdt.twin.script.planning.plan_values import StartState
 
 
 def rod(radius: float, material: str = "pmma") -> dict[str, Any]:
@@ -187,6 +188,13 @@ def test_what_cannot_be_is_an_error_with_what_is_allowed(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("distances", [{}, {"sod": 600.0}, {"sdd": 1059.0}])
+def test_a_start_alone_gives_no_distances(distances: dict[str, float]) -> None:
+    start = StartState.of(fx.machine("flexray"))
+    with pytest.raises(fx.TwinError, match=r"sod is .*; allowed: both of them in mm"):
+        fx.expose(rod(15.0), start=start, **distances)
+
+
 def test_the_command_says_the_same(
     forecast: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
