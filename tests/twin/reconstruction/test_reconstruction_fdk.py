@@ -451,17 +451,20 @@ def test_a_flat_that_drifted_is_no_object(drift: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("blur", [0.0, 0.7])
+@pytest.mark.parametrize("seed", [13, 11, 12, 14, 42, 43])
 @pytest.mark.campaign(1)
-def test_noise_at_the_edges_is_no_truncation(blur):
-    """Boxes that fit, in 12 to 80 views of panels of any size with 200 to 20 000 photons a
-    pixel; and boxes that do not fit, in the same noise."""
-    rng = np.random.default_rng(11)
-    for case in range(40):
+def test_noise_at_the_edges_is_no_truncation(seed):
+    """Of 80 boxes that fit, in 12 to 80 views of panels of any size with 200 to 20 000
+    photons a pixel, half of them blurred, at most 2 are called cut off; of 20 that do
+    not fit, in the same noise, all are."""
+    rng = np.random.default_rng(seed)
+    false = []
+    for case in range(80):
         views, (rows, cols) = int(rng.integers(12, 80)), rng.integers(16, 90, 2)
         scan = circle(views, pixel=128.0 / cols, sod=300.0, sdd=600.0)
         photons = 10.0 ** rng.uniform(2.3, 4.3)
-        for wide, cut_off in ((0.6, False), (1.3, True))[: 1 + (case % 8 == 0)]:
+        blur = 0.7 * (case % 2)
+        for wide, cut_off in ((0.6, False), (1.3, True))[: 1 + (case % 8 < 2)]:
             t = rng.uniform(0.0, np.pi)
             axes = (
                 (np.cos(t), np.sin(t), 0.0),
@@ -475,7 +478,12 @@ def test_noise_at_the_edges_is_no_truncation(blur):
             )
             data = -np.log(np.maximum(blurred, 1.0) / photons)
             found = truncation_of(lambda view, data=data: data[view], scan, (rows, cols))
-            assert (found is not None) == cut_off, (views, rows, cols, photons, wide)
+            drawn = (views, rows, cols, photons)
+            if cut_off:
+                assert found is not None, drawn
+            elif found is not None:
+                false.append(drawn)
+    assert len(false) <= 2, false
 
 
 @pytest.mark.slow

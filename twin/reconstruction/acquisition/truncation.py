@@ -505,9 +505,11 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
     all.
 
     The middle one of three views counts, and the mean of all, in which less noise hides
-    it. Noise is that of every other bin near the edge: detectors blur it over some
-    columns; an edge must exceed `SIGNIFICANT_SIGMAS` of it. The mean must also exceed pi
-    / 2 times `ACCURACY` of `usual`.
+    it. Noise is that of every other bin near an edge, as detectors blur it over some
+    columns, or that from view to view. Few views give a poor estimate, so that the
+    largest counts, of both edges between bins: a view must exceed `SIGNIFICANT_SIGMAS` of
+    it. The mean must exceed as much of its own noise, and pi / 2 times `ACCURACY` of
+    `usual`.
 
     Args:
         band: (n, bins) line integrals of a band of rows.
@@ -520,15 +522,15 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
     from scipy.ndimage import median_filter
 
     ends = band[:, [0, -1]]
-    noise = SIGNIFICANT_SIGMAS * np.array(
-        [_noise(band[:, :5:2]), _noise(band[:, :-6:-2])]
-    )
+    between_bins = max(_noise(band[:, :5:2]), _noise(band[:, :-6:-2]))
+    between_views = np.array([_noise(end) for end in ends.T])
+    noise = SIGNIFICANT_SIGMAS * np.maximum(between_bins, between_views)
     some = median_filter(ends, (min(3, len(band)), 1)) > np.maximum(least, noise)
     # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts
     # is what would change densities by the accuracy. Two edges add a pi-th of their sum, at
     # most.
     mean = band.mean(axis=0)
-    apart = np.array([_noise(end) for end in ends.T]) / np.sqrt(len(ends))
+    apart = between_views / np.sqrt(len(ends))
     apart = SIGNIFICANT_SIGMAS * np.hypot(apart, _noise(mean))
     every = mean[[0, -1]] > np.maximum(0.5 * np.pi * ACCURACY * usual, apart)
     return np.asarray(some.any(axis=0) | every)
