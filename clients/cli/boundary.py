@@ -45,10 +45,11 @@ LIMIT_CODES: Final = ("limit", "collision")
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     """Return the lines to print for an error, and its exit code.
 
-    Usage errors exit with USAGE, limits and collisions with LIMIT, refusals and lost
-    connections with REFUSED, the rest with INVALID; errors of the twin's wire as
-    `wire_code` has it. Connections that fail, time-outs and addresses in use count as
-    lost. A file's temporary name is replaced by the named one.
+    Usage errors exit with USAGE, limits and collisions with LIMIT, refusals of safety and
+    lost connections with REFUSED, a calibration that is not identifiable with
+    NOT_IDENTIFIABLE, a CommandError with its own code, the rest with INVALID; errors of
+    the twin's wire as `wire_code` has it. Connections that fail, time-outs and addresses
+    in use count as lost. A file's temporary name is replaced by the named one.
 
     Args:
         error: of any kind; one that is not expected is called a defect of flexdt.

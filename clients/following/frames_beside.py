@@ -110,9 +110,8 @@ def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, st
     """Convert a frame to line integrals (rows, cols) of `shape`, with a description of
     the white level.
 
-    Dark and flat images of its folder are used; without them white is a percentile of the
-    frame. The means of the folder's dark and flat images are used if it has both;
-    without, dark is 0 and white is the frame's 99.5 % percentile.
+    The means of the folder's dark and flat images are used if it has both; otherwise dark
+    is 0 and white is the frame's 99.5 % percentile.
 
     Returns:
         The line integrals, and a description of the white level.

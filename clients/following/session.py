@@ -153,7 +153,8 @@ class FollowSession:
         Two tasks: listen for messages, and look ahead; an error in one ends both.
 
         Raises:
-            ValueError, zmq.ZMQError: no address that can be connected to.
+            ExceptionGroup: with the error of a task, such as the ValueError or
+                zmq.ZMQError of an address that cannot be connected to.
         """
         from flexdt.clients.following.listening import listen  # pyzmq is an extra
 

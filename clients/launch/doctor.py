@@ -116,14 +116,13 @@ def kernels() -> CheckOutcome:
     """Compile and run the projector, and compare the shadow of a sphere with its closed
     form.
 
-    The first use compiles, and its time [s] is told. "ok" otherwise. A sphere of radius
-    10 mm and 0.02 /mm is projected to 33 x 47 pixels; the deviation is relative to the
-    shadow's maximum. "ok" or "error", never a warning; an error advises to reinstall
-    numba.
+    A sphere of radius 10 mm and 0.02 /mm is projected to 33 x 47 pixels; the deviation is
+    relative to the shadow's maximum.
 
     Returns:
-        An error where the largest deviation exceeds `WORST_ERROR`; time of the first use
-        as well.
+        An error with the advice to reinstall numba where the largest deviation exceeds
+        `WORST_ERROR`, otherwise "ok", never a warning; each states the deviation and the
+        time of the first use [s], which compiles.
     """
     import numpy as np
 

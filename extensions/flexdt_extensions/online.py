@@ -287,11 +287,17 @@ def next_angle(
     """Choose the angle whose frame would make the worst sigma, in units of its tolerance,
     smallest.
 
+    A new spot counts with the noise of those in the fit (`_noise_px`), a bead that would
+    not be visible with none; spots that would overlap count in full.
+
     Args:
         state: with an estimate.
         pose: nominal pose (one); its angle is replaced by each candidate.
         candidates: (m,) nominal stage angles to choose from [rad].
         tolerance: wanted sigma of each parameter that matters, edge units.
+
+    Returns:
+        The angle [rad], and each parameter's sigma after it, edge units.
 
     Raises:
         TwinError: there is no estimate yet, no candidate, or no tolerance.

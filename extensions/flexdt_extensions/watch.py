@@ -65,6 +65,10 @@ def watch(
     """Follow a job's frames, and end the job once the server's calibration from them is
     accurate enough.
 
+    The server is asked for one when the estimate of this process is identifiable, and
+    then when that estimate, scaled by the last answer, promises the tolerances, after an
+    eighth more frames at the earliest.
+
     Args:
         client: of the twin that runs it; it need not be in control.
         phantom: the scanned one; one that ships.

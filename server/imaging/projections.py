@@ -332,6 +332,7 @@ class Imaging:
 
         Raises:
             ProjectorUnavailable: the projector does not answer.
+            RpcError: the projector refuses the sample.
         """
         views, *grid = cone.shape
         if not sample.name:
@@ -408,7 +409,8 @@ class Imaging:
         """Check that a scan's sample fits into memory: here, in addition to the pinned
         ones, and there.
 
-        Nothing to check for an empty stage, and on a side without a known limit.
+        Nothing to check for an empty stage, and on a side without a known limit. The
+        sample is divided, and its pieces are kept here; nothing is sent.
 
         Args:
             sample: that the scan is to show.

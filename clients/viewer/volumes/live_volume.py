@@ -305,10 +305,11 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
 
 
 def _share(held: Held, name: str) -> Callable[[float, float], None]:
-    """Make a progress callback (done, whole) that prints done / whole under a name, at
-    most every `TELL_S` seconds.
+    """Make a progress callback (done, whole) that reports done / whole under a name by
+    `held.say`.
 
-    The end is left to what follows, which is told anyway.
+    The first call is reported, later ones at most every `TELL_S` seconds, the last one
+    like any other.
     """
     told = -TELL_S
 
@@ -436,8 +437,10 @@ class Served:
 def answer(held: Held, served: Served, asked: list[str]) -> None:
     """Answer one line of standard input.
 
-    "block" sends the codes, "voxel" the values of all volumes there, "compare" an empty
-    answer at once and the figures later; anything else gets an empty answer.
+    "block" sends head and codes of a volume, of at most `MAX_VOXELS` (of one that grows
+    `MAX_GROWING_VOXELS`) voxels; "voxel" the values of all volumes there; "compare" an
+    empty answer at once and the figures, or an error as `not_compared`, later. Anything
+    else, and an unknown volume, gets an empty answer.
 
     Args:
         held: volumes of the process.

@@ -46,7 +46,8 @@ def batch(
     """Make a batch of scans or calibrations; run again to take up an interrupted one.
 
     Results are Zarr arrays and a manifest with every item's seed, parameters and checksums;
-    they are the same bytes whatever the number of processes.
+    they are the same bytes whatever the number of processes. Too little free disk space is
+    stated, and not an error.
     """
     from flexdt_extensions.batch.batch_plan import read_plan
     from flexdt_extensions.batch.batch_run import run_batch

@@ -247,7 +247,8 @@ class Store:
         """Write figures as arrays too, so that readers need not parse the manifest.
 
         Written are "done", the true errors ("truth") and, of calibrations, values,
-        errors, sigmas and "identifiable"; missing numbers as `_table` has them.
+        errors, sigmas and "identifiable", each in place of an earlier one; missing
+        numbers as `_table` has them. A table without any column is left out.
 
         Args:
             items: records of all items, in order.

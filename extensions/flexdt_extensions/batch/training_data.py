@@ -64,8 +64,9 @@ class Augment:
         """Change a sample's projections, and the geometry they were truly made with.
 
         All images are shifted by one normal amount along columns and rows [px], which
-        `cone_vec_true` follows, and get Poisson noise of one random number of photons;
-        each only if it is set.
+        `cone_vec_true` follows, and get Poisson noise of one random number of photons
+        (drawn evenly in its logarithm; no count becomes half a photon); each only if it
+        is set.
 
         Args:
             sample: arrays by name; `projections` and `cone_vec_true` are replaced.

@@ -84,13 +84,14 @@ def circle(
     height: float = 0.0,
     above_deg: float = 0.0,
 ) -> ConeVec:
-    """Make views on a full circle, in the object frame.
+    """Make views on a full circle, in the object frame; the central ray always passes
+    through the origin.
 
     Args:
         views: number of views.
         shape: detector (rows, cols).
         sod, sdd: distances of source to axis and to detector [mm].
-        pitch: of pixels [mm]; None for that of `PITCH`.
+        pitch: of pixels [mm]; None for that of `PITCH`, which knows some shapes only.
         tilt_deg: of the detector about its normal, u and v [deg].
         height: of the source [mm].
         above_deg: turn of source and detector about u, which brings the source above the

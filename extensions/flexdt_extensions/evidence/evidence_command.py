@@ -18,7 +18,8 @@ def evidence(
 
     NAME: cate, htc2022, tooth, zeiss, carm, delft; all that are at hand where none is given.
     The data are not part of flexdt: each case says where they come from. What cannot be read is
-    said, and no missed figure.
+    said, and no missed figure. The command fails if a named case is not at hand, and, after all
+    results, if a figure is missed.
     """
     from flexdt_extensions.evidence.real_data import CASES, Figure, NotRead
 

@@ -91,21 +91,21 @@ def share_identified(
 def measured_spread(
     model: BeadModel, planned: PlannedScans, *, trials: int = 60, seed: int = 1
 ) -> dict[str, float]:
-    """Simulate fits to noisy points and compute the rms error of parameters and
-    IN_IMAGES.
+    """Simulate fits to noisy points and compute the rms error (fit minus truth) of
+    parameters and IN_IMAGES.
 
-    It is the check of `forecast`. Parameters that the first fit does not report are left
-    out.
+    It is the check of `forecast`. All frames are used. Parameters that the first fit does
+    not report are left out.
 
     Args:
-        model: the beads; with a tolerance in `planned` each trial's beads are off by it,
-            and parameters by their priors.
+        model: the beads; with a tolerance in `planned` each trial's beads are off by it
+            and fitted, too. Parameters are drawn from their priors (0 where none).
         planned: the scans.
         trials: fits.
         seed: of the noise.
 
     Returns:
-        Name -> standard deviation, edge units.
+        Name -> rms error, edge units.
     """
     rng = np.random.default_rng([seed, 11])
     errors: list[dict[str, float]] = []
@@ -294,8 +294,10 @@ def design(
     """Choose `count` of the seats so that a criterion is least, by exchanges from random
     sets.
 
-    Sets are tried from the best on; the first whose beads are told apart in all simulated
-    scans is returned, with its forecast and the number of ambiguous sets before it.
+    The search uses at most `DESIGN_FRAMES` of the frames. Sets are tried from the best
+    on; the first whose beads are told apart in all simulated scans is returned, beads in
+    order of z, x and y, with its forecast (of all frames) and the number of ambiguous
+    sets before it.
 
     Args:
         seats: (m, 3) places a bead may take [mm, object frame].
@@ -314,7 +316,8 @@ def design(
         resolution_mm: smallest step of those moves.
 
     Raises:
-        TwinError: too few seats, or every set found is ambiguous.
+        TwinError: an unknown criterion, a count below 2 or above the number of seats,
+            seats that the rules do not allow together, or every set found is ambiguous.
     """
     places = np.asarray(seats, dtype=np.float64).reshape(-1, 3)
     if criterion not in CRITERIA:

@@ -52,7 +52,11 @@ def design(
     machine: MachineName = None,
     profile: ProfileName = None,
 ) -> Answer:
-    """Choose bead places that determine the geometry best, and say how to build it."""
+    """Choose bead places that determine the geometry best, and say how to build it.
+
+    Without positions one scan at SOD 600 mm is planned; with --plan positions, --sdd and
+    --frames have no effect. The design is compared with the spiral of the thesis.
+    """
     from flexdt.library.machines import machine as find_machine
     from flexdt.library.machines import profile as find_profile
     from flexdt.twin.calibration import SIX

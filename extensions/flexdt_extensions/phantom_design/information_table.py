@@ -277,8 +277,8 @@ def inverse(information: FloatArray) -> FloatArray:
         information: (..., p, p) in units of tolerances.
 
     Returns:
-        Covariances (..., p, p); the variance of a parameter that a lost direction touches
-        is inf.
+        Covariances (..., p, p); the variance of a parameter that a lost direction (an
+        eigenvalue of at most 1e-12 of the largest) touches is inf.
     """
     values, vectors = np.linalg.eigh(information)
     lost = values <= 1e-12 * np.maximum(values[..., -1:], 1e-300)

@@ -124,8 +124,9 @@ def iterate(
 
     It stops after `MAX_ITERATIONS`, when the lengths of STALL_WINDOW steps differ by less
     than STALL_THRESHOLD (stalled), when a step is shorter than CONVERGENCE, or when the
-    equations are singular. Damping falls to a third after a better step, and grows five
-    times after a worse one, which is not taken.
+    equations are singular. Damping falls to a third (not below 1e-6) after a better step,
+    and grows five times (up to 1e6) after a worse one, which is not taken, but whose
+    length counts all the same.
 
     Args:
         residual: parameters (p,) [mm, deg] to residuals (m,) [px]; inf where there are

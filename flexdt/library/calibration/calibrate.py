@@ -566,7 +566,8 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
     """Return one sentence on use, and one on the limit of the calibration.
 
     If it is not to be used, one sentence with the first error, weak direction or lack of
-    a fit. Sharp is an axis known to `SHARP_PX`. The second sentence is about the least
+    a fit. Sharp is an axis known to `SHARP_PX`. With a saturated flat field the images
+    are not to be reconstructed, sharp or not. The second sentence is about the least
     certain length that was asked for, and is left out if none was.
 
     Args:

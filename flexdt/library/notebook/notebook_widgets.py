@@ -38,6 +38,9 @@ def volume_widgets(
 
     Returns:
         A box of widgets, which a notebook shows.
+
+    Raises:
+        TwinError: the window is not two growing numbers.
     """
     low, high = window_of(volume.data, window)
     beyond = WINDOW_REACH_WIDTHS * (high - low)

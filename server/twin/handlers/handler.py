@@ -185,9 +185,9 @@ async def change_stage(
     at once.
 
     A correction that cannot be applied is refused before anything is built. The sweep
-    runs in a thread. Motion that is not free of the new stage is halted; that also
-    interrupts a running job and ends a way around obstacles. The caller must hold
-    `stage_turn`.
+    runs in a thread. Motion that is not free of the new stage is halted, or refused where
+    a `scene` brings moves of its own; a halt also interrupts a running job and ends a way
+    around obstacles. The caller must hold `stage_turn`.
 
     Args:
         twin: whose stage.
