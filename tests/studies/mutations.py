@@ -19,6 +19,7 @@ wherever the code is. Options: --count N, --seed N, --jobs N, --under PATH..., -
 from __future__ import annotations
 
 import argparse
+import ast
 import hashlib
 import importlib
 import json
@@ -46,8 +47,11 @@ EQUIVALENT = Path(__file__).with_name("mutants_equivalent.toml")
 UNDER = ("protocol", "twin/geometry", "twin/machine", "twin/motion", "twin/script", "twin/dataset",
          "twin/collision")  # fmt: skip
 TESTS = (
-    "protocol/test_*.py", "cli/test_cli_machine_new.py", "dataset/test_*.py",
+    "protocol/test_*.py", "cli/test_cli_machine_new.py", "cli/test_cli_check*.py",
+    "dataset/test_*.py", "clients/test_bad_pixels.py", "clients/test_square_pixels.py",
+    "face/test_papercuts.py", "face/test_plans.py",
     "twin/script/test_*.py", "twin/test_[!ceps]*.py",
+    "twin/test_camera_modes.py", "twin/test_predicted_*.py",
     "twin/test_collision_*.py", "twin/test_scanner_*.py", "twin/test_script_*.py",
     "twin/exchange/test_exchange_r*.py", "twin/calibration/test_calibration_m*.py",
     "twin/calibration/test_panel_distortion.py",
@@ -74,7 +78,23 @@ digests."""
 
 
 def digest(path: Path) -> str:
+    """Return a short digest of a file's bytes."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+class _WithoutTexts(ast.NodeTransformer):
+    """Leave out docstrings, of attributes too."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if text else node
+
+
+def code_digest(path: Path) -> str:
+    """Return a short digest of what a Python file does: docstrings, comments and line
+    breaks do not change it."""
+    tree = _WithoutTexts().visit(ast.parse(path.read_text()))
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:16]
 
 
 class Copy:
@@ -412,22 +432,46 @@ def judge(job: tuple[Mutant, list[tuple[str, dict[str, float]]]], copy: Copy) ->
     return 0
 
 
-def equivalents() -> dict[tuple[str, str, str, str], str]:
-    """(file, function, before, after) -> why no test can tell."""
-    table = tomllib.loads(EQUIVALENT.read_text())["mutant"]
-    return {(m["file"], m["function"], m["before"], m["after"]): m["why"] for m in table}
+Explained = dict[tuple[str, str, str, str, int], str]
+"""Names of equivalent mutants -> why no test can tell."""
 
 
-def fate_of(
-    mutant: Mutant, status: int, known: dict[tuple[str, str, str, str], str]
-) -> str:
+def equivalents(by_file: dict[str, list[Mutant]]) -> Explained:
+    """Find the mutants that `mutants_equivalent.toml` explains.
+
+    An entry without `repeat` means all mutants with its four texts; those of files that
+    are not mutated are left out.
+
+    Args:
+        by_file: all mutants of the files that are.
+
+    Raises:
+        SystemExit: an entry about a mutant that its file no longer has, or about a file
+            that is gone.
+    """
+    explained: Explained = {}
+    for entry in tomllib.loads(EQUIVALENT.read_text())["mutant"]:
+        texts = tuple(entry[key] for key in ("file", "function", "before", "after"))
+        if texts[0] not in by_file and (ROOT / texts[0]).exists():
+            continue
+        found = [
+            m for m in by_file.get(texts[0], ())
+            if m.name[:4] == texts and entry.get("repeat", m.repeat) == m.repeat
+        ]  # fmt: skip
+        if not found:
+            sys.exit(f"{EQUIVALENT.name}: the code has no mutant {', '.join(texts)}")
+        explained |= {m.name: entry["why"] for m in found}
+    return explained
+
+
+def fate_of(mutant: Mutant, status: int, known: Explained) -> str:
     """What the end of a child means."""
     if os.WIFSIGNALED(status):
         late = os.WTERMSIG(status) in (signal.SIGPROF, signal.SIGKILL)
         return "timeout" if late else "killed"
     if status:
         return "killed"
-    return "equivalent" if mutant.name[:4] in known else "survived"
+    return "equivalent" if mutant.name in known else "survived"
 
 
 def share(fates: Iterable[str]) -> float:
@@ -476,10 +520,11 @@ def main() -> int:
         for path in ([ROOT / under] if under.endswith(".py") else (ROOT / under).rglob("*.py"))
         if "numba" not in path.read_text()
     )  # fmt: skip
-    everything = [
-        m for file in files for m in mutants_of(file, (ROOT / file).read_text())
-    ]
+    by_file = {file: mutants_of(file, (ROOT / file).read_text()) for file in files}
+    everything = [mutant for mutants in by_file.values() for mutant in mutants]
+    known = equivalents(by_file)
     digests = {file: digest(ROOT / file) for file in files}
+    codes = {file: code_digest(ROOT / file) for file in files}
     drawn = draw(everything, options.count, options.seed)
     print(
         f"{len(drawn)} of {len(everything)} mutants in {len(files)} files, seed {options.seed}"
@@ -494,7 +539,7 @@ def main() -> int:
     signal.signal(
         signal.SIGTERM, signal.default_int_handler
     )  # children end with this process
-    begun, known = time.monotonic(), equivalents()
+    begun = time.monotonic()
     copies = [Copy(options.work / f"copy-{i}") for i in range(options.jobs)]
     tests = Tests(options.work / "lines.json", copies, digests)
     book = options.work / "fates.jsonl"
@@ -504,7 +549,7 @@ def main() -> int:
         earlier[(*name, code)] = fate
     fates: dict[Mutant, str] = {}
     for mutant in drawn:
-        fate = earlier.get((*mutant.name, digests[mutant.file]))
+        fate = earlier.get((*mutant.name, codes[mutant.file]))
         if fate == "survived":
             fate = fate_of(mutant, 0, known)
         if fate is not None and not (options.again and fate == "survived"):
@@ -518,10 +563,10 @@ def main() -> int:
             copy.take_back(mutant)
             fate = fates[mutant] = fate_of(mutant, status, known)
             shown = "survived" if fate == "equivalent" else fate
-            written.write(json.dumps([mutant.name, digests[mutant.file], shown]) + "\n")
+            written.write(json.dumps([mutant.name, codes[mutant.file], shown]) + "\n")
             written.flush()
             if fate in ("survived", "equivalent"):
-                print(f"{fate}: {mutant} {known.get(mutant.name[:4], '')}", flush=True)
+                print(f"{fate}: {mutant} {known.get(mutant.name, '')}", flush=True)
             if count % 50 == 0:
                 print(f"{len(fates)} of {len(drawn)}: {100 * share(fates.values()):.1f} % killed "
                       f"after {time.monotonic() - begun:.0f} s", flush=True)  # fmt: skip
