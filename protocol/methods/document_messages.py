@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, MaxLen
-from pydantic import ConfigDict, Field, JsonValue
+from pydantic import Field, JsonValue
 
 from flexdt.protocol import fields as f
 from flexdt.protocol.field_checks import few
@@ -87,8 +87,6 @@ class Scene(f.Params):
     camera: CameraPart
     sample: SamplePart
     correction: CorrectionPart | None = None
-
-    model_config = ConfigDict(populate_by_name=True)
 
 
 class SceneSave(f.Params):

@@ -279,6 +279,22 @@ def test_what_is_allowed_instead_is_said_where_that_is_known(allowed: object) ->
     assert data == {"problems": []} | ({} if allowed is None else {"allowed": allowed})
 
 
+@pytest.mark.parametrize("wrong", [1, 50, 51, 64])
+def test_at_most_fifty_problems_of_a_request_are_listed(wrong: int) -> None:
+    """The message counts all of them."""
+    targets = {f"axis_{i}": "far" for i in range(wrong)}
+    with pytest.raises(RpcError) as caught:
+        parse_params(find("axes.move"), {"targets": targets})
+    assert len(caught.value.data["problems"]) == min(wrong, 50)  # type: ignore[index]
+
+
+def test_a_scene_has_the_keys_of_the_description_and_no_others() -> None:
+    with pytest.raises(RpcError) as caught:
+        parse_params(find("scene.load"), {"document": {"schema_version": 1}})
+    paths = {p["path"] for p in caught.value.data["problems"]}  # type: ignore[index]
+    assert {"document.schema", "document.schema_version"} <= paths
+
+
 def test_a_projection_has_places_within_10_km_and_pixels() -> None:
     def asked(number: float, *detector: object) -> Any:
         row = [0.0, -600.0, 0.0, 0.0, number, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0]
