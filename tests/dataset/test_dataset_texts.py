@@ -25,7 +25,7 @@ from flexdt.twin.dataset.scan_settings_text import (
     parse_scan_settings,
 )
 from flexdt.twin.dataset.stated_geometry import Figures, figures_of, poses_of
-from flexdt.twin.dataset.xre import format_sections, format_xre
+from flexdt.twin.dataset.xre import format_sections, format_settings, format_xre
 from flexdt.twin.dataset.xre_reading import parse_xre
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.description import (
@@ -136,6 +136,8 @@ def test_without_a_region_the_figures_count_and_heights_come_from_the_motors(
     for changed in (replace(s, roi=None), replace(s, hc_px=481.0, cor_px=481.0)):
         r = rebuild(changed, 361, (760, 956), [builtin_machine()], profiles)
         assert r.profile is None
+        reason = "no ROI and mode" if changed.roi is None else "no profile reproduces"
+        assert r.notes[-1].startswith(reason)
         assert "heights come from the motors and cwi-2023-08-21" in r.notes[-1]
         assert r.poses.source[0, 2] == pytest.approx(20.0)
         assert r.poses.axis[0, 2] == 20.0
@@ -270,6 +272,40 @@ def test_dates_with_a_zone_are_written_in_universal_time(
     assert xre.text("Scan info", "Start") == "2026-03-13 23:05:09.0002500 UTC"
 
 
+def test_the_flat_s_place_is_that_of_the_flats_not_of_the_darks(
+    record: Callable[..., ScanRecord],
+) -> None:
+    r = record()
+    dark, *others = r.blocks
+    aside = replace(dark, positions={**dark.positions, "tra_obj": np.array([7.0])})
+    for blocks, expected in (
+        ((aside, *others), "-100.000000"),
+        ((aside, others[1]), None),
+    ):
+        sections = parse_xre(format_xre(replace(r, blocks=blocks))).sections
+        assert sections["Acquisition settings"].get("Flat Field position") == expected
+
+
+def test_settings_of_the_xre_come_back_and_those_not_known_are_left_out(
+    record: Callable[..., ScanRecord],
+) -> None:
+    settings = parse_xre(format_xre(record())).settings
+    back = parse_xre(format_settings(settings)).settings
+    for name in ("kV", "power_W", "exposure_ms", "averages", "sample_name", "flat_axis"):
+        assert getattr(back, name) == getattr(settings, name) is not None
+    bare = parse_xre(format_settings(ScanSettings(kV=90.0))).sections
+    assert [len(entries) for entries in bare.values()] == [1]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "minutes"), [(29.0, 0.0), (147.4, 2.0), (3600.0, 60.0)]
+)
+def test_the_duration_is_in_whole_minutes(
+    record: Callable[..., ScanRecord], seconds: float, minutes: float
+) -> None:
+    assert settings_of(record(duration_s=seconds)).duration_minutes == minutes
+
+
 def test_sections_tell_scans_that_the_texts_cannot_describe(
     record: Callable[..., ScanRecord],
 ) -> None:
@@ -293,12 +329,16 @@ FIGURES = st.builds(
 
 
 @given(
-    FIGURES, st.floats(-50, 50), st.floats(-50, 50), st.floats(-50, 50), st.floats(-7, 7)
-)
+    FIGURES, st.floats(-50, 50), st.floats(-50, 50), st.floats(-50, 50), st.floats(-7, 7),
+    st.floats(-0.1, 0.1),
+)  # fmt: skip
 def test_figures_are_edges_and_poses_have_them(
-    f: Figures, across: float, up: float, axis_up: float, angle: float
+    f: Figures, across: float, up: float, axis_up: float, angle: float, roll: float
 ) -> None:
-    """A pinhole by hand: columns to the right, rows down, from the edge of the first pixel."""
+    """A pinhole by hand: columns to the right, rows down, from the edge of the first pixel.
+
+    COR is the axis's column at the source's height, also on a rolled panel.
+    """
     rows, cols = 760, 956
     p = poses_of(f, (rows, cols), np.array([angle, 0.3]), source_x=across, source_z=up,
                  axis_z=axis_up)  # fmt: skip
@@ -310,6 +350,11 @@ def test_figures_are_edges_and_poses_have_them(
     shadow = sx + (ax - sx) * f.sdd_mm / f.sod_mm
     assert (shadow - dx) / f.pixel_mm + cols / 2 == pytest.approx(f.cor_px, abs=1e-6)
     assert vars(figures_of(p[:1], (rows, cols))) == pytest.approx(vars(f), abs=1e-6)
+    c, s = math.cos(roll), math.sin(roll)
+    pixel = f.pixel_mm * np.ones((2, 1))
+    rolled = replace(p, u=-pixel * [c, 0.0, s], v=pixel * [s, 0.0, -c])
+    level = ((dx - shadow) * c + (dz - sz) * s) / f.pixel_mm + cols / 2
+    assert figures_of(rolled[:1], (rows, cols)).cor_px == pytest.approx(level, abs=1e-6)
     assert f.magnification == f.sdd_mm / f.sod_mm
     assert f.voxel_um * f.magnification == pytest.approx(1000 * f.pixel_mm)
 
@@ -486,6 +531,22 @@ def test_the_axis_of_the_flat_field_is_the_linear_one_that_moved_most() -> None:
         assert (r.count("flat"), r.count("projection"), r.smooth) == (1, 1, False)
         first = plan.exposures[-1]
         assert r.positions == pytest.approx(first.positions)
+
+
+@pytest.mark.parametrize("projections", [0, 1, 2])
+def test_a_scan_s_settings_are_those_of_its_first_projection_or_of_the_start(
+    projections: int,
+) -> None:
+    shot = "camera take image ACK\ncamera save image {}.tif ACK\n"
+    text = "tube xrayon ACK\n" + shot.format("io0")
+    for i in range(projections):
+        text += f"tube set kV {60 + i} ACK\ncamera set exposure {200 + i} ACK\n"
+        text += f"rot_obj move absolute {90 + i} ACK\n" + shot.format(f"s{i}")
+    plan = plan_script(text)
+    r = ScanRecord.from_plan(plan, name="a", started=datetime(2026, 3, 14))
+    found = (r.kV, r.camera.exposure_ms, r.positions["rot_obj"])
+    at_start = (plan.start.kV, plan.start.camera.exposure_ms, 0.0)
+    assert found == (at_start if projections == 0 else (60.0, 200.0, 90.0))
 
 
 @pytest.mark.parametrize("moving", ["flat", "projection"])

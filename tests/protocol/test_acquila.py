@@ -61,11 +61,14 @@ def test_a_uuid_comes_back_as_it_came(uuid: float | str) -> None:
             {"component": "tube\ud800"},
             r"component holds U\+D800 at 4; allowed: anything but",
         ),
-        ({"component": "tube\x00"}, r"component holds U\+0000 at 4"),
+        (
+            {"component": "tube\x00"},
+            r"component holds U\+0000 at 4; .* but surrogates and control characters$",
+        ),
         ({"command": "x\u2028ray on"}, r"command holds U\+2028"),
         (
             {"arg1": "\udcff"},
-            r"arg1 holds U\+DCFF at 0; allowed: anything but surrogates",
+            r"arg1 holds U\+DCFF at 0; allowed: anything but surrogates$",
         ),
         ({"UUID": "\ud800"}, r"UUID holds U\+D800"),
         ({"UUID": 10**200}, "number below 1e"),

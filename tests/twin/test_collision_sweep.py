@@ -31,6 +31,7 @@ from flexdt.twin.collision.first_contact import (
     first_contact,
 )
 from flexdt.twin.collision.guard import SceneGuard
+from flexdt.twin.collision.plan_report import _trace_times
 from flexdt.twin.collision.relative import (
     Limits,
     Moment,
@@ -47,7 +48,7 @@ from flexdt.twin.collision.stages import Body
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.motion import profiles as motion
-from flexdt.twin.motion.profiles import AxisPath, Piece, Trajectory
+from flexdt.twin.motion.profiles import AxisPath, Piece, Trajectory, at_rest
 
 AXES = ("x", "y", "turn")
 MARGIN, TOLERANCE = 1.0, 0.01
@@ -598,7 +599,7 @@ def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) ->
     assert set(names) == {"thing", "wall 0"}
     assert depth <= truth(begin) + 1e-6
     assert depth >= truth(begin) - polygon - (0.02 if polygon else 1e-6)
-    overlap = _Overlap.at(a, b, begin)
+    overlap, swapped = _Overlap.at(a, b, begin), _Overlap.at(b, a, begin)
     for turn in (0.0, 25.0, -170.0):
         for share in np.linspace(-6.0, 6.0, 5):
             q = begin + (share, -0.7 * share, turn)
@@ -606,6 +607,10 @@ def test_depth_of_an_overlap_and_what_is_left_of_it_on_the_way_out(seed: int) ->
             if turn == 0.0 and truth(q) < 0.0:
                 assert overlap.separation(q) >= truth(q) - polygon - (
                     1.0 if polygon else 1e-6
+                )
+            if not polygon:
+                assert overlap.separation(q) == pytest.approx(
+                    swapped.separation(q), abs=1e-6
                 )
 
 
@@ -783,6 +788,41 @@ def test_every_distance_that_is_evaluated_counts_as_a_look(seed: int) -> None:
     lowest = true_distance(a.solid.vertices, b.solid.vertices)
     assert least <= min(begin, end)
     assert lowest - 1e-4 <= least <= lowest + 0.1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_moment_after_a_travel_is_that_of_the_motor(seed: int) -> None:
+    """Along one axis, without turning, the bound is the motion itself."""
+    rng = np.random.default_rng(seed)
+    a, b = one_against(box((9, 8, 7)), [box((5, 5, 5), (70, 70, 0))]).bodies
+    begin, end = rng.uniform(-50, 50, 2)
+    move = motion.move(begin, 0.0, end, float(rng.uniform(5, 50)), 30.0, 0.0)
+    still = at_rest(0.0)
+    ways = dict.fromkeys(AXES, still) | {AXES[0]: move}
+    path = path_of(AXES, {n: AxisPath.along(t) for n, t in ways.items()}, 0.0, move.end)
+    moves = RelativeMotion(a, b, path)
+    for share in rng.uniform(0.05, 0.99, 4):
+        distance = float(share * abs(end - begin))
+        found = moves.after_travel(Moment(0, 0.0), distance)
+        assert found is not None
+        gone = abs(move.position(moves.time(found)) - begin)
+        assert gone == pytest.approx(distance, abs=1e-6)
+    assert moves.after_travel(Moment(0, 0.0), 1.01 * abs(end - begin)) is None
+
+
+@pytest.mark.parametrize("count", [2, 8, 9])
+def test_a_trace_has_times_even_in_travel_and_times_even_in_time(count: int) -> None:
+    """A motor goes 6 mm in one second and 2 mm in the next, then rests for eight."""
+    path = Path(
+        ("x",), np.array([1.0, 2.0, 3.0, 11.0]), np.array([[0.0], [6.0], [8.0], [8.0]]),
+        np.array([[6.0], [2.0], [0.0]]), np.zeros((3, 1)),
+    )  # fmt: skip
+    even = 1.0 + 10.0 * np.arange(count - count // 2) / max(1, count - count // 2 - 1)
+    by_travel = {1: [1.0], 4: [1.0, 1.0 + 8.0 / 18.0, 1.0 + 16.0 / 18.0, 11.0]}[
+        count // 2
+    ]
+    assert_allclose(_trace_times(path, count), np.unique([*by_travel, *even]))
+    assert_allclose(_trace_times(path, 1), [1.0, 11.0])
 
 
 def drawn_path(rng: np.random.Generator) -> tuple[dict[str, Trajectory], Path]:

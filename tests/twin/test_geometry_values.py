@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,10 @@ from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry import ConeVec
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.geometry.motion import Motion
-from flexdt.twin.geometry.panel import Border, PanelModel
+from flexdt.twin.geometry.panel import Border, Panel, PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.geometry.rigid import Rigid
+from flexdt.twin.geometry.virtual_panel import stretched
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.machine.kinematics import poses
 from flexdt.twin.projection import Grid, Volume, forward, project_scene
@@ -577,3 +580,54 @@ def test_gaps_and_bends_of_a_panel_have_priors_of_their_own() -> None:
     """Two stretches and two of each of seven powers, then two for each border."""
     panel = PanelModel(0.5, (60, 80), (Border(0, 40.0), Border(1, 30.0)))
     assert panel.sigmas.tolist() == [0.5] * 16 + [5.0] * 4
+
+
+@given(
+    st.floats(0.0, 0.05),
+    st.lists(st.floats(0.2, 1.0), min_size=2, max_size=6),
+)
+def test_the_light_of_the_frame_before_is_taken_off(
+    lag: float, light: list[float]
+) -> None:
+    """Frames of a panel that keeps a part of each, which is made here; what remains is of
+    second order in the lag."""
+    panel = replace(Panel.flat((1, 1)), lag=lag)
+    measured = [light[0]]
+    for before, now in itertools.pairwise(light):
+        measured.append((1.0 - lag) * now + lag * before)
+    for i in range(1, len(light)):
+        image, before = (
+            -np.log([[x]]).astype(np.float32) for x in (measured[i], measured[i - 1])
+        )
+        found = math.exp(-panel.without_lag(image, before).item())
+        assert found == pytest.approx(light[i], abs=2.0 * lag**2 + 1e-6)
+
+
+def test_only_panels_that_move_are_stretched_and_their_images_stay() -> None:
+    scan = ConeVec.circular(angles=4, **SCAN)
+    points = np.array([[3.0, -5.0, 7.0], [-20.0, 1.0, 2.0]])
+    assert stretched(scan, np.ones(4)) is scan
+    times = np.array([1.0, 2.0, 1.0, 1.25])
+    longer = stretched(scan, times)
+    assert_allclose(longer.source_detector_distance, 1059.0 * times)
+    assert_allclose(longer.project_points(points), scan.project_points(points))
+    assert_allclose(longer.rows[[0, 2]], scan.rows[[0, 2]], rtol=0.0)
+
+
+@pytest.mark.parametrize("column", range(12))
+@pytest.mark.parametrize("wrong", [math.nan, math.inf])
+def test_one_number_of_a_row_that_is_not_finite_is_an_error(
+    column: int, wrong: float
+) -> None:
+    rows = ConeVec.circular(angles=4, **SCAN).rows.copy()
+    rows[2, column] = wrong
+    with pytest.raises(GeometryError, match="row 2 is not finite"):
+        ConeVec(rows)
+
+
+def test_shifts_begin_at_nothing_and_turns_at_the_origin() -> None:
+    assert_allclose(Rigid.translate() @ [0.0, 0.0, 0.0], 0.0)
+    for axis in "xyz":
+        assert_allclose(Rigid.rotate(axis, 90.0) @ [0.0, 0.0, 0.0], 0.0)
+        assert_allclose(Rigid.translate(**{axis: 2.0}) @ np.zeros(3),
+                        2.0 * np.eye(3)["xyz".index(axis)])  # fmt: skip

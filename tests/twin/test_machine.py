@@ -451,7 +451,7 @@ def test_size_follows_mode_and_roi() -> None:
     assert binning_of("2_HW2SW1LOW") == 2
 
 
-@pytest.mark.parametrize("mode", ["", "HW0SW1High", "HW2SW1", "SW1HW1High"])
+@pytest.mark.parametrize("mode", ["", "HW0SW1High", "HW1SW0High", "HW2SW1", "SW1HW1High"])
 def test_unknown_mode(mode: str) -> None:
     with pytest.raises(LimitError, match="HWaSWb"):
         binning_of(mode)

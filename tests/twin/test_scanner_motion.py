@@ -19,7 +19,7 @@ from flexdt.twin.machine.description import (
 )
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.braking import braked_apart
-from flexdt.twin.motion.drives import Drive, home, plan_jog, plan_move
+from flexdt.twin.motion.drives import Drive, home, plan_jog, plan_move, with_settings
 from flexdt.twin.motion.profiles import at_rest
 from flexdt.twin.scanner.scanner import ScannerTwin
 
@@ -248,6 +248,26 @@ def test_limits_of_an_axis_without_a_motor_are_its_own(
     with pytest.raises(LimitError) as jog:
         s.jog("W", 1000.0, 1.0, 199.0)
     s.jog("W", jog.value.data["allowed"] * 0.9999, 1e-3, 199.0)
+    fastest = min(
+        machine.axes["X"].max_speed / abs(x), machine.axes["Z"].max_speed / abs(z)
+    )
+    assert jog.value.data["allowed"] == pytest.approx(fastest)
+
+
+@pytest.mark.parametrize(("tube", "panel"), [(-2.0, -0.5), (-0.25, 1.0)])
+def test_motors_of_an_axis_get_their_share_of_its_rates(
+    tube: float, panel: float
+) -> None:
+    geared = parse_machine(
+        f'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = {1 / tube}\n'
+        f"moves = {{ ver_tube = {tube}, ver_det = {panel} }}\n"
+    )
+    drives = with_settings(
+        geared, home(geared, 0.0), "ver_obj", speed=1.5, acceleration=2.5
+    )
+    for name, share in (("ver_tube", abs(tube)), ("ver_det", abs(panel))):
+        assert drives[name].speed == 1.5 * share
+        assert drives[name].acceleration == 2.5 * share
 
 
 @pytest.mark.parametrize(("tube", "panel"), [(-2.0, -0.5), (-0.25, 1.0), (-1.0, 3.0)])

@@ -293,6 +293,16 @@ def test_helix_rises_evenly_and_symmetrically() -> None:
     np.testing.assert_allclose(angle, 6.0 * np.arange(241), atol=1e-6)
 
 
+def test_where_nothing_else_rises_the_sample_sinks_through_the_helix() -> None:
+    cabinet = builtin_machine("xyzr_cabinet")
+    wish = ScanRequest(kind="helical", frames=481, turns=4.0, rise_mm=16.0)
+    plan = planned(wish, cabinet, profile_of(cabinet))
+    images = [e.positions for e in plan.exposures if e.kind == "projection"]
+    heights = np.array([at["Y"] for at in images])
+    expected = -16.0 * (np.array([at["R"] for at in images]) / 1440.0 - 0.5)
+    np.testing.assert_allclose(heights, expected, atol=1e-5)
+
+
 def test_tiles_lie_side_by_side_with_a_tenth_shared() -> None:
     plan = planned(ScanRequest(kind="tiled", frames=9, exposure_ms=1000, tiles=3))
     cone_vec, camera = geometry(plan)

@@ -100,6 +100,19 @@ def test_limits_and_rates_are_those_of_the_log_exactly(fitted: Fit) -> None:
     assert fitted.axes["tra_obj"][-1].position == pytest.approx(55.769165)
 
 
+def test_rates_that_the_script_sets_stay_those_of_the_base(
+    log: tuple[Executed, ...], blank: Machine
+) -> None:
+    """Only the turntable's speed and acceleration are set, between its moves."""
+    slow = {"speed": 3.0, "acceleration": 4.0}
+    axes = {n: a.model_copy(update=slow) for n, a in blank.axes.items()}
+    found = fit_machine([log], blank.model_copy(update={"axes": axes}), "slow").machine
+    rates = {n: (a.speed, a.acceleration) for n, a in found.axes.items()}
+    assert rates["rot_obj"] == rates["PI_X"] == (3.0, 4.0)
+    assert rates["ver_tube"] == rates["ver_det"] == (37.5, 125.0)
+    assert (rates["tra_obj"], rates["mag_obj"]) == ((40.0, 80.0), (40.0, 50.0))
+
+
 def test_errors_of_the_fit_and_cross_validated(fitted: Fit) -> None:
     rows = fitted.lines.rows
     assert len(fitted.samples) <= 12

@@ -10,7 +10,12 @@ import pytest
 from numpy.testing import assert_allclose
 from smooth_rule import smooth_scan
 
-from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.description import (
+    Machine,
+    Profile,
+    parse_machine,
+    profile_of,
+)
 from flexdt.twin.script import ScanPlan, parse_script, plan_script
 from flexdt.twin.script.planning.planned_images import run_up
 from tests.twin.script.conftest import Planner
@@ -91,6 +96,25 @@ def test_image_i_lies_at_i_360_over_n_minus_1_exactly_when_the_motor_is_there(
     assert_allclose(plan.positions(starts)["rot_obj"], angles, atol=1e-7)
     assert_allclose(np.diff(starts), rule.period_s, rtol=1e-6)
     assert all(e.moving for e in projections)
+
+
+@pytest.mark.parametrize("gear", [-2.0, -0.4])
+def test_a_trigger_of_an_axis_without_a_motor_is_at_its_own_position(gear: float) -> None:
+    machine = parse_machine(
+        f'base = "flexray"\n[virtual_axes.ver_obj]\nfactor = {1 / gear}\n'
+        f"moves = {{ ver_tube = {gear}, ver_det = {gear} }}\n"
+    )
+    script = parse_script(
+        "tube xrayon ACK\nver_obj move absolute 250 ACK\n"
+        "ver_obj move absolute 280 261 POS\ncamera take image ACK\n"
+        "camera save image scan_0.tif ACK\n"
+    )
+    plan = plan_script(script, machine, profile_of(machine))
+    assert not [p for p in plan.problems if p.severity == "error"]
+    [image] = plan.exposures
+    axis = machine.virtual_axes["ver_obj"]
+    motor = float(plan.positions(image.start_s)["ver_tube"])
+    assert axis.constant + motor / gear == pytest.approx(261.0)
 
 
 def fly_lines(exposure_ms: float, averages: int, frames: int) -> list[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import random
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -516,10 +518,33 @@ def test_the_sample_out_of_the_beam_and_in_the_flat(planned: Planner) -> None:
         "camera take image ACK",
         "camera save image scan_000000.tif ACK",
     ]
-    assert codes(planned(*lines)) == [
+    plan = planned(*lines)
+    assert codes(plan) == [
         ("warning", "sample_in_flat", 9),
         ("warning", "sample_out_of_beam", 12),
     ]
+    [said] = [p.message for p in plan.problems if p.code == "sample_in_flat"]
+    assert "the shadow of its axis lies at column" in said
+    sized = planned(*lines, sample=SampleSize(10.0, 10.0))
+    [said] = [p.message for p in sized.problems if p.code == "sample_in_flat"]
+    found = re.search(r"its shadow spans columns (\d+) to (\d+)", said)
+    assert found is not None
+    # By hand: 10 mm at SOD, enlarged, over pixels of 0.1496 mm.
+    [flat] = [e for e in sized.exposures if e.kind == "flat"]
+    sod = flat.positions["mag_obj"] + sized.profile.c_obj
+    sdd = flat.positions["mag_det"] + sized.profile.c_det
+    width = 10.0 * sdd / math.sqrt(sod**2 - 25.0) / 0.1496
+    assert int(found[2]) - int(found[1]) == pytest.approx(width, abs=2.0)
+
+
+def test_x_rays_that_are_on_at_the_start_light_the_first_image(
+    planned: Planner, flexray: Machine
+) -> None:
+    start = replace(StartState.of(flexray), xrays_on=True)
+    shot = ["camera take image ACK", "camera save image scan_000000.tif ACK"]
+    [image] = planned(*shot, start=start).exposures
+    assert image.start_s < 1.0
+    assert (image.kind, image.xrays_on) == ("projection", True)
 
 
 def test_another_scanner_is_another_file(profile: Profile) -> None:

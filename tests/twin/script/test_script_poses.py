@@ -122,6 +122,9 @@ def test_the_plan_is_that_of_a_script_with_the_same_steps(seed: int) -> None:
         plan = plan_poses(poses, machine, profile, start=start, flat=flat)
         away = next((e.positions for e in plan.exposures if e.kind == "flat"), None)
         assert (away is not None) == flat
+        assert {e.line for e in plan.exposures if e.kind != "projection"} == {0}
+        pictures = [e.line for e in plan.exposures if e.kind == "projection"]
+        assert pictures == [*range(1, len(poses) + 1)]
         script = plan_script(written(poses, start, away), machine, profile, start=start)
         assert bare(plan) == bare(script)
         assert plan.duration_s == script.duration_s

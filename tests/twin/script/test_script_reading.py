@@ -13,6 +13,7 @@ from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.script import ScriptError, Wait, parse_script, plan_script, read_script
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.grammar import shorten
+from flexdt.twin.script.parse import FEW_PROBLEMS, line_count, rows
 from tests.twin.script.conftest import blob, tabbed
 
 LISTING_1 = Path(__file__).parents[3] / "examples/scripts/listing1.txt"
@@ -309,6 +310,41 @@ def test_binary_sample_info_in_a_file_whose_line_ends_were_converted() -> None:
     info, on = parse_script(line + b"tube\txrayon\t\t\tACK\n").commands
     assert info == c.SetSampleInfo(line=1, data=data)
     assert isinstance(on, c.XrayOn)
+
+
+@pytest.mark.parametrize(("lines", "whole"), [(63, True), (64, False)])
+def test_a_binary_argument_is_looked_for_in_64_lines(lines: int, whole: bool) -> None:
+    data = b"scanner\tset sample info\t" + b"\x01\n" * lines + b"\x01\t\tACK\n"
+    assert (len([*rows(data.decode("latin-1"))]) == 1) == whole
+
+
+@pytest.mark.parametrize(
+    ("text", "lines"),
+    [
+        ("", 0),
+        ("a", 1),
+        ("a\n", 1),
+        ("a\nb", 2),
+        ("\n", 1),
+        ("a\r\n\r\n", 2),
+        ("a\rb\r", 2),
+    ],
+)
+def test_the_last_line_of_a_script_counts_with_and_without_an_end(
+    text: str, lines: int
+) -> None:
+    assert line_count(text) == lines
+
+
+@pytest.mark.parametrize("count", [FEW_PROBLEMS - 1, FEW_PROBLEMS, FEW_PROBLEMS + 1, 99])
+def test_of_a_file_that_is_no_script_a_few_problems_are_listed(count: int) -> None:
+    _, problems = read_script("Dear reader\n" * count)
+    if count > FEW_PROBLEMS:
+        assert len(problems) == FEW_PROBLEMS + 1
+        assert f"{FEW_PROBLEMS} of {count} problems are listed" in problems[0].message
+    else:
+        assert len(problems) == count
+        assert not any("are listed" in p.message for p in problems)
 
 
 def test_ten_errors_are_reported_at_once_with_their_places() -> None:
