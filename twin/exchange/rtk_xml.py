@@ -2,7 +2,8 @@
 
 RTK turns about its y with the source on +z: its (x, y, z) is our (x, z, -y). Nine numbers
 describe every view of a flat panel with orthogonal rows and columns; the file has neither pixel
-size nor shape, which belong to the images (spacing, and an origin of -(n - 1) / 2 pixels). A
+size nor shape, which belong to the images (spacing, and an origin of -(n - 1) / 2 pixels). Its
+projection matrices state the same views a second time: both must agree, and either is enough. A
 detector whose rows grow downwards has its u x v away from the source, which RTK writes with
 negative distances. Curved detectors are not supported.
 """
@@ -30,6 +31,12 @@ TO_RTK: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Matrix from our (x, y, z) to RTK's; a rotation, no mirror."""
 ROUNDING_TOLERANCE: Final = 1e-9
 """Largest relative difference of distances that counts as rounding."""
+MAX_DISAGREEMENT_PX: Final = 0.05
+"""Largest distance of the places where a view's matrix and its numbers put a point [px]."""
+PROBE_SHARE: Final = 0.1
+"""Distance of these points from the isocentre, relative to that of the source."""
+MAX_SKEW: Final = 1e-4
+"""Largest relative error of a matrix of rows and columns at a right angle, of one scale."""
 VERSION: Final = "3"
 NAMES: Final = (
     "GantryAngle",
@@ -43,8 +50,10 @@ NAMES: Final = (
     "ProjectionOffsetY",
 )
 """Names of the nine numbers: angles [deg], then lengths [mm]."""
+MATRIX: Final = "Matrix"
+"""Element of a view's projection matrix."""
 _PASSED_OVER = (
-    "Matrix",
+    MATRIX,
     "CollimationUInf",
     "CollimationUSup",
     "CollimationVInf",
@@ -147,8 +156,8 @@ def read_rtk(
 ) -> ScanGeometry:
     """Read RTK's XML.
 
-    Numbers before the views hold for all. Distances are refused only if those of every
-    view are such as no scanner has.
+    Numbers before the views hold for all. A view without numbers has those of its matrix.
+    Distances are refused only if those of every view are such as no scanner has.
 
     Args:
         text: the file.
@@ -158,7 +167,8 @@ def read_rtk(
 
     Raises:
         ExchangeError: no such XML, another version, a number that is not finite, a
-            parallel view, or an unknown element that is not 0, such as a curved detector.
+            parallel view, a matrix that contradicts the numbers of its view, or an unknown
+            element that is not 0, such as a curved detector.
     """
     try:
         root = ElementTree.fromstring(text)
@@ -172,18 +182,23 @@ def read_rtk(
     stated: list[tuple[float, float]] = []
     for element in root:
         if element.tag == "Projection":
+            where = f"{file}: view {len(rows)}"
             values = dict(common)
             for entry in element:
                 _take(entry, values, file)
-            if values["SourceToDetectorDistance"] == 0.0:
-                problem = (
-                    f"{file}: view {len(rows)} is parallel (no source-detector distance)"
-                )
+            matrix = _matrix(element, where)
+            numbers = tuple(values[n] for n in NAMES)
+            if matrix is not None and not any(numbers):
+                numbers, row = view_of_matrix(matrix, pitch_mm, where)
+            elif values["SourceToDetectorDistance"] == 0.0:
+                problem = f"{where} is parallel (no source-detector distance)"
                 raise ExchangeError.instead(problem, 0.0, "a cone beam", row=len(rows))
-            rows.append(row_of(tuple(values[n] for n in NAMES), pitch_mm))
-            stated.append(
-                (values["SourceToIsocenterDistance"], values["SourceToDetectorDistance"])
-            )
+            else:
+                row = row_of(numbers, pitch_mm)
+                if matrix is not None:
+                    _require_agreement(matrix, numbers, pitch_mm, where)
+            rows.append(row)
+            stated.append((numbers[3], numbers[4]))
         else:
             _take(element, common, file)
     _require_distances(stated, file)
@@ -228,6 +243,108 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
     return np.concatenate(
         [source, centre, axes[:, 0] * pitch_mm[0], axes[:, 1] * pitch_mm[1]]
     )
+
+
+def view_of_matrix(
+    matrix: FloatArray, pitch_mm: tuple[float, float], where: str
+) -> tuple[tuple[float, ...], FloatArray]:
+    """Compute the nine numbers and the cone_vec row of a projection matrix; the inverse of
+    `matrix_of`, whatever factor the matrix has.
+
+    Args:
+        matrix: (3, 4), from RTK's (x, y, z, 1) to the panel [mm].
+        pitch_mm: of a pixel along u and v.
+        where: file and view, for messages.
+
+    Returns:
+        Nine numbers in the order of `NAMES` [deg, mm], and the row (12,) [mm].
+
+    Raises:
+        ExchangeError: the matrix is singular or parallel, or is that of no flat panel with
+            rows and columns at a right angle.
+    """
+    with np.errstate(all="ignore"):
+        sign = np.sign(np.linalg.det(matrix[:, :3]))
+        scaled = matrix * (sign / np.linalg.norm(matrix[2, :3]))
+        normal = scaled[2, :3]
+        offsets = scaled[:2, :3] @ normal
+        across, down = scaled[:2, :3] - offsets[:, None] * normal
+        squares = across @ across, down @ down
+        skew = max(abs(across @ down), abs(squares[0] - squares[1]))
+        flat = np.isfinite(scaled).all() and 0.0 < squares[0]
+    if not flat or skew > MAX_SKEW * squares[0]:
+        problem = f"{where}: its Matrix is that of no cone beam on a flat panel"
+        allowed = "rows and columns at a right angle, of one scale in mm"
+        raise ExchangeError.instead(problem, matrix.tolist(), allowed, path=MATRIX)
+    source = -np.linalg.solve(scaled[:, :3], scaled[:, 3])
+    sdd = math.copysign(math.sqrt(squares[0]), source @ normal)
+    u = across / -sdd
+    v = np.cross(normal, u)
+    sx, sy, sid = (float(source @ axis) for axis in (u, v, normal))
+    px, py = sx - offsets[0], sy - offsets[1]
+    centre = px * u + py * v + (sid - sdd) * normal
+    parts = (source, centre, u * pitch_mm[0], v * pitch_mm[1])
+    row = np.concatenate([TO_RTK.T @ part for part in parts])
+    return parameters_of(row), row
+
+
+def _matrix(view: ElementTree.Element, where: str) -> FloatArray | None:
+    """Return the projection matrix (3, 4) of a view's XML, or None if it has none.
+
+    Args:
+        view: its element.
+        where: file and view, for messages.
+
+    Raises:
+        ExchangeError: it has not twelve finite numbers.
+    """
+    text = view.findtext(MATRIX)
+    if text is None:
+        return None
+    try:
+        values = np.array([float(part) for part in text.split()])
+    except ValueError:
+        values = np.array([math.nan])
+    if values.shape != (12,) or not np.isfinite(values).all():
+        problem = f"{where}: its Matrix is {' '.join(text.split())[:60]!r}"
+        raise ExchangeError.instead(problem, text[:60], "12 finite numbers", path=MATRIX)
+    return values.reshape(3, 4)
+
+
+def _require_agreement(
+    matrix: FloatArray,
+    numbers: tuple[float, ...],
+    pitch_mm: tuple[float, float],
+    where: str,
+) -> None:
+    """Check that the matrix of a view puts points around the isocentre where its numbers
+    do.
+
+    Args:
+        matrix: (3, 4), as the file states it.
+        numbers: nine, in the order of `NAMES` [deg, mm].
+        pitch_mm: of a pixel along u and v.
+        where: file and view, for messages.
+
+    Raises:
+        ExchangeError: places differ by more than `MAX_DISAGREEMENT_PX`.
+    """
+    apart = PROBE_SHARE * abs(numbers[3])
+    steps = np.hstack([np.zeros((3, 1)), np.eye(3), -np.eye(3)]) * apart
+    points = np.vstack([steps, np.ones(7)])
+    with np.errstate(all="ignore"):
+        stated, expected = (
+            one[:2] / one[2] for one in (matrix @ points, matrix_of(numbers) @ points)
+        )
+        off = np.abs(stated - expected) / np.array(pitch_mm)[:, None]
+    if not off.max() <= MAX_DISAGREEMENT_PX and np.isfinite(expected).all():
+        far = float(np.nan_to_num(off, nan=np.inf).max())
+        problem = (
+            f"{where}: its Matrix puts points {far:.3g} px from where its numbers do; "
+            "was one of them changed alone?"
+        )
+        allowed = f"{MAX_DISAGREEMENT_PX:g} px, or numbers or a Matrix alone"
+        raise ExchangeError.instead(problem, far, allowed, path=MATRIX)
 
 
 def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:
