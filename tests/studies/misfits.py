@@ -9,9 +9,11 @@ turned the other way, interlaced, in alphabetical order, a panel on the wrong si
 some pixels, motion. With `--right` they are made difficult instead: beam hardening, scatter,
 noise, few views, wires, foam, bodies that are almost symmetric. A contradiction counts as
 answered where its kind is named, where no accuracy is claimed, or where means of small balls
-are right within 10 %. "Not decided" are scans whose images fit another geometry as well: it is
-true of right and of wrong ones, and nothing is claimed. Exits with 1 where less than 98 % are
-answered, or more than 1 % of right scans are told of a contradiction.
+are right within 10 %. "Not decided" are scans whose images fit another geometry as well, "not
+comparable" those of too few views or columns to show whether they fit: both are true of right
+and of wrong ones, and nothing is claimed. A right one is told something false where another
+geometry is said to fit better. Exits with 1 where less than 98 % are answered, or more than
+1 % of right scans are told of a contradiction.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ import numpy as np
 import flexdt as fx
 from flexdt.twin.reconstruction import bias_of, field_of_view, truncation_of
 from flexdt.twin.reconstruction.bias import Bias
+from flexdt.twin.reconstruction.consistency.agreement import Undetermined
 
 MOST_OFF = 0.1
 """Error of a region above which no accuracy may be claimed."""
@@ -236,7 +239,8 @@ def looked_at(case: Case) -> Bias | None:
 
 def worst_error(case: Case) -> float:
     """Error that nine of ten small regions stay below, over their truth, of sorted means: a
-    volume that is turned or mirrored is not wrong.
+    volume that is turned or mirrored is not wrong. Regions without values are left out;
+    infinite if all are.
     """
     grid = field_of_view(case.geometry, case.scan.shape)
     with warnings.catch_warnings():
@@ -245,6 +249,7 @@ def worst_error(case: Case) -> float:
     rng = np.random.default_rng(case.scan.seed)
     axes = volume.centers()
     means, true = [], []
+    unseen = 0
     for _ in range(1500):
         index = [int(rng.integers(2, n - 2)) for n in volume.shape]
         z, y, x = (slice(i - 2, i + 3) for i in index)
@@ -252,10 +257,14 @@ def worst_error(case: Case) -> float:
         around = at + grid.voxel_mm * 5.5 * rng.standard_normal((60, 3)) / 1.7
         there = case.scan.truth(np.concatenate([[at], around]))
         if there[0] > 0.0 and np.ptp(there) < 1e-12:
-            means.append(float(np.nanmean(volume.data[z, y, x])))
+            values = volume.data[z, y, x]
+            if np.isnan(values).all():
+                unseen += 1
+                continue
+            means.append(float(np.nanmean(values)))
             true.append(float(there[0]))
     if not true:
-        return 0.0
+        return np.inf if unseen else 0.0
     off = np.sort(means) / np.sort(true) - 1.0
     return float(np.percentile(np.abs(off), 90.0))
 
@@ -301,8 +310,11 @@ def judged(case: Case, bias: Bias | None) -> tuple[str, bool]:
         bias: what was found of it; None if nothing.
     """
     found = None if bias is None else bias.contradiction
+    if isinstance(found, Undetermined):
+        return "not comparable", True
     if found is not None and found.change is not None:
-        return "not decided", True
+        wrongly = found.fits_better and case.kind in RIGHT
+        return ("told of a better fit", False) if wrongly else ("not decided", True)
     if case.kind in RIGHT:
         return ("told something" if found else "nothing told"), found is None
     if found is not None:

@@ -29,7 +29,9 @@ from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, NODES, CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import (
     Contradiction,
+    Undetermined,
     compared,
+    too_few,
 )
 from flexdt.twin.reconstruction.uniform_nodes import MIN_EVENNESS, UniformNodes
 from flexdt.twin.reconstruction.volume_errors import interpolated
@@ -69,7 +71,8 @@ class Bias:
         inside: nodes of the object, (nz, ny, nx).
         causes: angles, aside, cone, rows, beyond or drift -> its largest change [1/mm],
             (nz, ny, nx).
-        contradiction: between images and geometry, with which nothing is bounded.
+        contradiction: between images and geometry, or the reason why none would be seen,
+            with which nothing is bounded.
         widening: factor of all causes, of images that fit less well than usual.
     """
 
@@ -77,7 +80,7 @@ class Bias:
     even: FloatArray
     inside: npt.NDArray[np.bool_]
     causes: dict[str, FloatArray]
-    contradiction: Contradiction | None = None
+    contradiction: Contradiction | Undetermined | None = None
     widening: float = 1.0
 
     @cached_property
@@ -184,8 +187,8 @@ def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
     the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
     complete rows their level beside the object ("drift"). A whole scan whose images fit
-    another geometry as well, also those of a finer copy, has a contradiction besides its
-    causes.
+    another geometry as well, also those of a finer copy, or do not show whether they fit
+    their own, has a contradiction besides its causes.
 
     Args:
         copied: makes a coarse copy of the whole scan, of so many nodes.
@@ -237,8 +240,14 @@ def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     else:
         add("drift", 1.0, np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec)))
     accuracy = bias.accuracy(bias.found)
-    if comparison is None or accuracy is None or accuracy.cut_off:
+    if accuracy is None or accuracy.cut_off:
         return bias
+    if too_few(scan):
+        return replace(bias, contradiction=Undetermined(np.inf))
+    if comparison is None:
+        return bias
+    if (undetermined := comparison.undetermined) is not None:
+        return replace(bias, contradiction=undetermined)
     undecided = comparison.undecided(accuracy.most, sides_known=sides_known)
     if undecided is not None and undecided.finer_copy_decides:
         fine = copied(FINE_NODES)

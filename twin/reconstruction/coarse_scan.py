@@ -157,17 +157,22 @@ class CoarseScan:
         )
 
     def thinned(
-        self, *, all_views: bool = False, least_rows: int = COMPARED_ROWS
+        self,
+        *,
+        all_views: bool = False,
+        least_rows: int = COMPARED_ROWS,
+        across: int = 1,
     ) -> CoarseScan:
         """Take fewer views and rows of a circle: enough to compare images with the
         projections of a volume made from them.
 
-        About `COMPARED_VIEWS` views a column are chosen, and rows averaged; a rest of
-        rows is left out.
+        About `COMPARED_VIEWS` views a column are chosen, and rows and columns averaged; a
+        rest of rows or columns is left out.
 
         Args:
-            all_views: take fewer rows alone.
+            all_views: keep every view.
             least_rows: that are left, if the panel has so many.
+            across: columns over which a column of the result is the mean.
         """
         count, rows, cols = self.images.shape
         if all_views:
@@ -176,22 +181,25 @@ class CoarseScan:
             each = max(1, round(count / (COMPARED_VIEWS * cols)))
         down = max(1, rows // least_rows)
         rows -= rows % down
+        cols -= cols % across
         chosen = slice(None, None, each)
         part = window(self.cone_vec[chosen], self.images.shape[1:], (0, rows), (0, cols))
-        views = ConeVec.from_vectors(part.source, part.detector, part.u, part.v * down)
+        views = ConeVec.from_vectors(
+            part.source, part.detector, part.u * across, part.v * down
+        )
         truncation = self.truncation
         if truncation is not None:
             truncation = replace(truncation, rows=(truncation.rows + 0.5) / down - 0.5)
         return replace(
             self,
             images=np.ascontiguousarray(
-                binned_mean(self.images[chosen, :rows], (down, 1))
+                binned_mean(self.images[chosen, :rows, :cols], (down, across))
             ),
             cone_vec=views,
             angles=self.angles[chosen],
             truncation=truncation,
             numbers=self.numbers[chosen],
-            binned=(self.binned[0] * down, self.binned[1]),
+            binned=(self.binned[0] * down, self.binned[1] * across),
         )
 
     @cached_property

@@ -17,6 +17,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid
 from flexdt.twin.reconstruction import bias_warnings, fdk
 from flexdt.twin.reconstruction.bias import Bias
+from flexdt.twin.reconstruction.consistency.agreement import Contradiction, Undetermined
 
 SHAPE = (30, 60)
 TURN = np.arange(100) * 3.6
@@ -241,6 +242,69 @@ def test_a_mirrored_body_in_a_parallel_beam_is_not_decided() -> None:
     assert bias is not None
     assert bias.contradiction is None
     assert bias.accuracy(Grid((16, 30, 30), 1.0)) is not None
+
+
+def studied(number: int, *, right: bool = False) -> tuple[misfits.Case, Bias]:
+    """A wrong draw of the study's seed 5353, or its scan before it was made wrong, and what
+    is found of it."""
+    case = misfits.drawn(5353, number, right=False)
+    assert case is not None
+    if right:
+        images, geometry = case.scan.images(), case.scan.geometry
+        case = replace(case, images=images, geometry=geometry)
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    return case, bias
+
+
+def test_streaks_of_few_views_are_compared_in_averaged_columns() -> None:
+    """81 views over several turns of a panel aside: 33 columns show only streaks. What
+    the right geometry leaves open is told as such."""
+    case, wrong = studied(52)
+    assert isinstance(wrong.contradiction, Contradiction)
+    assert case.names & set(wrong.contradiction.kinds)
+    _, right = studied(52, right=True)
+    told = right.contradiction
+    assert isinstance(told, Contradiction)
+    assert told.change is not None
+    assert not told.fits_better
+
+
+def test_small_parts_are_seen_in_the_volume_of_the_explanation() -> None:
+    """Mirrored bricks leave no uniform node in the wrong geometry's volume."""
+    case, wrong = studied(149)
+    assert isinstance(wrong.contradiction, Contradiction)
+    assert case.names & set(wrong.contradiction.kinds)
+
+
+def test_a_better_fit_is_told_however_little_is_claimed() -> None:
+    """A large claimed error covers no order that fits better."""
+    angles = 2.2 * 360.0 / 81.0 * np.arange(81)
+    aside = ConeVec.circular(
+        sod=110, sdd=220, angles=angles, shape=SHAPE, pixel=1.6, offset=(40.8, 0.0)
+    )
+    scan = replace(brick(), geometry=aside)
+    images, _ = misfits.alphabetical(scan.images(), aside, np.random.default_rng(3))
+    bias = misfits.looked_at(misfits.Case("", images, aside, scan, frozenset()))
+    assert bias is not None
+    assert isinstance(bias.contradiction, Contradiction)
+    assert bias.contradiction.kinds == ("names",)
+    assert "they fit better if" in str(bias.contradiction)
+
+
+def test_nothing_is_claimed_of_images_that_fit_any_volume() -> None:
+    """Ten views, and a panel with hardly a column beyond the axis."""
+    scan = brick()
+    few = replace(scan, geometry=scan.geometry[::10])
+    edge = brick(aside=46.0)
+    edge = replace(edge, geometry=edge.geometry[::4])
+    for one, cause in ((few, "fewer than 12 views"), (edge, "a panel so far aside")):
+        case = misfits.Case("", one.images(), one.geometry, one, frozenset())
+        bias = misfits.looked_at(case)
+        assert bias is not None
+        assert isinstance(bias.contradiction, Undetermined)
+        assert cause in str(bias.contradiction)
+        assert bias.accuracy(Grid((16, 30, 30), 1.0)) is None
 
 
 def test_volumes_of_voxels_that_hold_no_region_claim_nothing() -> None:

@@ -9,12 +9,16 @@ volume would differ. All of it is done with few views and rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
-from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+import numpy as np
+
+from flexdt.twin.errors import GeometryError
+from flexdt.twin.reconstruction.coarse_scan import COMPARED_ROWS, CoarseScan
 from flexdt.twin.reconstruction.consistency.suspects import KINDS, SIDES
 from flexdt.twin.reconstruction.consistency.trials import (
+    MAX_RELIABLE_RESIDUAL,
     MIN_EVIDENCE_SIGMAS,
     Trial,
     Tried,
@@ -40,16 +44,22 @@ proportion."""
 MIN_CHANGE: Final = 0.01
 """Least relative change of uniform regions by an explanation that is named: a tilted
 panel's images may fit mirrored rows better, whose volume is the same."""
+MAX_UNTOLD_CHANGE: Final = 0.1
+"""Largest relative change of uniform regions by an explanation as likely that a claim of
+larger errors covers."""
 MIN_FINE_EVIDENCE_SIGMAS: Final = 3.0
 """Least distance of two likelihoods on a finer copy, in standard errors, at which an
-explanation is excluded that the first copy left undecided: the second look of the two."""
+explanation is excluded that the first copy left undecided: the second look of the two.
+From the same distance on, an explanation fits better than the stated geometry."""
 FOUND_BY_TRIALS: Final = frozenset({"offset", "movement"})
 """Kinds whose figure is found by trials, which a finer copy would have to repeat."""
 RIVALS_ROWS: Final = 6
 """Least rows of a scan whose images fit, in which explanations are compared with it."""
 MIN_VIEWS: Final = 12
-"""Least number of views and coarse columns; with fewer a volume fits anything and no
-result is given."""
+"""Least number of views and coarse columns; with fewer a volume fits anything."""
+MAX_AVERAGED_COLUMNS: Final = 4
+"""Largest number of coarse columns that are averaged where finer ones show only streaks
+(assumed)."""
 EQUAL_MISFIT_RATIO: Final = 1.05
 """Largest misfit of an equally good explanation, over the best one's."""
 UNEXPLAINED: Final = (
@@ -69,6 +79,8 @@ class Contradiction:
         figures: of the kinds.
         change: relative change of uniform regions in the volume of an explanation that
             fits as well; None where the images do not fit.
+        fits_better: with `change`, that the best explanation fits better than the stated
+            geometry, by `MIN_FINE_EVIDENCE_SIGMAS`.
     """
 
     misfit: float
@@ -76,6 +88,7 @@ class Contradiction:
     better: float = 1.0
     figures: tuple[str, ...] = ()
     change: float | None = None
+    fits_better: bool = False
 
     def __str__(self) -> str:
         """Describe the contradiction for the user as one sentence, with its figures.
@@ -84,9 +97,10 @@ class Contradiction:
         worse they fit than expected, and the explanations, if any.
         """
         if self.change is not None:
+            how = "better" if self.fits_better else "as well"
             return (
                 "no accuracy is claimed: the images do not decide between geometries; "
-                f"they fit as well if {self._explanations}; values would then differ by "
+                f"they fit {how} if {self._explanations}; values would then differ by "
                 f"{100.0 * self.change:.2g} % in a tenth of the uniform regions"
             )
         sentence = (
@@ -117,14 +131,42 @@ class Contradiction:
         return ", or ".join(words)
 
 
+@dataclass(frozen=True)
+class Undetermined:
+    """Images of too few views or columns to show whether they fit their geometry.
+
+    Attributes:
+        expected: residual of the volume's second reconstruction, over the images: that of
+            right geometry; infinite for fewer than `MIN_VIEWS` views or columns.
+    """
+
+    expected: float
+
+    def __str__(self) -> str:
+        """Describe for the user what no comparison tells, and why, as one sentence."""
+        if np.isinf(self.expected):
+            cause = f"fewer than {MIN_VIEWS} views or columns fit any volume"
+        else:
+            cause = (
+                "of so few views, or of a panel so far aside, the volume of a right scan, "
+                f"projected again, differs from its images by {100 * self.expected:.2g} % "
+                f"(a comparison needs {100 * MAX_RELIABLE_RESIDUAL:.0f} % or less)"
+            )
+        return (
+            "no accuracy is claimed: the images do not show whether they fit their "
+            f"geometry; {cause}"
+        )
+
+
 def compared(scan: CoarseScan) -> Comparison | None:
     """Compare a scan's images with the projections of its volume, and with those of other
     geometries (`Comparison`), which takes most of the time.
 
     Some views and rows are tried first; all views if the expected residual of values or
-    edges is too large. The comparison is `doubtful` if the misfit is at least
-    `MIN_DOUBTFUL_MISFIT` or centroids wander (`MAX_WANDER`). Else it is made once more,
-    with some views and at least `RIVALS_ROWS` rows, and judged by that misfit.
+    edges is too large; averaged columns while that of both is (`_reliable`). The
+    comparison is `doubtful` if the misfit is at least `MIN_DOUBTFUL_MISFIT` or centroids
+    wander (`MAX_WANDER`). Else it is made once more, with at least `RIVALS_ROWS` rows, and
+    judged by that misfit.
 
     Args:
         scan: coarse.
@@ -133,18 +175,67 @@ def compared(scan: CoarseScan) -> Comparison | None:
         None for helices, for scans of fewer than `MIN_VIEWS` views or columns, and where
         images fit of which the panel cuts a part off.
     """
-    if scan.circle.rise or min(len(scan.circle.step), scan.images.shape[2]) < MIN_VIEWS:
+    if scan.circle.rise or too_few(scan):
         return None
     thin = scan.thinned()
     trial = Trial(thin)
     if not trial.telling.all() and len(thin.images) < len(scan.images):
         trial = Trial(scan.thinned(all_views=True))
+    trial = _reliable(scan, trial, COMPARED_ROWS)
+    if not trial.telling.any():
+        return Comparison(trial, doubtful=False)
     if trial.excess >= MIN_DOUBTFUL_MISFIT or trial.wander > MAX_WANDER:
         return Comparison(trial, doubtful=True)
     if not trial.whole:
         return None
-    trial = Trial(scan.thinned(least_rows=RIVALS_ROWS))
+    trial = _reliable(scan, Trial(scan.thinned(least_rows=RIVALS_ROWS)), RIVALS_ROWS)
     return Comparison(trial, doubtful=trial.excess >= MIN_DOUBTFUL_MISFIT)
+
+
+def _fits_better(one: Tried) -> bool:
+    """Return whether an explanation fits better than the stated geometry, by
+    `MIN_FINE_EVIDENCE_SIGMAS` and by `EQUAL_MISFIT_RATIO`.
+
+    One with a figure that was found by trials (`FOUND_BY_TRIALS`) never does: the best of
+    many small movements always fits a little better, and a claim covers it.
+    """
+    if one.suspect.kind in FOUND_BY_TRIALS:
+        return False
+    less = one.residual * EQUAL_MISFIT_RATIO < 1.0
+    return less and one.evidence < -MIN_FINE_EVIDENCE_SIGMAS
+
+
+def too_few(scan: CoarseScan) -> bool:
+    """Return whether a scan has fewer than `MIN_VIEWS` views or columns."""
+    few = min(len(scan.circle.step), scan.images.shape[2]) < MIN_VIEWS
+    return bool(few)
+
+
+def _reliable(scan: CoarseScan, trial: Trial, least_rows: int) -> Trial:
+    """Average the columns of a scan until a comparison is reliable: streaks of few views
+    become shallow, and contradictions stay.
+
+    Args:
+        scan: coarse.
+        trial: without averaged columns.
+        least_rows: of the trial.
+
+    Returns:
+        `trial` if one of its measures is reliable, else the first that has one, of all
+        views and of columns averaged in pairs, threes, up to `MAX_AVERAGED_COLUMNS`;
+        without such a one the last that FDK can use.
+    """
+    across = 2
+    while not trial.telling.any() and across <= MAX_AVERAGED_COLUMNS:
+        if scan.images.shape[2] // across < MIN_VIEWS:
+            break
+        coarser = scan.thinned(all_views=True, least_rows=least_rows, across=across)
+        try:
+            trial = Trial(coarser)
+        except GeometryError:  # too few columns beyond the axis
+            break
+        across += 1
+    return trial
 
 
 class Comparison:
@@ -197,6 +288,16 @@ class Comparison:
                 self._tried.append(self._movement)
 
     @property
+    def undetermined(self) -> Undetermined | None:
+        """The reason why a whole scan's images do not show whether they fit their
+        geometry: no measure is reliable; None if one is.
+        """
+        trial = self._trial
+        if not trial.whole or trial.telling.any():
+            return None
+        return Undetermined(float(trial.expected.min()))
+
+    @property
     def widening(self) -> float:
         """Factor of a bound where the images fit less well than those of most scans: the
         misfit over `MIN_DOUBTFUL_MISFIT`; 1 unless doubtful, whole and tried.
@@ -235,7 +336,8 @@ class Comparison:
         self, claimed: float, *, sides_known: bool = False
     ) -> Contradiction | None:
         """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`) and would
-        change the volume by more than is claimed.
+        change the volume by more than is claimed or `MAX_UNTOLD_CHANGE`, whichever is less;
+        and those that fit better (`_fits_better`) and change it by `MIN_CHANGE`.
 
         Args:
             claimed: largest relative error that is claimed of nine of ten uniform
@@ -251,12 +353,13 @@ class Comparison:
             geometry of a doubtful scan.
         """
         trial = self._trial
+        covered = min(claimed, MAX_UNTOLD_CHANGE)
         rivals = [
             one
             for one in self._tried
             if one.evidence < self._least_evidence_against(one)
             and not (sides_known and one.suspect.kind in SIDES)
-            and one.change > claimed
+            and one.change > (MIN_CHANGE if _fits_better(one) else covered)
             and trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
         ]
         if not trial.whole or not rivals:
@@ -272,7 +375,8 @@ class Comparison:
             change = None
         else:
             change = max(one.change for one in as_good)
-        return self._named(as_good, best.score, change)
+        named = self._named(as_good, best.score, change)
+        return replace(named, fits_better=change is not None and _fits_better(best))
 
     @property
     def _clear_score(self) -> float:

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
@@ -65,8 +66,8 @@ class Tried:
         score: its misfit over that of the stated geometry.
         residual: the same with noise, from which the evidence is.
         evidence: by how many standard errors the stated geometry fits better.
-        change: what nine of ten uniform nodes of the volume change by at most, relative
-            to their values.
+        change: what nine of ten uniform nodes change by at most, relative to their
+            values (`Trial._change`).
     """
 
     suspect: Suspect
@@ -96,11 +97,15 @@ class Trial:
 
         Args:
             scan: coarse; all of its views and rows are compared.
+
+        Raises:
+            GeometryError: FDK cannot use the scan's geometry.
         """
         self.scan = scan
         self.whole = scan.truncation is None or not scan.truncation.cut_off.any()
         own = Reprojection.of(scan, scan.images, scan.cone_vec, scan.truncation)
-        assert own is not None  # as a scan has a volume
+        if own is None:
+            raise GeometryError("FDK cannot use the views of a coarse copy of the scan")
         self.own = own
         self._seconds: dict[Tried, FloatArray] = {}
         second = Reprojection.of(scan, own.again, scan.cone_vec, None)
@@ -223,7 +228,7 @@ class Trial:
         spread = max(float(each.std(ddof=1)), np.finfo(np.float32).tiny)
         evidence = float(each.mean()) * np.sqrt(len(each)) / spread
         residual = float(np.exp(each.mean()))
-        change = self._change(suspect, shown)
+        change = self._change(suspect, shown, better=residual < 1.0)
         return Tried(suspect, shown, score, residual, evidence, change)
 
     def _shown(self, suspect: Suspect) -> Reprojection | None:
@@ -237,8 +242,10 @@ class Trial:
             self.scan, suspect.images, suspect.cone_vec, truncation, suspect.shifts
         )
 
-    def _change(self, suspect: Suspect, shown: Reprojection) -> float:
-        """Compute the largest relative change of nine of ten uniform nodes.
+    def _change(self, suspect: Suspect, shown: Reprojection, *, better: bool) -> float:
+        """Compute the largest relative change of nine of ten uniform nodes of the stated
+        geometry's volume; of an explanation that fits better also of its own: a wrong
+        geometry leaves small parts without uniform nodes.
 
         A mirrored volume is turned upside down first (`UPSIDE_DOWN`), and one of `TURNED`
         is compared as it is and turned onto the scan's, whichever is less: the zero of an
@@ -247,12 +254,26 @@ class Trial:
         Args:
             suspect: the explanation.
             shown: its volume; voxels of the rim count as 0.
+            better: its residual is the smaller one.
         """
         nodes = self._nodes
-        values = np.where(self.scan.rim, np.float32(0.0), np.nan_to_num(shown.values))
-        other = smoothed(values)
+        values = shown.values
         if suspect.kind in UPSIDE_DOWN:
-            other = other[::-1]
+            values = values[::-1]
+        if better:
+            theirs = UniformNodes.of(values, self.scan.rim)
+            sides = [(nodes, theirs.found), (theirs, nodes.found)]
+        else:
+            values = np.where(self.scan.rim, np.float32(0.0), np.nan_to_num(values))
+            sides = [(nodes, smoothed(values))]
+        return max(self._change_of(suspect, *side) for side in sides)
+
+    def _change_of(
+        self, suspect: Suspect, nodes: UniformNodes, other: Float32Array
+    ) -> float:
+        """Compute the change of a volume's uniform nodes in another volume, which is also
+        turned onto it for one of `TURNED`.
+        """
         change = nodes.change(other)
         if suspect.kind not in TURNED:
             return change
