@@ -140,7 +140,7 @@ def test_a_tile_has_a_least_width(axis: int) -> None:
     [
         ("strain_z", 1), ("strain_x", 2), ("exposed_long", 2), ("as_assumed", 3),
         ("frame_doubled", 4), ("frame_doubled", 1011), ("frame_lost", 5), ("frame_lost", 1008),
-        ("exposed_again", 6),
+        ("exposed_again", 6), ("tiles_apart", 58000),
     ],
 )  # fmt: skip
 def test_a_drawn_cause_is_named_and_what_is_offered_holds(kind: str, seed: int) -> None:

@@ -428,6 +428,21 @@ class Candidates:
                 return pick
         return 0.0
 
+    def parts(self, choice: Choice) -> list[Choice]:
+        """List a choice, and what it leaves without one of its causes."""
+        parts = [with_pick(choice, i, 0.0) for i, pick in enumerate(choice) if pick]
+        return [choice, *parts]
+
+    def rank(self, choice: Choice) -> tuple[float, float]:
+        """Return the evidence of a choice, and the odds of the last border, by which
+        tables of one fit are compared.
+        """
+        return self.evidence(choice), self.odds()[border_name(self.borders[-1])]
+
+    def chosen_borders(self, choice: Choice) -> tuple[Border, ...]:
+        """Return the borders of panel tiles that a choice has."""
+        return tuple(b for b in self.borders if self.width(choice, border_name(b)))
+
     def border(self, choice: Choice) -> Border | None:
         """Find a tile's border that a choice's residuals suggest; borders known already
         are not found again.
@@ -507,20 +522,8 @@ def explained_by_causes(
     borders: tuple[Border, ...] = ()
     applied: tuple[object, ...] = ()
     for _ in range(MOST_ROUNDS):
-        candidates = Candidates(fit, known, borders)
-        choice = candidates.best()
-        while len(borders) < MOST_BORDERS:
-            more = candidates.border(choice)
-            if more is None:
-                break
-            wider = Candidates(fit, known, (*borders, more))
-            chosen = wider.best()
-            if not wider.width(chosen, border_name(more)):
-                break
-            borders = wider.borders
-            candidates = wider
-            choice = chosen
-        borders = tuple(b for b in borders if candidates.width(choice, border_name(b)))
+        candidates, choice = _searched(fit, known, borders)
+        borders = candidates.chosen_borders(choice)
         options = _options(candidates, choice, borders)
         if tuple(options.values()) == applied or not (applied or any(options.values())):
             break
@@ -548,6 +551,46 @@ def explained_by_causes(
     )
     found = Found(odds, names, doubtful, candidates.strain(choice))
     return _widened(fit, candidates, choice), found
+
+
+def _searched(
+    fit: FitResult, known: Known, borders: tuple[Border, ...]
+) -> tuple[Candidates, Choice]:
+    """Find the most likely causes, borders of the panel's tiles among them.
+
+    A border is looked for in what the most likely causes leave of the residuals, and in
+    what they leave without one of them: places of beads that keep their rows in all
+    frames explain a border along rows completely. The search ends with the first border
+    that is not chosen. That border stays in the table if it is open.
+
+    Args:
+        fit: of the geometry.
+        known: statements on the phantom and the positions.
+        borders: found before.
+
+    Returns:
+        The table, with at most `MOST_BORDERS` borders, and its most likely choice.
+    """
+    candidates = Candidates(fit, known, borders)
+    choice = candidates.best()
+    while len(candidates.borders) < MOST_BORDERS:
+        found = {candidates.border(c): None for c in candidates.parts(choice)}
+        some = [
+            (table, table.best())
+            for border in found
+            if border is not None
+            for table in [Candidates(fit, known, (*candidates.borders, border))]
+        ]
+        if not some:
+            break
+        wider, chosen = max(some, key=lambda one: one[0].rank(one[1]))
+        name = border_name(wider.borders[-1])
+        if wider.width(chosen, name) or wider.odds()[name] > -OPEN_LOG_ODDS:
+            candidates = wider
+            choice = chosen
+        if not wider.width(chosen, name):
+            break
+    return candidates, choice
 
 
 def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResult:
