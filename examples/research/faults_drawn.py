@@ -7,6 +7,7 @@ and the conic through those points has the centre. `causes_named` calibrates the
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -225,7 +226,11 @@ def phantom(rng: Rng, beads: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A scan that a fault may change before and after its shadows are made."""
+    """A scan that a fault may change before and after its shadows are made.
+
+    `slow_px` is the standard deviation of errors of single balls [px] that a frame has
+    in common with the one before to a part `slow_part`.
+    """
 
     world: World
     believed: Believed
@@ -235,6 +240,8 @@ class Draft:
     silent: bool = False
     after: Callable[[list[Array | None]], list[Array | None]] | None = None
     truth: Mapping[str, float] = field(default_factory=dict)
+    slow_px: float = 0.0
+    slow_part: float = 0.0
 
 
 def drawn(kind: str, seed: int) -> Faulty:
@@ -267,6 +274,8 @@ def drawn(kind: str, seed: int) -> Faulty:
         rng,
     )
     centres, sizes = shadows(draft.world)
+    if draft.slow_px > 0:
+        centres += draft.slow_px * _slow(rng, centres.shape, draft.slow_part)
     spots: list[Array | None] = []
     for place, size, shown in zip(centres, sizes, draft.world.shown, strict=True):
         rows = np.column_stack([place, size])[shown]
@@ -298,6 +307,17 @@ def drawn(kind: str, seed: int) -> Faulty:
     )
 
 
+def _slow(rng: Rng, shape: tuple[int, ...], part: float) -> Array:
+    """Draw normal errors of standard deviation 1, correlated along the first axis by `part`
+    from one to the next (autoregressive of first order).
+    """
+    errors = rng.normal(size=shape)
+    for before, now in itertools.pairwise(errors):
+        now *= math.sqrt(1.0 - part**2)
+        now += part * before
+    return errors
+
+
 Fault = Callable[[Draft, Rng], Draft]
 UNSEEN: Final = {
     "dD_x": 2.0, "dD_y": 2.0, "dD_z": 1.0, "det_roll": 0.3, "det_pitch": 0.3, "det_yaw": 0.3,
@@ -322,6 +342,17 @@ def _sign(rng: Rng) -> float:
 
 def _nothing(draft: Draft, rng: Rng) -> Draft:
     return replace(draft, silent=True)
+
+
+def _slow_errors(draft: Draft, rng: Rng) -> Draft:
+    """Let places of balls err slowly by 0.5 to 5 times their noise, each by itself."""
+    return replace(
+        draft,
+        silent=True,
+        names=("drift|vibration|bead_errors",),
+        slow_px=draft.noise_px * float(rng.uniform(0.5, 5.0)),
+        slow_part=float(rng.uniform(0.5, 0.9)),
+    )
 
 
 def _low_dose(draft: Draft, rng: Rng) -> Draft:
@@ -926,6 +957,7 @@ TURNS: Final = ("dD_x", "det_yaw")
 KINDS: Final[Mapping[str, Fault]] = {
     "nothing": _nothing,
     "low_dose": _low_dose,
+    "slow_errors": _slow_errors,
     "detector_aside": _offset("dD_x", 0.3, 4.0, *TURNS, silent=True),
     "detector_far_aside": _offset("dD_x", 40.0, 60.0, *TURNS),
     "detector_higher": _offset("dD_y", 0.3, 4.0, *LEANS, silent=True),

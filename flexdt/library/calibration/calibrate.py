@@ -584,7 +584,7 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         use = "Safe to reconstruct"
     else:
         use = "Too uncertain for a sharp volume"
-    if result.fit.panel is not None:
+    if any(f.code == "panel_distorted" for f in result.findings):
         use += " with this correction, which undoes the panel's distortion"
     if any(f.code == "saturated" for f in result.findings):
         use = "Geometry to be used, images not to be reconstructed (the flat field is saturated)"

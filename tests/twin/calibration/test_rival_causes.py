@@ -175,6 +175,14 @@ def test_an_exact_phantom_has_no_cause(seed: int) -> None:
     assert not [line for line in found.said if line.startswith(SAID)]
 
 
+@pytest.mark.parametrize("seed", [0, 4])
+def test_slow_errors_of_single_beads_are_no_evidence_of_another_cause(seed: int) -> None:
+    """They were told as a phantom aslant and as an open cause."""
+    found = scored("slow_errors", seed)
+    assert found.verdict == "right", found
+    assert not found.wrong, found
+
+
 def test_a_strain_takes_part_in_every_sigma() -> None:
     """Of magnification and distance, as scale and distance look alike."""
     scan = drawn("nothing", 7)

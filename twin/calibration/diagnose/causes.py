@@ -149,7 +149,13 @@ Refit = Callable[..., FitResult]
 class Candidates:
     """The table of a fit: its geometry's columns, and those of every cause."""
 
-    def __init__(self, fit: FitResult, known: Known, borders: Sequence[Border]) -> None:
+    def __init__(
+        self,
+        fit: FitResult,
+        known: Known,
+        borders: Sequence[Border],
+        alike: float = 1.0,
+    ) -> None:
         """Tabulate the residuals' derivatives with respect to all causes, residuals of
         bad spots (beyond `OUTLIER_SIGMAS`) weighted less.
 
@@ -160,11 +166,13 @@ class Candidates:
             fit: of the geometry.
             known: statements on the phantom and the positions.
             borders: panel borders that are causes, too.
+            alike: number of neighbouring frames whose residuals count as one.
         """
         problem = fit.problem
         x = fit.solution.x
         self.fit = fit
         self.known = known
+        self.alike = alike
         self.borders = tuple(borders)
         self.count = problem.layout.parameter_count
         everything, there = _with_every_column(problem, x, panel_of(fit, borders))
@@ -185,7 +193,7 @@ class Candidates:
         values = left.ravel() + rows @ causes
         self.rows = table
         self.values = values * share[:, 0]
-        self.table = Table(self.rows, self.values, known.floor)
+        self.table = Table(self.rows, self.values, known.floor, alike)
         self.causes = self._causes(everything)
         self._judged: dict[Choice, Judged | None] = {}
         self.means = np.zeros(table.shape[1])
@@ -473,7 +481,7 @@ class Candidates:
             self.rows[:, model.columns],
             self.values,
             widths,
-            model.noise,
+            model.noise * math.sqrt(self.alike),
             predicted,
             problem.whiten[problem.seen],
             shape,
@@ -506,7 +514,9 @@ def explained_by_causes(
     open.
 
     Causes, up to `MOST_BORDERS` borders between panel tiles among them, are searched
-    again after each new fit, until they stay the same or for `MOST_ROUNDS`.
+    again after each new fit, until they stay the same or for `MOST_ROUNDS`. Residuals that
+    a fit leaves correlated from frame to frame count by their correlation length, so that
+    slow errors are no evidence of slow causes.
 
     Args:
         fit: of the geometry, the phantom's strain with its prior.
@@ -521,17 +531,23 @@ def explained_by_causes(
     first = fit
     borders: tuple[Border, ...] = ()
     applied: tuple[object, ...] = ()
+    # Before a cause is fitted, it correlates the residuals itself.
+    alike = 1.0
     for _ in range(MOST_ROUNDS):
-        candidates, choice = _searched(fit, known, borders)
+        candidates, choice = _searched(fit, known, borders, alike)
         borders = candidates.chosen_borders(choice)
         options = _options(candidates, choice, borders)
-        if tuple(options.values()) == applied or not (applied or any(options.values())):
+        chosen = tuple(options.values())
+        settled = chosen == applied or not (applied or any(chosen))
+        if settled and alike == fit.certificate.enlargement:
             break
-        applied = tuple(options.values())
-        better = refit(**options)
-        if not better.identifiable:
-            return first, Found()
-        fit = better
+        if not settled:
+            applied = chosen
+            better = refit(**options)
+            if not better.identifiable:
+                return first, Found()
+            fit = better
+        alike = fit.certificate.enlargement
     odds = candidates.odds()
     moves = any(
         p for c, p in zip(candidates.causes, choice, strict=True) if c.name in MOTIONS
@@ -554,7 +570,7 @@ def explained_by_causes(
 
 
 def _searched(
-    fit: FitResult, known: Known, borders: tuple[Border, ...]
+    fit: FitResult, known: Known, borders: tuple[Border, ...], alike: float
 ) -> tuple[Candidates, Choice]:
     """Find the most likely causes, borders of the panel's tiles among them.
 
@@ -567,11 +583,12 @@ def _searched(
         fit: of the geometry.
         known: statements on the phantom and the positions.
         borders: found before.
+        alike: number of neighbouring frames whose residuals count as one.
 
     Returns:
         The table, with at most `MOST_BORDERS` borders, and its most likely choice.
     """
-    candidates = Candidates(fit, known, borders)
+    candidates = Candidates(fit, known, borders, alike)
     choice = candidates.best()
     while len(candidates.borders) < MOST_BORDERS:
         found = {candidates.border(c): None for c in candidates.parts(choice)}
@@ -579,7 +596,7 @@ def _searched(
             (table, table.best())
             for border in found
             if border is not None
-            for table in [Candidates(fit, known, (*candidates.borders, border))]
+            for table in [Candidates(fit, known, (*candidates.borders, border), alike)]
         ]
         if not some:
             break

@@ -52,6 +52,9 @@ BLOCK_SHARE = 0.7
 """Part of the frames of a block, from the first or to the last of a scan, that do not fit."""
 MOST_USED = 0.9
 """Share of the positions below which a fit is good only because it left the others out."""
+BEAD_ERROR_SIGMAS = 1.0
+"""Errors that repeat with the turn, in standard deviations of a position, up to which they
+widen the intervals alone and are no finding."""
 NOISE_SIGMAS = 1.5
 """Stated sigmas up to which residuals are noise, however large."""
 MAX_SIZE_ERROR = 0.04
@@ -360,8 +363,8 @@ def _one_is_elsewhere(plain: FitResult, moved: FitResult) -> bool:
 
 def _drifts(fit: FitResult) -> list[Finding]:
     """List warnings: the strongest drift or jump of a parameter, then errors that the
-    beads of a frame share (vibration), then those that a bead repeats in each turn; empty
-    without any.
+    beads of a frame share (vibration), then those that a bead repeats in each turn, if
+    they exceed the noise of a position (`BEAD_ERROR_SIGMAS`); empty without any.
     """
     certificate = fit.certificate
     out = []
@@ -391,11 +394,10 @@ def _drifts(fit: FitResult) -> list[Finding]:
             "the beads of a frame err together (vibration or angle jitter)",
         ),
         (
-            certificate.turning,
+            certificate.turning > BEAD_ERROR_SIGMAS,
             "bead_errors",
-            "single beads err in a way that repeats as the object turns (bead positions, "
-            "background, "
-            "distortion)",
+            f"single beads err by about {certificate.turning * certificate.rms_px:.2g} px, "
+            "smoothly as the object turns (bead positions, background, distortion)",
         ),
     ):
         if there:

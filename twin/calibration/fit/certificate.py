@@ -264,8 +264,8 @@ class Certificate:
         rms_px: root mean square residual per coordinate.
         enlargement: factor on the covariance for residuals correlated from frame to frame.
         shared: the beads of a frame err together; the covariance allows for it.
-        turning: errors of single beads repeat as the object turns; the covariance allows for
-            it.
+        turning: root mean square of errors of single beads that repeat as the object turns,
+            in standard deviations of a position; 0: none. The covariance allows for them.
         drifts: changes of parameters during the scan that the residuals show; each parameter's
             sigma contains its own.
         residuals_px: (n, k, 2) measured minus predicted, nan where unseen.
@@ -283,7 +283,7 @@ class Certificate:
     rms_px: float
     enlargement: float
     shared: bool
-    turning: bool
+    turning: float
     drifts: tuple[Drift, ...]
     residuals_px: FloatArray
     used: npt.NDArray[np.bool_]
@@ -487,7 +487,8 @@ def certify(
     covariance = prior + enlargement * (
         noise**2 * spec.unit_covariance[:reported, :reported] - cross(gain.T, gain.T)
     )
-    structure = (False, False)
+    shared = False
+    turning = 0.0
     moving: tuple[Drift, ...] = ()
     if spec.full and noise > MAX_ROUNDING:
         left = Residuals(
@@ -498,7 +499,7 @@ def certify(
             spec.unit_covariance,
             noise,
         )
-        covariance, structure, moving = _widened(
+        covariance, shared, turning, moving = _widened(
             left, predicted, covariance, prior, sampling_px
         )
     images = np.sqrt(np.maximum(np.diag(covariance) - np.diag(prior), 0.0))
@@ -534,8 +535,8 @@ def certify(
         noise=noise,
         rms_px=float(np.sqrt(np.mean(used_residual**2))) if use.any() else math.nan,
         enlargement=enlargement,
-        shared=structure[0],
-        turning=structure[1],
+        shared=shared,
+        turning=turning,
         drifts=moving,
         residuals_px=residual,
         used=use,
@@ -639,7 +640,7 @@ def _widened(
     covariance: FloatArray,
     prior: FloatArray,
     sampling_px: float,
-) -> tuple[FloatArray, tuple[bool, bool], tuple[Drift, ...]]:
+) -> tuple[FloatArray, bool, float, tuple[Drift, ...]]:
     """Enlarge the covariance by the structure of the residuals beyond white noise: errors
     that beads share, places in the pixel grid, errors that repeat with the turn, and
     drifts.
@@ -654,8 +655,9 @@ def _widened(
         sampling_px: see `certify`; 0 for none.
 
     Returns:
-        The covariance; whether the beads of a frame err together, and whether errors
-        repeat with the turn; and drifts, empty unless one is `SIGNIFICANT`.
+        The covariance; whether the beads of a frame err together; errors that repeat with
+        the turn, in standard deviations of a position; and drifts, empty unless one is
+        `SIGNIFICANT`.
     """
     reported = len(covariance)
     together = cluster_covariance(left)
@@ -666,8 +668,10 @@ def _widened(
         gain = left.unit_covariance[:reported] @ cross(left.jacobian, shifts)
         covariance = covariance + sampling_px**2 * gain @ gain.T
     turning = turning_errors(left)
+    size = 0.0
     if turning is not None:
-        covariance = covariance + turning[:reported, :reported]
+        covariance = covariance + turning.covariance[:reported, :reported]
+        size = turning.size
     moving = drifts(left)
     for drift in moving:
         bias = drift.bias[:reported]
@@ -682,7 +686,7 @@ def _widened(
         certain = moving
     else:
         certain = ()
-    return covariance, (together is not None, turning is not None), certain
+    return covariance, together is not None, size, certain
 
 
 def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:

@@ -56,18 +56,21 @@ class Judged:
 class Table:
     """Rows of residuals and of all columns that a model may have."""
 
-    def __init__(self, rows: FloatArray, values: FloatArray, floor: float) -> None:
+    def __init__(
+        self, rows: FloatArray, values: FloatArray, floor: float, alike: float = 1.0
+    ) -> None:
         """Sum up the normal equations of rows; the rows are not kept.
 
         Args:
             rows: (m, q).
             values: (m,) residuals that the columns are to explain.
             floor: least standard deviation of the values.
+            alike: number of correlated rows that count as one, 1 or more.
         """
-        self._count = len(values)
-        self._gram = cross(rows, rows)
-        self._push = np.einsum("mq,m->q", rows, values)
-        self._total = float(values @ values)
+        self._count = len(values) / alike
+        self._gram = cross(rows, rows) / alike
+        self._push = np.einsum("mq,m->q", rows, values) / alike
+        self._total = float(values @ values) / alike
         self._floor = floor
 
     def judged(
@@ -99,7 +102,7 @@ class Table:
         total = max(total, LEAST_SHARE * self._total)
         power = np.diag(gram)
         flats = int(flat.sum())
-        freedom = max(self._count - flats, 1)
+        freedom = max(self._count - flats, 1.0)
         variance = max(noise, self._floor) ** 2
         out = None
         for _ in range(PASSES):
@@ -130,7 +133,7 @@ class Table:
         return out
 
 
-def freedom_log(count: int, variance: float) -> float:
+def freedom_log(count: float, variance: float) -> float:
     """Return the part of the evidence from the spread of `count` values."""
     return count * math.log(variance)
 

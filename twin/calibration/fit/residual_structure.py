@@ -221,8 +221,21 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
     return np.asarray(out * (n / (n - fitted / 2)))
 
 
-def turning_errors(left: Residuals) -> FloatArray | None:
-    """Compute the covariance to add for errors of a bead that repeat as the object turns.
+@dataclass(frozen=True, eq=False)
+class TurningErrors:
+    """Errors of single beads that are smooth functions of the angle.
+
+    Attributes:
+        covariance: (p, p) that they add to the fitted values', edge units.
+        size: root mean square, in standard deviations of a position.
+    """
+
+    covariance: FloatArray
+    size: float
+
+
+def turning_errors(left: Residuals) -> TurningErrors | None:
+    """Estimate errors of a bead that repeat as the object turns, and the covariance to add.
 
     Bead positions that are off, a background that pulls centroids, distortion of the
     detector: each bead's error is then a smooth function of the angle. Its harmonics 0 to
@@ -233,7 +246,7 @@ def turning_errors(left: Residuals) -> FloatArray | None:
         left: residuals with their derivatives, covariance and noise.
 
     Returns:
-        (p, p); None if there are no such errors, or for fewer than 16 frames.
+        The errors; None if there are none, or for fewer than 16 frames.
     """
     problem = left.problem
     jacobian = left.jacobian
@@ -302,7 +315,8 @@ def turning_errors(left: Residuals) -> FloatArray | None:
         for m, variance in enumerate(variances):
             part = gain[:, (coordinate == c) & ((kind + 1) // 2 == m)]
             out += variance * part @ part.T
-    return out
+    size = math.sqrt(float(excess @ whole) / len(residual)) / noise
+    return TurningErrors(out, size)
 
 
 def _excess(
