@@ -50,9 +50,11 @@ class Mutant:
     node: int
     choice: int
     lines: range
-    """Those of the statement, or of its head, in the file."""
+    """Those of the statement, or of its head, in the file; for a default those where the
+    function begins."""
     inside: bool
-    """Whether it runs when a function is called, not when the module is imported."""
+    """Whether it counts when a function is called, as its defaults do, not when the module
+    is imported."""
 
     def __str__(self) -> str:
         return f"{self.file}:{self.lines[0]} ({self.function}): {self.before}  ->  {self.after}"
@@ -140,10 +142,10 @@ def places(
             if isinstance(node, ast.keyword) and node.arg == "strict":
                 continue
             its_lines, its_function = lines, function
-            its_inside = inside or (
-                isinstance(tree, ast.FunctionDef | ast.AsyncFunctionDef)
-                and field == "body"
-            )
+            its_inside = inside
+            if isinstance(tree, ast.FunctionDef | ast.AsyncFunctionDef):
+                its_inside = True
+                its_lines = _begin(tree)  # defaults are seen by whoever calls it
             if isinstance(node, ast.stmt):
                 its_lines = _head(node)
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -152,6 +154,12 @@ def places(
                 )
             yield Place(tree, field, node, its_function, its_lines, its_inside)
             yield from places(node, its_function, its_lines, its_inside)
+
+
+def _begin(function: ast.FunctionDef | ast.AsyncFunctionDef) -> range:
+    """The lines of a function's first statement behind its docstring."""
+    documented = ast.get_docstring(function, clean=False) is not None
+    return _head(function.body[1 if documented and len(function.body) > 1 else 0])
 
 
 def _head(statement: ast.stmt) -> range:
