@@ -187,7 +187,8 @@ async def move(
 ) -> str:
     """Move to a position and wait for arrival.
 
-    Where no image sequence takes the armed move within ARMED_S, it is made without.
+    With a trigger position, the move waits for an image sequence and is then a part of
+    its job. Where none takes the armed move within ARMED_S, it is made without.
 
     Args:
         twin: state and requests.
@@ -197,7 +198,8 @@ async def move(
     Returns:
         The motor's reply, see `ConnectedTwin.motor_text`.
 
-    With a trigger position, the move waits for an image sequence and is then a part of its job.
+    Raises:
+        Refusal: the move was refused or ended elsewhere, or its sequence failed.
     """
     if command.trigger is None:
         return await _go(twin, command.component, command.target, progress)

@@ -203,6 +203,7 @@ class TwinServer:
     ) -> None:
         """Build all parts of a server, and restore corrections and state from the folder `root`.
 
+        Files that killed writers left in `root` are deleted, damaged ones set aside.
         Nothing runs and no job is restored before `start`. `wall` gives real seconds,
         `seed` the noise's seed of a scan, `truth` the scanner's true geometry (None: it
         is nominal).

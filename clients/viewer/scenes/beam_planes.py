@@ -49,12 +49,12 @@ class BeamPlane:
 def fans(
     world: World, lines: npt.NDArray[np.generic], radius_mm: float
 ) -> list[BeamPlane]:
-    """Compute four planes of the beam: of the image's middle column and middle row, each
-    before and behind the sample.
+    """Compute four planes of the beam: through the image's middle column and middle row,
+    each one before the sample, with all light, and one behind it, with the light that
+    passes.
 
-    Four planes: for each direction one before the sample, with all light, and one behind
-    it, with the light that passes. The transmission is exp(-line integral). The order is
-    column before, column behind, row before, row behind.
+    The transmission is exp(-line integral). The order is column before, column behind,
+    row before, row behind.
 
     Args:
         world: of the image's moment.
@@ -77,7 +77,8 @@ def fans(
 def _fan(
     world: World, across: FloatArray, through: FloatArray, side: float, radius: float
 ) -> BeamPlane:
-    """Draw the rays to a line of pixels through the image's middle.
+    """Draw the rays to a line of pixels through the image's middle, as one picture of
+    `SHAPE` pixels in the plane of focal spot and line.
 
     Pixels are as opaque as transmission says, transparent where no ray passes. The
     opacity is at most `MOST` of 255, times the transmission of the pixel where the ray

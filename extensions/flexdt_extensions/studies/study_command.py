@@ -57,7 +57,8 @@ def study(
     """Repeat an experiment of the thesis.
 
     EXPERIMENT: beads, phantoms, damping, detector (6.6), real (experiment 4: the 242 fits of
-    real scans explained, or on synthetic images), basin (sensitivity to the start).
+    real scans explained, or on synthetic images), basin (sensitivity to the start). The command
+    fails, after all results, if a run failed.
     """
     from flexdt_extensions.studies.study import run_study
     from flexdt_extensions.studies.study_report import open_directions, real_lines

@@ -22,8 +22,8 @@ from flexdt_extensions.studies.runs import Run, grid
 def write_study(out: Path, document: Mapping[str, Any], runs: Sequence[Run]) -> None:
     """Write everything about a study into a folder (made if need be).
 
-    These are summary.json and report.html, and the charts of errors by setting as SVG,
-    too.
+    These are summary.json and report.html; of experiments other than basin and real also
+    the report's two charts, mae.svg and parameters.svg.
 
     Args:
         out: the folder.
@@ -105,10 +105,11 @@ def _basin_charts(document: Mapping[str, Any]) -> list[str]:
 
 
 def _real_charts(document: Mapping[str, Any]) -> list[str]:
-    """Plot the logged fits with their simulation: for each scan alpha against log N, and
-    a table.
+    """Plot the logged fits with their simulation: for each scan alpha [deg] against log10
+    of N, and a table.
 
-    Missing values are gaps in the curve (nan).
+    Three curves: logged, simulated as the author fits, and simulated with right angles
+    (our fit). Missing values are gaps in the curve (nan).
 
     Args:
         document: of the study.
@@ -309,6 +310,9 @@ def heat_map(
 ) -> str:
     """Draw a table of numbers as SVG, green where they are good and red where not; each
     cell shows its number.
+
+    With `good_below` colours follow the logarithm of value over limit, up to a factor of
+    100 either way; otherwise there are two colours.
 
     Args:
         values: (rows, columns); nan is white.
