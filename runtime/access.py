@@ -206,7 +206,7 @@ def token_matches(given: str | None, token: str) -> bool:
 def read_token(file: Path | None) -> str | None:
     """Read the token that a server requires or a client brings.
 
-    Spaces around it are removed.
+    Spaces around a file's token are removed.
 
     Args:
         file: whose first line it is; None: the environment's FLEXDT_TOKEN.
@@ -271,7 +271,8 @@ def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | N
         The context; None if no files are given.
 
     Raises:
-        AccessError: only one of the two is given, or a file is invalid.
+        AccessError: only one of the two is given.
+        AccessFileError: a file is missing or invalid.
     """
     if certificate is None and key is None:
         return None

@@ -321,7 +321,9 @@ async def served_pages(
         Facts for the process's `ready` line: `http_port`, the port in use.
 
     Raises:
-        AccessError: the address can be reached by others and there is no token.
+        AccessError: the address can be reached by others and there is no token, or the
+            token has fewer than 16 characters.
+        AccessFileError: the token's file cannot be read.
         OSError: the address is taken or not ours.
     """
     if settings.http_port is None:
@@ -361,10 +363,13 @@ def watching_pages(
     """Make the pages `/healthz` and `/metrics` of a running server.
 
     Args:
-        health: content of `/healthz` in addition to its status.
+        health: content of `/healthz` in addition to its status, which it may replace.
         figures: of `/metrics`, in addition to those that every process has.
         requests: counts of answered requests, for `/metrics`; None where there are none.
         failed: whether a part of the server has died; then `/healthz` answers 503.
+
+    Returns:
+        Path -> function that makes the page.
     """
 
     def healthz() -> HttpResponse:

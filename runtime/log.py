@@ -230,6 +230,8 @@ def set_up(
     """Send this program's log to `stream` as JSON lines, in place of its earlier handlers
     (for a process's main).
 
+    The root logger's handlers get these lines no longer.
+
     Args:
         stream: target.
         level: least level that is written.

@@ -48,7 +48,8 @@ class Address:
 def address(text: str) -> Address:
     """Parse HOST:PORT or [IPv6]:PORT.
 
-    The host is not looked up and may be any text; brackets around it are removed.
+    The host is not looked up and may be any text; brackets around it and spaces around
+    the whole are removed.
 
     Raises:
         typer.BadParameter: the text has another form, or the port is not from 1 to

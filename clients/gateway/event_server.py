@@ -77,19 +77,18 @@ class Gateway:
     def __init__(
         self, twin: ConnectedTwin, host: str, port: int, inbound: int | None = None
     ) -> None:
-        """Bind both sockets.
+        """Bind both sockets; `run` serves.
 
-        Raises too if `host` is not an address of this machine alone. `run` serves. The
-        neighbouring port is used if `inbound` is None. After an error nothing stays open.
-
+        After an error nothing stays open.
 
         Args:
             twin: connection and state.
             host: address, of this machine alone.
             port: of the PUB socket; 0 for a free one.
-            inbound: port of the socket that receives; the next one without.
+            inbound: port of the socket that receives; None is the one after `port`.
 
         Raises:
+            AccessError: other machines can reach `host`.
             OSError: a port is in use.
         """
         check_loopback(host)

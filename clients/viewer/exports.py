@@ -39,19 +39,18 @@ DARK = (16, 19, 25)
 
 
 def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> bytes:
-    """Render a client's view as PNG, on the page's background.
+    """Render a client's view as PNG, on the page's background; blocks.
 
-    `client` is one open view. The answer is awaited for 30 s; translucent pixels are
-    blended with `LIGHT` or `DARK`.
+    Translucent pixels are blended with `LIGHT` or `DARK`.
 
     Args:
-        client: renders it.
+        client: one open view, whose browser renders it.
         width: [px].
         height: [px].
         dark: the page's colours.
 
     Raises:
-        RuntimeError, TimeoutError: the browser does not answer.
+        RuntimeError, TimeoutError: the browser does not answer within 30 s.
     """
     rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(
         np.float32
@@ -127,10 +126,9 @@ def replay_file(
 
 
 def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
-    """Return the content of an exported scene.
+    """Convert an exported scene to the content of a file.
 
-    Only html has colours, title and `beside`. Returns bytes; title and text of the page
-    are escaped, `beside` is not.
+    Only html has colours, title and `beside`. The title is escaped, `beside` is not.
 
     Args:
         serializer: viser's, of the scene.
@@ -164,8 +162,11 @@ def beside(state: State | None, image: ShownImage | None) -> str:
     image the picture is empty. Names are escaped.
 
     Args:
-        state: of the twin; None gives "".
-        image: None for none.
+        state: of the twin.
+        image: radiograph, shown in its own window; None for none.
+
+    Returns:
+        The HTML; "" without a state.
     """
     if state is None:
         return ""

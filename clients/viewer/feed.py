@@ -164,14 +164,14 @@ class ImageFeed:
 
 
 def radiograph(params: Mapping[str, object], twin: str = "") -> ShownImage:
-    """Read the image of a `projection` event, made by that run of the twin.
+    """Read the image of a `projection` event.
 
-    Time is the event's where the image has none; flags and origin are None where unknown.
-    `params` are as decoded from the wire.
+    The time is the event's where the image has none; flags and origin are None where
+    unknown.
 
     Args:
-        params: of the event.
-        twin: run of the twin.
+        params: of the event, as decoded from the wire.
+        twin: run of the twin that made it.
 
     Raises:
         RpcError: the event holds no image.

@@ -215,18 +215,18 @@ class Front:
     async def _answer(
         self, connection: ServerConnection, request: Request
     ) -> Response | None:
-        """Answer a request; None to go on with a WebSocket.
+        """Answer a browser's request, or let it go on as a WebSocket.
 
-        A request that cannot be read has status 400; a still picture that is not there in
-        time has 204 (no content). Other content comes from `_content`. The time limit of
-        a picture is `STILL_S`. Nothing is raised for a bad request.
-
-        Requests of other sites and without the token are rejected; a still picture is
-        waited for.
+        In this order: 400 for a request that cannot be read, the responses of `_foreign`
+        and `_stranger`, the still picture, which is awaited for `STILL_S` (204 without
+        one), and `_content`.
 
         Args:
             connection: of the browser; an admitted one moves to the second room.
             request: its request.
+
+        Returns:
+            The response; None to go on with a WebSocket.
         """
         try:
             url = urlsplit(request.path)
@@ -300,11 +300,13 @@ class Front:
         return _kept(request, content, f"{kind}; charset=utf-8")
 
     def _foreign(self, request: Request) -> Response | None:
-        """Check that a request is not from another site's page; returns the error (403),
-        or None.
+        """Check that a request is not from another site's page.
 
-        On the loopback address the Host must be a local one; an Origin must equal the
-        Host. Elsewhere the Host is not checked; a request without Origin passes.
+        On the loopback address the Host must be a local one; elsewhere it is not checked.
+        An Origin must equal the Host; a request without Origin passes.
+
+        Returns:
+            The error (403); None admits.
         """
         host = request.headers.get("Host", "")
         if self._loopback and is_rebound(host):
@@ -319,14 +321,12 @@ class Front:
     async def _stranger(
         self, connection: ServerConnection, request: Request, url: SplitResult
     ) -> Response | None:
-        """Check the token or the cookie of a request.
+        """Check the token in a request's URL, else its cookie.
 
-        Without a token of the viewer all are admitted. At the path / the response is a
-        form. The answer to a wrong token waits `GUESS_S`, one after the other, and not
-        while closing. A valid one is answered with 302 to the path without it; all others
-        with 401.
-
-        A valid token sets the cookie; a wrong one is logged and answered slowly.
+        A right token sets the cookie and is redirected (302) to the path without it. All
+        others but a right cookie get 401, at the path / with a form. A wrong token is
+        counted, logged and answered after `GUESS_S`, one after the other, at once only
+        while the front closes.
 
         Args:
             connection: of the browser, for the log.
@@ -334,7 +334,8 @@ class Front:
             url: with the token.
 
         Returns:
-            The response to a request without a valid cookie; None admits.
+            The response to a request without a valid cookie; None admits, always if the
+            viewer has no token.
         """
         if self._token is None:
             return None
@@ -374,11 +375,10 @@ class Front:
     # -- WebSockets --------------------------------------------------------------------------
 
     async def _serve(self, connection: ServerConnection) -> None:
-        """Serve a WebSocket: a page, or a view (closed with 1013 if the largest number of
-        views is open); returns when it ends.
+        """Serve a WebSocket, whose path has been checked, until it ends.
 
-        A page in excess has no place here, and is closed by the page handler. The path
-        has been checked.
+        A view is closed with 1013 if the largest number of views is open. A page in
+        excess gets no place here, and is closed by the page handler.
         """
         assert connection.request is not None
         path = urlsplit(connection.request.path).path
@@ -404,9 +404,10 @@ class Front:
 
     async def _relay(self, browser: ServerConnection, path: str) -> None:
         """Pass messages between a browser and viser until either ends; `MessageFilter`
-        filters those to viser. Lost connections are not raised.
+        filters those to viser.
 
-        Both directions are ended together; viser's connection is closed.
+        Then both directions end and viser's connection is closed. Lost or refused
+        connections are not raised.
         """
         with contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake):
             async with self._connect(path, browser.subprotocol) as viser:
@@ -484,10 +485,9 @@ def _cookie(request: Request) -> str | None:
 def _kept(
     request: Request, body: bytes, kind: str, how_long: str = "no-cache"
 ) -> Response:
-    """Make a response that a browser may keep: sent again only where it has changed, and
-    packed.
+    """Make a response that a browser may keep: sent again only where it has changed.
 
-    Packed with gzip if the browser accepts it. The tag is a hash of the content.
+    It is packed with gzip if the browser accepts that. The tag is a hash of the content.
 
     Args:
         request: with the tag that the browser has.
@@ -496,7 +496,7 @@ def _kept(
         how_long: value of Cache-Control.
 
     Returns:
-        "Not Modified" if the browser has this content.
+        The response; 304 "Not Modified" without content if the browser has this content.
     """
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     more = {

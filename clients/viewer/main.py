@@ -46,18 +46,15 @@ if TYPE_CHECKING:
 async def run(options: ViewerSettings, out: TextIO) -> int:
     """Serve until SIGTERM or SIGINT, or until an essential part has failed.
 
-    `FAILED` if such a part has failed, else `OK`; the viewer is stopped in any case.
     Token, certificates and files are read first, and raise their errors; the parts' own
-    meshes are used only for a machine from a file.
+    meshes are used only for a machine from a file. The viewer is stopped in any case.
 
     Args:
         options: addresses, token, certificates, limits and files of the process.
         out: receives the ready line.
 
     Returns:
-        The exit code.
-
-    The ready line goes to `out`; returns the exit code.
+        The exit code: `FAILED` if such a part has failed, else `OK`.
     """
     from flexdt.clients.viewer.page_methods import ANSWERS
     from flexdt.clients.viewer.scenes.meshes.part_looks import own_looks
@@ -103,9 +100,8 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
 
 
 def viewer_pages(viewer: Viewer) -> Pages:
-    """Make the pages for monitoring of a running viewer.
-
-    Returns pages with health and metrics; failed if the viewer has failed.
+    """Make the pages for monitoring of a running viewer: health, failed once an essential
+    part of it has, and metrics.
 
     Args:
         viewer: started.

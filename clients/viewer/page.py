@@ -124,11 +124,11 @@ class Page:
         self._asked = self._busy = 0
 
     async def run(self) -> None:
-        """Run until the browser leaves or no longer reads, then cancel the page's tasks.
+        """Serve until the browser leaves or no longer reads, or the connection to the
+        twin, sending or reading fails; then cancel the page's tasks.
 
         With more than `MAX_NOTES` notices unsent, logs a warning and closes the
-        connection with TRY_AGAIN. It ends also if the connection to the twin, sending or
-        reading fails.
+        connection with TRY_AGAIN.
         """
         for work in (self.link.run(), self._send(), self._read()):
             self._start(work, "a page's connection", self._over.set)
@@ -273,11 +273,10 @@ class Page:
         return True
 
     def _took(self, slot: str) -> None:
-        """Note that the page has taken a message of a slot, and wake the sender; quick
-        pages get larger parts of images, slow ones small parts. Ignored if none was
-        sent.
+        """Note that the page has taken a message of a slot, and wake the sender.
 
-        Quick is less than `QUICK_S`.
+        After an image taken within `QUICK_S` larger parts of images are sent, else small
+        ones. Ignored if none was sent.
         """
         if not (sent := self._sent_at[slot]):
             return
@@ -290,12 +289,12 @@ class Page:
         self._due.set()
 
     async def _handle(self, text: str) -> None:
-        """Answer a request of the page with its result or an error.
+        """Answer a request of the page, in a trace of its own, with its result or an
+        error.
 
-        Errors of any kind are sent to the page; too many requests at a time are rejected,
-        except urgent ones. A message that is no request is answered with INVALID_REQUEST.
-        Too many is `MAX_ASKED`; each request gets a trace id, and the answer the time.
-        Nothing is raised.
+        Errors of any kind are sent, none is raised; unexpected ones are logged and sent
+        without details. A message that is no request is answered with INVALID_REQUEST.
+        With `MAX_ASKED` requests under way only urgent methods are called.
 
         Args:
             text: JSON with id, method and params.
@@ -341,14 +340,15 @@ class Page:
                 self._busy -= 1
 
     async def _ask(self, method: str, params: dict[str, Any]) -> object:
-        """Call a method for the page: one of the viewer, or of the twin if pages may call it;
-        returns the result.
+        """Call a method for the page, one of the viewer's own or else of the twin's, and
+        return its result.
 
-        Bytes in the twin's result become null. Hidden and unknown methods are
-        METHOD_NOT_FOUND; a lost connection raises ConnectionLost.
+        Bytes in the twin's result become None.
 
         Raises:
-            RpcError: no such method, parameters that do not fit, or the twin refuses.
+            RpcError: no method that pages may call, parameters that do not fit, or a
+                refusal.
+            ConnectionLost: the twin's connection is lost.
         """
         if method in self._local:
             return await self._local[method](self, params)

@@ -136,12 +136,10 @@ class SceneClients:
             self._put(client, camera)
 
     def fit(self, anew: bool = False) -> None:
-        """Put each view's camera so that it holds its points, unless a person has moved
-        it.
+        """Put each view's camera so that it holds its points.
 
-        Views whose pane has no known size yet are left out. Otherwise a camera moves only
-        if the points no longer fit its view. `anew` also moves those that a person has
-        moved.
+        A camera moves only if the points no longer fit its view and no person has moved
+        it. Views whose pane has no known size yet are left out.
 
         Args:
             anew: put all cameras to their presets, moved or not.
@@ -167,17 +165,20 @@ class SceneClients:
                 self._put(client, preset.at(client.camera.aspect))
 
     def look(self, page: str, view: str, at: FloatArray, radius_mm: float) -> None:
-        """Turn a page's view towards a ball, from where it looks.
+        """Turn a page's view towards a ball, in its preset's direction.
 
-        The preset's direction is kept. Raises KeyError for a view without a preset. The
-        distance is `FAR_RATIO` times that at which the ball fills the view, more in a
-        narrow pane. The camera then counts as moved by a person.
+        The distance is `FAR_RATIO` times that at which the ball fills the view, more in a
+        narrow pane. The camera then counts as moved by a person. A view that is not open
+        is left alone.
 
         Args:
             page: its id.
             view: name of the view.
             at: (3,) centre [mm].
-            radius_mm: of the ball, which fills the view.
+            radius_mm: of the ball.
+
+        Raises:
+            KeyError: the view is open and has no preset.
         """
         for client in self.of(page, view):
             aspect = client.camera.aspect
@@ -242,11 +243,11 @@ class SceneClients:
         return apart_m < MOVED_SHARE * reach_m
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        """Register a new client: its page and view, camera and theme.
+        """Register a new client with its page and view, set its camera and theme, and
+        call `joined`; in a thread of viser's.
 
-        Ignored if its path names none. Then `joined` is called. Called in a thread of
-        viser's. A view without preset keeps viser's camera; a page without theme is light
-        and plain.
+        A client whose path names no page and view is ignored. A view without preset keeps
+        viser's camera; a page without theme is light and plain.
 
         Args:
             client: of viser; its path names page and view.

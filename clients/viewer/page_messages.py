@@ -89,15 +89,15 @@ class Unwanted(ValueError):
 def admitted(raw: str | bytes) -> bytes:
     """Validate a page's message and encode it again for viser.
 
-    Only the kinds in `ALLOWED` pass; pictures must be small PNGs. A text message is
-    unwanted; messages but pictures have at most `MAX_SMALL` bytes. Unknown fields are
-    wrong ones.
+    Pictures must be PNGs of at most `LARGEST_SIDE` pixels a side, or empty; other
+    messages have at most `MAX_SMALL` bytes.
 
     Args:
         raw: as received.
 
     Raises:
-        Unwanted: another kind, too long, or a wrong field; names it.
+        Unwanted: text, no message, a kind that is not in `ALLOWED`, too long, or with an
+            unknown or wrong field; names it.
     """
     if isinstance(raw, str):
         raise Unwanted("text")

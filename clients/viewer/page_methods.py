@@ -322,11 +322,20 @@ async def window(viewer: Viewer, page: Page, params: Window) -> object:
 
 
 async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
-    """Show this page the ray of a pixel; returns the twin's path lengths through
-    materials and the ray's length [mm].
+    """Show this page the ray of a pixel, and return what it passes through.
 
-    Without a pixel or a known state hides the ray and returns {}. The pixel is (column,
-    row). Raises RpcError as the twin does, and while the scene is not there.
+    Without a pixel, or before the twin's state is known, the ray is hidden.
+
+    Args:
+        viewer, page: of the request.
+        params: `pixel` (column, row) or None.
+
+    Returns:
+        The twin's path lengths through materials, and `length_mm` of the ray from source
+        to pixel; {} if it is hidden.
+
+    Raises:
+        RpcError: the twin refuses, or there is no scene yet.
     """
     lab = _lab(viewer)
     world = viewer.world
@@ -343,12 +352,16 @@ async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
 async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
     """Compute the tube's spectrum behind the machine's filters at a voltage.
 
-    The photons are relative, behind the filters; limits are voltage [kV], power [W],
-    exposure [ms]. The voltage is in kV, energies in keV. Lists have one entry for each
-    energy; raises RpcError before the twin has been seen.
+    Args:
+        viewer, page: of the request.
+        params: `kV`, the voltage.
 
     Returns:
-        `energy_keV`, `photons`, `mean_keV`, `filters`, and `limits` of tube and camera.
+        `energy_keV` and relative `photons` behind the filters, one for each energy,
+        `mean_keV`, `filters`, and `limits` of voltage [kV], power [W] and exposure [ms].
+
+    Raises:
+        RpcError: the twin has not been seen yet.
     """
     machine = _lab(viewer).machine
     tube = tube_of(machine.tube)
@@ -373,17 +386,21 @@ async def spectrum(viewer: Viewer, page: Page, params: Spectrum) -> object:
 
 
 async def plan(viewer: Viewer, page: Page, params: Plan) -> object:
-    """Plan a script to scrub through; None removes the plan and its drawing from this
-    page.
+    """Plan a script to scrub through, from the twin's present positions, and draw its
+    path.
 
-    The plan starts from the twin's present positions. Removing returns {}; the path is
-    kept if no state is known.
+    Without a known state the path drawn before stays.
+
+    Args:
+        viewer, page: of the request.
+        params: `text` of the script; None removes plan and drawing from this page.
 
     Returns:
-        The time line, see `scrubbed_plan.document`.
+        The time line, see `scrubbed_plan.document`; {} after removing.
 
     Raises:
-        RpcError: a data set is open on this page.
+        RpcError: a data set is open on this page, there is no scene yet, or the script
+            cannot be planned.
     """
     lab = _lab(viewer)
     text = params.text
@@ -404,15 +421,21 @@ async def plan(viewer: Viewer, page: Page, params: Plan) -> object:
 
 
 async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
-    """Show this page the images of a data set instead of live ones; None shows live ones
-    again.
+    """Show this page the images of a data set instead of live ones; without a name live
+    ones again.
 
-    The plan of the page is replaced by the data set's positions if it is of this machine.
-    The path is that of the projections alone. Raises RpcError for an unknown data set;
-    else plan and path of the page are removed first.
+    Plan and path of the page are replaced by the data set's positions, and the path of
+    its projections, if it is of this machine, else removed.
+
+    Args:
+        viewer, page: of the request.
+        params: `name` of the data set, or None.
 
     Returns:
-        The result of `dataset.get`; empty for None.
+        The result of `dataset.get`; {} without a name.
+
+    Raises:
+        RpcError: the twin refuses, such as an unknown data set; nothing changes then.
     """
     lab = _lab(viewer)
     name = params.name
@@ -439,15 +462,20 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     """Show this page an image of its data set, and in its scenes the machine at that
     moment.
 
-    Without a usable virtual image `problem` states why, and the recorded one is shown
-    alone. A virtual image is made only of projections with known positions; one of other
-    size is a problem. The ghost is moved only if the page has a plan.
+    A virtual image is made only of a projection with known positions; without a usable
+    one, also one of another size, `problem` states why and the recorded one is shown
+    alone. The ghost is moved only if the page has a plan.
+
+    Args:
+        viewer, page: of the request.
+        params: index and kind of the image, and whether a virtual one is wanted.
 
     Returns:
         The image's entries, `geometry`, `tube` and `problem` of the virtual image.
 
     Raises:
-        RpcError: no data set is open, or another one was opened meanwhile.
+        RpcError: no data set is open, another one was opened meanwhile, or the twin
+            refuses.
     """
     lab = _lab(viewer)
     name = page.recorded
@@ -526,9 +554,16 @@ async def live(viewer: Viewer, page: Page, params: Live) -> object:
     """Start to grow a volume of a data set from its images so far, for all pages that
     want one; without a name, end that for this page. Returns {}.
 
-    Raises INVALID_PARAMS if there is no such data set (links do not count). With a
-    running process for the same volume its newest line is sent again. `past` requests the
-    complete one. Raises RpcError without --data.
+    If the same volume is growing already, its newest line is sent again.
+
+    Args:
+        viewer, page: of the request.
+        params: `name` of the data set or None, `side` of the volume, and `past`, which
+            requests the complete one.
+
+    Raises:
+        RpcError: there is no such data set (links do not count), or the viewer has no
+            --data.
     """
     page.live = params.name is not None
     if params.name is None:
@@ -599,11 +634,18 @@ async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
 
     Distances are those of the motors alone: a script moves motors, and the correction in
     force, in which SOD and SDD are a little different, may not lead beyond their travel.
-    Axes in `keep` stay where they are and are not in `moved`. Raises RpcError for a scan
-    that cannot be made; without a state `moved` is empty.
+
+    Args:
+        viewer, page: of the request.
+        params: the scan; axes in `keep` stay where they are.
 
     Returns:
-        `text`, and `moved`: axis -> its present position and the script's.
+        `text`, and `moved`: axis -> its present position and the script's, without axes
+        in `keep`; empty without a known state.
+
+    Raises:
+        RpcError: there is no scene yet.
+        TwinError: the machine cannot make that scan.
     """
     lab = _lab(viewer)
     state = viewer.state
@@ -653,15 +695,14 @@ def scan_request(
 
 
 def _moved(text: str, lab: LabScene, state: State) -> dict[str, tuple[float, float]]:
-    """Compare a script's poses with the present ones.
+    """Compare a script's poses with the present ones; blocks.
 
-    Same is within `MIN_DIFFERENCE` [mm, deg]; a script without projections moves none.
-    Blocks: called in a thread.
+    Same is within `MIN_DIFFERENCE` [mm, deg]. Axes that the script moves between
+    projections are left out, and all for a script without projections.
 
     Returns:
-        Axis -> (present position, that of the script's projections), for axes that are
-        neither
-        there nor at home; axes that the script moves between projections are left out.
+        Axis -> (present position, that of the script's projections), for axes whose
+        projections are neither there nor at home.
     """
     plan = plans.plan_text(text, lab.machine, lab.profile, state)
     stands = motors(lab.machine, state)
@@ -694,8 +735,11 @@ async def estimate(
 ) -> object:
     """Fit a geometry to data sets; nothing is applied.
 
-    Over a connection of its own: other requests of the page do not wait for this one. It
-    has no time limit. Raises RpcError as the twin does; bytes in the result become null.
+    It has a connection of its own and no time limit: other requests of the page do not
+    wait for it. Bytes in the result become None.
+
+    Raises:
+        RpcError: the twin refuses.
     """
     at = viewer.twin_address
     if isinstance(params, CalibrationFit):
@@ -718,10 +762,19 @@ async def correct(viewer: Viewer, page: Page, params: Correct) -> object:
 
 async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
     """Draw, for this page alone, a ghost of the machine where the plan has it at
-    `time_s`; returns its positions.
+    `time_s`.
 
-    None removes the ghost and returns None for the positions. Raises INVALID_PARAMS while
-    the page has no plan. Times beyond the plan's ends give its first or last positions.
+    Times beyond the plan's ends give its first or last positions.
+
+    Args:
+        viewer, page: of the request.
+        params: `time_s`; None removes the ghost.
+
+    Returns:
+        `positions` of the plan; None after removing.
+
+    Raises:
+        RpcError: the page has no plan, or there is no scene yet.
     """
     lab = _lab(viewer)
     time_s = params.time_s
@@ -738,10 +791,12 @@ async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
 
 
 async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
-    """Take a picture of one of this page's views; returns the offer of a PNG to download.
+    """Take a picture of one of this page's views, drawn by its first client, and offer
+    the PNG to download.
 
-    Raises INVALID_PARAMS if that view is not open. The first client of the view draws it.
-    Raises RpcError BUSY with `MAX_SHARED` pictures or exports under way.
+    Raises:
+        RpcError: that view is not open, or `MAX_SHARED` pictures or exports are under
+            way.
     """
     clients = viewer.clients.of(page.id, params.view)
     if not clients:
@@ -756,14 +811,15 @@ async def screenshot(viewer: Viewer, page: Page, params: Screenshot) -> object:
 async def export(viewer: Viewer, page: Page, params: Export) -> object:
     """Export the scene, or a replay of this page's plan, as one file: html or viser.
 
-    Without an open view of this page the scene is seen from the preset. It is made in a
-    thread; the file's name has the time.
+    The scene is seen as in the page's free view, else in any of its views, else from the
+    preset. It is made in a thread; the file's name has the time.
 
     Returns:
         The download's `url` and name.
 
     Raises:
-        RpcError: there is no plan to replay, or too many exports are running.
+        RpcError: there is no plan or no state to replay, no scene yet, or `MAX_SHARED`
+            pictures or exports are under way.
     """
     lab = _lab(viewer)
     form = params.format

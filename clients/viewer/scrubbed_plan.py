@@ -47,12 +47,13 @@ class RecordedPositions:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> RecordedPositions | None:
-        """Build from a result of `dataset.get`, ordered by time; None where poses are not
-        known. Images without times are a second apart; those without a position are
-        left out.
+        """Build from a result of `dataset.get`, ordered by time.
 
-        Times are the data set's [s], or its indices. Left out are images where the first
-        motor's position is unknown.
+        Times are the data set's [s]; images without times are a second apart, by index.
+        Images at which the first motor's position is unknown are left out.
+
+        Returns:
+            The positions; None where no motor's are known.
         """
         motors = {
             n: np.array(values, dtype=float) for n, values in told["positions"].items()
@@ -126,13 +127,12 @@ def work(parts: Sequence[bytes]) -> list[bytes]:
 
 
 def _made(text: str, machine: Machine, profile: Profile, state: State | None) -> Made:
-    """Plan a script, and compute the source's path and the time line.
-
-    Without a state there is no path. Too many is more than `MAX_IMAGES`. Also raises
-    ScriptError.
+    """Plan a script, and compute the source's path, None without a state, and the time
+    line.
 
     Raises:
-        RpcError: it takes too many images.
+        RpcError: it takes more than `MAX_IMAGES` images.
+        ScriptError: the script is invalid.
     """
     plan = plan_text(text, machine, profile, state)
     images = sum(len(group) for group in plan.groups)
@@ -163,17 +163,16 @@ def plan_text(
 def document(plan: ScanPlan) -> dict[str, Any]:
     """Make the data of a page's time line.
 
-    Images are thinned to at most `MAX_STEPS`; of steps the first `MAX_STEPS` are there.
-    Times are in [s]; curves have `CURVE_POINTS` points, axes that move less than 1e-9
-    none. Of n images every k-th is kept.
+    Of images every k-th is kept, at most `MAX_STEPS`; of steps the first `MAX_STEPS`.
+    Curves have `CURVE_POINTS` points; axes that move by 1e-9 or less have none. Times are
+    in [s].
 
     Args:
         plan: of the script.
 
     Returns:
         `duration_s`, `frames`, `bytes`, `times`, `curves` of moving axes, `images`,
-        `steps` and
-        `problems`.
+        `steps` and `problems`.
     """
     times = np.linspace(0.0, plan.duration_s, CURVE_POINTS)
     curves = plan.positions(times)

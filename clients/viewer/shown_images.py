@@ -55,16 +55,16 @@ class ShownImage:
 
 
 def window_of(image: ShownImage) -> tuple[float, float]:
-    """Choose the values of black and white: all matter but the densest 2 %, so that beads do
-    not set them.
+    """Choose the values of black and white: all matter but the densest 2 %, so that beads
+    do not set them.
 
-    Only every fourth row and column is looked at. For line integrals the lower value is
-    at most 0 and matter is what exceeds AIR; other images use the percentiles 0.2 and
-    99.8. Without pixels: (0, 1); where all are equal, high is low + 1. Percentiles are of
-    the looked-at pixels; NaN is not expected.
+    For line integrals the lower value is at most 0 and matter is what exceeds `AIR`;
+    other images use the percentiles 0.2 and 99.8. Only every fourth row and column is
+    looked at.
 
     Returns:
-        (low, high), high the greater one.
+        (low, high), high the greater one: low + 1 where all are equal, and (0, 1) without
+        pixels.
     """
     pixels = np.asarray(image.pixels[::4, ::4], dtype=np.float32)
     if pixels.size == 0:

@@ -398,17 +398,19 @@ class Viewer:
             await asyncio.sleep(max(0.0, begun + 0.8 / most_hz - loop.time()))
 
     async def _take_state(self, raw: Mapping[str, Any]) -> None:
-        """Draw a state: sample, cameras, scene and pages.
+        """Draw a state: sample, cameras, scene; then send it to the pages with framing,
+        nearest parts and time.
 
-        Then the pages get it with framing, nearest parts and time. Travel ranges are
-        drawn only if a page shows them. Cameras get new presets each time; they move for
-        a new machine only, and the beam's eye always follows. Raises for a state that is
-        not valid.
-
-        A new machine or sample is built first; the first state starts the images.
+        A new machine or sample is built first, and the first state starts the images. All
+        views get new presets, but cameras move for a new machine only; the beam's eye
+        always follows. Travel ranges are drawn only if a page shows them.
 
         Args:
             raw: the state as the twin sends it.
+
+        Raises:
+            ValueError: it is not valid.
+            TwinError: an unknown machine or profile.
         """
         state = State.model_validate(raw)
         before = self.lab
@@ -459,12 +461,14 @@ class Viewer:
             page.show("state", text)
 
     async def _ready_lab(self) -> LabScene:
-        """Return the scene of the twin's machine and profile (the given ones first,
-        "flexray" while no twin is known).
+        """Return the scene of the twin's machine and profile; those given to the viewer
+        come first, and "flexray" while no twin is known.
 
-        It is built anew in a thread if they have changed; pages then get the layers.
-        Raises TwinError for an unknown machine or profile. The former scene's nodes are
-        replaced.
+        If they have changed it is built anew in a thread, in place of the former scene's
+        nodes, and pages get the layers.
+
+        Raises:
+            TwinError: an unknown machine or profile.
         """
         hello = self.link.hello
         machine = self._machine or builtin_machine(
@@ -501,8 +505,8 @@ class Viewer:
         """Fetch the mesh of an upload, and show it if the sample is still on the stage; a
         box is drawn until then.
 
-        Nothing is shown if the twin has none; a failure is logged. Errors are
-        ConnectionLost, TwinError and ValueError; all others are logged by the task.
+        If the twin has none the box stays. A lost connection, a refusal or a mesh that
+        cannot be read is logged as a warning; other errors are raised.
         """
         try:
             stl = await sample_looks.fetch(self.link.request, sample)
@@ -563,10 +567,14 @@ class Viewer:
 
     async def still(self, asked: Mapping[str, str]) -> bytes | None:
         """Draw the present scene as a JPEG (see `Stills`), once it has been placed or
-        `STILL_S` has passed; None if nothing is placed or the view is not known.
+        `STILL_S` has passed.
 
-        `asked` is the page's query: view, page, and those of `Stills`. The view "sample"
-        shows only what turns with it.
+        Args:
+            asked: the page's query: view, page, and those of `Stills`. The view "sample"
+                shows only what turns with it.
+
+        Returns:
+            The picture; None if nothing is placed or the view is not known.
         """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._placed.wait(), STILL_S)
@@ -607,10 +615,10 @@ class Viewer:
     async def _page(self, id: str, connection: ServerConnection) -> None:
         """Serve a page until it ends, or reject it where too many are open.
 
-        A page in excess is logged and closed with TRY_AGAIN. A page's name is cut at 40
-        characters ("a visitor" without one). At its end the cameras are forgotten, and
-        volume and feeds stopped if no page wants them. Two connections with one id: the
-        newer one counts.
+        A page in excess is logged and closed with TRY_AGAIN. The user's name is cut at 40
+        characters ("a visitor" without one). Of two connections with one id the newer one
+        counts. At its end the page's cameras are forgotten, and volume and feeds stopped
+        if no other page wants them.
 
         Args:
             id: of the page.

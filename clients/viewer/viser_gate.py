@@ -73,6 +73,9 @@ class Scenes:
 
         Args:
             label: of the server.
+
+        Raises:
+            GateError: viser starts its server in another way than on that socket.
         """
         usual = tempfile.gettempdir()
         if len(usual.encode()) <= LONGEST_TMP:
@@ -102,11 +105,20 @@ class Scenes:
     async def connect(
         self, path: str, subprotocol: Subprotocol | None
     ) -> AsyncIterator[ClientConnection]:
-        """Connect a browser's frame to viser's socket, uncompressed; `path` identifies
-        the frame. Closes the connection at the end.
+        """Connect a browser's frame to viser's socket, uncompressed, and close the
+        connection at the end.
 
-        A message has at most `MAX_OF_VISER` bytes. Yields the connection; errors of
-        connecting are raised.
+        A message has at most `MAX_OF_VISER` bytes.
+
+        Args:
+            path: identifies the frame.
+            subprotocol: of the browser; None for none.
+
+        Yields:
+            The connection.
+
+        Raises:
+            OSError, InvalidHandshake: viser does not accept it.
         """
         async with unix_connect(
             str(self.path),
@@ -156,10 +168,13 @@ class Scenes:
 
 
 def clear_left_behind(folder: Path) -> None:
-    """Remove the sockets of viewers that were killed: those older than `YOUNG_S` on which
-    no process listens; others stay, errors are ignored.
+    """Remove the folders of viewers that were killed, with all they hold: those named
+    `PREFIX`..., older than `YOUNG_S`, on whose socket no process listens.
 
-    `folder` is searched for `PREFIX` names only; a removed folder goes with all it holds.
+    Others stay; errors are ignored.
+
+    Args:
+        folder: where they are.
     """
     for left in folder.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
@@ -232,8 +247,8 @@ def parted(html: bytes) -> tuple[bytes, bytes]:
 def _listening_at(path: Path) -> Iterator[None]:
     """Make a server that viser starts meanwhile listen at a path and nowhere else.
 
-    Only one at a time. After an error the socket is closed. The library's own function is
-    put back in any case. The socket is left to viser.
+    For that a function of the library is replaced meanwhile, in any case put back; other
+    contexts wait until then. The socket is left to viser, or closed after an error.
 
     Args:
         path: of the Unix socket.

@@ -17,15 +17,15 @@ from flexdt.runtime.log import log
 def watched(
     work: Coroutine[Any, Any, None], what: str, died: Callable[[], None] = lambda: None
 ) -> asyncio.Task[None]:
-    """Run `work` as a task.
-
-    An error is logged, not raised; `died` is not called if the task is cancelled. Returns
-    the task, which ends without an exception. It is not started again.
+    """Run `work` as a task, which is not started again.
 
     Args:
         work: the coroutine.
         what: name of the work, for the log.
-        died: called when it has failed.
+        died: called when it has failed, not when it was cancelled.
+
+    Returns:
+        The task; an error of the work is logged, not raised.
     """
 
     async def run() -> None:

@@ -66,9 +66,16 @@ class Jobs:
     ) -> None:
         """Make an empty queue of scans; nothing runs before `work`.
 
-        `changed` is called after each change of a job; `max_waiting` jobs may wait,
-        `max_ended` ended ones are kept for `max_age`; `projectors` scales how many frames
-        are made at a time.
+        Args:
+            scanner: on which scans run.
+            clock: the twin's time.
+            changed: called after each change of a job.
+            max_waiting: number of jobs that may wait.
+            projectors: scales how many frames are made at a time.
+            root: data directory, to which paths in jobs' errors become relative; None:
+                they stay.
+            max_ended, max_age: how many ended jobs are kept, and for how long.
+            today: the time now.
         """
         self._root = root
         self._max_ended = max_ended

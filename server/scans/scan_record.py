@@ -163,8 +163,8 @@ class JobRecord:
         """Add the record, as JSON for the data set `name`, to changes that are written
         together.
 
-        The file is in `FOLDER`, named after the data set; the text that lists poses is
-        not in it.
+        The file is in `FOLDER`, named after the data set. Poses are in it, but not their
+        `listing`.
 
         Args:
             changes: files written as one.

@@ -67,7 +67,17 @@ class TwinClock:
     def __init__(
         self, speed_up: SpeedUp = 1.0, wall: Callable[[], float] = time.monotonic
     ) -> None:
-        """Start at twin time 0, flowing at `speed_up` times the seconds of `wall`."""
+        """Start at twin time 0, flowing at `speed_up` times the seconds of `wall`.
+
+        With "max" it does not flow, but jumps to awaited moments.
+
+        Args:
+            speed_up: "max", or above 0 and at most `MAX_SPEED_UP`.
+            wall: real time [s], monotonic.
+
+        Raises:
+            LimitError: another speed-up.
+        """
         self._wall = wall
         self._speed_up = check_speed_up(speed_up)
         self._base = 0.0
