@@ -37,10 +37,10 @@ def assignments(words: Iterable[str]) -> dict[str, float]:
     """Read AXIS=VALUE words as axis -> value, in order.
 
     Values are numbers, of any unit. Blanks around the axis are dropped. No words give {}.
-    Also raised for a value that is no finite number.
 
     Raises:
-        typer.BadParameter: a word of another form, or an axis given twice.
+        typer.BadParameter: a word of another form, an axis given twice, or a value that
+            is no finite number.
     """
     out: dict[str, float] = {}
     for word in words:
@@ -59,13 +59,16 @@ def assignments(words: Iterable[str]) -> dict[str, float]:
 def span(word: str, what: str) -> tuple[float, float]:
     """Read LOWER:UPPER, or one number for both.
 
-    `what` names the value in the error. Returns (lower, upper), equal ones for one
-    number.
+    Args:
+        word: as given.
+        what: names the value in the error.
+
+    Returns:
+        (lower, upper), equal ones for one number.
 
     Raises:
-        typer.BadParameter: neither, or the lower is above the upper.
-
-    Each end has to be a finite number, too.
+        typer.BadParameter: another form, an end that is no finite number, or the lower is
+            above the upper.
     """
     ends = [number(part, what) for part in word.split(":")]
     if len(ends) > 2 or ends[0] > ends[-1]:
@@ -111,10 +114,8 @@ def triple(word: str, what: str, form: str) -> tuple[float, float, float]:
 def position(word: str) -> tuple[float, float]:
     """Read SOD[:LATERAL] as (SOD, lateral) [mm]; lateral is 0 if left out.
 
-    Also raised for numbers that are not finite.
-
     Raises:
-        typer.BadParameter: not numbers.
+        typer.BadParameter: not finite numbers.
     """
     sod, _, lateral = word.partition(":")
     return (

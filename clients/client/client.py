@@ -172,16 +172,18 @@ class Core:
             raise
 
     def follow(self, listener: Listener, params: Mapping[str, object]) -> None:
-        """Have `listener` subscribed with these params whenever a connection is made.
+        """Have `listener` subscribed with these params whenever a connection is made;
+        nothing is subscribed at once.
 
-        The listener's own earlier parameters count as such, too. Compared are the rate,
-        and for projections kind and binning.
+        Rate, and for projections kind and binning, must be those of all listeners to the
+        same topic, also those with which this one was followed before.
+
+        Args:
+            listener: gets the events.
+            params: of the subscription; replace the listener's earlier ones.
 
         Raises:
-            ValueError: as `subscribe`.
-
-        The parameters must be those of other listeners to the same topic. Nothing is
-        subscribed at once.
+            ValueError: they are not.
         """
         for other, theirs in self._listeners.items():
             for topic in set(listener.topics) & set(other.topics):

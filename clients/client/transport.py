@@ -115,7 +115,7 @@ class TcpTransport:
         timeout_s: float = 5.0,
         ssl: tls.SSLContext | None = None,
     ) -> None:
-        """Store where and how to connect; `open` connects.
+        """Store where and how to connect; nothing is opened before `open`.
 
         Args:
             host: name or address.
@@ -126,8 +126,6 @@ class TcpTransport:
 
         Raises:
             ValueError: another port.
-
-        Nothing is opened yet.
         """
         if type(port) is not int or not 1 <= port <= 65535:
             raise ValueError(f"port {port!r} is not a number from 1 to 65535")
@@ -150,13 +148,12 @@ class TcpTransport:
     async def open(self) -> None:
         """Connect to the server; an earlier connection is closed.
 
-        Also raised after `timeout_s`; the message names the cause, and `flexdt up` if the
-        connection was refused. With TLS the certificate is checked for `host`. The new
-        connection starts with an empty message buffer; OSError and a time-out become
-        ConnectionLost.
+        With TLS the certificate is checked for `host`. The new connection starts with an
+        empty message buffer.
 
         Raises:
-            ConnectionLost: no server answers at the address.
+            ConnectionLost: no server answers at the address within `timeout_s`; names the
+                cause, and `flexdt up` if the connection was refused.
         """
         self.close()
         try:
@@ -194,14 +191,12 @@ class TcpTransport:
         """Send one message; all its bytes are queued at once, so a cancelled call breaks
         nothing.
 
-        A message that cannot be encoded raises the codec's error before anything is sent.
-        Waits until the stream's buffer has room.
+        Waits until the stream's buffer has room. A message that cannot be encoded raises
+        the codec's error before anything is sent.
 
         Raises:
-            ConnectionLost: there is no connection, or it has ended.
-
-        `.sent` of the error is True if the connection broke while the bytes were sent,
-        else it says not sent.
+            ConnectionLost: there is no connection, or it has ended; its `sent` is True if
+                it broke while the bytes were sent.
         """
         data = self._wire.send(message)
         if self._streams is None:

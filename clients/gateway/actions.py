@@ -69,10 +69,12 @@ async def remember(
 async def write_settings(
     twin: ConnectedTwin, command: c.WriteSettingsFile, progress: CommandProgress
 ) -> str:
-    """Write the present motor positions into the recording's settings texts; returns "".
-    Raises Refusal if that fails.
+    """Write the present motor positions into the recording's settings texts; return "".
 
-    They are stored, too, if no image was saved yet.
+    Before the first saved image they are only stored, for later texts.
+
+    Raises:
+        Refusal: they cannot be written, or the twin does not answer.
     """
     try:
         twin.record().write_settings(await twin.state())
@@ -139,12 +141,17 @@ async def wait_ready(
 async def take_image(
     twin: ConnectedTwin, command: c.TakeImage, progress: CommandProgress
 ) -> str:
-    """Take an image at the present pose and settings, keep it in the camera and wait for
-    its exposure on the twin's clock.
+    """Take an image at the present pose and settings, and wait for its exposure on the
+    twin's clock.
 
-    Returns "columns x rows, mean" of its counts. Nothing is saved. Counts are those of
-    the present state; uint16 (rows, cols). The exposure [s] is exposure times averages;
-    the image before it is replaced.
+    The camera keeps it in place of the one before; nothing is saved. The exposure is
+    exposure time times averages.
+
+    Returns:
+        "columns x rows, mean" of its counts.
+
+    Raises:
+        Refusal: the twin refuses, or does not answer.
     """
     state = await twin.state()
     counts = np.asarray((await twin.run(m.projection("counts"))).image, dtype=np.uint16)
@@ -443,14 +450,13 @@ def _sequence_script(state: State, command: c.TakeSequence, armed: Armed | None)
 async def abort_script(
     twin: ConnectedTwin, command: AbortScript, progress: CommandProgress
 ) -> str:
-    """Abort the job that this gateway started; returns its name.
+    """Abort the job that this gateway started, without waiting for its end.
 
-    Errors of the twin are raised as Refusal.
+    Returns:
+        Its name.
 
     Raises:
-        Refusal: none is running.
-
-    It does not wait for the job's end.
+        Refusal: none is running, or the twin refuses.
     """
     if twin.job is None:
         raise Refusal("no script or sequence of this gateway is running")
@@ -518,11 +524,14 @@ def _name_taken(refusal: Refusal) -> bool:
 
 
 async def _adopt(twin: ConnectedTwin, folder: str, state: State) -> str:
-    """Add the frames in a data set's folder to this session's recording; returns how many
-    and where.
+    """Add the frames in a data set's folder to this session's recording.
 
-    A folder that this machine's disk lacks is returned as it is. Raises Refusal if they
-    cannot be added.
+    Returns:
+        How many, and the recording's folder; `folder` itself, with nothing added, if this
+        machine's disk lacks it.
+
+    Raises:
+        Refusal: they cannot be added.
     """
     if not folder or not Path(folder).is_dir():
         return folder

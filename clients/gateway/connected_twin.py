@@ -112,8 +112,11 @@ class ConnectedTwin:
         """Take an event of the twin: keep the status of a job, and wake `news`, whatever
         the topic.
 
-        The end of a job that was not kept before is not kept. `topic` is "state" or
-        "job", `params` those of the event with `data`. Other topics only wake.
+        The end of a job that was not kept before is not kept.
+
+        Args:
+            topic: other topics than "job" only wake.
+            params: of the event, with `data`.
         """
         if topic == "job":
             status = JobStatus.model_validate(params["data"])
@@ -138,11 +141,9 @@ class ConnectedTwin:
         return found
 
     async def news(self) -> None:
-        """Wait until something may have changed: an event has come, or some time has passed
-        while something moves.
+        """Wait for the twin's next event, or `LIVELY_S` while `lively`.
 
-        At the end it waits another POLL_S, so that several changes are met at once. The
-        time is `LIVELY_S`, only while `lively`; else only an event ends the wait.
+        Then it waits another `POLL_S`, so that several changes are met at once.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LIVELY_S if self.lively else None):
@@ -191,12 +192,18 @@ class ConnectedTwin:
         return state
 
     async def until(self, seconds: float, progress: CommandProgress, what: str) -> None:
-        """Wait for `seconds` of the twin's clock, reporting the time left; at speed-up
-        "max" returns at once.
+        """Wait for `seconds` of the twin's clock, reporting the time left in `progress`.
 
-        The sleep between two requests is at most 0.2 s; `progress.text` is "WHAT: N s
-        left". A change of the speed-up takes effect within that time. Raises Refusal as
-        `ask`.
+        At speed-up "max" it returns at once. A change of the speed-up takes effect within
+        0.2 s.
+
+        Args:
+            seconds: on the twin's clock.
+            progress: its text becomes "WHAT: N s left".
+            what: is waited for.
+
+        Raises:
+            Refusal: as `ask`.
         """
         state = await self.state()
         end = state.time + seconds

@@ -482,8 +482,6 @@ class Gateway:
 def check_loopback(host: str) -> None:
     """Check that `host` is a loopback address.
 
-    Returns nothing.
-
     Raises:
         AccessError: it is not; lists the allowed ones.
     """

@@ -98,11 +98,10 @@ async def run(options: GatewaySettings) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the gateway with the options of `argv` (default: the command line) until it is ended;
-    returns the exit code.
+    """Run the gateway with the options of `argv` (default: the command line) until it is
+    ended; return the exit code.
 
-    Where pyzmq is not installed it says so and returns the code of an invalid call. A
-    missing package is reported on standard error before anything is opened.
+    Without pyzmq, INVALID, with a line on standard error, before anything is opened.
     """
     options = parse(GatewaySettings, argv)
     set_up()

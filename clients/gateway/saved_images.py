@@ -176,6 +176,9 @@ class Recording:
     def write_settings(self, state: State) -> None:
         """Store a state whose motor positions the settings texts show from now on;
         rewrite the texts if the folder has images.
+
+        Raises:
+            DatasetError: the texts cannot be written; the state is stored.
         """
         with self._turn:
             self._settings = state
@@ -183,11 +186,9 @@ class Recording:
                 self._write_texts()
 
     def close(self) -> None:
-        """Close the folder, once a saving in progress has ended; nothing is saved into it
-        any more.
+        """Close the folder, once a saving in progress has ended.
 
-        Waits for a saving in progress; a second call does nothing. A later saving raises
-        DatasetError.
+        A later saving raises DatasetError. A second call does nothing.
         """
         with self._turn:
             self._closed = True
@@ -241,11 +242,10 @@ class Recording:
         self._write_texts()
 
     def _write_texts(self) -> None:
-        """Write the transcript, and the settings texts if machine and profile are known, into
-        the folder.
+        """Write the transcript into the folder, and the settings texts if machine and
+        profile are known.
 
-        Needs a folder (asserts it). Lines end with CR LF; existing texts are replaced.
-        Nothing but the transcript is written for an unknown machine.
+        Lines end with CR LF; existing texts are replaced. There must be a folder.
         """
         assert self._folder is not None
         text = "\r\n".join([*self.transcript, ""])

@@ -89,18 +89,18 @@ def known_commands(component: str) -> tuple[str, ...]:
 
 
 def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
-    """Read the command of an event.
+    """Read the command of an event, also one of the interface alone, such as stop.
 
-    Also raised for an unknown component, arguments in excess and wrong ones. The axis
-    name is read in any letter case. Arguments beyond those of the command have to be
-    empty. Commands of the interface alone, such as stop, are read too.
+    The axis name is read in any letter case. Arguments beyond those of the command have
+    to be empty.
 
     Args:
         event: from a client.
         axes: motors and virtual axes of the twin.
 
     Raises:
-        Refusal: no such command; the message lists the allowed ones.
+        Refusal: no such component or command, with those allowed, or arguments that are
+            wrong or in excess.
     """
     name = grammar.own_name(event.component, axes)
     event = replace(event, component=name)

@@ -16,17 +16,15 @@ def require_startable(
 ) -> None:
     """Check the words that a twin server is started with.
 
-    Returns nothing. With both None, machine and profile are not checked; the profile is
-    looked up for the machine. "" and the empty stage are allowed samples. Only existence
-    is checked for a sample; a data folder with any content counts as one that may hold
-    uploads.
+    Of a sample only its existence is checked, and not where the data folder has any
+    content, which may be a sample of that name. "" and the empty stage are allowed.
 
     Args:
         machine: shipped name or file; None for the FleX-ray.
-        profile: of zero offsets; None for the machine's.
-        sample: on the stage at the start; None for the twin's own. Not checked where the data
-            folder may hold a sample of that name.
-        data: the twin's folder, made by the twin if it is missing; None for one of its own.
+        profile: of zero offsets; None for the machine's. Not checked if both are None.
+        sample: on the stage at the start; None for the twin's own.
+        data: the twin's folder, made by the twin if it is missing; None for one of its
+            own.
 
     Raises:
         TwinError: an unknown name, or a file that does not hold.

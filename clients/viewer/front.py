@@ -439,11 +439,11 @@ async def _down(viser: ClientConnection, browser: ServerConnection) -> None:
 
 
 def _quiet() -> logging.Logger:
-    """Set up the library's logger, without a traceback for each connection that sends
-    nothing.
+    """Return the library's logger, without the message "opening handshake failed" and its
+    traceback for each connection that sends nothing.
 
-    Such are pages' connections to us, and ours to viser when a page leaves at once.
-    Returns the logger; only the message "opening handshake failed" is dropped.
+    Such are pages' connections to us, and ours to viser when a page leaves at once, whose
+    logger gets the same filter.
     """
     front = logging.getLogger("websockets.front")
     for logger in (front, logging.getLogger("websockets.server")):

@@ -108,10 +108,7 @@ def viewer_pages(viewer: Viewer) -> Pages:
     """
 
     def health() -> dict[str, object]:
-        """Return name and version of this server, and whether the twin is connected.
-
-        Raises nothing.
-        """
+        """Return name and version of this server, and whether the twin is connected."""
         return {
             "server": f"flexdt viewer {version('flexdt')}",
             "twin": "connected" if viewer.link.connected else "not connected",
@@ -151,11 +148,10 @@ def viewer_pages(viewer: Viewer) -> Pages:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the viewer with the options of `argv` (default: the command line) until it is ended;
-    returns the exit code.
+    """Run the viewer with the options of `argv` (default: the command line) until it is
+    ended; return the exit code.
 
-    What viser prints is suppressed. Only standard output is suppressed; the ready line is
-    printed there all the same.
+    Standard output gets only the ready line: what viser prints there is dropped.
     """
     options = parse(ViewerSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)

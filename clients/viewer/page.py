@@ -185,11 +185,13 @@ class Page:
         self._over.set()
 
     def say(self, kind: str, **content: object) -> None:
-        """Send something that must arrive, in order; a page that has not taken 1000 is
-        closed.
+        """Send something that must arrive, in order; it is converted to JSON now.
 
-        `kind` is the message's type, `content` its fields. The page is closed at more
-        than `MAX_NOTES`; the content is converted to JSON now.
+        A page with more than `MAX_NOTES` unsent is closed.
+
+        Args:
+            kind: type of the message.
+            content: its fields.
         """
         self._notes.append(json.dumps({"type": kind, **content}))
         if len(self._notes) > MAX_NOTES:
@@ -364,9 +366,8 @@ class Page:
             raise
 
     def _fail(self, id: object, error: RpcError) -> None:
-        """Answer the request `id` with an error's code, message and data without bytes.
-
-        Returns nothing; the message is for people (`_words`).
+        """Answer the request `id` with an error's code, message for people (`_words`) and
+        data, in which bytes are None.
         """
         data = without_bytes(error.data)
         self.say(
@@ -422,13 +423,10 @@ def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:
 
 
 def _request(message: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Read method and parameters of a message.
-
-    Without params these are {}. Params that are null or empty are {}. Also raised if
-    params are a list.
+    """Read method and parameters of a message; missing, null or empty params are {}.
 
     Raises:
-        ValueError: it has none.
+        ValueError: it has no method, or params that are not by name.
     """
     method = message.get("method")
     params = message.get("params") or {}

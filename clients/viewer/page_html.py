@@ -19,15 +19,13 @@ BOXES: Final = "<!-- a box for each layer -->"
 
 
 def page_file(name: str) -> bytes:
-    """Read a file of the page as browsers get it.
+    """Read a file of the page as browsers get it; the page itself has the boxes of the
+    layers filled in.
 
-    Also raises for other files of the package that are missing; names are not checked
-    here. Returns bytes.
+    Names are not checked here.
 
     Raises:
         FileNotFoundError: there is none of this name.
-
-    The page itself has the boxes of the layers filled in.
     """
     content = (resources.files("flexdt.clients.viewer") / "data" / name).read_bytes()
     if name == PAGE:
@@ -36,13 +34,10 @@ def page_file(name: str) -> bytes:
 
 
 def token_form(wrong: bool) -> bytes:
-    """Make the page with the form for the viewer's token.
-
-    Returns HTML as bytes; it says so if a wrong one was given. Otherwise the mark stays,
-    a comment.
+    """Make the page (HTML) with the form for the viewer's token.
 
     Args:
-        wrong: whether a wrong one was given.
+        wrong: whether a wrong one was given, which the page then says.
     """
     if wrong:
         said = b'<p id="wrong" role="alert">This is not it.</p>'

@@ -264,7 +264,11 @@ async def layers(viewer: Viewer, page: Page, params: Params) -> object:
 
 
 async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
-    """Set light or dark, plain or fine, for this page's scenes."""
+    """Set light or dark, plain or fine, for this page's scenes, also for later ones;
+    returns {}.
+
+    If no page is fine, states are drawn less often.
+    """
     page.dark = params.dark
     page.fine = params.fine
     viewer.clients.theme(page.id, page.dark, params.fine)
@@ -537,11 +541,19 @@ def _readout(
 
 
 async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Predict the virtual image at a recorded one's pose and exposure; returns its
-    origin as well.
+    """Predict the virtual image at a recorded one's pose and exposure.
 
-    Tube and camera settings that are None are left out, so the present ones count.
-    Returns (pixels, origin or None). Raises RpcError as the twin does.
+    Tube and camera settings that were not recorded are the present ones.
+
+    Args:
+        page: whose connection asks the twin.
+        told: the recorded image's entries.
+
+    Returns:
+        Pixels, and origin or None.
+
+    Raises:
+        RpcError: the twin refuses.
     """
     asked = {name: told[name] for name in ("kind", "positions")}
     for what in ("tube", "camera"):  # unknown settings are the present ones
@@ -577,11 +589,19 @@ async def live(viewer: Viewer, page: Page, params: Live) -> object:
 
 
 async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, bytes]:
-    """Send a request to the volume's process; returns nothing where it has another
-    volume by now.
+    """Send a request to the volume's process.
 
-    Returns a head and bytes; nothing is ({}, b""). Raises RpcError without --data or for
-    a name that is not plain.
+    Args:
+        viewer: the viewer.
+        params: name the volume.
+        *words: of the request.
+
+    Returns:
+        A head and bytes; ({}, b"") where the process has another volume by now, or none.
+
+    Raises:
+        RpcError: the viewer has no --data.
+        DatasetNameError: the data set's name is not a plain one.
     """
     folder = _data(viewer) / plain_name(params.name or "", "data set")
     return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or (
@@ -591,11 +611,19 @@ async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, by
 
 
 async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
-    """Offer a reconstructed volume to a page: a head, and codes to fetch; empty while
-    there is none.
+    """Offer a part of a reconstructed volume to a page.
 
-    The former block of the page is dropped if it was not fetched. Codes are offered as a
-    download, its url and size in the result.
+    A part offered before that was not fetched is dropped.
+
+    Args:
+        viewer, page: of the request.
+        params: name the volume, and the part: `what`.
+
+    Returns:
+        Its head, and url, name and size of the codes to download; {} while there is none.
+
+    Raises:
+        RpcError: the viewer has no --data.
     """
     head, codes = await _of_volume(viewer, params, "block", params.what)
     if not codes:
@@ -944,16 +972,18 @@ async def serve(
 ) -> object:
     """Answer one request of a page: check its parameters and call the method.
 
-    The result is the method's own.
-
     Args:
         name: of METHODS.
         viewer: the viewer.
         page: that calls.
         given: parameters.
 
+    Returns:
+        The method's result.
+
     Raises:
-        RpcError: -32602 with every problem of the parameters, or an error of the twin's code.
+        RpcError: -32602 with every problem of the parameters, or the method's refusal;
+            its TwinErrors are converted.
     """
     model, answer = METHODS[name]
     try:

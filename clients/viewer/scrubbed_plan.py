@@ -98,21 +98,21 @@ class Made:
 async def make(
     workers: Workers, text: str, machine: Machine, profile: Profile, state: State | None
 ) -> Made:
-    """Plan a script, in a process of its own where that may take long.
-
-    Short scripts are planned in a thread. Returns plan, path (None without a state) and
-    document.
+    """Plan a script, in a thread if it is short, else in a process of its own.
 
     Args:
         workers: these processes.
         text: of the script.
-        machine: its machine.
-        profile: its profile.
+        machine, profile: of the scan.
         state: of the twin, from which the script starts; None: from home.
 
+    Returns:
+        Plan, path (None without a state) and document.
+
     Raises:
-        ScriptError: it does not parse.
-        RpcError: it has too many images, or takes too long or too much memory.
+        ScriptError: it does not parse, if it is short.
+        RpcError: it has too many images, takes too long or too much memory, or, if it is
+            long, does not parse.
     """
     if is_light(text.encode()):
         return await asyncio.to_thread(_made, text, machine, profile, state)

@@ -83,8 +83,11 @@ def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8
     """Convert to 8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter
     bright on black.
 
-    `window` is the values of black and white; NaN is black. Values beyond the window are
-    cut; equal ends divide by zero.
+    Values beyond the window are cut; NaN is black.
+
+    Args:
+        image: whose pixels are drawn.
+        window: values of black and white, not equal.
     """
     low, high = window
     scaled = (np.asarray(image.pixels, dtype=np.float32) - low) * (255.0 / (high - low))

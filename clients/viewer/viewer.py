@@ -212,7 +212,7 @@ class Viewer:
         """End all tasks, feeds, pages, reconstructions and planners, and viser's server,
         in this order, waiting for each but the planners.
 
-        Raises nothing for tasks that failed.
+        Errors of tasks that have failed are not raised.
         """
         for task in self._tasks:
             task.cancel()
@@ -262,8 +262,8 @@ class Viewer:
     def _state_came(self, data: Mapping[str, Any]) -> None:
         """Keep a state of the twin, and wake the task that draws it.
 
-        A time earlier than the last one means another twin: it is then reported anew.
-        Only the log's numbering starts again then.
+        A time earlier than the last one means a new twin, whose log entries are numbered
+        anew: they are passed on again.
         """
         if data["time"] < self._twin_time:  # a new twin, which counts from 0 again
             self._told = -1

@@ -191,10 +191,9 @@ def _check_together(
 ) -> None:
     """Check that options go together.
 
-    Checked: preview, the ending of `out`, kV, options that the algorithm lacks, SLURM
-    with a scheduler, workers for FDK only, and correction with a geometry. The first
-    wrong one is raised. Returns nothing; `out` names the wrong ending, all others their
-    option.
+    Checked in this order, the first wrong one is raised: preview, the ending of `out`,
+    kV, options that the algorithm lacks, SLURM with a scheduler, workers for an algorithm
+    that has none, and correction with a geometry.
 
     Args:
         given: options by name.
@@ -202,7 +201,8 @@ def _check_together(
         kept_out: options that a preview sets itself.
 
     Raises:
-        typer.BadParameter: they do not.
+        typer.BadParameter: they do not; names the option, or the file with a wrong
+            ending.
     """
     from flexdt.library.reconstruction.volume_files import ending, endings
 

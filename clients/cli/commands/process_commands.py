@@ -140,12 +140,13 @@ def start(name: str, more: Sequence[str]) -> None:
 def _check(given: Mapping[str, Any], named: Sequence[str]) -> None:
     """Check options against each other, and names and folders by themselves.
 
-    Returns nothing. TLS needs certificate and key together; a projector's address and
-    port exclude each other.
+    TLS needs certificate and key together; a projector's address and port exclude each
+    other.
 
     Args:
         given: option -> value.
-        named: options whose values are checked by themselves, where there are such options.
+        named: options whose values are checked by themselves, where there are such
+            options.
 
     Raises:
         typer.BadParameter: options that do not go together.

@@ -602,8 +602,8 @@ def save(
 ) -> None:
     """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in colour.
 
-    An existing file is replaced. A TIFF holds the image unchanged. Raises CommandError
-    for an image that cannot be drawn as PNG.
+    An existing file is replaced. A TIFF, for any ending but .png, holds the image
+    unchanged.
 
     Args:
         file: its ending selects the format.
@@ -612,6 +612,7 @@ def save(
         marks: (rows, cols) of pixels to colour, in a PNG; None for none.
 
     Raises:
+        CommandError: it cannot be drawn as PNG.
         OSError: the file cannot be written.
     """
     if file.suffix.lower() == ".png":

@@ -62,10 +62,12 @@ class LiveReconstruction:
 
     def grow(self, folder: Path, side: int, past: bool = False) -> None:
         """Start the volume of a data set and end any other; for the same request only
-        send its newest line again.
+        send its newest line again, if there is one.
 
-        `side` is the number of voxels a side, `past` whether the scan is complete. A
-        repeated request with no line yet does nothing. Returns nothing.
+        Args:
+            folder: of the data set.
+            side: number of voxels a side.
+            past: whether the scan is complete.
         """
         asked = wish(folder, side, past)
         if asked == self._asked:

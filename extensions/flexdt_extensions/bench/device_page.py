@@ -428,10 +428,10 @@ def geometries(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Convert volume and views to ASTRA's dictionaries. Safe without a GPU.
 
+    ASTRA's z, y, x order is flexdt's; its volumes are centred where flexdt's are, in mm.
+
     Returns:
         Volume geometry and projection geometry.
-
-    ASTRA's z, y, x order is flexdt's; its volumes are centred where flexdt's are, in mm.
     """
     nz, ny, nx = volume.shape
     low = [c - s / 2 for c, s in zip(volume.center_mm, volume.size_mm, strict=True)]

@@ -465,13 +465,14 @@ class ScenarioImages:
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write all images as TIFF, and CTSimU's metadata, into a new folder.
 
+        The folder appears only when everything is in it; after an error nothing is left.
+        An empty folder is replaced.
+
         Returns:
             Path of the metadata file.
 
-        The folder appears only when everything is in it; after an error nothing is left.
-
         Raises:
-            ExchangeError: the folder exists and is not empty.
+            ExchangeError: the folder exists and is not empty, or a file has its name.
             OSError: it cannot be written.
         """
         folder = Path(folder).absolute()

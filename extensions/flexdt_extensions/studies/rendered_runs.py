@@ -272,13 +272,13 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     """Calibrate rendered images with each number of projections of a task, identities
     unknown; a failure is a run, too.
 
+    The images of the largest N are made once; smaller N take every so many of them, with
+    the same noise.
+
     Args:
         task: one setting in one scenario.
         model: the beads.
         scene: the phantom.
-
-    The images of the largest N are made once; smaller N take every so many of them, with
-    the same noise.
 
     Raises:
         LimitError: some N do not divide the largest.

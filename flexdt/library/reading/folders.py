@@ -232,14 +232,13 @@ def read_tiffs(
 
 
 def _without_flat(folder: str, names: Sequence[str], pattern: str) -> str:
-    """Say what a scan without flat images lacks, and which files may be such images.
+    """Say what a scan without flat images lacks, and name the first file that looks like
+    one.
 
     Args:
         folder: name of the folder.
         names: of all files in it, sorted.
         pattern: that no file matches.
-
-    The first name that looks like a flat image is named.
     """
     some = [name for name in names if FLAT_NAME.search(name)]
     guess = f"; {some[0]} looks like one" if some else ""

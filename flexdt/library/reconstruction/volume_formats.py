@@ -303,12 +303,15 @@ def _nifti_header(places: VoxelPlaces) -> bytes:
 def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
     """Write one data set, `volume`, with its place as attributes.
 
-    Yields the function that takes the slabs, lowest first. Raises TwinError if h5py is
-    missing.
-
     Args:
         part: the unfinished file.
         places: of the voxels.
+
+    Yields:
+        The function that takes the slabs, lowest first.
+
+    Raises:
+        TwinError: h5py is missing.
     """
     grid = places.grid
     with _h5py().File(part, "w") as file:
