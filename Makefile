@@ -48,8 +48,8 @@ $(COMPILED): $(STAMP)
 
 # The third-party packages that tests check flexdt against: nothing a user of the twin needs.
 $(TEST_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]' \
-	  -e 'extensions[test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
+	  -e '.[test]' -e 'extensions[test]'
 	touch $@
 
 # What the site is built with: Sphinx, and the extras whose modules and notebooks are on its pages.
@@ -104,7 +104,7 @@ test: lint typecheck kernels $(COLLECTED) $(WEB_STAMP)
 
 # The second distribution's own tests, the slow ones included.
 test-extensions: lint typecheck $(TEST_STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m 'not night' extensions/tests \
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not night' extensions/tests \
 	  --junitxml=build/durations/extensions.xml
 
 slow: studies page campaigns

@@ -48,9 +48,8 @@ def test_the_job_ends_early_and_its_data_set_is_worth_what_was_asked(
     truth = drawn_truth(rng)
     wanted = {"tau_x": rng.uniform(1.5e-4, 3e-4), "tau_z": rng.uniform(1.5e-4, 3e-4)}
     with hiding(rays, tmp_path, truth) as port, TwinClient("127.0.0.1", port) as mine:
-        job, _ = submit(
-            mine, rng, FRAMES, 2.0
-        )  # slow enough for a busy machine to look on
+        # A frame in about 2 s: slow enough for a busy machine to look on.
+        job, _ = submit(mine, rng, FRAMES, 5.0)
         words = ",".join(f"{name}={most}" for name, most in wanted.items())
         capsys.readouterr()
         code = run(["job", "watch", "lego", job, "--stop-when", words,

@@ -14,6 +14,7 @@ from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt_extensions.studies import runs as solved_runs
+from flexdt_extensions.studies import study
 from flexdt_extensions.studies.experiment_4 import hidden_phantom, off_truth
 from flexdt_extensions.studies.experiments import (
     EXPERIMENTS,
@@ -97,15 +98,34 @@ def test_rendered_noisy_images_with_unknown_identities() -> None:
         assert max(run.errors[n] / run.sigmas[n] for n in run.errors) < 6.0
 
 
+def one_scenario_each(*words: Any, **options: Any) -> list[WorkUnit]:
+    """List a unit of each setting, of another scenario than the one before; for damping,
+    whose settings share their images, all of the first scenario."""
+    every = tasks(*words, **options)
+    settings = list(dict.fromkeys(t.setting for t in every))
+    if words[0] == "damping":
+        return every[: len(settings)]
+    of = {s: [t for t in every if t.setting == s] for s in settings}
+    return [of[s][i % len(of[s])] for i, s in enumerate(settings)]
+
+
 @pytest.mark.slow
+@pytest.mark.campaign(4)
+@pytest.mark.parametrize("scenarios", ["one", "all"])
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_an_experiment_in_images_runs_to_its_end(experiment: str) -> None:
+def test_an_experiment_in_images_runs_to_its_end(
+    experiment: str, scenarios: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whole by `flexdt study EXPERIMENT --fidelity images`; here with two numbers of
     projections.
 
     One bead determines nothing; of two beads, three images may be too few.
     """
+    if scenarios == "one":
+        monkeypatch.setattr(study, "tasks", one_scenario_each)
     document = run_study(experiment, "images", counts=(3, 12), jobs=1)
+    settings = {t.setting for t in tasks(experiment, "images")}
+    assert {row["setting"] for row in document["rows"]} == settings
     assert [run["note"] for run in document["runs"] if run["failed"]] == []
     assert all(run["note"] for run in document["runs"] if not run["identifiable"])
     for row in document["rows"]:
