@@ -64,7 +64,6 @@ export const store = {
 export const OLD_S = 1;
 const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5);
 const LOOK_MS = 200;
-const STOOD_MS = 1000;
 const REST_MS = 500;
 const TRY_AGAIN = 1013;
 type Listeners = { [E in keyof Events]?: Array<(...args: Events[E]) => unknown> };
@@ -225,7 +224,7 @@ const handlers: { [T in keyof Messages]: (m: Messages[T]) => void } = {
   },
   beat(m) {
     heard = { at: performance.now(), late: late(m.at), silent: m.silent_s };
-    if (rested()) look();
+    look();
   },
 };
 function text(content: string) {
@@ -258,30 +257,34 @@ export function imageMade(
 }
 function look() {
   const now = performance.now();
-  store.age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
+  const own = delay(now) / 1000;
+  const age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
+  store.age = Math.max(0, age - own);
   store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
   // An image of other things than the state's is old, once none has come for a while.
   const image = store.image;
   store.imageDiffers = image && store.now ? differences(imageMade(image), store.now) : [];
   const apart = image && store.imageDiffers.length && !image.recorded ? image : null;
   differs = apart ? (differs ?? now) : null;
-  store.imageAge =
-    apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
+  const waited = apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
+  store.imageAge = Math.max(0, waited - own);
   emit("age");
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come
-// meanwhile, before it says that the viewer is silent.
+// meanwhile: the longest delay of its own within REST_MS is no silence of the viewer.
 let looked = performance.now();
-let woken = -Infinity;
-const rested = () =>
-  performance.now() - looked < STOOD_MS && performance.now() - woken > REST_MS;
+let longest = { ms: 0, at: -Infinity };
+function delay(now: number): number {
+  const due = now - looked - LOOK_MS;
+  return Math.max(0, due, now - longest.at < REST_MS ? longest.ms : 0);
+}
 setInterval(() => {
   const now = performance.now();
-  const awake = now - looked < STOOD_MS;
-  if (!awake) woken = now;
+  const due = now - looked - LOOK_MS;
+  if (due >= delay(now)) longest = { ms: due, at: now };
   looked = now;
-  if (rested()) look();
-  if (!awake || store.age <= SILENT_S) return;
+  look();
+  if (store.age <= SILENT_S) return;
   for (const [id, w] of waiting)
     if (now - w.since > 1000 * SILENT_S) {
       waiting.delete(id);
