@@ -139,8 +139,10 @@ def interrupted_end(code: str, folder: Path) -> tuple[int, str, str]:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(10)
+@pytest.mark.parametrize("seed", [7, 8])
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_ends_without_a_traceback(name: str) -> None:
-    for _, moment, end in campaign([name], 3, 3.0, seed=7):
+def test_a_command_ends_without_a_traceback(name: str, seed: int) -> None:
+    for _, moment, end in campaign([name], 1, 3.0, seed):
         assert end.kind != "wrong", (moment, end)
         assert end.used_s < MOST_USED_S, (moment, end)

@@ -170,7 +170,7 @@ def test_what_a_report_proposes_ends_right(
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize("name", sorted(set(CASES) - {"angle_scale"}))
 def test_everything_a_report_proposes_ends_right_or_more_careful(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -277,7 +277,8 @@ def test_one_slab_is_held_at_a_time(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slabs", [1, 3])
+@pytest.mark.parametrize("slabs", [3, 1])
+@pytest.mark.campaign(1)
 def test_scatter_correction_reads_each_image_once(
     slabs: int, tmp_path: Path, reads: Counter[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -317,6 +318,7 @@ class Stop(Exception):
     "seed",
     [pytest.param(seed, marks=[pytest.mark.slow] * (seed > 1)) for seed in range(8)],
 )
+@pytest.mark.campaign(4)
 def test_no_file_stays_behind_whatever_fails_and_when(
     seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

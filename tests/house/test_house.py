@@ -244,6 +244,7 @@ def test_every_measure_has_a_name_of_its_own_and_a_kept_figure_is_known() -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_the_programme_reads_the_repository_and_does_not_fail() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "house"], cwd=ROOT / "tests" / "studies",

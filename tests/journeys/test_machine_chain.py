@@ -135,7 +135,8 @@ def assert_beads_in_volume(outcome: Outcome, root: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", [*SHIPPED[1:], SHIPPED[0]])  # the demonstration is of it
+@pytest.mark.campaign(3)
 def test_a_shipped_machine_goes_through_the_chain_at_its_own_defaults(
     name: str, tmp_path: Path
 ) -> None:
@@ -143,7 +144,7 @@ def test_a_shipped_machine_goes_through_the_chain_at_its_own_defaults(
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize("seed", range(36))
 def test_a_drawn_machine_goes_through_the_chain_or_is_refused(
     seed: int, tmp_path: Path

@@ -34,7 +34,7 @@ def right(tmp_path_factory: pytest.TempPathFactory) -> Right:
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", PARTS)
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 def test_nothing_is_ever_half_done(name: str, right: Right, tmp_path: Path) -> None:
     before, undisturbed = right[name]
     disturbed = 0

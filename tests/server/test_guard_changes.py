@@ -92,7 +92,7 @@ def warned(warnings: list[str], *parts: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["move", "jog"])
-@pytest.mark.daily(1)
+@pytest.mark.campaign(1)
 def test_a_bar_put_on_a_turning_stage_halts_it_before_the_panel(
     wire: Wire, how: str
 ) -> None:

@@ -89,6 +89,7 @@ def on_move_tab(page: Any) -> None:
 
 
 @pytest.mark.parametrize("axis", list(TARGETS))
+@pytest.mark.campaign(3)
 def test_number_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str) -> None:
     field = page.locator(f"[data-axis={axis}] .num")
     field.fill(str(TARGETS[axis]))
@@ -98,6 +99,7 @@ def test_number_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str
 
 
 @pytest.mark.parametrize("axis", list(TARGETS))
+@pytest.mark.campaign(3)
 def test_slider_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str) -> None:
     value = twin.state().axes[axis].position - 2.0
     # Read in the same breath: a state that comes may draw the slider anew.
@@ -113,6 +115,7 @@ def test_slider_of_every_axis(page: Any, twin: TwinClient, wait: Wait, axis: str
 
 
 @pytest.mark.parametrize("axis", list(TARGETS))
+@pytest.mark.campaign(3)
 def test_jog_buttons_of_every_axis(
     page: Any, twin: TwinClient, wait: Wait, axis: str
 ) -> None:
@@ -143,6 +146,7 @@ KEYS = {
 
 
 @pytest.mark.parametrize("key", list(KEYS))
+@pytest.mark.campaign(6)
 def test_keys_jog_while_held(page: Any, twin: TwinClient, wait: Wait, key: str) -> None:
     axis, direction = KEYS[key]
     page.check("#key-jog")

@@ -149,6 +149,7 @@ def test_a_small_screen_shows_the_button_and_its_sample_beside_each_other(
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (1366, 768), (1440, 900), (1920, 1080)])
+@pytest.mark.campaign(2)
 def test_the_close_up_is_a_quarter_of_each_pane_and_the_bar_is_whole(
     open_page: Callable[..., Any], size: tuple[int, int]
 ) -> None:

@@ -16,7 +16,7 @@ def test_every_advised_argument_is_read_from_its_sentence() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(3)
+@pytest.mark.campaign(2)
 @pytest.mark.parametrize("kind", advice_followed.ADVISED)
 def test_following_the_advice_is_right_or_more_careful(kind: str) -> None:
     for run in advice_followed.followed(kind, 3):

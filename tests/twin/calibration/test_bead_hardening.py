@@ -73,6 +73,7 @@ def scanned(
         pytest.param(112, 0.6, 24, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.campaign(3)
 def test_beads_in_a_hard_beam_are_where_they_are(
     monkeypatch: pytest.MonkeyPatch, seed: int, pitch_mm: float, frames: int
 ) -> None:

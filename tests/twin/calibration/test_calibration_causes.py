@@ -108,7 +108,7 @@ def test_a_drawn_fault_has_its_name(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in SOME][::2])
-@pytest.mark.campaign(4)
+@pytest.mark.campaign(2)
 def test_no_other_drawn_fault_is_offered_wrong(kind: str) -> None:
     """A second draw where the first is too mild; more: docs/evidence/calibration.json."""
     found = scored(kind, 50)

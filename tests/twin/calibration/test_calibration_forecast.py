@@ -82,6 +82,7 @@ def test_points(kind: str, priors: Given | None) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("priors", [None, "none"])
 @pytest.mark.parametrize("kind", ["spiral", "random 1"])
+@pytest.mark.campaign(2)
 def test_images(kind: str, priors: Given | None) -> None:
     beads = beads_of(kind)
     images = own.radiographs(np.random.default_rng(4), beads, ANGLES, own.SOD, TRUTH)

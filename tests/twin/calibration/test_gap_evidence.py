@@ -64,7 +64,7 @@ def test_natural_objects_have_no_gap(kind: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "seed"), [("foam", 1001), ("board", 102), ("printed", 1001), ("stone", 102)]
 )
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 def test_gaps_behind_natural_objects_are_named(kind: str, seed: int) -> None:
     """The mean's own axis is off by half of the gap; single frames show another at the axis."""
     told = natural_objects.tried(kind, seed, gap=True)

@@ -89,7 +89,7 @@ def test_outlines_at_both_sides_are_no_gap() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize(
     ("kind", "seed"), [("bone", 802), ("bottle", 601), ("foam", 802), ("printed", 601)]
 )

@@ -290,6 +290,7 @@ assert np.abs(here - wanted).max() < most
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.daily(1)
+@pytest.mark.campaign(2)
 def test_both_devices_filter_as_the_ramp_in_space(seed) -> None:
     run_simulated(FILTERED, str(seed))
 
