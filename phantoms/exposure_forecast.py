@@ -594,8 +594,15 @@ def _views(
     """Simulate views: paths (k, n, rows, cols), transmission (n, rows, cols), saturated
     and starved parts.
 
-    Without noise. Paths are by material [mm]. Both parts are shares of all pixels, 0 to
-    1; starved pixels have less than `FEW_COUNTS` above dark.
+    Without noise, with X-rays on. Paths are by material [mm]. Both parts are shares of
+    all pixels, 0 to 1; starved pixels have less than `FEW_COUNTS` above dark.
+
+    Args:
+        parts: the sample's k channels.
+        chain: of the machine.
+        camera: mode and region.
+        cone: n views.
+        lit: tube and time.
     """
     paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
     images = radiographs(chain, paths, cone.rows, [lit] * len(cone))

@@ -50,7 +50,8 @@ def check_distances(
     """Check that the machine has an exposure and distances, by composing a script of
     them.
 
-    The script is thrown away; the region of the camera is not checked here.
+    The script is thrown away; the region of the camera is not checked here. Motors have
+    the zero offsets of the machine's own profile.
 
     Args:
         machine: whose camera and motors these are.

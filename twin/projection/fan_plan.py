@@ -314,7 +314,7 @@ def plan_turns(
 
     The jobs of a view are gathered to units at least `MIN_UNIT_WIDTH` voxels wide; every
     second unit is of one turn, the rest of the next. Neighbouring views with fewer than
-    four units, and all with one worker, are one unit for one thread.
+    three units, and all with one worker, are one unit for one thread.
 
     Args:
         plan: of these views.

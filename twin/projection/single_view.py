@@ -285,6 +285,10 @@ class ViewMemory:
         """Compare the image with that of numba's launch, once for each kernel of a
         process; a kernel that was equal before is not compared.
 
+        Args:
+            views: voxels and box.
+            kind: of `prepare`.
+
         Returns:
             Whether all bytes are equal; a line of the log says if not.
         """
