@@ -409,7 +409,8 @@ class ConjugateRays:
         """Read the distance between both ends of rays at each distance from the axis, in
         bins.
 
-        Bins of less correlation than `MIN_CORRELATION` are left out.
+        Bins of less correlation than `MIN_CORRELATION` are left out. The sigma of each is
+        the larger of those by sectors and by groups of rows.
 
         Args:
             values: parameters in the order of `circular_scan.FREE`, (k,).

@@ -62,7 +62,8 @@ def find_gap(
     A gap counts if single frames show it and both ends of rays agree, if it is a likely
     hidden one, or if both ends of rays show a significant step. Its width is that of both
     ends of rays. The gap is marked as beside the axis if its place leaves the width to
-    the prior. Hidden ones are judged only if none is closed.
+    the prior. Hidden ones are judged only if none is closed; a likely one does not count
+    if both ends of rays show another step behind it.
 
     Args:
         rays: both ends of rays of a turn.

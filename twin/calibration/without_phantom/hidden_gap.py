@@ -148,8 +148,9 @@ def hidden_gap(
 
     Returns:
         The range of columns in which one may be hidden, its probability, its root mean
-        square width, and the likeliest gap if its odds exceed `REPORTED_ODDS`; None for
-        images of too few columns about the axis.
+        square width (a share `OPEN_SHARE` of the usual width at least, where the odds
+        exceed 1 / `REPORTED_ODDS`), and the likeliest gap if its odds exceed
+        `REPORTED_ODDS`; None for images of too few columns about the axis.
     """
     if profile:
         reach = _hidden_radius(profile, smoothing)
@@ -364,6 +365,9 @@ def _beside_others(gains: FloatArray, count: FloatArray) -> Judged:
         gains: in log likelihood of a gap over none, by frame and border, (n, c).
         count: edges that pass each border, (c,): so visible a gap would be there; one
             above 0 at least.
+
+    Returns:
+        Evidence and gain of each border, (c,), and how well the model fits, at most 1.
     """
     whole = gains.sum(axis=0)
     passed = np.maximum(count, 1.0)

@@ -446,7 +446,7 @@ class _MirrorPairs:
 
         The noise is widened where blocks of rows or columns scatter more or residuals are
         larger. Errors of sampling at edges (the diagonal alone), and of systematic doubts
-        of the mean, are added.
+        of the mean, are added; half of the first doubt, for the lack of views.
 
         Args:
             inverse: (k, k) of the slopes of the equation.
