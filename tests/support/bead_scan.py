@@ -45,6 +45,13 @@ def bead_scan_on(
 ) -> tuple[Path, ScanPlan]:
     """Scan the LEGO phantom on any machine, `truth` hidden.
 
+    Args:
+        machine: with its own profile.
+        request: the scan; its script has to be free of errors.
+        root: where the data set, "lego", is written.
+        truth: hidden offsets by name, as corrections give them [mm, deg].
+        physics: of the images; their noise is always the same.
+
     Returns:
         The data set's folder, and the plan.
     """

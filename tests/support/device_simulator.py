@@ -10,7 +10,16 @@ from typing import Any
 
 
 def run_simulated(program: str, *arguments: str) -> None:
-    """Run a program, which has to end without an error, in a process of its own."""
+    """Run a program in a process of its own, with numba's simulator of devices.
+
+    Args:
+        program: Python, as a text.
+        arguments: of the program.
+
+    Raises:
+        AssertionError: it ends with an error; the message is what it wrote of it.
+        subprocess.TimeoutExpired: it takes longer than 300 s.
+    """
     done = subprocess.run(
         [sys.executable, "-c", program, *arguments],
         env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"},

@@ -387,7 +387,14 @@ def healthy(
     seconds: float,
     overhead: tuple[float, float] | None = None,
 ) -> Iterator[Message]:
-    """So many seconds of a machine and a server without a fault, nearly in order."""
+    """So many seconds of a machine and a server without a fault, nearly in order.
+
+    Args:
+        dialect: how messages are written.
+        seed: of all that is drawn.
+        seconds: of the machine's time, at least; the last command is ended.
+        overhead: see `Conversation`.
+    """
     made = Conversation(
         dialect, random.Random(f"{dialect.name} healthy {seed}"), overhead=overhead
     )
@@ -406,7 +413,14 @@ def trapezium(way: float, speed: float, acceleration: float) -> float:
 
 
 def travelled(time: float, way: float, speed: float, acceleration: float) -> float:
-    """How far a move has got."""
+    """How far a move from rest to rest has got: 0 before it begins, the whole way after.
+
+    Args:
+        time: since it began [s].
+        way: whole length, 0 or more.
+        speed: the most.
+        acceleration: of both ramps.
+    """
     whole = trapezium(way, speed, acceleration)
     t = min(max(time, 0.0), whole)
     ramp = min(speed / acceleration, whole / 2.0)

@@ -39,6 +39,12 @@ def images(
     The axis stands `aside` to the left of the line from the source to the panel's middle, and
     its upper end leans by `roll` [rad] to the right. The panel is `moved` to the right and up
     [pixels], in each view (n, 2) or in all.
+
+    Args:
+        aside: see above [mm].
+        start: angle of the stage in the first view [rad].
+        sense: 1 for clockwise seen from above, -1 for the other way.
+        roll, moved: see above.
     """
     out = np.empty((VIEWS, ROWS, COLS))
     x, z = (

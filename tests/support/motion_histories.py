@@ -505,9 +505,17 @@ class Outcome:
 def run_histories(rng: Rng, runs: int, repeats: int) -> Outcome:
     """Long runs on one drawn machine, each of the arm that took most from the gap when tried.
 
-    A bandit: every arm is tried a few times where parts have just come near, the one with the
-    greatest reward (gap taken, or the published state's distance from the oracle's) is
-    repeated, with others of its kind in between; blocked states are reset as a person would.
+    A bandit: every arm is tried three times where parts have just come near; the one with the
+    greatest reward (gap taken) is repeated, with the next two in between. Where nothing is
+    gained any more, three others are drawn. Blocked states are reset as a person would.
+
+    Args:
+        rng: draws all.
+        runs: how many.
+        repeats: requests of each run.
+
+    Returns:
+        What it came to; the runs end with the first thing found.
     """
     subject = Subject(rng)
     accepted = made = 0

@@ -827,6 +827,11 @@ def recover(
 
     A stretch counts as a parabola when positions and velocities in its middle and at its end
     are those of one; else it is halved, until it is KNOT_S long.
+
+    Args:
+        machine: whose motors they are.
+        positions, velocities: the scanner's, at any time.
+        start, end: [s]; `end` is the later one.
     """
 
     hardest = machine.hardest
