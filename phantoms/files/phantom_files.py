@@ -359,7 +359,9 @@ def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
     """Read the beads of a bead file: position [mm], radius [mm], material (steel if left
     out) of each.
 
-    Other keys are errors.
+    Raises:
+        PhantomError: no list, a missing or another key, or a wrong value; names the key
+            path.
     """
 
     def read(one: object, at: str) -> tuple[Vector, float, str]:

@@ -273,8 +273,8 @@ def motor_reply(reply: bytes) -> MotorReply | None:
 
     None if it is too short, has been saved as plain text (no byte from 0x80 on), or its
     numbers are not a motor's: limits that are not repeated or in order, speed or
-    acceleration not above 0 or above their maxima, maxima above 1e6, a position more than
-    1 outside the limits.
+    acceleration not above 0 or above their maxima, maxima above 1e6, a number beyond 1e9
+    or NaN, a position more than 1 outside the limits.
 
     Args:
         reply: column 9: 17 big-endian doubles (0 position, 1 target, 2 speed, 4
