@@ -256,8 +256,7 @@ def _filled(
 
     Returns:
         Of each pixel, row by row: the inverse depth of the nearest triangle, and its
-        index; 0 and -1
-        where there is none.
+        index; 0 and -1 where there is none.
     """
     low = np.floor(corners[:, :, :2].min(axis=1))
     high = np.minimum(np.ceil(corners[:, :, :2].max(axis=1)), [width, height])

@@ -256,21 +256,18 @@ def fitted(
 def beam_view(world: World) -> tuple[Standpoint, dict[str, object]]:
     """Compute the beam's eye of a geometry, and how a page crops it to the image alone.
 
-    The eye is at the focal spot and looks at the foot of the perpendicular, unless that
-    needs too large a picture. Too large is more than `MAX_SIZE_RATIO` times the image in
-    width or height. Up is the image's -v; distances of the camera are in [m].
+    The eye is at the focal spot and looks at the foot of the perpendicular, or at the
+    panel's middle if that needs a picture of more than `MAX_SIZE_RATIO` times the image
+    in width or height. Up is the image's -v; distances of the camera are in [m].
 
     Args:
         world: geometry.
 
     Returns:
-        Camera and framing. Lengths are in units of the image's width: the picture is
-        `width` x
-        `height`, and the image, 1 x `aspect`, has its top left corner `left`, `top`
-        inside it; the
-        sample is `sample_height_mm` above the focal spot. Where not `exact` the eye looks
-        at the
-        panel's middle.
+        Camera and framing, whose lengths are in units of the image's width: the picture
+        is `width` x `height`, and the image, 1 x `aspect`, has its top left corner
+        `left`, `top` inside it. `exact` is False where the eye looks at the panel's
+        middle; `sample_height_mm` is the sample's height above the focal spot.
     """
     rows, cols = world.shape
     pu = float(np.linalg.norm(world.u))

@@ -148,8 +148,7 @@ def surface(
 
     Returns:
         `vertices` (v, 3) float32 [mm, object frame] and `faces` (f, 3) int32, both
-        base64; empty
-        where nothing is dense.
+        base64; empty where nothing is dense.
     """
     factor = max(1, -(-max(grown.shape) // cells))
     while True:

@@ -134,24 +134,21 @@ def placement(folder: Path) -> StagePlacement:
 def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[str, Any]:
     """Measure figures of a volume, and the same of the truth.
 
-    Voxels that no data cover are left out. Main material: within `ALIKE_SHARE` (10 %) of
-    the main level, without its outermost voxels where any remain. Solid is above half the
-    level, measured and true alike. The rms box is the sample's, 3 voxels wider on each
-    side. `voxel_mm` is the same on all axes; each pair is [measured, true].
+    The main material is what the truth has within `ALIKE_SHARE` (10 %) of its main level,
+    without its outermost voxels where any remain. Solid is above half the level, measured
+    and true alike. Voxels that no data cover are left out.
 
     Args:
         values: (z, y, x) [1/mm], not a number where no data cover.
         truth: of the same shape.
-        voxel_mm: edge of a voxel.
+        voxel_mm: edge of a voxel, the same on all axes.
 
     Returns:
-        `attenuation` of the main material, a voxel and more inside it [1/mm]; `void` part
-        of the
-        volume within its outlines, layer by layer; `x_mm`, `y_mm`, `z_mm` from face to
-        face; each as
-        measured and as true, None where it cannot be measured. And the `rms` difference
-        [1/mm] in
-        the box around the sample.
+        Pairs [measured, true], None where it cannot be measured: `attenuation` of the
+        main material [1/mm]; `void`, the part of the volume within its outlines, layer by
+        layer, that is not solid; `x_mm`, `y_mm`, `z_mm` from face to face. And `rms`, the
+        difference [1/mm] in the sample's box, 3 voxels wider on each side, or in all of a
+        volume without solid voxels.
     """
     mu = main_level(truth)
     known = np.isfinite(values)

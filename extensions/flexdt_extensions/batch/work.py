@@ -644,8 +644,7 @@ def _compare_with_truth(
 
     Returns:
         `identifiable`, `values`, `errors`, `sigmas`, `rms_px`, `iterations`, `note` and,
-        without a
-        fit, `error`.
+        without a fit, `error`.
     """
     truth = item.truth.to_edge()
     if fit is None:

@@ -592,7 +592,7 @@ def place(
         part: centre, axes, deviations and drifts.
         turn: (n,) of the part about its w [rad].
         frame: number of the frame.
-        real: include deviations unknown to reconstruction.
+        real: include deviations and drifts that are unknown to reconstruction.
         stage: centre and axes of the stage, for a sample.
 
     Returns:

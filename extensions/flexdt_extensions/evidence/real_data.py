@@ -251,8 +251,7 @@ def _distances(one: Array, other: Array) -> tuple[float, float]:
 
     Returns:
         Root mean square distance, and the second's size over the first's, which the two
-        scans' SDD
-        determine to a few tenths of a per cent.
+        scans' SDD determine to a few tenths of a per cent.
     """
     from scipy.spatial import procrustes
 
