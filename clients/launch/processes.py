@@ -167,6 +167,8 @@ class Servers:
 
         Raises:
             ServersError: the process ended first; with the end of its log.
+            subprocess.TimeoutExpired: it printed its last line and then did not end within
+                `STOP_TIMEOUT_S`.
         """
         assert process.stdout is not None
         for line in (

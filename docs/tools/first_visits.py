@@ -49,7 +49,7 @@ def as_opened(page: Any) -> None:
 
 
 def four_views(page: Any) -> None:
-    """Show four views, with X-rays on."""
+    """Switch X-rays on, show four views, and wait until the page's notes have faded."""
     page.evaluate("flexdt.call('tube.set', {on: true})")
     page.locator("#beam", has_text="ON").wait_for()
     page.get_by_role("button", name="Four views").click()
@@ -64,7 +64,9 @@ def beams_eye(page: Any) -> None:
 
 
 def script_written(page: Any) -> None:
-    """Switch X-rays off, compose a script in the Scan tab, and wait for its verdict."""
+    """Switch X-rays off, show the isometric view, compose a script in the Scan tab, and
+    wait for its verdict.
+    """
     page.evaluate("flexdt.call('tube.set', {on: false})")
     page.get_by_role("button", name="Isometric").click()
     page.click("#tabs [data-tab=scan]")
@@ -87,7 +89,9 @@ def images(page: Any) -> None:
 
 
 def story_open(page: Any) -> None:
-    """Open the story of the Calibrate tab."""
+    """Close the page's data set, and open the story of the Calibrate tab unless it is
+    open.
+    """
     page.evaluate("flexdt.data.open(null).then(() => null)")
     page.click("#tabs [data-tab=calibrate]")
     if page.get_attribute("#story", "open") is None:
@@ -95,7 +99,7 @@ def story_open(page: Any) -> None:
 
 
 def designed(page: Any) -> None:
-    """Open the designer of the Scan tab."""
+    """Open the designer of the Scan tab unless it is open, and wait for its quality."""
     page.click("#tabs [data-tab=scan]")
     if page.get_attribute("#designer", "open") is None:
         page.click("#designer summary")
@@ -117,7 +121,18 @@ WITH_DATA: dict[str, Reach] = {
 
 
 def opened(browser: Any, url: str, size: Size, theme: str) -> Any:
-    """Open the page by a browser that has never been there."""
+    """Open the page by a browser that has never been there, and wait until it has an
+    image, a session and a live view, and its notes have faded.
+
+    Args:
+        browser: of playwright.
+        url: of the page.
+        size: of the window (width, height) [px].
+        theme: of the page.
+
+    Returns:
+        The page, in a context of its own, which the caller closes.
+    """
     width, height = size
     context = browser.new_context(viewport={"width": width, "height": height})
     page = context.new_page()
@@ -130,7 +145,9 @@ def opened(browser: Any, url: str, size: Size, theme: str) -> Any:
 
 
 def pictured(page: Any) -> Image.Image:
-    """Take a picture of the page once what was asked for is there."""
+    """Take a picture of the page, without transparency, once what was asked for is drawn
+    and nothing is marked as old.
+    """
     page.wait_for_timeout(SETTLING_MS)
     page.wait_for_function(DRAWN)
     page.locator("#veil").wait_for(state="hidden")
@@ -139,7 +156,17 @@ def pictured(page: Any) -> Image.Image:
 
 
 def fresh(browser: Any, url: str, size: Size, theme: str) -> dict[str, Image.Image]:
-    """Return a picture of each state without data, from one visit."""
+    """Make a picture of each state of `FRESH`, those without data, in one visit.
+
+    Args:
+        browser: of playwright.
+        url: of the page.
+        size: of the window (width, height) [px].
+        theme: of the page.
+
+    Returns:
+        State -> picture.
+    """
     page = opened(browser, url, size, theme)
     pictures = {}
     for state, reach in FRESH.items():
@@ -152,7 +179,18 @@ def fresh(browser: Any, url: str, size: Size, theme: str) -> dict[str, Image.Ima
 def with_data(
     browser: Any, url: str, sizes: list[Size], theme: str
 ) -> dict[Size, dict[str, Image.Image]]:
-    """Return a picture of each state with data at each size, from one visit."""
+    """Make a picture of each state of `WITH_DATA` at each size, in one visit: all sizes
+    of a state before the next one.
+
+    Args:
+        browser: of playwright.
+        url: of the page.
+        sizes: of the window (width, height) [px], the first when the page is opened.
+        theme: of the page.
+
+    Returns:
+        Size -> state -> picture.
+    """
     page = opened(browser, url, sizes[0], theme)
     pictures: dict[Size, dict[str, Image.Image]] = {size: {} for size in sizes}
     for state, reach in WITH_DATA.items():
@@ -166,7 +204,9 @@ def with_data(
 
 
 def sheet(pictures: list[Image.Image]) -> Image.Image:
-    """Put pictures of one size side by side, SHEET_COLUMNS a row."""
+    """Put pictures of one size side by side, `SHEET_COLUMNS` a row and each `SHEET_PX`
+    wide; places left over in the last row are black.
+    """
     width, height = pictures[0].size
     small = (SHEET_PX, round(SHEET_PX * height / width))
     rows = -(-len(pictures) // SHEET_COLUMNS)
