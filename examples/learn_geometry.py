@@ -167,8 +167,14 @@ def voxels(ellipsoids: list[tuple], grid: fx.Grid, sharp: bool) -> fx.Volume:
 
 
 def make(seed: int, views: int, count: int, sharp: bool = False) -> Task:
-    """Draw twelve ellipsoids, voxelised in count^3, and a misalignment of up to 2 px
-    each, and render the images of the true geometry.
+    """Draw twelve ellipsoids in a cube of 40 mm and a misalignment of up to 2 px each,
+    and render the images of the true geometry.
+
+    Args:
+        seed: of the draws.
+        views: of the circle.
+        count: voxels a side of the model; the panel has two thirds as many pixels.
+        sharp: as for `render`.
     """
     rng = np.random.default_rng(seed)
     size = 40.0

@@ -24,8 +24,13 @@ from flexdt.clients import TwinClient
 
 
 def start(*words: str) -> tuple[subprocess.Popen[str], int]:
-    """Start a `flexdt` process on a free port, wait for its ready line, and return it
-    with its port.
+    """Start a `flexdt` process on a free port and wait for its ready line.
+
+    Args:
+        words: of the command line, without the port.
+
+    Returns:
+        The process, and its port.
     """
     command = [sys.executable, "-m", "flexdt.clients.cli", *words, "--port", "0"]
     child = subprocess.Popen(
@@ -38,7 +43,8 @@ def start(*words: str) -> tuple[subprocess.Popen[str], int]:
 def scan(
     ports: list[int], data: Path, frames: int, *how: str
 ) -> tuple[dict[str, str], float]:
-    """Scan `frames` poses by a twin that shares its views among projectors.
+    """Scan `frames` poses of one turn by a twin that shares its views among projectors,
+    the stage at mag_obj 500 mm; the twin is ended afterwards.
 
     Args:
         ports: of the projectors on this machine.

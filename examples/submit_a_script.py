@@ -14,8 +14,14 @@ from flexdt.clients import TwinClient
 
 
 def main(script: str, host: str = "127.0.0.1", port: int = 55000) -> None:
-    """Check a script on a twin and print its problems, then submit it and print its
-    progress until it has ended.
+    """Check a script on a twin and print its problems, then put the sample normal-5 on
+    the stage, submit the script and print its progress until it has ended or is paused.
+
+    It is submitted even if the check has found errors, and the clock runs at "max".
+
+    Args:
+        script: its file.
+        host, port: of the twin.
     """
     text = Path(script).read_bytes()
     with TwinClient(host, port) as client:

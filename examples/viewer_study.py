@@ -89,8 +89,13 @@ async def rates(viewer: str) -> list[dict[str, float]]:
     """Measure the states, images and MB a second that each of PAGES pages gets while the
     stage turns, for SECONDS.
 
+    It begins 2 s after the motion, which is stopped at the end.
+
     Args:
         viewer: HOST:PORT.
+
+    Returns:
+        The figures of each page.
     """
     async with contextlib.AsyncExitStack() as stack:
         pages = [
@@ -146,6 +151,9 @@ def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
     """Measure latency, displayed rate and memory of the page in headless Chromium with
     software rendering.
 
+    Latency is that from a move by 2 deg to the next image shown, 40 times; rates are over
+    SECONDS while the stage turns.
+
     Args:
         url: of the page.
         view: that it shows.
@@ -153,8 +161,9 @@ def browser(url: str, view: str, minutes: float, pid: int) -> dict[str, Any]:
         pid: of the viewer's process.
 
     Returns:
-        Latency [ms], images and states a second, the viewer's share of a core, and the
-        samples of `memory`.
+        Latency [ms] (median, 95 % and number), images displayed and images and states
+        received a second, the viewer's share of a core, and, if measured, the samples of
+        `memory`.
     """
     from playwright.sync_api import sync_playwright
 
@@ -204,8 +213,8 @@ def cpu_s(pid: int) -> float:
 
 
 def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
-    """Measure the viewer's resident memory and the page's heap in use [MB] at intervals
-    of at most 30 s, while the stage turns.
+    """Measure the viewer's resident memory and the page's heap in use, after a garbage
+    collection, [MB] at intervals of at most 30 s, while the stage turns to and fro.
 
     Args:
         page: of the browser.

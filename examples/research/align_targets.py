@@ -205,7 +205,9 @@ def smooth(rng: np.random.Generator) -> Solids:
 
 
 def truncated(rng: np.random.Generator) -> Solids:
-    """Draw a porous body that is wider and higher than the field of view."""
+    """Draw a porous body that is wider and higher than the field of view, at 0.4 of the
+    attenuation of `porous`.
+    """
     inside = porous(rng)
     wide = inside.ellipsoids.copy()
     wide[:, :3] *= 2.9
@@ -307,11 +309,15 @@ def measured(
     lines: np.ndarray, hidden: Hidden, photons: float, rng: np.random.Generator,
     keep: np.ndarray | None = None, ramp: float = 0.0,
 ) -> fx.DataSet:  # fmt: skip
-    """Make a data set of counts with Poisson noise and 20 flat images.
+    """Make a data set of counts with Poisson noise, the mean of 20 flat images, and dark
+    images of 0.
+
+    A count is a photon, or 60 counts where there are at most 1000 photons; counts end at
+    65535. Warnings are suppressed.
 
     Args:
         lines: line integrals (n, rows, cols).
-        hidden: the scanner.
+        hidden: the scanner; the data set states its nominal geometry.
         photons: of the open beam, a pixel and frame.
         rng: for the noise.
         keep: which frames the data set has, in which order; default: all.
@@ -436,7 +442,14 @@ RADIUS: Final = 14.0
 
 def edges(plain: Hidden, rng: np.random.Generator) -> list[float]:
     """Reconstruct a ball with nominal, aligned and true geometry, and measure the width
-    of its edge, 10 to 90 %, in each [voxels].
+    of its edge in each.
+
+    Args:
+        plain: the scanner without offsets, which are drawn.
+        rng: of offsets and noise.
+
+    Returns:
+        Widths from 10 to 90 % [voxels], in this order.
     """
     hidden = drawn(rng, plain)
     ball = Solids(np.array([[2.0, -1.0, 0.0, *3 * [RADIUS], 0.02]]), np.zeros((0, 7)))

@@ -247,6 +247,16 @@ class Draft:
 def drawn(kind: str, seed: int) -> Faulty:
     """Draw a scanner, a phantom and a scan with the fault `kind`, of KINDS, and compute
     its noisy spots.
+
+    Spots beyond the panel are left out, those of a frame are in random order.
+
+    Args:
+        kind: of the fault.
+        seed: of all draws, together with the kind.
+
+    Returns:
+        The scan, with what is believed, the true least and greatest value of each
+        parameter, and the expected findings.
     """
     rng = np.random.default_rng([seed, *kind.encode()])
     n, k = int(rng.choice([24, 36, 60])), int(rng.integers(5, 8))
@@ -327,8 +337,13 @@ UNSEEN: Final = {
 
 
 def _bent(draft: Draft, rng: Rng, after: Callable[..., list[Array | None]]) -> Draft:
-    """Distort the panel by a change of the spots, `after`, and move it off its stated
-    place as far as is usual.
+    """Distort the panel by a change of the spots, and move it off its stated place as far
+    as is usual; `panel_distorted` is expected.
+
+    Args:
+        draft: of the scan; its own offsets stay.
+        rng: of the panel's place.
+        after: changes the spots of all frames.
     """
     offsets = {name: float(rng.normal(0.0, width)) for name, width in UNSEEN.items()}
     world = replace(draft.world, offsets={**offsets, **draft.world.offsets})
@@ -429,7 +444,7 @@ def _jump(name: str, low: float, high: float) -> Fault:
 
 def _spot_drift(draft: Draft, rng: Rng) -> Draft:
     """Let the focal spot drift aside by 0.05 to 0.3 mm over the scan: it looks like the
-    object drifting the other way.
+    object drifting the other way, and a finding of motion is expected.
     """
     n = len(draft.world.angles)
     way = np.array([_sign(rng) * rng.uniform(0.05, 0.3), 0.0, 0.0])
@@ -440,7 +455,9 @@ def _spot_drift(draft: Draft, rng: Rng) -> Draft:
 
 
 def _runout(draft: Draft, rng: Rng) -> Draft:
-    """Let the axis run out by 0.03 to 0.2 mm, two or three times a turn."""
+    """Let the axis run out sideways by 0.03 to 0.2 mm, two or three times a turn, and
+    expect a finding of motion.
+    """
     turn = np.radians(draft.world.angles)
     size = float(rng.uniform(0.03, 0.2))
     periods = int(rng.integers(2, 4))
@@ -450,7 +467,9 @@ def _runout(draft: Draft, rng: Rng) -> Draft:
 
 
 def _screw(draft: Draft, rng: Rng) -> Draft:
-    """Let the object rise evenly by 0.3 to 1.5 mm over the scan."""
+    """Let the object rise evenly by 0.3 to 1.5 mm over the scan, and expect findings of
+    motion and of dO_y.
+    """
     draft = _varying(
         draft, "dO_y", rng.uniform(0.3, 1.5) * np.linspace(0, 1, len(draft.world.angles))
     )
@@ -458,7 +477,9 @@ def _screw(draft: Draft, rng: Rng) -> Draft:
 
 
 def _wobble(draft: Draft, rng: Rng) -> Draft:
-    """Lean the axis to and fro by 0.1 to 0.4 deg, twice a turn."""
+    """Lean the axis to and fro by 0.1 to 0.4 deg, twice a turn, and expect a finding of
+    wobble or motion.
+    """
     turn = np.radians(draft.world.angles)
     size = float(rng.uniform(0.1, 0.4))
     draft = _varying(draft, "axis_tilt_z", size * np.sin(2 * turn))
@@ -466,7 +487,9 @@ def _wobble(draft: Draft, rng: Rng) -> Draft:
 
 
 def _vibration(draft: Draft, rng: Rng) -> Draft:
-    """Shift every frame at random along columns and rows, by 0.02 to 0.08 mm rms."""
+    """Shift every frame at random along columns and rows, by 0.02 to 0.08 mm rms each,
+    and expect a finding of shaking.
+    """
     size = float(rng.uniform(0.02, 0.08))
     n = len(draft.world.angles)
     for name in ("dO_x", "dO_y"):
@@ -504,7 +527,7 @@ def _gap(angles: Array, rng: Rng) -> Array:
 
 def _stuttered(draft: Draft, rng: Rng) -> Draft:
     """Replace at least two frames, and a twelfth of them, by the one before, as a camera
-    that stutters.
+    that stutters, and expect `frames_repeated`.
     """
     n = len(draft.world.angles)
     again = rng.choice(np.arange(1, n), size=max(2, n // 12), replace=False)
@@ -519,7 +542,9 @@ def _stuttered(draft: Draft, rng: Rng) -> Draft:
 
 
 def _missing_frames(draft: Draft, rng: Rng) -> Draft:
-    """Remove a fifth of the frames, at least one."""
+    """Remove each frame with a chance of a fifth, at least one, and expect
+    `frames_missing`.
+    """
     gone = rng.random(len(draft.world.angles)) < 0.2
     gone[int(rng.integers(len(gone)))] = True
 
@@ -530,7 +555,9 @@ def _missing_frames(draft: Draft, rng: Rng) -> Draft:
 
 
 def _swapped_frames(draft: Draft, rng: Rng) -> Draft:
-    """Swap the spots of two frames that are a quarter to half of a turn apart."""
+    """Swap the spots of two frames that are a quarter to half of a turn apart, and expect
+    `frames_inconsistent` with one of their numbers.
+    """
     n = len(draft.world.angles)
     a = int(rng.integers(0, n - 1))
     b = (a + int(rng.integers(n // 4, n // 2))) % n
@@ -574,7 +601,7 @@ def _lost(count: int) -> Fault:
 
 
 def _extra(draft: Draft, rng: Rng) -> Draft:
-    """Add one or two balls to the beads."""
+    """Add one or two balls to the beads, and expect `extra_spots`."""
     more = rng.uniform([-10, -10, -22], [10, 10, 22], size=(int(rng.integers(1, 3)), 3))
     return _beads(
         draft, np.concatenate([draft.world.beads, more]), "extra_spots", beside=OTHERS
@@ -582,7 +609,9 @@ def _extra(draft: Draft, rng: Rng) -> Draft:
 
 
 def _displaced(draft: Draft, rng: Rng) -> Draft:
-    """Displace one bead by 0.3 to 1.5 mm."""
+    """Displace one bead by 0.3 to 1.5 mm, and expect a finding of its displacement or
+    tolerance.
+    """
     beads = draft.world.beads.copy()
     one = int(rng.integers(len(beads)))
     way = rng.normal(size=3)
@@ -593,7 +622,9 @@ def _displaced(draft: Draft, rng: Rng) -> Draft:
 
 
 def _tolerance(draft: Draft, rng: Rng) -> Draft:
-    """Displace all beads at random, by 0.03 to 0.1 mm rms along each axis."""
+    """Displace all beads at random, by 0.03 to 0.1 mm rms along each axis, and expect a
+    finding of the beads' tolerance or errors.
+    """
     beads = draft.world.beads + rng.uniform(0.03, 0.1) * rng.normal(
         size=draft.world.beads.shape
     )
@@ -603,7 +634,9 @@ def _tolerance(draft: Draft, rng: Rng) -> Draft:
 
 
 def _tolerance_and_roll(draft: Draft, rng: Rng) -> Draft:
-    """Displace all beads as `_tolerance`, and roll the detector by 2 to 3 deg."""
+    """Displace all beads as `_tolerance` and roll the detector by 2 to 3 deg, and expect
+    a finding of either.
+    """
     draft = _tolerance(draft, rng)
     roll = _sign(rng) * float(rng.uniform(2.0, 3.0))
     world = replace(draft.world, offsets={**draft.world.offsets, "det_roll": roll})
@@ -649,7 +682,7 @@ def _no_beads(draft: Draft, rng: Rng) -> Draft:
 
 def _symmetric(draft: Draft, rng: Rng) -> Draft:
     """Replace the phantom, also the believed one, by two rings of four balls, which look
-    the same after a quarter of a turn.
+    the same after a quarter of a turn, and expect `ambiguous`.
     """
     quarter = 0.5 * math.pi * np.arange(4)
     ring = 9.0 * np.stack([np.cos(quarter), np.sin(quarter), 0 * quarter], axis=1)
@@ -743,7 +776,9 @@ def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
 
 
 def _row_offset(draft: Draft, rng: Rng) -> Draft:
-    """Shift all images by 2 to 7 rows, as if the panel were higher or lower."""
+    """Shift all images by 2 to 7 rows, as if the panel were higher or lower: dD_y is so
+    much then, and no finding is right, too.
+    """
     rows = int(_sign(rng) * rng.integers(2, 8))
 
     def after(spots: list[Array | None]) -> list[Array | None]:
@@ -757,7 +792,9 @@ def _row_offset(draft: Draft, rng: Rng) -> Draft:
 
 
 def _binned(draft: Draft, rng: Rng) -> Draft:
-    """Change the pixels' true size to half or 1.6 times the stated one."""
+    """Change the pixels' true size to half or 1.6 times the stated one, and expect a
+    finding of beads' sizes, no beads, an implausible offset or a wrong radius.
+    """
     world = replace(draft.world, pixel=draft.world.pixel * float(rng.choice([0.5, 1.6])))
     return replace(
         draft,
@@ -814,7 +851,9 @@ def _usual(draft: Draft, rng: Rng) -> Draft:
 
 
 def _right(draft: Draft, rng: Rng) -> Draft:
-    """Draw a phantom and a scanner within their assumed tolerances."""
+    """Draw a phantom and a scanner within their assumed tolerances, the phantom strained
+    by 0.1 % rms; findings of strain or narrow priors are allowed, none is right, too.
+    """
     draft = _usual(draft, rng)
     change = np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
     world = replace(draft.world, beads=draft.world.beads @ change.T)
