@@ -888,8 +888,8 @@ def _strained(kind: str) -> Fault:
 
 
 def _exposed_long(draft: Draft, rng: Rng) -> Draft:
-    """Expose while the stage turns, for 0.1 to 1 of a step; below 3 deg silence is right,
-    too.
+    """Expose while the stage turns, for 0.1 to 1 of a step, and expect a finding of it;
+    below 3 deg silence is right, too.
     """
     draft = _usual(draft, rng)
     step = 360.0 / len(draft.world.angles)
@@ -927,7 +927,9 @@ def _renumbered(shift: int) -> Fault:
 
 
 def _exposed_again(draft: Draft, rng: Rng) -> Draft:
-    """Expose one frame at the angle of the one before."""
+    """Expose one frame at the angle of the one before, and expect `frames_inconsistent`
+    with its number.
+    """
     draft = _usual(draft, rng)
     at = int(rng.integers(1, len(draft.world.angles)))
     angles = draft.world.angles.copy()
@@ -937,7 +939,10 @@ def _exposed_again(draft: Draft, rng: Rng) -> Draft:
 
 
 def _four_tiles(draft: Draft, rng: Rng) -> Draft:
-    """Shift and skew each of a panel's 2 x 2 tiles a little, by 0.3 to 2 px."""
+    """Shift the right tiles of a panel of 2 x 2 along the rows and the lower ones along
+    the columns, by 0.3 to 2 px, and each a little across that; `panel_distorted` is
+    expected.
+    """
     column = SHAPE[1] * rng.uniform(0.42, 0.58)
     row = SHAPE[0] * rng.uniform(0.42, 0.58)
     across, down = (float(_sign(rng) * rng.uniform(0.3, 2.0)) for _ in range(2))
@@ -957,7 +962,7 @@ def _four_tiles(draft: Draft, rng: Rng) -> Draft:
 
 def _source_jumps(draft: Draft, rng: Rng) -> Draft:
     """Let the focal spot jump aside by 0.02 to 0.3 mm in the middle half of the scan,
-    which looks like an object that jumps.
+    which looks like an object that jumps: a finding of motion is expected.
     """
     draft = _usual(draft, rng)
     n = len(draft.world.angles)
@@ -969,7 +974,9 @@ def _source_jumps(draft: Draft, rng: Rng) -> Draft:
 
 
 def _grows(draft: Draft, rng: Rng) -> Draft:
-    """Let the phantom grow by 0.05 to 0.7 % during the scan, as one that warms up."""
+    """Let the phantom grow by 0.05 to 0.7 % during the scan, as one that warms up, and
+    expect a finding of growth or motion; dO_z may be that of any frame.
+    """
     draft = _usual(draft, rng)
     size = float(rng.uniform(5e-4, 7e-3))
     n = len(draft.world.angles)
@@ -983,7 +990,9 @@ def _grows(draft: Draft, rng: Rng) -> Draft:
 
 
 def _other_pitch(draft: Draft, rng: Rng) -> Draft:
-    """Make the true pixels 1 to 8 % larger or smaller than the stated ones."""
+    """Make the true pixels 1 to 8 % larger or smaller than the stated ones, and expect a
+    finding of the pixel.
+    """
     draft = _usual(draft, rng)
     factor = 1.0 + _sign(rng) * rng.uniform(0.01, 0.08)
     world = replace(draft.world, pixel=draft.world.pixel * factor)

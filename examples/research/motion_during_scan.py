@@ -46,6 +46,9 @@ SIX: Final = tuple(REACH)
 def moved(rng: np.random.Generator, kind: str, turn: Array) -> Array:
     """Draw the deviations (n,) [mm] of the parameter that moves, of mean zero.
 
+    A runout is a sum of two to five waves a turn, at most 0.02 mm; a screw 1 mm a turn to
+    either side; a spot drifts to at most 0.1 mm, ever slower; jitter is 0.02 mm rms.
+
     Args:
         rng: generator.
         kind: of ASKED; "nothing" gives zeros.

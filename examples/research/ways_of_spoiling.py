@@ -174,8 +174,8 @@ def _foreign_box(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _other_body(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Move the beads' holder by a few millimetres, and keep, change or remove its
-    attenuation.
+    """Move the beads' holder by a few millimetres at most, and remove, keep or change its
+    attenuation; the beads stay.
     """
     shift = rng.normal(size=3) * math.exp(rng.uniform(math.log(0.05), math.log(2.0)))
     factor = float(rng.choice([0.0, 1.0, math.exp(rng.normal())]))
@@ -218,7 +218,9 @@ def _reversed(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _renumbered(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Skip one to three frames' angles from a frame on."""
+    """Turn the stage one to three frames' angles further from a frame on, not among the
+    first or last four.
+    """
     gap = int(rng.integers(1, 4))
     at = int(rng.integers(4, FRAMES - 4))
     return _angles(
@@ -372,7 +374,7 @@ def _gradient(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _dead_columns(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Set up to 29 columns of all images to 9, and 400 pixels to -3."""
+    """Set 1 to 29 columns of all images to 9, and 400 pixels to -3."""
     columns = rng.integers(0, SHAPE[1], size=int(rng.integers(1, 30)))
     spots = rng.integers(0, [[SHAPE[0]], [SHAPE[1]]], size=(2, 400))
 
@@ -413,7 +415,9 @@ def _rotated(scan: Spoilt, rng: Rng) -> Spoilt:
 
 
 def _repeated(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Replace 3 to 30 % of the frames by the one before, as a camera that stutters."""
+    """Replace each frame but the first, with a chance of 3 to 30 %, by the one before, as
+    a camera that stutters.
+    """
     stuck = rng.random(FRAMES) < rng.uniform(0.03, 0.3)
     images = list(scan.images)
     for i in range(1, FRAMES):
