@@ -31,7 +31,9 @@ def xtekct(folder, said=None, before="", names=None):
     [{"SrcToObject": 0}, {"SrcToObject": 500}, {"SrcToObject": -100}, {"SrcToDetector": 0},
      {"DetectorPixelSizeX": 0}, {"DetectorPixelSizeY": -0.2}, {"SrcToDetector": "inf"},
      {"SrcToObject": "nan"}, {"DetectorPixelSizeX": 300}, {"Projections": 1e30},
-     {"Projections": -3}, {"SrcToObject": "1e999"}, {"AngularStep": "9" * 5000}],
+     {"Projections": -3}, {"SrcToObject": "1e999"}, {"AngularStep": "9" * 5000},
+     {"Projections": 8.9}, {"DetectorPixelsX": 9.5}, {"WhiteLevel": 0}, {"WhiteLevel": -1000},
+     {"AngularStep": "1.234,5"}, {"SrcToObject": "100.5 mm"}],
 )  # fmt: skip
 def test_impossible_numbers_are_refused(tmp_path, said):
     path = xtekct(tmp_path, said)
@@ -46,6 +48,44 @@ def test_impossible_numbers_are_refused(tmp_path, said):
 def test_numbers_as_some_countries_write_them_are_read(tmp_path, before, said):
     data = fx.open(xtekct(tmp_path, said, before))
     assert np.linalg.norm(data.geometry.source[0]) == pytest.approx(100.5)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "latin-1"])
+@pytest.mark.parametrize("ends", ["\r\n", "\n", "\r"])
+def test_texts_in_any_encoding_are_read(tmp_path, encoding, ends):
+    """Helsinki: as programs of Windows and of old machines write them."""
+    path = xtekct(tmp_path, {"Name": "Z\u00fcrich"})
+    text = path.read_text("utf-8").replace("\r\n", "\n").replace("\n", ends)
+    path.write_bytes(text.encode(encoding))
+    assert len(fx.open(path)) == VIEWS
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("SrcToObject", 200), ("AngularStep", -45), ("Projections", 9), ("WhiteLevel", 900)],
+)
+def test_a_key_with_two_values_is_refused(tmp_path, key, value):
+    path = xtekct(tmp_path)
+    text = path.read_text()
+    path.write_text(text + f"[Copy]\n{key}={value}\n")
+    with pytest.raises(DatasetError, match=rf"{key} is \S+ and {value}; allowed"):
+        fx.open(path)
+    path.write_text(text + "".join(text.splitlines(True)[1:]) + "Notes=1\nNotes=2\n")
+    assert fx.open(path).warnings == ()  # the same values twice, and unused ones
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.06, -0.06])
+@pytest.mark.parametrize("middle", [0.0, 0.4, -0.4])
+def test_old_centres_of_rotation_place_the_axis(tmp_path, middle, lean):
+    """CIL#1277: millimetres along the columns where the axis meets first and last row."""
+    stated = [middle + lean, middle - lean]
+    keys = ("CentreOfRotationTop", "CentreOfRotationBottom")
+    data = fx.open(xtekct(tmp_path, dict(zip(keys, stated, strict=True))))
+    height = SHAPE[0] * 0.2 / 2 * 100.5 / 400.25
+    ends = np.array([[0.0, 0.0, height], [0.0, 0.0, -height]])
+    columns = data.geometry.project_points(ends, SHAPE)[0][:, 0]
+    across = (columns - (SHAPE[1] - 1) / 2) * 0.2
+    np.testing.assert_allclose(across, stated, atol=2e-3)
 
 
 @pytest.mark.parametrize("lost", [1, 4, VIEWS])

@@ -180,6 +180,7 @@ def read_rtk(
     common = dict.fromkeys(NAMES, 0.0)  # numbers before the views hold for all
     rows: list[FloatArray] = []
     stated: list[tuple[float, float]] = []
+    twice: list[tuple[str, FloatArray, tuple[float, ...]]] = []
     for element in root:
         if element.tag == "Projection":
             where = f"{file}: view {len(rows)}"
@@ -196,12 +197,14 @@ def read_rtk(
             else:
                 row = row_of(numbers, pitch_mm)
                 if matrix is not None:
-                    _require_agreement(matrix, numbers, pitch_mm, where)
+                    twice.append((where, matrix, numbers))
             rows.append(row)
             stated.append((numbers[3], numbers[4]))
         else:
             _take(element, common, file)
     _require_distances(stated, file)
+    for where, matrix, numbers in twice:
+        _require_agreement(matrix, numbers, pitch_mm, where)
     return ScanGeometry(cone_vec_of(rows, file), shape)
 
 
@@ -271,7 +274,7 @@ def view_of_matrix(
         across, down = scaled[:2, :3] - offsets[:, None] * normal
         squares = across @ across, down @ down
         skew = max(abs(across @ down), abs(squares[0] - squares[1]))
-        flat = np.isfinite(scaled).all() and 0.0 < squares[0]
+        flat = np.isfinite(scaled).all() and squares[0] > 0.0
     if not flat or skew > MAX_SKEW * squares[0]:
         problem = f"{where}: its Matrix is that of no cone beam on a flat panel"
         allowed = "rows and columns at a right angle, of one scale in mm"

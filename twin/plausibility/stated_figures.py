@@ -26,18 +26,24 @@ PIXEL_TOLERANCE: Final = 0.02
 def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Finding]:
     """Compare a file's angles with the geometry's, whatever their zero and sense are.
 
-    Yields at most one warning: degrees and radians are confused, the order is another, or
-    the angles differ; its figure is the largest difference [deg]. Nothing if they agree
-    within `ANGLE_TOLERANCE_DEG` or `ANGLE_TOLERANCE_STEPS` steps, if their number is not
-    the views' or below 3, if they are not finite or all equal, or if the geometry does
-    not turn about z.
+    Yields at most one warning: angles are not finite (its figure: how many), degrees and
+    radians are confused, the order is another, or the angles differ; its figure is the
+    largest difference [deg]. Nothing if they agree within `ANGLE_TOLERANCE_DEG` or
+    `ANGLE_TOLERANCE_STEPS` steps, if their number is not the views' or below 3, if they
+    are all equal, or if the geometry does not turn about z.
 
     Args:
         geometry: n views.
         stated_rad: (n,) [rad].
     """
     stated = np.asarray(stated_rad, dtype=np.float64).ravel()
-    if len(stated) != len(geometry) or len(stated) < 3 or not np.isfinite(stated).all():
+    if len(stated) != len(geometry) or len(stated) < 3:
+        return
+    lost = int((~np.isfinite(stated)).sum())
+    if lost:
+        cause = f"{lost} of the file's {len(stated)} angles are not finite"
+        remedy = "they are not compared with the geometry"
+        yield Finding("angles disagree", cause, remedy, Severity.WARNING, float(lost))
         return
     if not about_z(geometry) or np.ptp(stated) == 0.0:
         return

@@ -13,6 +13,8 @@ from flexdt.twin.errors import TwinError
 
 MAX_HEAD_BYTES: Final = 16 << 20
 """Of a text that describes a scan."""
+UTF_16_MARKS: Final = (b"\xff\xfe", b"\xfe\xff")
+"""Byte order marks of UTF-16, as programs of Windows begin a text."""
 MAX_REPEATED_CHARACTERS: Final = 200
 """Largest number of characters of a parser's error that a message repeats."""
 
@@ -49,9 +51,10 @@ def parsing(path: Path, form: str) -> Iterator[None]:
 
 
 def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
-    """Read a text that describes a scan, as UTF-8 with or without a byte order mark.
+    """Read a text that describes a scan, as UTF-8 with or without a byte order mark, or as
+    UTF-16 with one.
 
-    Bytes that are no UTF-8 become replacement characters.
+    Bytes that have no character become replacement characters.
 
     Raises:
         DatasetFormatError: it has more than `most` bytes; nothing is read.
@@ -63,7 +66,9 @@ def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
         raise DatasetFormatError.instead(
             said, size, f"{most} bytes of text", path=str(path)
         )
-    return path.read_text("utf-8-sig", "replace")
+    raw = path.read_bytes()
+    encoding = "utf-16" if raw[:2] in UTF_16_MARKS else "utf-8-sig"
+    return "\n".join(raw.decode(encoding, "replace").splitlines())
 
 
 def require_memory(path: Path, what: str, size: int) -> None:

@@ -50,12 +50,12 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
             state its numbers all the same, but impossible distances are no error then.
 
     Raises:
-        DatasetError: the file lacks a number, has impossible distances or not 1 to
-            `MOST_VIEWS` projections; or images are missing or of another shape than it
-            states.
+        DatasetError: the file lacks a number or states two, has impossible distances, no
+            open beam or not 1 to `MOST_VIEWS` projections; or images are missing or of
+            another shape than it states.
     """
-    said = dict(LINE.findall(head_text(path)))
-    views = int(_number(path, said, "Projections"))
+    said = _stated(head_text(path))
+    views = _count(path, said, "Projections")
     sod, sdd = (_number(path, said, key) for key in ("SrcToObject", "SrcToDetector"))
     across, down = (_number(path, said, f"DetectorPixelSize{axis}") for axis in "XY")
     impossible = distance_findings(
@@ -63,7 +63,7 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     )
     if geometry is None:
         settled(impossible, DatasetFormatError, str(path))
-    size = [int(_number(path, said, f"DetectorPixels{axis}")) for axis in "YX"]
+    size = [_count(path, said, f"DetectorPixels{axis}") for axis in "YX"]
     if not 0 < views <= MOST_VIEWS:
         raise DatasetFormatError.instead(
             f"{path}: Projections is {views}", views, f"1 to {MOST_VIEWS}"
@@ -98,7 +98,12 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
             f"{data.shape[1]} x {data.shape[0]}",
             {"asked": size, "allowed": list(data.shape)},
         )
-    white = np.full((1, *data.shape), _number(path, said, "WhiteLevel"), np.float32)
+    level = _number(path, said, "WhiteLevel")
+    if level <= 0.0:
+        raise DatasetFormatError.instead(
+            f"{path}: WhiteLevel is {level:g}", level, "counts of the open beam, above 0"
+        )
+    white = np.full((1, *data.shape), level, np.float32)
     doubts = told + [
         f"{path.name} states {key} {said[key]}, which is not applied"
         for key in ("DetectorOffsetX", "DetectorOffsetY")
@@ -151,6 +156,30 @@ def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     before, digits, after = numbers[first].groups()
     width = len(digits) if digits.startswith("0") else 1
     return [f"{before}{n:0{width}d}{after}" for n in range(start, start + views)], told
+
+
+def _stated(text: str) -> dict[str, str]:
+    """Return keys and values of the file; a key with several values has all, separated by
+    "and", which is no number.
+    """
+    values: dict[str, dict[str, None]] = {}
+    for key, value in LINE.findall(text):
+        values.setdefault(key, {})[value] = None
+    return {key: " and ".join(several) for key, several in values.items()}
+
+
+def _count(path: Path, said: Mapping[str, str], key: str) -> int:
+    """Return a whole number of the file; arguments as for `_number`.
+
+    Raises:
+        DatasetFormatError: the value is no whole number.
+    """
+    value = _number(path, said, key)
+    if not value.is_integer():
+        raise DatasetFormatError.instead(
+            f"{path}: {key} is {value:g}", value, "a whole number"
+        )
+    return int(value)
 
 
 def _number(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -17,13 +16,17 @@ from flexdt.library.extras import package
 from flexdt.library.reading.foreign_parsing import require_memory
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.length_units import UNITS_MM
-from flexdt.twin.plausibility import Finding, settled
+from flexdt.twin.length_units import UNITS_RAD, angle_rad, length_mm
+from flexdt.twin.plausibility import Finding, Severity, settled
+from flexdt.twin.plausibility.scan_geometry import distance_findings
 from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
 
 KNOWN_KEYS: Final = (PROJECTION, FLAT, DARK, INVALID)
 MOST_DEFLATED: Final = 2000
 """Bytes of images for each byte of the file; of zeros alone there are more."""
+KNOWN_LENGTHS: Final = "m, cm, mm, um, nm, inch"
+"""Units of length that the message of an unknown one lists."""
+KNOWN_ANGLES: Final = ", ".join(UNITS_RAD)
 SMALL_BYTES: Final = 1 << 30
 """Images of which it does not matter how far they were deflated."""
 
@@ -242,7 +245,8 @@ def _geometry(
         The geometry, and a sentence on the assumptions made; none with cone_vec.
 
     Raises:
-        DatasetFormatError: the file states too little; lists the missing quantities.
+        DatasetFormatError: the file states too little (lists the missing quantities), in
+            an unknown unit, or distances are such as no scanner has.
     """
     entry = file[name.split("/")[0]]
     rows = next(
@@ -259,10 +263,14 @@ def _geometry(
     lengths = {what: _length(file, name, *places) for what, places in LENGTHS.items()}
     if distances is not None:
         sod, sdd = distances
+        impossible = distance_findings(sod, sdd, lengths["x_pixel_size"] or 1e-9 * sdd)
+        settled(impossible, DatasetFormatError, f"{path}: distances={distances}")
         lengths |= {"source distance": sod, "detector distance": sdd - sod}
     pixel = lengths["x_pixel_size"]
     missing = [
-        what for what, length in lengths.items() if not length and what in NEEDED_LENGTHS
+        what
+        for what, length in lengths.items()
+        if what in NEEDED_LENGTHS and not length and (distances is None or "size" in what)
     ]
     if angles is None:
         missing.insert(0, "rotation_angle")
@@ -315,7 +323,7 @@ def _angles(
     each image.
 
     Places are the group with the images, the entry, and the entry's groups, in this
-    order. Angles are in degrees unless their unit begins with "rad".
+    order. Angles without a unit are in degrees.
 
     Args:
         file: open HDF5.
@@ -324,6 +332,9 @@ def _angles(
 
     Returns:
         The projections' angles [rad]; None without such a place.
+
+    Raises:
+        DatasetFormatError: they are in an unknown unit.
     """
     entry = file[name.split("/")[0]]
     near = file[name]
@@ -333,15 +344,12 @@ def _angles(
             angles = _member(place, at)
             if angles is not None and angles.shape == projections.shape:
                 values = np.asarray(angles, dtype=np.float64)[projections]
-                radians = _unit(angles, "deg").startswith("rad")
-                if radians:
-                    return values
-                return values * (math.pi / 180)
+                return values * _scale(angles, "deg", angle_rad, KNOWN_ANGLES)
     return None
 
 
 def _length(file: Any, name: str, *members: str) -> float | None:
-    """Read a length from the first of some places that has one number in a known unit.
+    """Read a length from the first of some places that has one number.
 
     All names are looked up in the entry, then in the group. A length without unit is in
     metres; its sign is kept.
@@ -353,6 +361,9 @@ def _length(file: Any, name: str, *members: str) -> float | None:
 
     Returns:
         Length [mm]; None without such a place.
+
+    Raises:
+        DatasetFormatError: it is in an unknown unit.
     """
     entry = file[name.split("/")[0]]
     near = file[name]
@@ -360,9 +371,8 @@ def _length(file: Any, name: str, *members: str) -> float | None:
         for member in members:
             found = _member(place, member)
             if getattr(found, "size", 0) == 1:
-                scale = UNITS_MM.get(_unit(found, "m"))
-                if scale is not None:
-                    return float(np.ravel(found)[0]) * scale
+                scale = _scale(found, "m", length_mm, KNOWN_LENGTHS)
+                return float(np.ravel(found)[0]) * scale
     return None
 
 
@@ -379,7 +389,7 @@ def _stated_figures(
     """Compare the angles and the pixel that the file states with the geometry.
 
     Only the first pixel size found counts (next to the images, then at the entry and its
-    groups); one in an unknown unit is not compared.
+    groups). What is in an unknown unit is a finding, too.
 
     Args:
         file: open.
@@ -390,9 +400,13 @@ def _stated_figures(
     Returns:
         Findings of differences.
     """
-    turn = _angles(file, name, projections)
-    if turn is not None:
-        yield from angle_findings(geometry, turn)
+    try:
+        turn = _angles(file, name, projections)
+    except DatasetFormatError as error:
+        yield _not_compared(error)
+    else:
+        if turn is not None:
+            yield from angle_findings(geometry, turn)
     entry = file[name.split("/")[0]]
     near = file[name]
     places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
@@ -402,15 +416,49 @@ def _stated_figures(
         else:
             size = _member(place, "x_pixel_size")
         if size is not None and size.size == 1:
-            scale = UNITS_MM.get(_unit(size, "m"))
-            if scale is not None:
-                yield from pixel_findings(geometry, float(np.ravel(size)[0]) * scale)
+            try:
+                scale = _scale(size, "m", length_mm, KNOWN_LENGTHS)
+            except DatasetFormatError as error:
+                yield _not_compared(error)
+                return
+            yield from pixel_findings(geometry, float(np.ravel(size)[0]) * scale)
             return
 
 
+def _not_compared(error: DatasetFormatError) -> Finding:
+    """Make the warning of a figure in an unknown unit, of its error."""
+    remedy = "it is not compared with the geometry"
+    return Finding("unknown unit", error.message, remedy, Severity.WARNING, 0.0)
+
+
+def _scale(
+    dataset: Any, usual: str, known: Callable[[str], float | None], names: str
+) -> float:
+    """Return the size of the unit that a dataset of HDF5 states.
+
+    Args:
+        dataset: with or without a unit.
+        usual: unit of one without.
+        known: gives the size of a unit, None of an unknown one.
+        names: of known units, for the message.
+
+    Raises:
+        DatasetFormatError: the unit is unknown.
+    """
+    unit = _unit(dataset, usual)
+    scale = known(unit)
+    if scale is None:
+        problem = f"{dataset.name} is in {unit[:40]!r}"
+        raise DatasetFormatError.instead(problem, unit[:40], names)
+    return scale
+
+
 def _unit(dataset: Any, usual: str) -> str:
-    """Return the unit that a dataset's attribute states, or the usual one."""
-    said = dataset.attrs.get("units", usual)
-    if isinstance(said, bytes):
-        return said.decode()
-    return str(said)
+    """Return the unit that a dataset's attribute states, as a text or an array of one, or
+    the usual one without any.
+    """
+    said = np.ravel(dataset.attrs.get("units", usual))[:1].tolist()
+    first = said[0] if said else usual
+    if isinstance(first, bytes):
+        first = first.decode("utf-8", "replace")
+    return str(first).strip() or usual

@@ -78,6 +78,18 @@ def test_a_matrix_that_contradicts_the_numbers_is_refused(name, view):
         read_rtk(f"<{name}>".join(parts), pitch(geometry), SHAPE, "mine.xml")
 
 
+@pytest.mark.parametrize("value", [0.0, -300.0, 1e-10])
+def test_impossible_distances_are_named_before_the_matrix(value):  # RTK#482
+    text = re.sub(
+        r"<SourceToIsocenterDistance>[^<]*",
+        f"<SourceToIsocenterDistance>{value}", rtk_text(scan(1)),
+    )  # fmt: skip
+    if value > 0.0:
+        text = re.sub(r"(<SourceToDetectorDistance>)[^<]*", r"\g<1>1e-12", text)
+    with pytest.raises(ExchangeError, match="allowed: 0 < SourceToIsocenterDistance <="):
+        read_rtk(text, pitch(scan(1)), SHAPE)
+
+
 @pytest.mark.parametrize(
     "change", ["rounded", "no matrix", "numbers of all views first", "foreign of 0"]
 )
