@@ -36,6 +36,8 @@ Thing = TypeVar("Thing", bound=Callable[..., Any])
 NAMES: Final = (("voxel", "voxel_mm"), ("center", "center_mm"), ("geometry", "cone_vec"))
 """Names of one thing (docs/conventions.md): where a signature has one, the other is
 deprecated."""
+REAL_KINDS: Final = "biuf"
+"""Kinds of numpy's types that hold real numbers or truth values."""
 MAX_SHOWN_CHARS: Final = 60
 """Characters of a value that a message repeats."""
 MAX_CHECKED_MEMBERS: Final = 100
@@ -508,11 +510,13 @@ def _is_numbers(value: Any) -> bool:
     """Return whether an array of numbers can be made of a value; memory on a device
     counts unread.
 
-    Truth values in arrays and lists are numbers, one by itself is not; texts and lists of
-    different lengths are not.
+    Truth values in arrays and lists are numbers, one by itself is not; texts, complex
+    numbers, masked values and lists of different lengths are not.
     """
     import numpy as np
 
+    if _masks(value):
+        return False
     kind = (
         "O"
         if isinstance(value, bool)
@@ -533,7 +537,14 @@ def _is_numbers(value: Any) -> bool:
             "__dlpack__",
         )
         return any(hasattr(value, form) for form in (*forms, "__getitem__"))
-    return kind in "biufc"
+    return kind in REAL_KINDS
+
+
+def _masks(value: Any) -> bool:
+    """Return whether a value is a masked array of numpy with at least one masked element."""
+    import numpy as np
+
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
 
 
 def _is_list(value: Any, kinds: Sequence[Kind | None], *, several: bool = False) -> bool:
@@ -575,15 +586,20 @@ def _type_words(kind: type) -> str:
 
 
 def _value_words(value: object) -> str:
-    """Format a value for a message: an array by its shape, a short plain value itself,
-    any other by the name of its type.
+    """Format a value for a message: an array by its shape, and by its type if that is no
+    real number; a short plain value itself, any other by the name of its type.
 
     Short is at most `MAX_SHOWN_CHARS`; plain are numbers, texts, lists, tuples, mappings
     and None.
     """
     shape = getattr(value, "shape", None)
     if shape is not None and hasattr(value, "dtype"):
-        return f"an array of shape {tuple(shape)}"
+        described = f"an array of shape {tuple(shape)}"
+        if _masks(value):
+            return f"{described} with masked values"
+        if getattr(value.dtype, "kind", "f") == "c":
+            return f"{described} of {value.dtype}"
+        return described
     text = repr(value)
     plain = isinstance(value, Real | str | bytes | list | tuple | Mapping | None)
     if plain and len(text) <= MAX_SHOWN_CHARS:

@@ -38,7 +38,7 @@ from flexdt.twin.exchange.tigre_arrays import ANGLES, tigre_arrays
 from flexdt.twin.geometry.cone_vec import ConeVec, Shape2, check_spread
 from flexdt.twin.geometry.conventions import FloatArray, as_numbers
 from flexdt.twin.plausibility import warn_of
-from flexdt.twin.plausibility.scan_geometry import radian_findings
+from flexdt.twin.plausibility.scan_geometry import geometry_findings, radian_findings
 from flexdt.twin.projection.volume import Grid, Volume
 from flexdt.twin.signatures import File
 
@@ -51,8 +51,8 @@ MAX_CUBE_DIFFERENCE: Final = 1e-6
 def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
     """Convert a geometry of ASTRA; see `ConeVec.from_astra`.
 
-    Rows are checked for pixels with rays of their own. Angles of `cone` are [rad]; those
-    that look like degrees give a warning.
+    Rows are checked for pixels with rays of their own, and for distances that no scanner
+    has. Angles of `cone` are [rad]; those that look like degrees give a warning.
 
     Args:
         geometry: ASTRA's dictionary (`cone` or `cone_vec`), or rows (n, 12).
@@ -63,7 +63,7 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
             `shape`.
     """
     if not isinstance(geometry, Mapping):
-        return check_spread(ConeVec(as_numbers("cone_vec", geometry), shape))
+        return _plausible(check_spread(ConeVec(as_numbers("cone_vec", geometry), shape)))
     try:
         kind = geometry["type"]
         counted = (geometry["DetectorRowCount"], geometry["DetectorColCount"])
@@ -88,6 +88,16 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
         ) from None
     cone_vec = check_spread(ConeVec(rows, counted))
     cone_vec.of_shape(shape)
+    return _plausible(cone_vec)
+
+
+def _plausible(cone_vec: ConeVec) -> ConeVec:
+    """Return a geometry of another program; warns of pixels of another unit.
+
+    Raises:
+        GeometryError: no scanner has such distances.
+    """
+    warn_of(geometry_findings(cone_vec, cone_vec.detector_shape), GeometryError)
     return cone_vec
 
 
@@ -147,7 +157,7 @@ def from_tomosipo(geometry: Any) -> ConeVec:
         stored = (np.asarray(getattr(vectors, name)) for name in names)
         geometry = dict(zip(TOMOSIPO_NAMES, stored, strict=True))
     arrays = {name: np.asarray(values) for name, values in geometry.items()}
-    return _value(read_tomosipo(arrays, "tomosipo's geometry"))
+    return _plausible(_value(read_tomosipo(arrays, "tomosipo's geometry")))
 
 
 def to_tomosipo(cone_vec: ConeVec) -> Any:

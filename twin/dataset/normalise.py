@@ -21,7 +21,9 @@ MIN_FLAT: Final = 1.0
 """Least counts above dark of a live pixel of the flat."""
 MIN_COUNTS: Final = 0.5
 """Counts above dark that are assumed for a pixel without signal."""
-
+NO_LIGHT: Final = (
+    "the flat field is nowhere brighter than the dark image: was the tube off?"
+)
 LEAST_LIGHT: Final = 1e-6
 """Least open beam of a pixel of images on another scale, as a share of the brightest."""
 
@@ -58,9 +60,7 @@ class LineIntegrals:
         opened = np.asarray(flat, dtype=np.float32) - np.asarray(dark, dtype=np.float32)
         dead = ~(opened >= MIN_FLAT)
         if dead.all():
-            raise DatasetFormatError(
-                "the flat field is nowhere brighter than the dark image: was the tube off?"
-            )
+            raise DatasetFormatError(NO_LIGHT)
         log_open = np.log(np.where(dead, np.float32(1.0), opened))
         return cls(np.asarray(dark, dtype=np.float32), log_open, dead, *_neighbours(dead))
 
@@ -109,9 +109,9 @@ def of_intensities(
     """Convert images that are not whole counts to line integrals.
 
     Such images are dark-subtracted, averaged or scaled, or transmissions with a flat
-    image of ones. The open beam counts as at least `LEAST_LIGHT` of the brightest flat
-    pixel, the light as at least float32's smallest normal number. No pixel is
-    interpolated.
+    image of ones. Light counts as at least float32's smallest normal number. Pixels whose
+    open beam is not above `LEAST_LIGHT` of the brightest flat pixel are dead, NaN too, and
+    interpolated in their row.
 
     Args:
         images: (n, rows, cols), of any scale; noise may bring them below the dark image.
@@ -120,12 +120,23 @@ def of_intensities(
 
     Returns:
         float32 (n, rows, cols).
+
+    Raises:
+        DatasetFormatError: no pixel of the flat is brighter than the dark image.
     """
-    opened = np.maximum(flat - dark, LEAST_LIGHT * np.max(flat))
+    opened = np.asarray(flat - dark, dtype=np.float64)
+    dead = ~(opened > LEAST_LIGHT * max(float(np.nanmax(flat, initial=0.0)), 0.0))
+    if dead.all():
+        raise DatasetFormatError(NO_LIGHT)
+    opened[dead] = 1.0
     light = (np.asarray(images, dtype=np.float32) - dark) / opened
-    return np.asarray(
-        -np.log(np.maximum(light, np.finfo(np.float32).tiny)), dtype=np.float32
-    )
+    least = np.finfo(np.float32).tiny
+    out = np.asarray(-np.log(np.maximum(light, least)), dtype=np.float32)
+    before, after, weight = _neighbours(dead)
+    if len(before):
+        pixels = out.reshape(len(out), -1)
+        out[:, dead] = (1.0 - weight) * pixels[:, before] + weight * pixels[:, after]
+    return out
 
 
 def _neighbours(

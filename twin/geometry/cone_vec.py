@@ -35,6 +35,8 @@ ROW_LENGTH = 12
 MIN_SINE = 1e-12
 """Sine of an angle below which two directions count as one."""
 FULL_TURN_DEG = 360.0
+MAX_COUNTED_VIEWS = 1_000_000
+"""Largest number of views that is made of a number alone."""
 MAX_PRINTED_VIEWS = 2
 """Largest number of views of a geometry that is printed with every number."""
 Shape2 = tuple[int, int]
@@ -923,11 +925,15 @@ def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray
         turns: over which a number of views is spread; the end is not a view.
 
     Raises:
-        GeometryError: no views, an array of more dimensions, or an angle that is not
-            finite.
+        GeometryError: no views, a number above `MAX_COUNTED_VIEWS`, an array of more
+            dimensions, or an angle that is not finite.
     """
     degrees: FloatArray = np.asarray(angles, dtype=np.float64)
     if isinstance(angles, int | np.integer):
+        if angles > MAX_COUNTED_VIEWS:
+            problem = f"angles: {angles:g} views"
+            allowed = f"1 to {MAX_COUNTED_VIEWS}"
+            raise GeometryError.instead(problem, int(angles), allowed)
         degrees = np.linspace(
             0.0, FULL_TURN_DEG * turns, max(int(angles), 0), endpoint=False
         )

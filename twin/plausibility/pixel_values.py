@@ -23,6 +23,14 @@ MAX_BRIGHT_SHARE: Final = 0.02
 """Largest share of pixels that noise makes a fifth brighter than the open beam."""
 MAX_LINE_INTEGRAL: Final = 25.0
 """Line integral above which no photon passes: fewer than 1e-10."""
+MAX_GIVEN_INTEGRAL: Final = 4 * MAX_LINE_INTEGRAL
+"""Line integral above which a scale is doubted; simulations without noise have large ones."""
+MIN_NEGATIVE_INTEGRAL: Final = -0.1
+"""Line integral below which a beam that is brighter than the flat image explains no sign."""
+MAX_POSITIVE_SHARE: Final = 0.1
+"""Largest value of negative attenuation, relative to the most negative one."""
+TAIL: Final = 1e-3
+"""Share of the pixels at either end that single bad ones may be."""
 MAX_PER_MM: Final = 200.0
 """Largest attenuation of any element at energies of tubes [1/mm]."""
 MIN_ATTENUATION: Final = -200.0
@@ -36,8 +44,8 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
     Yields at most one finding, from type and values. Integers: counts above
     `MAX_LINE_INTEGRAL` (refusal), smaller but not all zero "whole numbers" (warning).
     Floats: an open beam at the images' edges above `MAX_LINE_INTEGRAL` (counts, refusal)
-    or near 1 with a darker object (transmission, warning). Nothing without pixels, or if
-    the left and right edges differ (`_beam`).
+    or near 1 with a darker object (transmission, warning); else line integrals of the
+    other sign, or above `MAX_GIVEN_INTEGRAL` (warnings). Nothing without pixels.
 
     Args:
         images: some of the scan's, (k, rows, cols).
@@ -51,7 +59,7 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
             "counts", cause, _FROM_COUNTS, Severity.REFUSAL, float(values.max())
         )
         return
-    if values.dtype.kind in "ui" and values.any():
+    if values.dtype.kind in "bui" and values.any():
         cause = f"line integrals of {values.dtype} have no fractions"
         remedy = "give floating-point numbers"
         yield Finding(
@@ -59,7 +67,8 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
         )
         return
     beam = _beam(values)
-    if beam is None:
+    if beam is None or not beam > OPEN[0]:
+        yield from _range_findings(values)
         return
     darker = float((values < MAX_OBJECT_TRANSMISSION * beam).mean())
     brighter = float((values > 1.2 * beam).mean())
@@ -77,6 +86,27 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
             )
             remedy = "line integrals are -np.log of it"
             yield Finding("transmission", cause, remedy, Severity.WARNING, beam)
+    else:
+        yield from _range_findings(values)
+
+
+def _range_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
+    """Find line integrals of the other sign, and those that no panel can measure.
+
+    Yields at most one warning; `TAIL` of the pixels at either end are left out.
+
+    Args:
+        values: line integrals, any shape, not empty; nothing is found if one is NaN.
+    """
+    low, high = (float(x) for x in np.quantile(values, (TAIL, 1.0 - TAIL)))
+    if low < MIN_NEGATIVE_INTEGRAL and high < MAX_POSITIVE_SHARE * -low:
+        cause = f"line integrals from {low:.4g} to {high:.4g} are negative"
+        remedy = "line integrals are -np.log of the transmission, from 0 on"
+        yield Finding("negative", cause, remedy, Severity.WARNING, low)
+    elif high > MAX_GIVEN_INTEGRAL:
+        cause = f"line integrals of up to {high:.4g}, at which no photon passes"
+        remedy = "are they grey values, or scaled?"
+        yield Finding("scaled", cause, remedy, Severity.WARNING, high)
 
 
 _FROM_COUNTS: Final = (
@@ -105,8 +135,8 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
 
     Yields a warning if values are NaN or infinite; then, of the finite ones, a refusal
     below `MIN_ATTENUATION` (Hounsfield units), else a warning above `MAX_PER_MM`, more
-    than any element has. Nothing for types other than float or integer, or without
-    voxels.
+    than any element has, or of the other sign throughout. Nothing for types other than
+    float or integer, or without voxels.
 
     Args:
         values: of the voxels (nz, ny, nx) [1/mm].
@@ -146,3 +176,9 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
         cause = f"attenuation of up to {high:.5g} /mm, more than any element has"
         remedy = "grey values need a scale to 1/mm, labels material={1: NAME}"
         yield Finding("Hounsfield", cause, remedy, Severity.WARNING, high)
+    elif low < 0.0 and high <= MAX_POSITIVE_SHARE * -low:
+        cause = f"attenuation from {low:.5g} to {high:.5g} /mm is negative"
+        remedy = (
+            "is its sign right? of Hounsfield units / 1000 it is mu_water * (1 + value)"
+        )
+        yield Finding("negative", cause, remedy, Severity.WARNING, low)

@@ -25,6 +25,8 @@ RADIOGRAPHS: Final = "radiographs"
 FLAT_IMAGE: Final = "flat image"
 SATURATED: Final = "are saturated, where attenuation comes out wrong"
 """Words that every sentence about saturated images contains."""
+UNLIT: Final = "not brighter in the flat image than in the dark one"
+"""Words of the sentence about pixels without an open beam."""
 DARK: Final = (
     "no pixel of the flat images is brighter than the dark ones: was the tube off?"
 )
@@ -79,8 +81,8 @@ def image_doubts(
     is the largest among the images if it is one at which converters end (2^bits - 1). All
     radiographs in memory are examined, `MAX_FROM_DISK` of those in files, and the flat
     image. A share of at least `WARNING_SHARE` is a doubt; starved pixels have fewer than
-    `FEW_COUNTS` above dark. Pixels without an open beam, and those that the data set
-    interpolates, are left out.
+    `FEW_COUNTS` above dark. Pixels without an open beam have a doubt of their own; these,
+    and those that the data set interpolates, are left out of the others.
 
     Args:
         scan: the data set.
@@ -99,6 +101,7 @@ def image_doubts(
     flat = scan.flat
     dark = scan.dark
     alive = flat > dark
+    unlit = 1.0 - float(alive.mean())
     wanted = scan.present
     if scan.interpolated is not None and (alive & ~scan.interpolated).any():
         alive &= ~scan.interpolated
@@ -135,6 +138,11 @@ def image_doubts(
             for kind, share in shares.items()
             if share >= WARNING_SHARE
         ]
+        if unlit >= WARNING_SHARE:
+            doubts.append(
+                f"{100.0 * unlit:.3g} % of the pixels are {UNLIT}: their line integrals are "
+                "interpolated from their neighbours'"
+            )
         if starved >= WARNING_SHARE:
             doubts.append(
                 f"{100.0 * starved:.3g} % of the pixels of the radiographs are starved (fewer "

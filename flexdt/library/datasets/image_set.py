@@ -205,7 +205,7 @@ class ImageSet:
             flat = np.full(values.shape[1:], opened)
             warnings = [*lost, *doubts, *warnings]
         if (
-            values.dtype.kind in "ui"
+            values.dtype.kind in "bui"
             and flat is None
             and 0 < int(values[0].max()) < MIN_PEAK_COUNTS
         ):
@@ -719,7 +719,7 @@ def _image_stack(
         The images; None without any.
 
     Raises:
-        DatasetFormatError: images of another shape.
+        DatasetFormatError: images of another shape, or with values that are not finite.
     """
     if images is None:
         return None
@@ -730,6 +730,10 @@ def _image_stack(
             f"{what} images of shape {values.shape}; allowed: {shape} or (k, *{shape})",
             {"asked": list(values.shape), "allowed": list(shape)},
         )
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        many = int((~np.isfinite(values)).sum())
+        problem = f"{what} images: {many} of {values.size} values are not finite"
+        raise DatasetFormatError.instead(problem, many, "finite")
     return values
 
 

@@ -268,23 +268,39 @@ def _of_floats(
     Raises:
         DatasetFormatError: a pixel is not finite.
     """
-    shape = read_values(folder / names[0]).shape
-    values = [read_values(folder / n, shape) for n in names]
-    images = np.stack(values).astype(np.float32)
-    if not np.isfinite(images).all():
-        bad = names[int(np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))[0])]
-        raise DatasetFormatError(
-            f"{folder / bad} has pixels that are no numbers; allowed: finite",
-            {"path": bad},
-        )
+    rows, cols = read_values(folder / names[0]).shape
+    shape = (rows, cols)
+    images = _finite_images(folder, names, shape)
     if flats:
+        dark: npt.NDArray[np.float32] | float = 0.0
         if darks:
-            dark = np.mean([read_values(folder / n) for n in darks], axis=0)
-        else:
-            dark = 0.0
-        flat = np.mean([read_values(folder / n) for n in flats], axis=0)
+            dark = _finite_images(folder, darks, shape).mean(axis=0)
+        flat = _finite_images(folder, flats, shape).mean(axis=0)
         images = of_intensities(images, dark, flat)
     return DataSet.from_arrays(images, geometry, name=folder.name)
+
+
+def _finite_images(
+    folder: Path, names: Sequence[str], shape: tuple[int, int]
+) -> npt.NDArray[np.float32]:
+    """Read float images of a folder, (n, rows, cols).
+
+    Args:
+        folder: of the images.
+        names: of the files, in order.
+        shape: that each must have (rows, cols).
+
+    Raises:
+        DatasetFormatError: a pixel is not finite, or an image has another shape.
+    """
+    images = np.stack([read_values(folder / n, shape) for n in names]).astype(np.float32)
+    bad = np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))
+    if len(bad):
+        raise DatasetFormatError(
+            f"{folder / names[int(bad[0])]} has pixels that are no numbers; allowed: finite",
+            {"path": names[int(bad[0])]},
+        )
+    return images
 
 
 def _from_document(
