@@ -67,7 +67,7 @@ def test_the_shape_of_an_upload_comes_back_and_its_revision_changes(
 
 
 @pytest.mark.parametrize("form", ["stl", "obj", "ply", "glb", "off"])
-@pytest.mark.daily(1)
+@pytest.mark.campaign(2)
 def test_every_format_that_the_wire_names_is_read(server: Process, form: str) -> None:
     """As bytes in chunks, in the format's own unit and in another one, of a chosen material."""
     raw = angle(8.0).export(file_type=form)
