@@ -109,22 +109,35 @@ def test_every_name_of_the_face_is_on_the_page() -> None:
     assert {n for n in fx.__all__ if n != "__version__"} <= named
 
 
-@pytest.mark.slow
-def test_a_stranger_needs_one_import_and_finds_every_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The notebook itself is executed when the site is built; here without the cell of
-    servers."""
-    pytest.importorskip("matplotlib", reason="the extra `plots`").use("Agg")
-    monkeypatch.chdir(tmp_path)
-    text = (ROOT / "docs" / "tutorials" / "by-completion.md").read_text(encoding="utf-8")
+BY_COMPLETION = ROOT / "docs" / "tutorials" / "by-completion.md"
+
+
+def cells_of_completion() -> list[str]:
+    """Read the cells of the notebook that is written by completion alone."""
+    text = BY_COMPLETION.read_text(encoding="utf-8")
     cells = re.findall(r"```\{code-cell\} python\n(.*?)```", text, re.S)
-    cells = [cell for cell in cells if ":tags: [remove-cell]" not in cell]
+    return [cell for cell in cells if ":tags: [remove-cell]" not in cell]
+
+
+def test_a_stranger_needs_one_import_and_finds_every_name() -> None:
+    """The notebook itself is executed when the site is built."""
+    cells = cells_of_completion()
     imports = [line for cell in cells for line in cell.splitlines() if "import " in line]
     assert imports == ["import flexdt as fx"]
+    text = BY_COMPLETION.read_text(encoding="utf-8")
     assert {n for n in fx.__all__ if f"fx.{n}" not in text} == {"__version__"}
+
+
+@pytest.mark.slow
+@pytest.mark.campaign
+def test_the_cells_of_completion_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All but those of servers, in the test's process."""
+    pytest.importorskip("matplotlib", reason="the extra `plots`").use("Agg")
+    monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    for cell in cells:
+    for cell in cells_of_completion():
         if "LocalTwin" not in cell:
             exec(compile(cell, "by-completion.md", "exec"), names)
     assert (tmp_path / "lego.nrrd").stat().st_size > 0
