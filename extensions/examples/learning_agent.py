@@ -296,6 +296,9 @@ def learn(
 def judge(envs: ScanVectorEnv, policy: Policy, seed: int, judged: int) -> Array:
     """Score a policy on objects of their own seeds.
 
+    Objects are played in groups of as many as there are environments; those of the last
+    group beyond `judged` do not count.
+
     Args:
         envs: environments, stepped together.
         policy: to judge.

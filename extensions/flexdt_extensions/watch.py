@@ -192,6 +192,9 @@ def watch_job(
     PHANTOM is what is scanned. JOB: the current one if left out. The data set stays, says why
     it ended, and calibrates as far as it goes. A job whose sigmas are not reached runs to its
     end.
+
+    Yields:
+        What was found, and the job, as document of --json, then one line.
     """
     wanted = assignments(stop_when.split(","))
 

@@ -21,6 +21,9 @@ def commission(
         folders: Past scans.
         traffic: Read this recording of `flexdt follow --record` too.
         out: Write machine, profile and report to this folder.
+
+    Yields:
+        The document of --json, a table of each part of the report, and the files written.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise CommandError(f"{out} is there; allowed: a new or an empty folder")

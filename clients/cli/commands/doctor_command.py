@@ -19,6 +19,10 @@ def doctor() -> Answer:
 
     Ports and data directory are those that `flexdt up` would use. Ends with exit code 1 when
     something is wrong; warnings alone are fine.
+
+    Yields:
+        A line for each finding as it comes, the document of --json, and a verdict if
+        nothing is wrong.
     """
     from flexdt.clients.launch.doctor import examine
 

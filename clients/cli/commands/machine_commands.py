@@ -29,7 +29,11 @@ NameOrFile = Annotated[
 
 
 def list_machines() -> Answer:
-    """List the machines that ship."""
+    """List the machines that ship.
+
+    Yields:
+        Names and descriptions, as document of --json and as a table.
+    """
     from flexdt.twin.machine.description import builtin_machine, builtin_machines
 
     found = [builtin_machine(name) for name in builtin_machines()]
@@ -38,7 +42,12 @@ def list_machines() -> Answer:
 
 
 def show(name: NameOrFile) -> Answer:
-    """Print a machine's axes, distances, bodies and times, and where each value comes from."""
+    """Print a machine's axes, distances, bodies and times, and where each value comes from.
+
+    Yields:
+        The machine as document of --json, then tables of axes, distances, panel, tube,
+        bodies and times.
+    """
     found = machines.machine(name)
     yield found.model_dump(mode="json", by_alias=True)
     yield f"{found.name}: {found.description}\n"
@@ -59,7 +68,12 @@ def show(name: NameOrFile) -> Answer:
 
 
 def check(name: NameOrFile) -> Answer:
-    """Check a machine file: every value, its zero offsets, and whether it can stand at home."""
+    """Check a machine file: every value, its zero offsets, and whether it can stand at home.
+
+    Yields:
+        Counts of axes and components, as document of --json and as a line, the table of
+        distances, and a note where nothing is checked for collisions.
+    """
     from flexdt.twin.collision.home_check import check_home
 
     found = machines.machine(name)

@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 
 
 def list_phantoms() -> Answer:
-    """List the phantoms that ship."""
+    """List the phantoms that ship.
+
+    Yields:
+        The phantoms as document of --json, a table of name, size [mm], number of beads and
+        description, and a note on cuboids.
+    """
     from flexdt.phantoms import load_phantom, phantom_names
 
     found = {name: load_phantom(name) for name in phantom_names()}

@@ -37,7 +37,11 @@ if TYPE_CHECKING:
 
 
 def state(twin: Twin) -> Answer:
-    """Show axes, geometry, tube, camera, sample, safety, job."""
+    """Show axes, geometry, tube, camera, sample, safety, job.
+
+    Yields:
+        The state as document of --json, a table of the axes, and a line for each other fact.
+    """
     with twin() as client:
         current = client.state()
     yield current
@@ -192,7 +196,11 @@ def camera(
 
 
 def clock(twin: Twin, speed_up: str = argument(..., "X or max")) -> Answer:
-    """Set how fast the twin's time runs."""
+    """Set how fast the twin's time runs.
+
+    Yields:
+        The clock as document of --json, then one line.
+    """
     wanted = process_settings.speed_up(speed_up)
     with twin() as client:
         now = client.set_clock(wanted)
@@ -347,7 +355,11 @@ def _outwait(client: TwinClient, axis: str, duration_s: float) -> State:
 
 
 def stop(twin: Twin) -> Answer:
-    """Bring all motors to rest (pauses a running job)."""
+    """Bring all motors to rest (pauses a running job).
+
+    Yields:
+        The state as document of --json, then one line.
+    """
     with twin() as client:
         current = client.stop()
     yield current
@@ -355,7 +367,11 @@ def stop(twin: Twin) -> Answer:
 
 
 def estop(twin: Twin) -> Answer:
-    """Emergency stop: everything halts, X-rays off."""
+    """Emergency stop: everything halts, X-rays off.
+
+    Yields:
+        The state as document of --json, then one line that names `flexdt reset`.
+    """
     with twin() as client:
         current = client.estop()
     yield current
@@ -496,6 +512,9 @@ def delete_sample(twin: Twin, name: str = argument(..., "NAME")) -> Answer:
 
     Args:
         name: As `flexdt sample` lists it.
+
+    Yields:
+        Name and bytes, as document of --json and as a line.
     """
     with twin() as client:
         gone = client.delete_sample(name)
@@ -508,6 +527,9 @@ def delete_correction(twin: Twin, name: str = argument(..., "NAME")) -> Answer:
 
     Args:
         name: Of the correction.
+
+    Yields:
+        Its name, as document of --json and as a line.
     """
     with twin() as client:
         gone = client.delete_calibration(name)

@@ -48,6 +48,11 @@ def batch(
     Results are Zarr arrays and a manifest with every item's seed, parameters and checksums;
     they are the same bytes whatever the number of processes. Too little free disk space is
     stated, and not an error.
+
+    Yields:
+        The summary as document of --json, then items done, failed and taken up, a table of
+        the parameters' errors if any were judged, and the manifest; with --slurm-script
+        only that script.
     """
     from flexdt_extensions.batch.batch_plan import read_plan
     from flexdt_extensions.batch.batch_run import run_batch

@@ -25,6 +25,10 @@ def bench(
 
     A CUDA device is not used, unless --device measures it alone: then --only and --no-peers
     have no effect, and DIR gets device.json and device.md.
+
+    Yields:
+        The document of --json; with --device and without DIR its page, too; with --list
+        only names and lines of the cases.
     """
     from flexdt.measuring import gpu
     from flexdt_extensions.bench.benchmark import (

@@ -24,6 +24,10 @@ def simulate(
     """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.
 
     What the scenario asks and cannot be done is an error; what is left out is a warning.
+
+    Yields:
+        Files, counts, shape, largest intensity and warnings as document of --json, then one
+        line.
     """
     from flexdt_extensions.ctsimu.scenario import ScenarioImages
 

@@ -20,6 +20,10 @@ def evidence(
     The data are not part of flexdt: each case says where they come from. What cannot be read is
     said, and no missed figure. The command fails if a named case is not at hand, and, after all
     results, if a figure is missed.
+
+    Yields:
+        For each case its source and licence, a table of published and own figures, and what
+        was not read; then all as document of --json.
     """
     from flexdt_extensions.evidence.real_data import CASES, Figure, NotRead
 

@@ -56,6 +56,9 @@ def design(
 
     Without positions one scan at SOD 600 mm is planned; with --plan positions, --sdd and
     --frames have no effect. The design is compared with the spiral of the thesis.
+
+    Yields:
+        The document of --json, a table of sigmas, a verdict, and the files if written.
     """
     from flexdt.library.machines import machine as find_machine
     from flexdt.library.machines import profile as find_profile

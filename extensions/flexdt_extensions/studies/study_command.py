@@ -59,6 +59,10 @@ def study(
     EXPERIMENT: beads, phantoms, damping, detector (6.6), real (experiment 4: the 242 fits of
     real scans explained, or on synthetic images), basin (sensitivity to the start). The command
     fails, after all results, if a run failed.
+
+    Yields:
+        The document of --json, a table of the settings, remarks on the experiment, and the
+        report's folder if one is written.
     """
     from flexdt_extensions.studies.study import run_study
     from flexdt_extensions.studies.study_report import open_directions, real_lines

@@ -40,9 +40,10 @@ DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     """Read a scan of Nikon's; its images stay in their files.
 
-    They are in `InputFolderName`, beside the file by default. The white level of the file
-    serves as flat image, the dark one is zero; detector offsets are not applied and
-    become warnings.
+    They are in `InputFolderName`, beside the file by default. The axis is placed and
+    leant as the file's object offset, roll and tilt, or else CentreOfRotation, state. The
+    white level of the file serves as flat image, the dark one is zero; detector offsets
+    are not applied and become warnings.
 
     Args:
         path: the .xtekct file.
