@@ -38,13 +38,15 @@ class Recorded:
 
 
 def time_of_day(seconds: float, digits: int = 3) -> str:
-    """Format a time since a midnight as hh:mm:ss.mmm.
+    """Format a time since a midnight as hh:mm:ss.mmm; it begins again at 0 each day.
+
+    Args:
+        seconds: since the midnight [s].
+        digits: number of decimals.
 
     Example:
         >>> time_of_day(86400.0 + 3723.5)
         '01:02:03.500'
-
-    It begins again at 0 each day; `digits` is the number of decimals.
     """
     unit = 10**digits
     whole, part = divmod(round(seconds * unit) % round(DAY_S * unit), unit)

@@ -520,12 +520,11 @@ def fly_scan(
     md: Mapping[str, Any] | None = None,
     flush_s: float = 0.5,
 ) -> MsgGenerator[str]:
-    """Run one smooth scan; its images are announced while it goes on.
+    """Run one smooth scan, as a plan of bluesky; its images are announced while it goes
+    on.
 
-    Run as a plan of bluesky; the flyer is staged and unstaged.
-
-    The stream `frames` then has an event for each image with the stage's angle, in their
-    order, also where the scan did not end well.
+    The flyer is staged and unstaged. The stream `frames` then has an event for each image
+    with the stage's angle, in their order, also where the scan did not end well.
 
     Args:
         flyer: `lab.scan`.

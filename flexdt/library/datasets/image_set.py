@@ -393,7 +393,10 @@ class ImageSet:
 
         Args:
             parameters: offsets from the nominal geometry; default: the correction in
-                force, or none.
+                force, or none, which leaves a geometry as it was given.
+
+        Raises:
+            GeometryError: offsets of a panel on its side, whose motors are not known.
 
         Example:
             >>> import numpy as np

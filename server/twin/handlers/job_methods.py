@@ -162,6 +162,11 @@ async def forget(
 
     Returns:
         The ids of the removed jobs.
+
+    Raises:
+        UnknownNameError: there is no such job.
+        RpcError: -32003, the named one has not ended.
+        DatasetWriteError: the system cannot write; nothing is removed.
     """
     jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
 

@@ -101,6 +101,8 @@ async def mesh(
 
     Raises:
         LimitError: the stage is empty.
+        PhantomError: an upload that cannot be read any more.
+        RpcError: -32008, the mesh would be larger than the limit.
     """
     sample = twin.scanner.sample
     if not sample.name:
