@@ -88,13 +88,14 @@ def setting(
 ) -> Action:
     """Make the action of a command that only sets a value.
 
-    Returns the action; it sends the request, waits for the answer and returns the reply.
-    Errors of the twin are raised as Refusal.
-
     Args:
         method: of the twin.
         params: its parameters, from the command.
         reply: the text of ACK, from the command.
+
+    Returns:
+        The action: it sends the request, waits for the answer and returns the reply;
+        errors of the twin become Refusal.
     """
 
     async def send(

@@ -77,17 +77,13 @@ class ConnectedTwin:
         machine: Machine | None = None,
         profile: Profile | None = None,
     ) -> None:
-        """Store the connection, the folder of saved images and the machine; the twin's
-        state is not known yet.
-
-        Nothing is recorded or known of the twin yet. Machine and profile that are None
-        are those that the twin names, as far as they ship.
+        """Store the connection, the folder of saved images and the machine; nothing is
+        recorded, or known of the twin, yet.
 
         Args:
             link: to the twin.
             root: folder for saved images.
-            machine: that of the twin without.
-            profile: that of the twin without.
+            machine, profile: of the twin; None: those that it names, as far as they ship.
         """
         self.link = link
         self.root = root

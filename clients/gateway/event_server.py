@@ -435,9 +435,7 @@ class Gateway:
     ) -> tuple[zmq.asyncio.Socket, zmq.asyncio.Socket, int, int]:
         """Bind PUB and SUB; if any free port will do, find two neighbouring ones.
 
-        Raises zmq.ZMQError if a port is in use, or after `PAIR_TRIES` pairs. Other socket
-        errors are raised at once. `inbound` has a limit of `MAX_BYTES` a message and
-        `MAX_HELD` messages a sender.
+        SUB has a limit of `MAX_BYTES` a message and `MAX_HELD` messages a sender.
 
         Args:
             port: of PUB; 0 is any free port.
@@ -445,6 +443,9 @@ class Gateway:
 
         Returns:
             PUB, SUB and their ports.
+
+        Raises:
+            zmq.ZMQError: a port is in use, or `PAIR_TRIES` pairs were not free.
         """
         for left in reversed(range(PAIR_TRIES if port == 0 and inbound is None else 1)):
             out = self._socket(zmq.PUB)

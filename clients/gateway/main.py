@@ -36,16 +36,16 @@ EVENTS_HZ = 20.0
 async def run(options: GatewaySettings) -> int:
     """Serve until SIGTERM or SIGINT.
 
-    Announces the ports, once open, in a line on standard output. It subscribes to state
-    and jobs at `EVENTS_HZ`. Machine and profile are read from files where the options
-    name them. The first task that ends (with its error, if any) ends all. Returns OK; a
-    ZMQError of a port becomes the OSError.
+    Token, certificate, machine and profile are read first, from files where the options
+    name them, and raise their errors. The ports, once open, are announced in a line on
+    standard output. It subscribes to state and jobs at `EVENTS_HZ`. The first task that
+    ends, with its error, if any, ends all.
 
     Args:
         options: addresses, token, certificate, folders and files of the process.
 
     Returns:
-        The exit code.
+        The exit code, OK.
 
     Raises:
         OSError: a port is taken.

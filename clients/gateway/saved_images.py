@@ -120,12 +120,14 @@ class Recording:
         """Write an image as TIFF under a plain file name, add it to the record and
         rewrite the texts.
 
-        Returns the file's path. Its kind comes from the name; its time counts from the
-        first image [s].
+        Its kind comes from the name; its time counts from the first image [s].
+
+        Returns:
+            The file's path.
 
         Raises:
-            DatasetError: the name is not plain or is taken, the file cannot be written, or
-                another output path has been set meanwhile.
+            DatasetError: the name is not plain or is taken, the file cannot be written,
+                or another output path has been set meanwhile.
         """
         with self._turn:
             files = self._files([file])
@@ -145,12 +147,11 @@ class Recording:
             return files.path / file
 
     def adopt(self, folder: Path, state: State) -> int:
-        """Add the projections of a data set that the twin made.
+        """Add the projections of a data set that the twin made, and rewrite the texts.
 
         Files are linked or copied under their own names; frames that are no file of the
-        folder are copied. Blocks begin at the time of `state`
-        minus the set's duration; the texts are rewritten. A document without frames adds
-        none.
+        folder are copied. Blocks begin at the time of `state` minus the set's duration. A
+        document without frames adds none.
 
         Args:
             folder: of the data set.
@@ -160,7 +161,8 @@ class Recording:
             The number of images.
 
         Raises:
-            DatasetError, OSError: the data set cannot be read, a name is taken, or no room.
+            DatasetError, OSError: the data set cannot be read, a name is taken, or no
+                room.
         """
         source = Directory(folder.parent).folder(folder.name)
         document = read_document(source)
@@ -200,15 +202,17 @@ class Recording:
         """Open the recording's folder, made at the first use, and check that names are
         free.
 
-        The name is made free in the data directory at the first use. Returns the open
-        folder. If the name of the folder is taken, a number is added. Only the first
-        taken file is named in the error.
+        If the folder's name is taken in the data directory, a number is added to it.
 
         Args:
             names: of files to be written.
 
+        Returns:
+            The open folder.
+
         Raises:
-            DatasetError: the recording is closed, or a file of that name exists.
+            DatasetError: the recording is closed, or files of those names exist; the
+                message names the first.
         """
         if self._closed:
             raise DatasetError(

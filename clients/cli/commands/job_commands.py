@@ -97,22 +97,24 @@ def failure_code(status: JobStatus) -> int:
 
 
 def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
-    """Show a job's progress until it ends.
+    """Show a job's progress as a bar on standard error until it ends.
 
-    A paused job of another client is waited for, and the reason printed. Progress is a
-    bar on standard error. Only an own job raises for a pause.
-
-    Returns:
-        Its last status.
+    A pause because of an error is reported once with its reason, and waited for unless
+    the job is an own one.
 
     Args:
         client: connected to the twin.
         job: which one.
-        own: no other client steers the job, so Ctrl-C and a pause because of an error end the
-            wait.
+        own: no other client steers the job, so Ctrl-C and a pause because of an error end
+            the wait.
+
+    Returns:
+        Its last status.
 
     Raises:
-        CommandError: Ctrl-C; the job goes on, and the message says how to steer it.
+        CommandError: Ctrl-C; the job goes on, and the message says how to steer it. Of an
+            own job: it is paused because of an error.
+        KeyboardInterrupt: Ctrl-C, of an own job.
     """
     shown = ""
 
