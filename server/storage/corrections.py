@@ -60,9 +60,13 @@ class Corrections:
         """Read the corrections and their history from a folder; unreadable files are set
         aside, logged.
 
-        `in_force` is the state's: a whole history, which replaces the file's, or the one
-        name in force, which is joined to it. `most` limits how many are kept. A lost
-        correction that was in force is named in `lost`, and none is in force then.
+        A lost correction that was in force is named in `lost`, and none is in force then.
+
+        Args:
+            folder: of the corrections.
+            in_force: of the state: a whole history, which replaces the file's, or the one
+                name in force, which is joined to it.
+            most: number of corrections that may be stored.
         """
         self._folder = folder
         self._most = most
@@ -149,8 +153,7 @@ class Corrections:
         is stored yet.
 
         Parameters that are left out are nominal. A known name with the same values
-        returns the known correction with its own note and date, and
-        its `sides_known`.
+        returns the known correction with its own note, date and `sides_known`.
 
         Args:
             values: parameter -> value [mm, deg].

@@ -227,10 +227,15 @@ class StateStore:
         job_files: JobFiles,
         changed_jobs: Callable[[], ChangedJobs],
     ) -> None:
-        """Name where the state is written and what makes it; nothing is read or written yet.
+        """Name where the state is written and what makes it; nothing is read or written
+        yet.
 
-        `make(ended)` returns the state to write, `changed_jobs` the jobs changed since
-        its last call.
+        Args:
+            root: the data directory.
+            make: returns the state to write; its argument is whether the server has
+                ended.
+            job_files: files of the jobs.
+            changed_jobs: returns the jobs changed since its last call.
         """
         self._root = root
         self._make = make

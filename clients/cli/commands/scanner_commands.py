@@ -80,12 +80,13 @@ def _axis(name: str, axis: AxisState) -> tuple[str, ...]:
 
 def _facts(state: State) -> list[tuple[str, str]]:
     """List the facts of a state for its table: geometry, view, tube, camera, sample,
-    safety, clock, correction and controller; then image (saturated, starved, cut off)
-    and job, if there are any.
+    safety, clock, correction and controller; then image (saturated, starved, cut off) and
+    job, if there are any.
 
-    Lengths are in [mm], voxels in [um]; nothing is printed.
+    Lengths are in [mm], voxels in [um].
 
-    Returns: (label, text) of each.
+    Returns:
+        Label and text of each.
     """
     g = state.geometry
     c = state.camera

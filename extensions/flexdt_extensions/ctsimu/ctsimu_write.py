@@ -225,10 +225,8 @@ def _stage_motion(
     """Determine the stage's motion from the angles.
 
     Directions are as seen from above: growing angles are CW; falling ones are CCW with
-    start and stop negated.
-
-    Deviations of 1e-12 deg or more from equal steps become a drift of a turn about the
-    stage's own axis.
+    start and stop negated. Deviations of 1e-12 deg or more from equal steps become a
+    drift of a turn about the stage's own axis.
 
     Args:
         angles_deg: (n,) of the views.
