@@ -245,8 +245,8 @@ class VolumeStore:
 def memory_of(value: Body) -> int:
     """Estimate the memory that a volume, mesh or scene is counted with [bytes].
 
-    A volume `LAYOUT_COPIES` times its float32 voxels; a scene `SOLID_BYTES` a solid (at
-    least one).
+    A volume counts `LAYOUT_COPIES` times its float32 voxels, a mesh its vertices and
+    faces, a scene `SOLID_BYTES` a solid (at least one).
     """
     if isinstance(value, Volume):
         return LAYOUT_COPIES * 4 * math.prod(value.shape)

@@ -96,10 +96,13 @@ class TwinClock:
     def set_speed_up(self, speed_up: SpeedUp) -> None:
         """Run faster or slower from now on.
 
-        The present time does not jump.
+        The present time does not jump; the next wake-up is scheduled anew.
+
+        Args:
+            speed_up: "max", or above 0 and at most `MAX_SPEED_UP`.
 
         Raises:
-            LimitError: not a positive number and not "max".
+            LimitError: another one; nothing changes.
         """
         checked = check_speed_up(speed_up)
         self._rebase()

@@ -88,8 +88,13 @@ class PastScans:
     """
 
     def __init__(self, root: Path, machine: Machine, profile: Profile) -> None:
-        """Set up the listing of data sets below `root`, with worker processes that start on
-        demand.
+        """Set up the listing of data sets below `root`, with worker processes that start
+        on demand: `MAX_WORKERS`, and one with longer limits for calibration and
+        alignment.
+
+        Args:
+            root: the data directory.
+            machine, profile: of the twin, with which data sets are compared.
         """
         self._root = root
         self._machine = machine.model_dump(mode="json", by_alias=True)

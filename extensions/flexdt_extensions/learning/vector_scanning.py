@@ -144,9 +144,11 @@ class Rays:
     """
 
     def __init__(self, table: Turntable) -> None:
-        """Compute voxels, lengths and sums of all rays of the 36 angles.
+        """Compute, for all rays of the 36 angles, the voxels that they pass with their
+        lengths, each ray's total length, each view's total length in each voxel, and the
+        information of each view.
 
-        Lengths are in [mm]; rays are listed by view, with the voxels that they pass.
+        Lengths are in [mm]; rays are listed by view; voxels passed by 0 mm are left out.
 
         Args:
             table: poses and detector.
