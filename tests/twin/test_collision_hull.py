@@ -13,6 +13,7 @@ from scipy.optimize import linprog, nnls
 
 from flexdt.twin.collision import outer_hull as hulls
 from flexdt.twin.collision.collision_scene import build_scene
+from flexdt.twin.collision.convex_solids import hull
 from flexdt.twin.collision.first_contact import clearance
 from flexdt.twin.collision.outer_hull import outer_hull
 from flexdt.twin.errors import MachineFileError, TwinError
@@ -47,6 +48,17 @@ def drawn(rng: np.random.Generator, many: int, size: float = 60.0) -> Points:
     return np.asarray(
         size * rng.uniform(0.3, 1.0, 3) * points + rng.uniform(-5.0, 5.0, 3)
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_planes_of_a_body_are_those_of_its_faces(seed: int) -> None:
+    """All corners are behind each plane, at least three of them in it."""
+    body = hull(drawn(np.random.default_rng(seed), 12))
+    planes = hulls._planes(body)
+    assert len(planes) == len(body.faces)
+    heights = body.vertices @ planes[:, :3].T + planes[:, 3]
+    assert heights.max() <= 1e-9
+    assert ((np.abs(heights) < 1e-9).sum(axis=0) >= 3).all()
 
 
 def inside(point: Points, corners: Points) -> bool:

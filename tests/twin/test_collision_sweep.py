@@ -791,31 +791,35 @@ def test_every_distance_that_is_evaluated_counts_as_a_look(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_moment_after_a_travel_is_that_of_the_motor(seed: int) -> None:
-    """Along one axis, without turning, the bound is the motion itself."""
+@pytest.mark.parametrize(("axis", "mm"), [("x", 1.0), ("turn", math.radians(6.0208))])
+def test_the_moment_after_a_travel_is_that_of_the_motor(
+    axis: str, mm: float, seed: int
+) -> None:
+    """With one motor the bound is the motion itself; a corner of the box is 6.0208 mm from
+    the turntable's axis."""
     rng = np.random.default_rng(seed)
     a, b = one_against(box((9, 8, 7)), [box((5, 5, 5), (70, 70, 0))]).bodies
     begin, end = rng.uniform(-50, 50, 2)
     move = motion.move(begin, 0.0, end, float(rng.uniform(5, 50)), 30.0, 0.0)
     still = at_rest(0.0)
-    ways = dict.fromkeys(AXES, still) | {AXES[0]: move}
+    ways = dict.fromkeys(AXES, still) | {axis: move}
     path = path_of(AXES, {n: AxisPath.along(t) for n, t in ways.items()}, 0.0, move.end)
     moves = RelativeMotion(a, b, path)
     for share in rng.uniform(0.05, 0.99, 4):
-        distance = float(share * abs(end - begin))
+        distance = float(share * abs(end - begin)) * mm
         found = moves.after_travel(Moment(0, 0.0), distance)
         assert found is not None
         gone = abs(move.position(moves.time(found)) - begin)
-        assert gone == pytest.approx(distance, abs=1e-6)
-    assert moves.after_travel(Moment(0, 0.0), 1.01 * abs(end - begin)) is None
+        assert gone * mm == pytest.approx(distance, rel=1e-5)
+    assert moves.after_travel(Moment(0, 0.0), 1.01 * mm * abs(end - begin)) is None
 
 
 @pytest.mark.parametrize("count", [2, 8, 9])
 def test_a_trace_has_times_even_in_travel_and_times_even_in_time(count: int) -> None:
-    """A motor goes 6 mm in one second and 2 mm in the next, then rests for eight."""
+    """A motor goes 6 mm in one second, rests for eight, and goes 2 mm in the last."""
     path = Path(
-        ("x",), np.array([1.0, 2.0, 3.0, 11.0]), np.array([[0.0], [6.0], [8.0], [8.0]]),
-        np.array([[6.0], [2.0], [0.0]]), np.zeros((3, 1)),
+        ("x",), np.array([1.0, 2.0, 10.0, 11.0]), np.array([[0.0], [6.0], [6.0], [8.0]]),
+        np.array([[6.0], [0.0], [2.0]]), np.zeros((3, 1)),
     )  # fmt: skip
     even = 1.0 + 10.0 * np.arange(count - count // 2) / max(1, count - count // 2 - 1)
     by_travel = {1: [1.0], 4: [1.0, 1.0 + 8.0 / 18.0, 1.0 + 16.0 / 18.0, 11.0]}[

@@ -19,7 +19,7 @@ from flexdt.twin.collision.convex_solids import box
 from flexdt.twin.collision.first_contact import clearance, touching
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.obstacle_path import _Planner, free_moves
-from flexdt.twin.collision.plan_report import collision_check
+from flexdt.twin.collision.plan_report import _from_size, collision_check
 from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_z
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -359,6 +359,13 @@ def test_the_stated_size_stands_in_for_a_mesh() -> None:
     assert {c.pair for c in wide.collisions} >= {("detector", "sample")}
     unknown_height = check(plan, M, P, SampleSize(420.0))
     assert unknown_height.collisions
+
+
+def test_the_sample_of_a_stated_size_is_about_its_origin() -> None:
+    for size, height in ((SampleSize(12.0, 30.0), 30.0), (SampleSize(12.0), 12.0)):
+        [solid] = _from_size(size)
+        half = np.array([6.0, 6.0, height / 2.0])
+        np.testing.assert_allclose(solid.bounds(), (-half, half))
 
 
 def test_a_size_of_nothing_is_no_sample() -> None:

@@ -20,6 +20,7 @@ from flexdt.twin.geometry import ConeVec
 from flexdt.twin.geometry.cone_vec import check_cone_vec
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.panel import Border, Panel, PanelModel
+from flexdt.twin.geometry.panel_corners import panel_corners
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.geometry.rigid import Rigid
 from flexdt.twin.geometry.virtual_panel import stretched
@@ -612,6 +613,17 @@ def test_only_panels_that_move_are_stretched_and_their_images_stay() -> None:
     assert_allclose(longer.source_detector_distance, 1059.0 * times)
     assert_allclose(longer.project_points(points), scan.project_points(points))
     assert_allclose(longer.rows[[0, 2]], scan.rows[[0, 2]], rtol=0.0)
+
+
+def test_corners_of_a_panel_are_seen_at_the_corners_of_its_image() -> None:
+    scan = ConeVec.circular(
+        angles=3, **{**SCAN, "pixel": (1.2, 1.6)}, tilts=(2.0, 3.0, 1.0)
+    )
+    seen = scan.project_points(panel_corners(scan).reshape(-1, 3)).reshape(3, 3, 4, 2)
+    expected = [[-0.5, -0.5], [95.5, -0.5], [95.5, 75.5], [-0.5, 75.5]]
+    assert_allclose(
+        [seen[i, i] for i in range(3)], np.tile(expected, (3, 1, 1)), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("column", range(12))

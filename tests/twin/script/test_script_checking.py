@@ -384,6 +384,18 @@ def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> N
         assert (checked.ok, repr(checked).split(",")[1]) == (ok, f" {1 - ok} collisions")
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_range_of_the_duration_holds_where_the_start_is_known(known: bool) -> None:
+    """The times of the UniTOM XL are measured."""
+    start = StartState.of(builtin_machine("unitom_xl")) if known else None
+    text = "rot_obj move absolute 90 ACK\ncamera take image ACK\ncamera save image s.tif ACK\n"
+    made = check_script(text, builtin_machine("unitom_xl"), start=start)
+    said = dict(summary(made))["  90 % range"]
+    assert said.split(" s", 1)[1] == (
+        "" if known else ", if axes and X-rays start as assumed below"
+    )
+
+
 class _Tags(HTMLParser):
     """Every element is closed, and nothing comes from elsewhere."""
 
