@@ -79,6 +79,8 @@ class CoarseScan:
         numbers: (n,) of these views among all of the scan.
         binned: rows and columns of the panel over which a pixel is the mean.
         nodes: largest number of voxels along the longest side.
+        rest: rows and columns at the panel's end that fill no pixel and are left out
+            [coarse pixels].
     """
 
     images: Float32Array
@@ -89,6 +91,7 @@ class CoarseScan:
     numbers: npt.NDArray[np.intp]
     binned: tuple[int, int]
     nodes: int = NODES
+    rest: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(
@@ -154,6 +157,7 @@ class CoarseScan:
             numbers,
             (down, across),
             nodes,
+            (shape[0] / down - rows, shape[1] / across - cols),
         )
 
     def thinned(
@@ -175,6 +179,7 @@ class CoarseScan:
             across: columns over which a column of the result is the mean.
         """
         count, rows, cols = self.images.shape
+        ends = rows + self.rest[0], cols + self.rest[1]
         if all_views:
             each = 1
         else:
@@ -200,6 +205,7 @@ class CoarseScan:
             truncation=truncation,
             numbers=self.numbers[chosen],
             binned=(self.binned[0] * down, self.binned[1] * across),
+            rest=((ends[0] - rows) / down, (ends[1] - cols) / across),
         )
 
     @cached_property

@@ -17,7 +17,13 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid
 from flexdt.twin.reconstruction import bias_warnings, fdk
 from flexdt.twin.reconstruction.bias import Bias
-from flexdt.twin.reconstruction.consistency.agreement import Contradiction, Undetermined
+from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.consistency.agreement import (
+    Contradiction,
+    Undetermined,
+    compared,
+)
+from flexdt.twin.reconstruction.consistency.suspects import suspects
 
 SHAPE = (30, 60)
 TURN = np.arange(100) * 3.6
@@ -244,10 +250,12 @@ def test_a_mirrored_body_in_a_parallel_beam_is_not_decided() -> None:
     assert bias.accuracy(Grid((16, 30, 30), 1.0)) is not None
 
 
-def studied(number: int, *, right: bool = False) -> tuple[misfits.Case, Bias]:
-    """A wrong draw of the study's seed 5353, or its scan before it was made wrong, and what
-    is found of it."""
-    case = misfits.drawn(5353, number, right=False)
+def studied(
+    number: int, *, seed: int = 5353, right: bool = False
+) -> tuple[misfits.Case, Bias]:
+    """A wrong draw of the study, or its scan before it was made wrong, and what is found
+    of it."""
+    case = misfits.drawn(seed, number, right=False)
     assert case is not None
     if right:
         images, geometry = case.scan.images(), case.scan.geometry
@@ -290,6 +298,60 @@ def test_a_better_fit_is_told_however_little_is_claimed() -> None:
     assert isinstance(bias.contradiction, Contradiction)
     assert bias.contradiction.kinds == ("names",)
     assert "they fit better if" in str(bias.contradiction)
+
+
+@pytest.mark.parametrize("draw", range(6))
+def test_mirrored_images_are_tried_about_the_middle_of_the_panel(draw: int) -> None:
+    """Coarse pixels that do not fill the panel leave its end out. Points of the object are
+    at the same places of the explanation's images and of its geometry."""
+    rng = np.random.default_rng([59, draw])
+    shape = int(rng.integers(41, 120)), int(rng.integers(41, 120))
+    offset = tuple(rng.uniform(-30.0, 30.0, 2))
+    tilts = tuple(rng.uniform(-4.0, 4.0, 3))
+    right = ConeVec.circular(
+        sod=400, sdd=700, angles=TURN, shape=shape, pixel=1.1, offset=offset, tilts=tilts
+    )
+    blank = np.zeros(shape, np.float32)
+    coarse = CoarseScan.of(lambda _: blank, right, shape, None).thinned()
+    places = rng.uniform(-15.0, 15.0, (5, 3))
+    tried = {one.kind: one for one in suspects(coarse, whole=True)}
+    for kind, sides in {"columns": (0,), "rows": (1,), "turned": (0, 1)}.items():
+        seen = right[coarse.numbers].project_points(places, shape)
+        for side in sides:
+            seen[..., side] = shape[1 - side] - 1 - seen[..., side]
+        coarsely = (seen + 0.5) / coarse.binned[::-1] - 0.5
+        size = coarse.images.shape[1:]
+        for side in sides:
+            coarsely[..., side] = size[1 - side] - 1 - coarsely[..., side]
+        found = tried[kind].cone_vec.project_points(places, size)
+        np.testing.assert_allclose(found, coarsely, atol=1e-6)
+
+
+def test_a_panel_is_tried_beyond_the_first_step_where_few_columns_overlap() -> None:
+    """A panel 2.7 px off, of which movements of a third of a pixel fit worse."""
+    case = misfits.drawn(6061, 202, right=False)
+    assert case is not None
+    middle = np.ascontiguousarray(case.images[:, 19:39])
+    scan = CoarseScan.of(middle.__getitem__, case.geometry, middle.shape[1:], None)
+    comparison = compared(scan)
+    assert comparison is not None
+    assert comparison.contradiction() is not None
+
+
+def test_a_jump_is_named_before_a_panel_at_another_place() -> None:
+    """A panel moved once for all explains half of a jump."""
+    _, wrong = studied(94, seed=6061)
+    assert isinstance(wrong.contradiction, Contradiction)
+    assert wrong.contradiction.kinds == ("movement",)
+
+
+def test_an_object_that_only_seems_cut_off_is_no_moved_panel() -> None:
+    """Any geometry of a complete object fits better than rows that are continued."""
+    _, wrong = studied(127, seed=8484)
+    assert wrong.contradiction is None
+    accuracy = wrong.accuracy(Grid((16, 30, 30), 1.0))
+    assert accuracy is not None
+    assert accuracy.cut_off
 
 
 def test_nothing_is_claimed_of_images_that_fit_any_volume() -> None:

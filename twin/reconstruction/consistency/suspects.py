@@ -81,21 +81,26 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
     Yields:
         Mirrored columns (of a truncated scan only with an offset), offsets along rows if
         above `CENTRE_TOLERANCE`; for a whole scan also mirrored rows, both mirrored,
-        other orders and spans, and the opposite offset along columns if above it.
+        other orders and spans, and the opposite offset along columns if above it. Images
+        are mirrored about the middle of the panel with `CoarseScan.rest`.
     """
     images = scan.images
     cone_vec = scan.cone_vec
+    below, beside = scan.rest
     aside, above = _axis_from_middle(scan)
     offset = abs(aside) > CENTRE_TOLERANCE
     if whole or offset:
-        yield Suspect("columns", np.ascontiguousarray(images[:, :, ::-1]), cone_vec)
+        mirrored = moved(cone_vec, beside)
+        yield Suspect("columns", np.ascontiguousarray(images[:, :, ::-1]), mirrored)
     if offset:
         yield Suspect("sign", images, moved(cone_vec, 2.0 * aside))
         yield Suspect("middle", images, moved(cone_vec, aside))
     if not whole:
         return
-    yield Suspect("rows", np.ascontiguousarray(images[:, ::-1]), cone_vec)
-    yield Suspect("turned", np.ascontiguousarray(images[:, ::-1, ::-1]), cone_vec)
+    upside_down = moved(cone_vec, 0.0, below)
+    yield Suspect("rows", np.ascontiguousarray(images[:, ::-1]), upside_down)
+    turned_panel = moved(cone_vec, beside, below)
+    yield Suspect("turned", np.ascontiguousarray(images[:, ::-1, ::-1]), turned_panel)
     yield from _orders(scan)
     if abs(above) > CENTRE_TOLERANCE:
         yield Suspect("height", images, moved(cone_vec, 0.0, 2.0 * above))
@@ -191,8 +196,9 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
 
 
 def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
-    """Compute where the source's foot on the axis falls, from the middle of the panel,
-    averaged over about eight views.
+    """Compute where the source's foot on the axis falls, from the middle of the panel
+    with the rows and columns that the copy leaves out (`CoarseScan.rest`), averaged over
+    about eight views.
 
     Args:
         scan: coarse.
@@ -215,5 +221,6 @@ def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
             for k in range(0, len(foot), max(1, len(foot) // 8))
         ]
     )
-    along, down = at.mean(axis=0) - (np.array(shape[::-1]) - 1.0) / 2.0
+    middle = (np.array(shape[::-1]) + scan.rest[::-1] - 1.0) / 2.0
+    along, down = at.mean(axis=0) - middle
     return float(along), float(down)

@@ -44,6 +44,9 @@ FAR_PROBE_COLUMNS: Final = 3.0
 MIN_EVIDENCE_SIGMAS: Final = 2.0
 """Least distance of two likelihoods, in standard errors, at which one geometry fits
 better than another."""
+DOUBTFUL_STEPS: Final = 2
+"""Least number of movements of the panel to either side if images fit less well than most:
+FDK rounds a narrow overlap to half columns, so that the first step alone may fit worse."""
 MAX_PROBE_STEPS: Final = 7
 """Number of further movements of the panel, each twice as far."""
 UPSIDE_DOWN: Final = frozenset({"rows", "turned"})
@@ -124,22 +127,37 @@ class Trial:
         """The stated geometry's volume."""
         return UniformNodes.of(self.own.values, self.scan.rim)
 
+    @cached_property
+    def _stated(self) -> Reprojection:
+        """The stated geometry, beside which explanations are tried: of an object that
+        seems cut off also as a complete one, as `_shown` takes it to be, if that fits
+        better. What merely ends the continuation of rows explains nothing.
+        """
+        if self.whole:
+            return self.own
+        scan = self.scan
+        complete = Reprojection.of(scan, scan.images, scan.cone_vec, None)
+        if complete is None or complete.arcs.sum() >= self.own.arcs.sum():
+            return self.own
+        return complete
+
     def opposite(self) -> Tried:
         """Try the rotation the other way."""
         return self._tried(reversed_turn(self.scan))
 
-    def others(self, *, far: bool, mirrored: bool = True) -> list[Tried]:
+    def others(self, *, far: bool, doubtful: bool = True) -> list[Tried]:
         """Try all explanations but the opposite rotation: panels moved along rows, then
         `suspects`.
 
         Args:
             far: panels far aside, too, as for images that do not fit.
-            mirrored: images mirrored or turned, too; a panel in the middle sees the
-                opposite rotation so.
+            doubtful: images mirrored or turned, too (a panel in the middle sees the
+                opposite rotation so), and panels moved by `DOUBTFUL_STEPS` at least.
         """
         listed = suspects(self.scan, whole=self.whole)
-        chosen = [one for one in listed if mirrored or one.kind not in MIRRORED]
-        return [*self._beside(far), *map(self._tried, chosen)]
+        chosen = [one for one in listed if doubtful or one.kind not in MIRRORED]
+        steps = DOUBTFUL_STEPS if doubtful else 1
+        return [*self._beside(far, steps), *map(self._tried, chosen)]
 
     def movement(self) -> Tried:
         """Try shifts of single images: movement of object or scanner between views."""
@@ -221,9 +239,9 @@ class Trial:
         shown = self._shown(suspect)
         if shown is None or not self.telling.any():
             return Tried(suspect, None)
-        misfits = (shown.misfit() / self.own.misfit())[self.telling]
+        misfits = (shown.misfit() / self._stated.misfit())[self.telling]
         score = float(np.exp(np.log(misfits).mean()))
-        residuals = (shown.arcs / self.own.arcs)[self.telling]
+        residuals = (shown.arcs / self._stated.arcs)[self.telling]
         each = 0.5 * np.log(residuals).mean(axis=0)
         spread = max(float(each.std(ddof=1)), np.finfo(np.float32).tiny)
         evidence = float(each.mean()) * np.sqrt(len(each)) / spread
@@ -285,7 +303,7 @@ class Trial:
         moved_panel = moved(self.scan.cone_vec, columns)
         return self._tried(Suspect("offset", self.scan.images, moved_panel, figure))
 
-    def _beside(self, far: bool) -> list[Tried]:
+    def _beside(self, far: bool, least_steps: int) -> list[Tried]:
         """Try panels moved along their rows (offset axis): towards the side where images
         fit better, in doubled steps until they fit worse (`MAX_PROBE_STEPS` at most);
         then twice at the parabola's vertex between the best.
@@ -296,6 +314,7 @@ class Trial:
 
         Args:
             far: see above.
+            least_steps: that are tried on either side of a whole scan.
 
         Returns:
             All that were tried, in order.
@@ -324,9 +343,10 @@ class Trial:
             for _ in range(2):
                 score(_lowest(known))
         for at in (-PROBE_COLUMNS, PROBE_COLUMNS) if self.whole else ():
-            for _ in range(MAX_PROBE_STEPS):
+            for steps in range(1, MAX_PROBE_STEPS + 1):
                 score(at)
-                if at in tried and tried[at].evidence >= MIN_EVIDENCE_SIGMAS:
+                excluded = at in tried and tried[at].evidence >= MIN_EVIDENCE_SIGMAS
+                if excluded and steps >= least_steps:
                     break
                 at *= 2.0
         return list(tried.values())
