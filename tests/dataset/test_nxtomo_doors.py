@@ -91,6 +91,28 @@ def test_keys_of_another_length_are_refused(path, keys):
         opened(path)
 
 
+@pytest.mark.parametrize(
+    "keys", [[0] * (VIEWS + 2), [2, 2] + [0] * VIEWS, [3, 3] + [0] * VIEWS]
+)
+def test_flat_images_in_another_file_are_asked_for(path, keys):
+    """Savu#400: no flat image, dark ones alone, invalid ones; line integrals need none."""
+    views = keys.count(0)
+    scan = ConeVec.circular(sod=100, sdd=200, angles=views, pixel=0.2)
+    with h5py.File(path, "w") as file:
+        entry(file, keys=keys, angles=None)
+    data = opened(path, scan)
+    assert any("no image has the key of a flat image, 1" in one for one in data.warnings)
+    with pytest.raises(DatasetError, match="images of key 1 in an NXtomo file"):
+        data.line_integrals()
+    images = np.linspace(0.1, 0.4, VIEWS * 48).reshape(VIEWS, *SHAPE)
+    with h5py.File(path, "w") as file:
+        entry(file, keys=[0] * VIEWS, angles=None, images=images)
+    np.testing.assert_allclose(opened(path).line_integrals(), images, rtol=1e-6)
+    flat = np.full((2, *SHAPE), 1000)  # from the other file
+    whole = fx.DataSet.from_arrays(data.counts(), scan, dark=data.dark, flat=flat)
+    assert np.isfinite(whole.line_integrals()).all()
+
+
 def test_keys_that_nobody_knows_are_left_out_and_said(path):
     with h5py.File(path, "w") as file:
         entry(file, keys=[2, 1, -1, -1] + [0] * (VIEWS - 2), angles=None)

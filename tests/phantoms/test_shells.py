@@ -54,6 +54,27 @@ def test_a_cavity_is_missing_from_the_path():
     assert hollow / solid == pytest.approx(0.6, rel=0.05)
 
 
+def turned(mesh, every):
+    faces = mesh.faces.copy()
+    faces[::every] = faces[::every, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 7])
+@pytest.mark.parametrize("bodies", [[box(10)], [box(6, (-4, 0, 0)), box(4, (4, 1, 0))]])
+@pytest.mark.parametrize("door", ["stl", "mesh"])
+def test_faces_turned_inside_out_cast_the_same_image(every, bodies, door):
+    """WebCT#8, stl-to-voxel#63, Slic3r#3245: all of them, or some."""
+    scan = fx.ConeVec.circular(sod=50, sdd=80, angles=3, shape=(9, 15), pixel=1.5)
+    whole = trimesh.util.concatenate(bodies)
+    samples = [whole, turned(whole, every)]
+    if door == "stl":
+        samples = [mesh_phantom(stl(one), file_type="stl") for one in samples]
+    right, found = (fx.project(one, scan) for one in samples)
+    assert right.max() > 0.1
+    np.testing.assert_allclose(found, right, atol=1e-5 * right.max())
+
+
 @pytest.mark.parametrize("wrong", [3, 50, -3, -50])
 def test_a_binary_stl_of_another_length_says_so(wrong):
     raw = stl(box(10))

@@ -309,9 +309,13 @@ def test_an_answer_to_the_server_ends_the_connection() -> None:
     run(body)
 
 
-@pytest.mark.parametrize("last", [call("state.get", 9), b'{"jsonrpc"', b"\0\0\0\x09abc"])
+@pytest.mark.parametrize(
+    "last",
+    [call("state.get", 9), call("state.get", 9) + b"\r", b'{"jsonrpc"', b"\0\0\0\x09abc"],
+)
 def test_end_of_file_inside_a_message_is_answered_with_an_error(last: bytes) -> None:
-    """The line is not served, also where only its end is missing: it may have been cut off."""
+    """The line is not served, also where only its end is missing: it may have been cut off
+    (ironfish#1614, bjsonrpc#14, jayson#114)."""
 
     async def body(server: TcpServer, app: FakeApp) -> None:
         reader, writer = await dial(server)

@@ -66,14 +66,17 @@ def as_numbers(
         dtype: of the result.
 
     Raises:
-        GeometryError: `value` contains something that is no number.
+        GeometryError: `value` contains something that is no real number.
 
     Example:
         >>> as_numbers("distances", [1, 2]).tolist()
         [1.0, 2.0]
     """
     try:
-        return np.asarray(value, dtype=dtype)
+        values = np.asarray(value)
+        if values.dtype.kind == "c":
+            raise TypeError
+        return values.astype(dtype, copy=False)
     except (TypeError, ValueError):
         kind = type(value).__name__
         raise GeometryError(

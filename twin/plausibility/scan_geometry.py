@@ -37,6 +37,13 @@ MISSING_DEG: Final = (12.0, 30.0)
 [deg]."""
 TIMES_USUAL: Final = (8.0, 5.0)
 """Least size of the same gaps, in usual steps."""
+UNSEEN_DEG: Final = 20.0
+"""Least angle between all beams and a plane from which a trajectory leaves that plane
+out [deg]."""
+SPARSE_VIEWS: Final = 10.0
+"""Over the number of views: sine of the same angle that few views leave by chance."""
+PROBES: Final = 500
+"""Number of planes that are compared with the beams."""
 INCLINED_DEG: Final = (10.0, 20.0)
 """Inclinations of the beam to the plane of rotation at which FDK warns and refuses
 [deg]."""
@@ -250,10 +257,14 @@ def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
 
     The widest gap, less the mean of the others, must exceed one of `MISSING_DEG`, and the
     gap as many `TIMES_USUAL` that mean. Yields at most one finding, its figure the gap
-    [deg]. Nothing for fewer than 3 views or directions, or a rotation that is not about
-    z. Opposite directions count as one.
+    [deg]. Opposite directions count as one. Views that do not turn about z leave out a
+    plane if all beams are more than `UNSEEN_DEG` from it, its figure that angle [deg].
+    Nothing for fewer than 3 views or directions about z.
     """
-    if len(cone_vec) < 3 or not about_z(cone_vec):
+    if not about_z(cone_vec):
+        yield from _plane_findings(cone_vec)
+        return
+    if len(cone_vec) < 3:
         return
     at = np.unique((azimuths(cone_vec) % math.pi).round(6) % round(math.pi, 6))
     if len(at) < 3:
@@ -274,6 +285,41 @@ def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
             "views over half a turn and the fan are needed for a volume that is right"
         )
         yield Finding("limited arc", cause, remedy, Severity.WARNING, widest)
+
+
+def _plane_findings(cone_vec: ConeVec) -> Iterator[Finding]:
+    """Warn if all beams of a trajectory of any form leave out a plane.
+
+    Yields at most one finding, its figure the angle between that plane and the nearest
+    beam [deg]; nothing for so few views that they would leave it out by chance.
+
+    Args:
+        cone_vec: n views.
+    """
+    if not len(cone_vec):
+        return
+    beams = cone_vec.detector - cone_vec.source
+    beams = beams / np.linalg.norm(beams, axis=1, keepdims=True)
+    sines = np.abs(_normals(PROBES) @ beams.T).min(axis=1)
+    unseen = float(sines.max())
+    by_chance = SPARSE_VIEWS / len(cone_vec)
+    if unseen <= max(math.sin(math.radians(UNSEEN_DEG)), by_chance):
+        return
+    apart = math.degrees(math.asin(min(unseen, 1.0)))
+    cause = (
+        f"the beams of all views are {apart:.3g} deg or more from some planes: edges along "
+        "those are blurred or missing, and values off"
+    )
+    remedy = "views from more sides are needed for a volume that is right"
+    yield Finding("limited arc", cause, remedy, Severity.WARNING, apart)
+
+
+def _normals(count: int) -> FloatArray:
+    """Return directions spread evenly over half a sphere, (count, 3)."""
+    height = (np.arange(count) + 0.5) / count
+    turn = GOLDEN[0] * np.arange(count)
+    level = np.sqrt(1.0 - height**2)
+    return np.stack([level * np.cos(turn), level * np.sin(turn), height], axis=1)
 
 
 def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[Finding]:

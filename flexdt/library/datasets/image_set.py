@@ -509,9 +509,9 @@ class ImageSet:
         flat = self._mean(self.flats, None if self.arrays is None else self.arrays.flats)
         if flat is None:
             raise DatasetMissingError(
-                f"{self.where}: no flat field (io000000.tif, or the images that `flat` of "
-                "fx.read_tiffs and from_arrays names); without one there are no line "
-                "integrals",
+                f"{self.where}: no flat field (io000000.tif, images of key 1 in an NXtomo "
+                "file, or those that `flat` of fx.read_tiffs and from_arrays names); without "
+                "one there are no line integrals",
                 {"path": self.where, "missing": ["io000000.tif"]},
             )
         return flat

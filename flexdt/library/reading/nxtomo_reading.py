@@ -93,6 +93,11 @@ def _read(
     several = [
         images[keys == key] if (keys == key).any() else None for key in (DARK, FLAT)
     ]
+    if several[1] is None and images.dtype.kind in "ui":
+        doubts.append(
+            f"{path.name}: no image has the key of a flat image, {FLAT}; counts have no line "
+            "integrals without one"
+        )
     projections = keys == PROJECTION
     if not projections.any():
         raise DatasetFormatError(

@@ -7,6 +7,8 @@ numbers in names and values stand in tests/dataset and tests/twin/plausibility.
 
 from __future__ import annotations
 
+import gc
+import tracemalloc
 import warnings
 from collections.abc import Callable
 from functools import partial
@@ -133,6 +135,61 @@ def test_a_panel_aside_in_a_short_scan_is_said(
     assert caught or abs(mean - 1.0) < 0.01
 
 
+SWEEP = np.deg2rad(np.linspace(-60.0, 60.0, 41))
+LEVEL = np.zeros(len(SWEEP))
+SOURCES = {
+    "arc": (200.0 * np.sin(SWEEP), -200.0 * np.cos(SWEEP), LEVEL),
+    "line": (140.0 * np.sin(SWEEP), LEVEL - 200.0, LEVEL),
+    "rising": (LEVEL, LEVEL - 200.0, 60.0 * np.sin(SWEEP)),
+    "circle": (80.0 * np.cos(3.0 * SWEEP), LEVEL - 200.0, 80.0 * np.sin(3.0 * SWEEP)),
+}
+
+
+@pytest.mark.parametrize("path", SOURCES)
+def test_a_panel_that_stands_still_shifts_nothing(path: str) -> None:
+    """TIGRE#679, #99: the ball is where it is across the beam, and what is unseen is told."""
+    sources = np.stack(SOURCES[path], axis=1)
+    scan = fx.ConeVec.from_vectors(
+        sources, (0, 80, 0), (1.6, 0, 0), (0, 0, -1.6), (60, 150)
+    )
+    grid = Grid((15, 15, 15), 1.2, (3.0, -2.0, 1.0))
+    with pytest.warns(UserWarning, match="edges along those are blurred"):
+        volume = sirt(integrals(scan), scan, grid, iterations=12)
+    x, y, z = np.meshgrid(*volume.centers(), indexing="ij")
+    values = volume.data.transpose(2, 1, 0)
+    weights = np.where(values > 0.3 * values.max(), values, 0.0)
+    at = np.array([(weights * axis).sum() for axis in (x, y, z)]) / weights.sum()
+    np.testing.assert_allclose(at[[0, 2]], CENTRE[[0, 2]], atol=0.15)
+    np.testing.assert_allclose(at[1], CENTRE[1], atol=0.6)  # along the beam
+
+
+@pytest.mark.parametrize("views", [20, 60, 200])
+@pytest.mark.parametrize("form", ["sphere", "saddle", "about x", "two circles"])
+def test_trajectories_that_leave_nothing_out_are_told_nothing(
+    form: str, views: int
+) -> None:
+    turn = np.linspace(0.0, 2.0 * np.pi, views, endpoint=False)
+    level = 0.0 * turn
+    beams = {
+        "sphere": RNG.normal(size=(views, 3)),
+        "saddle": np.stack([np.cos(turn), np.sin(turn), 0.4 * np.cos(2.0 * turn)], axis=1),
+        "about x": np.stack([level, np.cos(turn), np.sin(turn)], axis=1),
+        "two circles": np.stack([np.sin(turn), np.cos(turn) * (turn < 3.1), np.cos(turn) *
+                                 (turn >= 3.1)], axis=1),
+    }[form]  # fmt: skip
+    beams /= np.linalg.norm(beams, axis=1, keepdims=True)
+    u = np.cross(beams, RNG.normal(size=3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    scan = fx.ConeVec.from_vectors(
+        -100 * beams, 100 * beams, u, np.cross(beams, u), (9, 9)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sirt(
+            np.zeros((views, 9, 9), np.float32), scan, Grid((3, 3, 3), 0.5), iterations=1
+        )
+
+
 @pytest.mark.parametrize(
     "voxel", [(0.6, 0.6, 0.6), (0.4, 0.6, 1.0), (1.0, 0.5, 0.5), (0.5, 1.0, 0.7)]
 )
@@ -157,6 +214,38 @@ def test_no_half_pixel_is_lost(shape: tuple[int, int], layers: int) -> None:
     )
     for axis in range(3):
         np.testing.assert_allclose(data, np.flip(data, axis), atol=0.02 * MU)
+
+
+SMALL = circle(angles=8)
+WORK: dict[str, Callable[[Any], Any]] = {
+    "forward": lambda images: fx.forward(fx.Volume(np.ones((6, 8, 8)), 1.0), SMALL),
+    "back": lambda images: fx.back(images, SMALL, Grid((6, 8, 8), 1.0)),
+    "fdk": lambda images: fdk(images, SMALL, Grid((6, 8, 8), 1.0), errors=False),
+    "sirt": lambda images: sirt(images, SMALL, Grid((6, 8, 8), 1.0), iterations=1),
+    "data set": lambda images: fx.DataSet.from_arrays(images, SMALL).line_integrals(),
+}
+ROUNDS = 12
+MAX_KEPT_BYTES = 3000
+"""Of a round; images of one are 35 840 bytes, the volume of one 1536."""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("work", WORK)
+def test_rounds_of_the_same_work_keep_no_memory(work: str) -> None:  # tomosipo#17
+    images = integrals(SMALL)
+    for _ in range(3):
+        WORK[work](images)
+    gc.collect()
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        for _ in range(ROUNDS):
+            WORK[work](images)
+        gc.collect()
+        kept = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert kept < ROUNDS * MAX_KEPT_BYTES
 
 
 @pytest.mark.parametrize("edge", [0.05, 0.1, 0.3, 1.0])
