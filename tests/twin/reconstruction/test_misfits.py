@@ -338,6 +338,29 @@ def test_a_panel_is_tried_beyond_the_first_step_where_few_columns_overlap() -> N
     assert comparison.contradiction() is not None
 
 
+def test_orders_are_tried_on_all_views() -> None:
+    """Every second image of three passes has uneven angles, which hide the right order."""
+    _, wrong = studied(29, seed=9091)
+    assert isinstance(wrong.contradiction, Contradiction)
+    assert wrong.contradiction.kinds == ("interlaced",)
+    assert wrong.contradiction.change is None
+
+
+def test_a_claim_covers_three_times_the_change_of_a_coarse_volume() -> None:
+    """A reversed scan that fits as well, 3.4 % apart in the coarse volume, is 19 % off: a
+    claim of 3.4 % does not cover it."""
+    case = misfits.drawn(9091, 49, right=False)
+    assert case is not None
+    image = case.images.__getitem__
+    scan = CoarseScan.of(image, case.geometry, case.scan.shape, None)
+    comparison = compared(scan)
+    assert comparison is not None
+    open_ = comparison.undecided(0.05)
+    assert open_ is not None
+    assert open_.kinds == ("direction",)
+    assert comparison.undecided(0.2) is None
+
+
 def test_a_jump_is_named_before_a_panel_at_another_place() -> None:
     """A panel moved once for all explains half of a jump."""
     _, wrong = studied(94, seed=6061)

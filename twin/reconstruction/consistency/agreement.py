@@ -44,6 +44,8 @@ proportion."""
 MIN_CHANGE: Final = 0.01
 """Least relative change of uniform regions by an explanation that is named: a tilted
 panel's images may fit mirrored rows better, whose volume is the same."""
+SMOOTH_CHANGE_SHARE: Final = 1.0 / 3.0
+"""Share of a volume's change that the smooth coarse one shows: that of `bias.SAFETY_FACTOR`."""
 MAX_UNTOLD_CHANGE: Final = 0.1
 """Largest relative change of uniform regions by an explanation as likely that a claim of
 larger errors covers."""
@@ -56,6 +58,8 @@ MIN_SHIFT_SCATTER_PX: Final = 0.25
 moved once for all: of 16 simulated scans with such a panel, where movement fitted better,
 at most 0.15; of 12 with movement 0.38 and more (`tests/studies/misfits.py --seed 5353`)
 [coarse pixels]."""
+ORDERS: Final = frozenset({"interlaced", "names", "listed", "span"})
+"""Kinds that give images to other angles, of which some views alone may be uneven."""
 PLACES: Final = frozenset({"offset", "middle", "sign", "height"})
 """Kinds of a panel at another place, which movement includes."""
 FOUND_BY_TRIALS: Final = frozenset({"offset", "movement"})
@@ -138,6 +142,27 @@ class Contradiction:
         return ", or ".join(words)
 
 
+def _with_orders(scan: CoarseScan, comparison: Comparison) -> Comparison:
+    """Try orders of the images on all views of a doubtful scan: every second image of an
+    interlaced scan has uneven angles, of which the right order fits no better than the
+    stated one.
+
+    Args:
+        scan: coarse.
+        comparison: of some views, without a contradiction.
+
+    Returns:
+        The comparison of all views with the `ORDERS`, if it contradicts or leaves one
+        open; else `comparison`.
+    """
+    trial = Trial(scan.thinned(all_views=True, least_rows=RIVALS_ROWS))
+    if not trial.telling.any():
+        return comparison
+    orders = Comparison(trial, doubtful=True, kinds=ORDERS)
+    found = orders.contradiction() or orders.undecided(MAX_UNTOLD_CHANGE)
+    return comparison if found is None else orders
+
+
 @dataclass(frozen=True)
 class Undetermined:
     """Images of too few views or columns to show whether they fit their geometry.
@@ -172,8 +197,8 @@ def compared(scan: CoarseScan) -> Comparison | None:
     Some views and rows are tried first; all views if the expected residual of values or
     edges is too large; averaged columns while that of both is (`_reliable`). The
     comparison is `doubtful` if the misfit is at least `MIN_DOUBTFUL_MISFIT` or centroids
-    wander (`MAX_WANDER`). Else it is made once more, with at least `RIVALS_ROWS` rows, and
-    judged by that misfit.
+    wander (`MAX_WANDER`); orders are then tried on all views (`_with_orders`). Else it is
+    made once more, with at least `RIVALS_ROWS` rows, and judged by that misfit.
 
     Args:
         scan: coarse.
@@ -192,11 +217,25 @@ def compared(scan: CoarseScan) -> Comparison | None:
     if not trial.telling.any():
         return Comparison(trial, doubtful=False)
     if trial.excess >= MIN_DOUBTFUL_MISFIT or trial.wander > MAX_WANDER:
-        return Comparison(trial, doubtful=True)
+        comparison = Comparison(trial, doubtful=True)
+        if comparison.contradiction() is None and len(trial.scan.images) < len(
+            scan.images
+        ):
+            return _with_orders(scan, comparison)
+        return comparison
     if not trial.whole:
         return None
     trial = _reliable(scan, Trial(scan.thinned(least_rows=RIVALS_ROWS)), RIVALS_ROWS)
     return Comparison(trial, doubtful=trial.excess >= MIN_DOUBTFUL_MISFIT)
+
+
+def _covered(claimed: float) -> float:
+    """Return the largest change of a coarse volume that a claim covers: its
+    `SMOOTH_CHANGE_SHARE`, but at least `MIN_CHANGE` of a claim that is larger, and at most
+    `MAX_UNTOLD_CHANGE`.
+    """
+    least = min(claimed, MIN_CHANGE)
+    return min(max(SMOOTH_CHANGE_SHARE * claimed, least), MAX_UNTOLD_CHANGE)
 
 
 def _shift_scatter(movement: Tried) -> float:
@@ -281,7 +320,8 @@ class Comparison:
         Args:
             trial: of the scan's stated geometry.
             doubtful: the residual is larger than of most scans.
-            kinds: explanations that are tried, none of `FOUND_BY_TRIALS`; all if empty.
+            kinds: explanations that are tried, none of `FOUND_BY_TRIALS`; all if empty. Of
+                some alone no result is that nothing explains the images.
             excluded_from: least evidence against an explanation that excludes it
                 [standard errors].
         """
@@ -344,7 +384,8 @@ class Comparison:
         if self._movement is not None and wandering and not clear:
             return self._named([self._movement], min(self._movement.score, 1.0))
         refuted = best is not None and clear and best.evidence < -MIN_FINE_EVIDENCE_SIGMAS
-        if self._unfit or wandering or refuted:
+        unfit = self._unfit and self._movement is not None
+        if unfit or wandering or refuted:
             return Contradiction(trial.excess)
         return None
 
@@ -352,8 +393,8 @@ class Comparison:
         self, claimed: float, *, sides_known: bool = False
     ) -> Contradiction | None:
         """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`) and would
-        change the volume by more than is claimed or `MAX_UNTOLD_CHANGE`, whichever is less;
-        and those that fit better (`_fits_better`) and change it by `MIN_CHANGE`.
+        change the volume by more than is claimed (`_covered`); and those that fit better
+        (`_fits_better`) and change it by `MIN_CHANGE`.
 
         Args:
             claimed: largest relative error that is claimed of nine of ten uniform
@@ -369,7 +410,7 @@ class Comparison:
             geometry of a doubtful scan.
         """
         trial = self._trial
-        covered = min(claimed, MAX_UNTOLD_CHANGE)
+        covered = _covered(claimed)
         rivals = [
             one
             for one in self._tried
