@@ -21,6 +21,10 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import log_softmax, logsumexp, softmax
 
 from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
+from flexdt.twin.calibration.without_phantom.gradient_step import (
+    BLOCK_FRAMES,
+    gradient_steps,
+)
 from flexdt.twin.calibration.without_phantom.tile_gap import (
     SIDE,
     Gap,
@@ -62,6 +66,9 @@ MOST_EDGES: Final = 30_000
 """Places that are compared, at most."""
 OUTLINE_COLUMNS: Final = 1
 """By so many columns the two sides of an outline may differ from mirror images."""
+CURVED_SHARE: Final = 0.25
+"""Standard deviation of a width by gradients, as a share of it: a gap moves its two sides
+apart, and bodies that curve there change the gradient (drawn ones by up to that)."""
 MIN_HIDDEN_PX: Final = 0.3
 """Width of gaps that are not hidden where both ends of rays determine steps to a third of
 it [px]."""
@@ -82,6 +89,8 @@ class HiddenGap(NamedTuple):
         width_px: root mean square of its width, no gap included, and at least OPEN_SHARE of a
             usual gap's where it is not excluded [px].
         likely: the gap, where its odds exceed REPORTED_ODDS.
+        open: whether the images do not exclude it: the odds against one are below
+            REPORTED_ODDS, or a gap at one of the columns explains them better than none.
     """
 
     first: int
@@ -89,11 +98,7 @@ class HiddenGap(NamedTuple):
     chance: float
     width_px: float
     likely: Gap | None
-
-    @property
-    def open(self) -> bool:
-        """Whether the images do not exclude it."""
-        return self.chance * REPORTED_ODDS > 1.0 - self.chance
+    open: bool
 
     @property
     def column_px(self) -> float:
@@ -168,13 +173,16 @@ def hidden_gap(
     if profile is not None:
         evidence = evidence.beside(_evidence_of_rays(columns, axis, profile))
     hidden = np.abs(columns - 0.5 - axis) <= reach
-    odds = CHANCE / (1.0 - CHANCE) * evidence.ratio * hidden / hidden.sum()
+    ratio = evidence.ratio * hidden
+    odds = CHANCE / (1.0 - CHANCE) * ratio / hidden.sum()
     total = float(odds.sum())
+    # Many columns that exclude a gap say nothing about one that does not.
+    open_gap = total * REPORTED_ODDS > 1.0 or float(ratio.max()) > 1.0
     wide = np.square(WIDTHS_PX) + np.square(local_sigma(WIDTHS_PX))
     # Blurred and noisy edges tell that there is a gap better than how wide it is.
     doubted = 0.5 * (evidence.widths + np.exp(_LOG_PRIOR))
     mean_square = float(odds @ (wide @ doubted)) / (1.0 + total)
-    if total * REPORTED_ODDS > 1.0:
+    if open_gap:
         usual = float(wide @ np.exp(_LOG_PRIOR[:, 0]))
         mean_square = max(mean_square, OPEN_SHARE**2 * usual)
     shown = columns[hidden]
@@ -187,6 +195,7 @@ def hidden_gap(
         _gap_at(int(columns[best]), evidence.widths[:, best])
         if total > REPORTED_ODDS
         else None,
+        open_gap,
     )
 
 
@@ -259,8 +268,27 @@ def _evidence_of_rays(
     steps = [profile.beside_axis(abs(b)) for b in beside.tolist()]
     width = np.array([step.width for step in steps]) * np.sign(beside)
     sigma = np.array([step.sigma for step in steps])
-    left = (width - WIDTHS_PX[:, None]) / sigma
-    return _log_student(left) - _log_student(width / sigma)
+    return _evidence_of_widths(width, sigma)
+
+
+def _evidence_of_widths(
+    width: FloatArray, sigma: FloatArray, share: float = 0.0
+) -> FloatArray:
+    """Compute log likelihood ratios of a gap of each width to none from a measured width
+    (Student).
+
+    Args:
+        width: measured at each column, (c,) [px].
+        sigma: standard deviation of each where there is no gap, (c,) [px].
+        share: standard deviation that a gap adds, as a share of its width.
+
+    Returns:
+        (w, c).
+    """
+    of_gap = np.hypot(sigma, share * WIDTHS_PX[:, None])
+    left = (width - WIDTHS_PX[:, None]) / of_gap
+    none = _log_student(width / sigma) - np.log(sigma)
+    return np.asarray(_log_student(left) - np.log(of_gap) - none)
 
 
 def _evidence(images: FloatArray) -> Evidence:
@@ -288,7 +316,31 @@ def _evidence(images: FloatArray) -> Evidence:
     edges = places & (of_rows > EDGE_NOISE * noise).reshape(power.shape)
     of_places = _evidence_of(around, power, places, len(images), evenly=True)
     of_edges = _evidence_of(around, power, edges, len(images), evenly=False)
-    return Evidence(np.maximum(of_places.found, of_edges.found), of_places.width)
+    smooth = gradient_steps(around, _is_smooth(around, share), len(images))
+    of_smooth = _evidence_of_widths(smooth.width, smooth.sigma, CURVED_SHARE)
+    return Evidence(
+        np.maximum(of_places.found, of_edges.found) + of_smooth,
+        of_places.width + of_smooth,
+    )
+
+
+def _is_smooth(around: FloatArray, share: float) -> npt.NDArray[np.bool_]:
+    """Mark all places but those that change most from one side of the border to the
+    other.
+
+    What both sides have in common, and the step across the border, are not looked at:
+    noise and a gap in them are the same in the places that are left.
+
+    Args:
+        around: differences about each border, (m, c, 2 SIDE - 1).
+        share: of the places that are left out.
+
+    Returns:
+        (m, c).
+    """
+    apart = around[:, :, SIDE:] - around[:, :, SIDE - 2 :: -1]
+    change = np.square(apart).sum(axis=2)
+    return np.asarray(change <= np.quantile(change, 1.0 - share))
 
 
 def _evidence_of(
@@ -375,7 +427,8 @@ def _beside_others(gains: FloatArray, count: FloatArray) -> Judged:
     usual = rate * count
     own = np.sqrt(passed)
     between = 1.4826 * float(np.median((np.abs(whole - usual) / own)[count > 0.0]))
-    of_frames = np.sqrt(np.square(gains).sum(axis=0)) / own
+    blocks = np.add.reduceat(gains, np.arange(0, len(gains), BLOCK_FRAMES), axis=0)
+    of_frames = np.sqrt(np.square(blocks).sum(axis=0)) / own
     spread = max(between, float(np.median(of_frames[count > 0.0])), 1e-6) * own
     excess = (whole - usual) / spread
     # Where the model fits, a gap gains what it loses elsewhere, and its variance is twice its
