@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, SampleRecord, ScanRecord
@@ -234,6 +235,20 @@ def test_the_document_ignores_nothing_that_is_said_of_an_image(
     for entry, camera in zip((document.detector, *document.frames), cameras, strict=True):
         said = camera.of_image
         assert {name: getattr(entry, name) for name in said} == said
+
+
+@pytest.mark.parametrize("side", ["rows", "cols"])
+def test_an_image_has_at_least_one_pixel(
+    record: Callable[..., ScanRecord], side: str
+) -> None:
+    document = DatasetDocument.of(record()).model_dump(mode="json", by_alias=True)
+    for pixels in (1, 0):
+        document["detector"][side] = pixels
+        if pixels:
+            assert getattr(DatasetDocument.model_validate(document).detector, side) == 1
+        else:
+            with pytest.raises(ValidationError, match=side):
+                DatasetDocument.model_validate(document)
 
 
 def test_both_texts_of_a_scan_agree(record: Callable[..., ScanRecord]) -> None:

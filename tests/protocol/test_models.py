@@ -295,6 +295,15 @@ def test_a_scene_has_the_keys_of_the_description_and_no_others() -> None:
     assert {"document.schema", "document.schema_version"} <= paths
 
 
+def test_methods_with_the_same_parameters_take_as_much_of_them() -> None:
+    """What may be checked may be submitted."""
+    sizes: dict[type, set[bool]] = {}
+    for method in METHODS.values():
+        sizes.setdefault(method.params, set()).add(method.bulky)
+    assert [model for model, bulky in sizes.items() if len(bulky) > 1] == []
+    assert find("trajectory.submit").bulky
+
+
 def test_a_projection_has_places_within_10_km_and_pixels() -> None:
     def asked(number: float, *detector: object) -> Any:
         row = [0.0, -600.0, 0.0, 0.0, number, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0]

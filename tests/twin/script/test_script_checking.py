@@ -354,6 +354,11 @@ def test_an_axis_is_in_the_beam_as_far_as_the_edge_of_the_last_pixel(
     assert len(said) == (beyond > 0)
 
 
+_SHOT = (
+    "rot_obj move absolute 90 ACK\ncamera take image ACK\ncamera save image s.tif ACK\n"
+)
+
+
 def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> None:
     pause = "scanner pause 3724000 ACK"
     made = check_script(
@@ -363,6 +368,10 @@ def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> N
     seconds = round(made.plan.duration_s) - 3600
     assert facts["duration"].startswith(f"1 h {seconds // 60} min {seconds % 60} s (")
     assert facts["  truncation"] == "none"
+    assert "projections, line 14" in facts
+    again = [*LINES[:-1], LINES[13], "camera save image scan_000001.tif ACK"]
+    two = check_script("\n".join(again), flexray, profile)
+    assert "projections, lines 14-16" in dict(summary(two))
     assert facts["collisions"] == "not checked"
     assert repr(made).startswith(
         "<CheckReport: ok, 0 collisions, of <ScanPlan on flexray: "
@@ -388,8 +397,7 @@ def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> N
 def test_a_range_of_the_duration_holds_where_the_start_is_known(known: bool) -> None:
     """The times of the UniTOM XL are measured."""
     start = StartState.of(builtin_machine("unitom_xl")) if known else None
-    text = "rot_obj move absolute 90 ACK\ncamera take image ACK\ncamera save image s.tif ACK\n"
-    made = check_script(text, builtin_machine("unitom_xl"), start=start)
+    made = check_script(_SHOT, builtin_machine("unitom_xl"), start=start)
     said = dict(summary(made))["  90 % range"]
     assert said.split(" s", 1)[1] == (
         "" if known else ", if axes and X-rays start as assumed below"

@@ -24,6 +24,7 @@ from flexdt.twin.machine.description import (
     profile_of,
 )
 from flexdt.twin.script import ScanPlan, StartState, plan_poses, plan_script
+from flexdt.twin.script.motor_targets import BESIDE_BEAM_MM
 from flexdt.twin.script.planning.plan_values import Exposure, SampleSize
 
 SEEDS = range(12)
@@ -173,6 +174,11 @@ def test_the_sample_casts_no_shadow_into_the_flat(seed: int) -> None:
     y = axis_y + size.diameter_mm / 2 * np.sin(around)
     shadow = x / y * distance
     assert shadow.min() > edges[1] or shadow.max() < edges[0]
+    # Beside the field of view where the sample stands, unless the travel ends before.
+    gaps = [abs(axis_x - edge * axis_y / distance) for edge in edges]
+    travel = machine.axes["tra_obj"]
+    if travel.lower < at["tra_obj"] < travel.upper:
+        assert min(gaps) - size.diameter_mm / 2 == pytest.approx(BESIDE_BEAM_MM, abs=1e-5)
     assert not any(p.code == "sample_in_flat" for p in plan.problems)
 
 
