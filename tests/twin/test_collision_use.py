@@ -20,6 +20,7 @@ from flexdt.twin.collision.first_contact import clearance, touching
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.collision.obstacle_path import _Planner, free_moves
 from flexdt.twin.collision.plan_report import _from_size, collision_check
+from flexdt.twin.collision.stages import _placed
 from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
 from flexdt.twin.geometry.conventions import FloatArray, rotation_x, rotation_z
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -366,6 +367,15 @@ def test_the_sample_of_a_stated_size_is_about_its_origin() -> None:
         [solid] = _from_size(size)
         half = np.array([6.0, 6.0, height / 2.0])
         np.testing.assert_allclose(solid.bounds(), (-half, half))
+
+
+def test_a_sample_that_is_only_shifted_is_where_it_was_shifted_to() -> None:
+    """A cylinder is exact where it stays, and a prism around it where it goes."""
+    [solid] = _from_size(SampleSize(12.0, 30.0))
+    assert _placed(solid, np.eye(3), np.zeros(3)) is solid
+    shift = np.array([3.0, -7.0, 11.0])
+    before, after = solid.bounds(), _placed(solid, np.eye(3), shift).bounds()
+    np.testing.assert_allclose(after, np.array(before) - shift, atol=0.05)
 
 
 def test_a_size_of_nothing_is_no_sample() -> None:

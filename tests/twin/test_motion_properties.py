@@ -383,3 +383,14 @@ def test_the_time_of_a_position_is_the_first_that_many_moments_show() -> None:
             if len(passed):
                 assert found <= times[passed[0] + 1] + 1e-9
         assert way.time_at(low - 0.1) is way.time_at(high + 0.1) is None
+
+
+@pytest.mark.parametrize("far", [1.0, 1e4, 1e8])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_earlier_of_two_times_keeps_its_digits(far: float, sign: float) -> None:
+    """A place that is passed at once, and again long after."""
+    soon = 1e-6 / 3.0
+    when = Trajectory(
+        (Piece(0.0, 0.0, sign * (soon + far), -2.0 * sign),), 2.0 * far, 0.0
+    ).time_at(sign * soon * far)
+    assert when == pytest.approx(soon, rel=1e-9)

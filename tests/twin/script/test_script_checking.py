@@ -368,6 +368,11 @@ def test_figures_of_the_report_in_words(flexray: Machine, profile: Profile) -> N
     seconds = round(made.plan.duration_s) - 3600
     assert facts["duration"].startswith(f"1 h {seconds // 60} min {seconds % 60} s (")
     assert facts["  truncation"] == "none"
+    assert (
+        f"({made.plan.assumed_s:.2f} s assumed; flexray timing: " in facts["  commands"]
+    )
+    idle = dict(summary(check_script(pause, flexray, profile)))
+    assert idle["  commands"].startswith("0.00 s (none; flexray timing: ")
     assert "projections, line 14" in facts
     again = [*LINES[:-1], LINES[13], "camera save image scan_000001.tif ACK"]
     two = check_script("\n".join(again), flexray, profile)
