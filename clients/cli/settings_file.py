@@ -103,13 +103,17 @@ def config_file(environ: Mapping[str, str]) -> Path:
     """
     named = environ.get(f"{PREFIX}CONFIG")
     if named:
-        return Path(named).expanduser()
-    base = environ.get("XDG_CONFIG_HOME")
-    return (
-        (Path(base) if base else Path("~/.config").expanduser())
-        / "flexdt"
-        / "config.toml"
-    )
+        return Path(_expanded(named))
+    base = environ.get("XDG_CONFIG_HOME") or _expanded("~/.config")
+    return Path(base) / "flexdt" / "config.toml"
+
+
+def _expanded(path: str) -> str:
+    """Return a path with ~ expanded, or as it is for a user without a home."""
+    try:
+        return str(Path(path).expanduser())
+    except RuntimeError:  # neither HOME nor an entry among the users, as in containers
+        return path
 
 
 def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
@@ -142,11 +146,7 @@ def configuration(environ: Mapping[str, str] | None = None) -> Configuration:
         raise CommandError(f"{where} are both set; allowed: one of them")
     tables = {name: found.pop(name) for name in TABLES if name in found}
     given = {key: value for key, value in found.items() if value}
-    paths = {
-        key: str(Path(value).expanduser())
-        for key, value in given.items()
-        if KEYS[key] in PATHS
-    }
+    paths = {key: _expanded(value) for key, value in given.items() if KEYS[key] in PATHS}
     return Configuration(**given | paths, tables=tables)
 
 
@@ -167,8 +167,8 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
         CommandError: unreadable, not TOML, an unknown key, or a value that is no text.
     """
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (FileNotFoundError, NotADirectoryError):
         if required:
             raise CommandError(f"{path}: no such file (FLEXDT_CONFIG names it)") from None
         return {}

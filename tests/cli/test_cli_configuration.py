@@ -275,6 +275,28 @@ def test_a_file_that_is_named_must_be_there() -> None:
     assert config_file({}) == Path("~/.config/flexdt/config.toml").expanduser()
 
 
+@pytest.mark.parametrize("base", ["below a file", "nobody's home", "BOM"])
+def test_homes_and_files_of_other_machines_are_no_error(
+    base: str, no_configuration: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """numba#4032: a home that cannot be used or is unknown; vs-streamjsonrpc#695: a mark."""
+    no_configuration.write_text(
+        "\ufefftoken = 'long enough to be one'\n", encoding="utf-8"
+    )
+    if base == "BOM":
+        assert configuration().token == "long enough to be one"
+        return
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(no_configuration))
+    if base == "nobody's home":
+        monkeypatch.delenv("XDG_CONFIG_HOME")
+        monkeypatch.setattr(Path, "expanduser", _nobody)
+    assert configuration() == Configuration()
+
+
+def _nobody(path: Path) -> Path:
+    raise RuntimeError("Could not determine home directory.")
+
+
 def test_phantoms_of_a_calibration_are_those_with_beads() -> None:
     assert value_completion.calibration_targets("un") == ["unknown"]
     assert "lego" in value_completion.bead_phantom_names("")
