@@ -31,6 +31,7 @@ from flexdt.twin.reconstruction.consistency.agreement import (
     Contradiction,
     Undetermined,
     compared,
+    still_misfits,
     too_few,
 )
 from flexdt.twin.reconstruction.uniform_nodes import MIN_EVENNESS, UniformNodes
@@ -183,7 +184,8 @@ def bias_of(
 def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     """Reconstruct a coarse scan and bound its errors, cause by cause.
 
-    If images and geometry contradict each other, nothing else is bounded. Bounds are
+    If images and geometry contradict each other, a misfit that nothing explains also on a
+    finer copy, nothing else is bounded. Bounds are
     `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
     the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
     complete rows their level beside the object ("drift"). A whole scan whose images fit
@@ -206,7 +208,12 @@ def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     bias = Bias(scan.grid.like(found), nodes.even, nodes.inside, causes)
     comparison = compared(scan)
     if comparison is not None:
-        if (seen := comparison.contradiction()) is not None:
+        seen = comparison.contradiction()
+        if seen is not None and seen.by_misfit_alone:
+            finer = copied(FINE_NODES)
+            if finer.binned != scan.binned and not still_misfits(finer):
+                seen = None
+        if seen is not None:
             return replace(bias, contradiction=seen)
         bias = replace(bias, widening=comparison.widening)
 
@@ -252,8 +259,8 @@ def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     if undecided is not None and undecided.finer_copy_decides:
         fine = copied(FINE_NODES)
         if fine.binned != scan.binned:
-            finer = comparison.finer(undecided, fine)
-            undecided = finer.undecided(accuracy.most, sides_known=sides_known)
+            closer = comparison.finer(undecided, fine)
+            undecided = closer.undecided(accuracy.most, sides_known=sides_known)
     return replace(bias, contradiction=undecided)
 
 

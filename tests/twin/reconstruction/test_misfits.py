@@ -21,7 +21,6 @@ from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import (
     Contradiction,
     Undetermined,
-    compared,
 )
 from flexdt.twin.reconstruction.consistency.suspects import suspects
 
@@ -250,41 +249,6 @@ def test_a_mirrored_body_in_a_parallel_beam_is_not_decided() -> None:
     assert bias.accuracy(Grid((16, 30, 30), 1.0)) is not None
 
 
-def studied(
-    number: int, *, seed: int = 5353, right: bool = False
-) -> tuple[misfits.Case, Bias]:
-    """A wrong draw of the study, or its scan before it was made wrong, and what is found
-    of it."""
-    case = misfits.drawn(seed, number, right=False)
-    assert case is not None
-    if right:
-        images, geometry = case.scan.images(), case.scan.geometry
-        case = replace(case, images=images, geometry=geometry)
-    bias = misfits.looked_at(case)
-    assert bias is not None
-    return case, bias
-
-
-def test_streaks_of_few_views_are_compared_in_averaged_columns() -> None:
-    """81 views over several turns of a panel aside: 33 columns show only streaks. What
-    the right geometry leaves open is told as such."""
-    case, wrong = studied(52)
-    assert isinstance(wrong.contradiction, Contradiction)
-    assert case.names & set(wrong.contradiction.kinds)
-    _, right = studied(52, right=True)
-    told = right.contradiction
-    assert isinstance(told, Contradiction)
-    assert told.change is not None
-    assert not told.fits_better
-
-
-def test_small_parts_are_seen_in_the_volume_of_the_explanation() -> None:
-    """Mirrored bricks leave no uniform node in the wrong geometry's volume."""
-    case, wrong = studied(149)
-    assert isinstance(wrong.contradiction, Contradiction)
-    assert case.names & set(wrong.contradiction.kinds)
-
-
 def test_a_better_fit_is_told_however_little_is_claimed() -> None:
     """A large claimed error covers no order that fits better."""
     angles = 2.2 * 360.0 / 81.0 * np.arange(81)
@@ -325,56 +289,6 @@ def test_mirrored_images_are_tried_about_the_middle_of_the_panel(draw: int) -> N
             coarsely[..., side] = size[1 - side] - 1 - coarsely[..., side]
         found = tried[kind].cone_vec.project_points(places, size)
         np.testing.assert_allclose(found, coarsely, atol=1e-6)
-
-
-def test_a_panel_is_tried_beyond_the_first_step_where_few_columns_overlap() -> None:
-    """A panel 2.7 px off, of which movements of a third of a pixel fit worse."""
-    case = misfits.drawn(6061, 202, right=False)
-    assert case is not None
-    middle = np.ascontiguousarray(case.images[:, 19:39])
-    scan = CoarseScan.of(middle.__getitem__, case.geometry, middle.shape[1:], None)
-    comparison = compared(scan)
-    assert comparison is not None
-    assert comparison.contradiction() is not None
-
-
-def test_orders_are_tried_on_all_views() -> None:
-    """Every second image of three passes has uneven angles, which hide the right order."""
-    _, wrong = studied(29, seed=9091)
-    assert isinstance(wrong.contradiction, Contradiction)
-    assert wrong.contradiction.kinds == ("interlaced",)
-    assert wrong.contradiction.change is None
-
-
-def test_a_claim_covers_three_times_the_change_of_a_coarse_volume() -> None:
-    """A reversed scan that fits as well, 3.4 % apart in the coarse volume, is 19 % off: a
-    claim of 3.4 % does not cover it."""
-    case = misfits.drawn(9091, 49, right=False)
-    assert case is not None
-    image = case.images.__getitem__
-    scan = CoarseScan.of(image, case.geometry, case.scan.shape, None)
-    comparison = compared(scan)
-    assert comparison is not None
-    open_ = comparison.undecided(0.05)
-    assert open_ is not None
-    assert open_.kinds == ("direction",)
-    assert comparison.undecided(0.2) is None
-
-
-def test_a_jump_is_named_before_a_panel_at_another_place() -> None:
-    """A panel moved once for all explains half of a jump."""
-    _, wrong = studied(94, seed=6061)
-    assert isinstance(wrong.contradiction, Contradiction)
-    assert wrong.contradiction.kinds == ("movement",)
-
-
-def test_an_object_that_only_seems_cut_off_is_no_moved_panel() -> None:
-    """Any geometry of a complete object fits better than rows that are continued."""
-    _, wrong = studied(127, seed=8484)
-    assert wrong.contradiction is None
-    accuracy = wrong.accuracy(Grid((16, 30, 30), 1.0))
-    assert accuracy is not None
-    assert accuracy.cut_off
 
 
 def test_nothing_is_claimed_of_images_that_fit_any_volume() -> None:
