@@ -10,7 +10,7 @@ import pytest
 from prior_coverage import NOISE_PX, PIXEL, SDD, SHAPE, SOD, drawn, pixels, scan, study
 
 from flexdt.phantoms import load_phantom
-from flexdt.twin.calibration import estimate_geometry, identifiability
+from flexdt.twin.calibration import BeadModel, estimate_geometry, identifiability
 from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors, loosened
 from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact, prior_widths
@@ -196,3 +196,22 @@ def test_exact_positions_are_no_reason_to_refuse(noise: float) -> None:
     )
     assert fit.identifiable
     assert all(abs(fit.values[n] - v) < 1e-4 for n, v in SIX.items())
+
+
+def test_the_joint_region_follows_its_bend() -> None:
+    """Of 40 phantoms strained by 1e-3, whose magnification is so little known: with an
+    ellipsoid 26 were inside, and every interval held."""
+    model = BeadModel(BEADS, np.ones(len(BEADS)))
+    inside = []
+    for seed in range(40):
+        rng = np.random.default_rng([5, seed])
+        truth = drawn(rng, 1.0, False)
+        strained = BEADS @ (np.eye(3) + 1e-3 * rng.normal(size=(3, 3))).T
+        tracks = pixels(strained, ANGLES, SOD, truth)
+        tracks += NOISE_PX * rng.normal(size=tracks.shape)
+        found = estimate_geometry(
+            tracks, model, poses(), shape=SHAPE, priors=ASSUMED, strain=(1e-3, 1e-3)
+        )  # fmt: skip
+        names = found.certificate.estimates
+        inside.append(found.certificate.inside_95({n: truth[n] for n in names}))
+    assert np.mean(inside) >= 0.87

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import fdtri, stdtrit
 
+from flexdt.twin.calibration.fit.curved_region import bend_covariance
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor
 from flexdt.twin.calibration.fit.residual_structure import (
     SIGNIFICANT,
@@ -257,6 +258,8 @@ class Certificate:
     Attributes:
         estimates: column -> value and uncertainty; empty of meaning (nan) where not determined.
         covariance: (p, p) of the reported columns, edge units, enlargement included.
+        bend: (p, p) of the second-order term that the covariance lacks, edge units: the region
+            of likely values is not quite an ellipsoid (`curved_region`).
         correlation: (p, p).
         spectrum: rank, condition, null and weak directions.
         dof: degrees of freedom of s^2, after allowing for correlated residuals.
@@ -276,6 +279,7 @@ class Certificate:
 
     estimates: dict[str, Estimate]
     covariance: FloatArray
+    bend: FloatArray
     correlation: FloatArray
     spectrum: Conditioning
     dof: float
@@ -347,7 +351,7 @@ class Certificate:
 
     def mahalanobis2(self, truth: Mapping[str, float]) -> float:
         """Compute the squared distance of some values from the estimates, in the
-        covariance of those columns.
+        covariance of those columns, widened by the bend of their region.
 
         Args:
             truth: column -> value, edge units, some or all reported columns.
@@ -358,7 +362,8 @@ class Certificate:
         names = list(self.estimates)
         at = [names.index(n) for n in truth]
         d = np.array([v - self.estimates[n].value for n, v in truth.items()])
-        return float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d))
+        whole = self.covariance + self.bend
+        return float(d @ np.linalg.solve(whole[np.ix_(at, at)], d))
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
         """Check whether values are in the joint 95 % ellipsoid of their columns
@@ -490,7 +495,11 @@ def certify(
     shared = False
     turning = 0.0
     moving: tuple[Drift, ...] = ()
+    bend = np.zeros_like(covariance)
     if spec.full and noise > MAX_ROUNDING:
+        bend = bend_covariance(
+            problem, x, jac[keep] / factor, keep, factor, spec.unit_covariance, noise
+        )[:reported, :reported]
         left = Residuals(
             problem,
             jac[keep] / factor,
@@ -529,6 +538,7 @@ def certify(
     return Certificate(
         estimates=estimates,
         covariance=covariance,
+        bend=bend,
         correlation=correlation,
         spectrum=spec,
         dof=effective,
