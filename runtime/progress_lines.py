@@ -19,14 +19,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from flexdt.runtime.progress_bars import Shown, shown_on
-from flexdt.twin.long_work import Advance, Progress, ignore
+from flexdt.twin.long_work import Advance, Pace, Progress, ignore
 
 SILENT_S = 2.0
 """Time for which work goes on unseen, and between two lines of the log [s]."""
 DRAWN_S: Final = 0.5
 """Time between two drawings of a bar [s]."""
-RATED_FRACTION: Final = 0.1
-"""Progress from whose duration the time left is estimated."""
 FOLLOWED: Final = frozenset({"compiling"})
 """First words of works that follow each other as one wait."""
 LOG: Final = logging.getLogger("flexdt.progress")
@@ -42,7 +40,7 @@ class _Work:
         begun: when it began, or the first of the works of its kind that follow each other [s].
         due: when it is shown next [s].
         done: fraction; None where nobody says.
-        rated_from: first fraction above 0, and when it was done [s].
+        pace: how fast it goes on.
         inner: name of the work within it, "" if there is none.
         shown: the bar; None before it is drawn.
         lock: held while it is drawn or ended.
@@ -54,7 +52,7 @@ class _Work:
     begun: float
     due: float
     done: float | None = None
-    rated_from: tuple[float, float] = (0.0, 0.0)
+    pace: Pace = field(default_factory=Pace)
     inner: str = ""
     shown: Shown | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -65,30 +63,9 @@ class _Work:
         """Set the fraction that is done; 0 or less is ignored. The first one begins the
         measurement of the rate.
         """
-        if self.done is None and done > 0.0:
-            self.rated_from = done, time.monotonic()
+        self.pace.advance(done, time.monotonic())
         if done > 0.0:
             self.done = done
-
-    def left_s(self, now: float) -> float | None:
-        """Estimate the time left, from the pace after the first fraction [s].
-
-        What comes before that is preparation, such as a kernel that is compiled.
-
-        Args:
-            now: time [s].
-
-        Returns:
-            Seconds; None before `RATED_FRACTION` has been done at that pace, and at the
-            end.
-        """
-        if self.done is None or self.done >= 1.0:
-            return None
-        first, since = self.rated_from
-        paced = self.done - first
-        if paced < RATED_FRACTION:
-            return None
-        return (now - since) * (1.0 - self.done) / paced
 
     def tell(self) -> None:
         """Draw the work's name, fraction and times, and set when to show it next, after
@@ -107,7 +84,8 @@ class _Work:
             else:
                 what = self.what
             now = time.monotonic()
-            self.shown.show(what, self.done, now - self.begun, self.left_s(now))
+            left_s = None if self.done is None else self.pace.left_s(self.done, now)
+            self.shown.show(what, self.done, now - self.begun, left_s)
             self.due = now + (DRAWN_S if self.shown.bar else SILENT_S)
 
     def end(self) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol, TypeAlias, TypeVar
+from dataclasses import dataclass
+from typing import Final, Protocol, TypeAlias, TypeVar
 
 Part = TypeVar("Part")
 Advance: TypeAlias = Callable[[float], None]
@@ -13,6 +14,8 @@ Advance: TypeAlias = Callable[[float], None]
 Progress: TypeAlias = bool | Advance | None
 """What callers choose: None or True for a bar after two seconds, False for silence, or a
 function that is called with the fraction done and shows it in its own way."""
+RATED_FRACTION: Final = 0.1
+"""Progress from whose duration the time left is estimated."""
 
 
 class Announcer(Protocol):
@@ -80,6 +83,44 @@ class Passes:
             return read(index)
 
         return one
+
+
+@dataclass(eq=False)
+class Pace:
+    """Measures how fast work goes on after its first fraction.
+
+    What comes before that is preparation, such as a kernel that is compiled.
+
+    Attributes:
+        first: first fraction above 0; None before it.
+        since_s: when that was done.
+    """
+
+    first: float | None = None
+    since_s: float = 0.0
+
+    def advance(self, done: float, now_s: float) -> None:
+        """Begin the measurement at the first fraction above 0; later ones change nothing."""
+        if self.first is None and done > 0.0:
+            self.first, self.since_s = done, now_s
+
+    def left_s(self, done: float, now_s: float) -> float | None:
+        """Estimate the time left at a constant pace [s].
+
+        Args:
+            done: fraction.
+            now_s: time.
+
+        Returns:
+            Seconds; None before `RATED_FRACTION` has been done at that pace, and at the
+            end.
+        """
+        if self.first is None or done >= 1.0:
+            return None
+        paced = done - self.first
+        if paced < RATED_FRACTION:
+            return None
+        return (now_s - self.since_s) * (1.0 - done) / paced
 
 
 during: Announcer = unseen

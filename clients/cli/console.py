@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from flexdt.twin import long_work
+from flexdt.twin.long_work import Pace
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -261,7 +262,8 @@ class ProgressBar:
             self._terminal = terminal
         self._bar: Progress | None = None
         self._task: TaskID | None = None
-        self._begun = self._spoken = clock()
+        self._spoken = clock()
+        self._pace = Pace()
         self._last: tuple[float, float] | None = None
         self._alone = ExitStack()
 
@@ -310,19 +312,21 @@ class ProgressBar:
         if _quiet:
             return
         now = self._clock()
+        if total:
+            self._pace.advance(done / total, now)
         if now - self._spoken < PLAIN_INTERVAL_S or (done, total or 0.0) == self._last:
             return
         self._spoken = now
         self._last = (done, total or 0.0)
-        note(self._line(text or self._title, done, total, now - self._begun))
+        note(self._line(text or self._title, done, total, now))
 
-    def _line(self, text: str, done: float, total: float | None, elapsed: float) -> str:
+    def _line(self, text: str, done: float, total: float | None, now: float) -> str:
         """Make a line of text with what is done, its share [%] and an estimate of the
         time left.
 
         Without a total only what is done; amounts that are not whole are left out; no
-        estimate at the beginning and end. `elapsed` is the time so far [s]; the time left
-        assumes a constant rate.
+        estimate at the beginning and end. `now` is the time [s]; the time left assumes the
+        pace since the first unit.
         """
         if not total:
             return f"{text}: {done:g} {self._unit}"
@@ -331,8 +335,9 @@ class ProgressBar:
         else:
             counted = ""
         line = f"{text}: {counted}({100 * done / total:.0f} %)"
-        if 0 < done < total:
-            line += f", about {duration(elapsed * (total - done) / done)} left"
+        left_s = self._pace.left_s(done / total, now)
+        if left_s is not None:
+            line += f", about {duration(left_s)} left"
         return line
 
     def __exit__(self, *_: object) -> None:

@@ -80,16 +80,19 @@ def test_plain_progress_counts_and_estimates(capsys: pytest.CaptureFixture[str])
     now = [0.0]
     with ProgressBar("scanning", clock=lambda: now[0], terminal=False) as bar:
         bar.update(0, 100)
-        now[0] = PLAIN_INTERVAL_S * 2
-        bar.update(25, 100)
+        now[0] = 5000 * PLAIN_INTERVAL_S  # preparation, such as a kernel that is compiled
+        bar.update(1, 100)
+        now[0] += 2 * PLAIN_INTERVAL_S
         bar.update(26, 100)
+        bar.update(27, 100)
         now[0] += PLAIN_INTERVAL_S
-        bar.update(25, 100)
+        bar.update(26, 100)
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.splitlines() == [
         "scanning ...",
-        f"scanning: 25 of 100 frames (25 %), about {6 * PLAIN_INTERVAL_S:.1f} s left",
+        "scanning: 1 of 100 frames (1 %)",
+        f"scanning: 26 of 100 frames (26 %), about {5.92 * PLAIN_INTERVAL_S:.1f} s left",
     ]
 
 

@@ -19,6 +19,7 @@ import flexdt as fx
 from flexdt.clients.cli import console
 from flexdt.runtime import progress_bars, progress_lines
 from flexdt.twin import long_work
+from flexdt.twin.long_work import Pace
 
 LONG = (
     fx.sirt, fx.tv, fx.cgls, fx.fdk, fx.calibrate, fx.align, fx.project, fx.reconstruct,
@@ -190,21 +191,17 @@ def test_the_same_call_once_more_begins_at_0_s(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_time_left_follows_the_pace_and_not_the_preparation(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_time_left_follows_the_pace_and_not_the_preparation(seed: int) -> None:
     """A kernel compiles for a drawn time, then each percent takes as long as the others."""
     rng = np.random.default_rng(6400 + seed)
     prepared, percent_s = rng.uniform(5.0, 60.0), rng.uniform(0.05, 2.0)
-    now = 0.0
-    monkeypatch.setattr(progress_lines.time, "monotonic", lambda: now)
-    work = progress_lines._Work("reconstructing", 0.0, 0.0)
-    work.advance(0.0)
-    assert work.left_s(now) is None
+    pace = Pace()
+    pace.advance(0.0, 0.0)
+    assert pace.left_s(0.0, 0.0) is None
     for percent in range(1, 101):
         now = prepared + percent * percent_s
-        work.advance(percent / 100.0)
-        left = work.left_s(now)
+        pace.advance(percent / 100.0, now)
+        left = pace.left_s(percent / 100.0, now)
         if percent <= 10 or percent == 100:
             assert left is None
         else:
