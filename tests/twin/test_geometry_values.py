@@ -204,6 +204,12 @@ def test_numbers_that_no_scanner_has_are_named(
         ConeVec.circular(**{"angles": 4, **SCAN, **wrong})  # type: ignore[arg-type]
 
 
+def test_of_a_long_list_of_numbers_a_hundred_characters_are_given_back() -> None:
+    with pytest.raises(GeometryError) as caught:
+        ConeVec.circular(**{"angles": 4, **SCAN, "pixel": [0.123] * 60})  # type: ignore[arg-type]
+    assert caught.value.data["asked"] == repr([0.123] * 60)[:100]
+
+
 def test_a_shape_that_contradicts_the_geometrys_own_is_an_error() -> None:
     scan = ConeVec.circular(angles=3, **SCAN)
     volume = Volume(np.ones((4, 4, 4)), 2.0)
