@@ -289,6 +289,10 @@ def test_coupled_motors_of_different_gears_run_in_step(tube: float, panel: float
         assert gone["ver_tube"] / tube == pytest.approx(gone["ver_det"] / panel, abs=1e-9)
         for name, way in ways.items():
             assert abs(way.velocity(t)) <= drives[name].speed + 1e-9
+    times = np.linspace(0.0, 1.01 * end, 400)
+    for name, way in ways.items():
+        gained = np.abs(np.diff([way.velocity(t) for t in times])) / np.diff(times)
+        assert gained.max() <= drives[name].acceleration + 1e-6
     assert gone["ver_det"] == pytest.approx(20.0 * panel)
 
 
