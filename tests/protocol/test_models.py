@@ -302,6 +302,12 @@ def test_methods_with_the_same_parameters_take_as_much_of_them() -> None:
         sizes.setdefault(method.params, set()).add(method.bulky)
     assert [model for model, bulky in sizes.items() if len(bulky) > 1] == []
     assert find("trajectory.submit").bulky
+    binary = [
+        method for method in METHODS.values()
+        if any(field.annotation is bytes for field in method.params.model_fields.values())
+    ]  # fmt: skip
+    assert find("sample.upload") in binary
+    assert all(method.bulky for method in binary)
 
 
 def test_a_projection_has_places_within_10_km_and_pixels() -> None:
