@@ -55,7 +55,8 @@ for name in sys.argv[1:]:
 @pytest.mark.slow
 def test_itk_sees_one_place_in_all_formats(tmp_path: Path) -> None:
     """ITK's axes point left, back and up: x and y of ours with the other sign. It runs in a
-    process of its own, because its HDF5 and h5py's cannot live in one."""
+    process of its own, because its HDF5 and h5py's cannot live in one. (ami#64, Slicer#2611,
+    pyvista#3284)"""
     if importlib.util.find_spec("itk") is None:
         pytest.skip("itk is an optional peer")
     endings = [".nrrd", ".mha"]

@@ -76,7 +76,7 @@ def exposed(integrals, flats, beam=1.0, seed=0, noise=True):
 
 
 @pytest.mark.parametrize("flats", [(1, 1.05), (1, 1.5), (1, 1, 1, 0.9), (0.7, 1.1)])
-def test_flats_that_disagree_are_said(integrals, flats):
+def test_flats_that_disagree_are_said(integrals, flats):  # ToMoBAR#58
     assert any(
         "flat images differ" in doubt for doubt in image_doubts(exposed(integrals, flats))
     )

@@ -217,9 +217,14 @@ def test_blank_lines_and_carriage_returns_are_white_space() -> None:
 
 
 def test_a_byte_order_mark_before_a_document_says_nothing() -> None:
-    mark = b"\xef\xbb\xbf"  # .NET's streams begin with it
+    mark = (
+        b"\xef\xbb\xbf"  # .NET's streams begin with it (vs-streamjsonrpc#695, Jayrock#49)
+    )
     assert Connection().receive_data(mark + LINE) == [PING]
     assert Connection().receive_data(LINE + mark + LINE) == [PING, PING]
+    wire = Connection()
+    assert [wire.receive_data(bytes([byte])) for byte in mark] == [[], [], []]
+    assert wire.receive_data(LINE) == [PING]
 
 
 MALFORMED_JSON = [

@@ -1,4 +1,5 @@
-"""Names of images come back in their true order, however they are listed and written."""
+"""Names of images come back in their true order, however they are listed and written
+(TeraStitcher#30, Suite2P#116)."""
 
 import random
 

@@ -1,5 +1,5 @@
 """A process that has used kernels is forked: its children compute the same bits, or are
-told."""
+told (numba#7872, fast-array-utils#179, novae#62)."""
 
 from __future__ import annotations
 

@@ -118,7 +118,9 @@ threads by estimate, and as much again."""
     "moment_s", np.random.default_rng(5).uniform(0.3, 2.0, 2).round(3)
 )
 @pytest.mark.parametrize("name", ["forward", "back", "cgls", "tv"])
-def test_a_signal_is_heard_between_portions(name: str, moment_s: float) -> None:
+def test_a_signal_is_heard_between_portions(
+    name: str, moment_s: float
+) -> None:  # numba#2324, #5551
     done = subprocess.run(
         [sys.executable, "-c", LONG, name, str(moment_s)], capture_output=True, text=True,
         check=False,
