@@ -128,6 +128,67 @@ def test_what_cannot_be_written_or_read_is_said(
             VOLUME.save(tmp_path / f"v{ending}")
 
 
+CHANGES = {
+    ".mha": [
+        ("False\nCompressed", "True\nCompressed", "ByteOrderMSB is True"),
+        ("CompressedData = False", "CompressedData = True", "CompressedData"),
+        ("MET_FLOAT", "MET_UCHAR", "MET_UCHAR"), ("MET_FLOAT", "MET_DOUBLE", "MET_DOUBLE"),
+        ("-1 0 0 0 -1 0 0 0 1", "1 0 0 0 1 0 0 0 1", "TransformMatrix"),
+        ("NDims = 3", "NDims = 2", "NDims"), ("DimSize = 7", "DimSize = 4", "bytes; it holds"),
+        ("NDims = 3", "NDims = 3\nElementNumberOfChannels = 3", "Channels"),
+        ("ElementSpacing = 0.25", "ElementSpacing = -0.25", "voxel"),
+    ],
+    ".nrrd": [
+        ("endian: little", "endian: big", "endian"),
+        ("encoding: raw", "encoding: gzip", "encoding"),
+        ("type: float", "type: double", "type"), ("right-anterior", "left-posterior", "space"),
+        ("sizes: 7", "sizes: 70", "bytes; it holds"), ("(0.25,0,0)", "(0.25,0.1,0)", "axes"),
+        ("(0.25,0,0)", "(-0.25,0,0)", "axes"), ("type: float", "type: float\nbyte skip: 4", "skip"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("ending", "change"),
+    [(ending, k) for ending in CHANGES for k in range(len(CHANGES[ending]))],
+)
+def test_values_of_another_form_are_refused(
+    tmp_path: Path, ending: str, change: int
+) -> None:
+    """ami#64, Slicer#2611, pyvista#3284: byte order, type, axes and lengths of other files."""
+    file = tmp_path / f"v{ending}"
+    VOLUME.save(file)
+    old, new, said = CHANGES[ending][change]
+    raw = file.read_bytes()
+    assert raw.count(old.encode()) == 1
+    file.write_bytes(raw.replace(old.encode(), new.encode()))
+    with pytest.raises(fx.TwinError, match=said):
+        fx.Volume.load(file)
+
+
+@pytest.mark.parametrize(
+    "change", ["metres", "turned", "mirrored", "complex", "4d", "right"]
+)
+def test_nifti_of_another_form_is_refused(tmp_path: Path, change: str) -> None:
+    nibabel = pytest.importorskip("nibabel", reason="the extra `io`")
+    axes = np.diag([0.5, 0.25, 0.75, 1.0])
+    values = np.full((5, 6, 7), 0.02, np.complex64 if change == "complex" else np.float32)
+    if change == "turned":
+        axes[:2, :2] = [[0.3, -0.3], [0.3, 0.3]]
+    if change == "mirrored":
+        axes[0, 0] = -0.5
+    if change == "4d":
+        values = np.repeat(values[..., None], 2, axis=3)
+    image = nibabel.Nifti1Image(values, axes)
+    image.header.set_xyzt_units("meter" if change == "metres" else "mm")
+    nibabel.save(image, tmp_path / "v.nii.gz")
+    if change == "right":
+        assert_allclose(fx.Volume.load(tmp_path / "v.nii.gz").voxel_mm, (0.5, 0.25, 0.75))
+        return
+    with pytest.raises(fx.TwinError, match=r"meter|axes|complex|values are"):
+        fx.Volume.load(tmp_path / "v.nii.gz")
+
+
 def test_zarr_without_the_extensions_says_how_to_install_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

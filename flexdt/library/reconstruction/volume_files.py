@@ -29,6 +29,8 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.signatures import File
 
+MAX_REPEATED_CHARACTERS: Final = 200
+"""Characters of a reader's error that a message repeats."""
 NO_PLACE: Final = (
     "NumPy's files have no room for the voxel size; write with numpy.save(FILE, "
     "volume.data) and "
@@ -163,9 +165,12 @@ def read_volume(file: File) -> Volume:
         x, y, z = (float(p) for p in place)
         cubes = along_x == along_y == along_z
         return Volume(values, along_x if cubes else edges, (x, y, z))
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError):
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        why = " ".join(str(error).split())[:MAX_REPEATED_CHARACTERS]
         raise LimitError(
-            f"{path}: not a volume of flexdt reconstruct", {"file": str(path)}
+            f"{path}: not a volume of flexdt reconstruct ({why}); values of other programs: "
+            "fx.Volume(array, voxel_mm)",
+            {"file": str(path)},
         ) from None
 
 

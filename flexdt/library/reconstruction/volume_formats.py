@@ -10,7 +10,7 @@ import gzip
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -25,7 +25,7 @@ from flexdt.twin.projection import Grid
 from flexdt.twin.projection.volume import edges_xyz
 
 if TYPE_CHECKING:
-    from flexdt.twin.geometry.conventions import Float32Array
+    from flexdt.twin.geometry.conventions import Float32Array, FloatArray
     from flexdt.twin.projection import Volume
 
 HEADER_BYTES: Final = 4096
@@ -36,6 +36,45 @@ BLOCK_BYTES: Final = 64 << 20
 """Of a volume, that are put in a file's order at a time."""
 BIG_TIFF_BYTES: Final = 3 << 30
 """A volume above it is a BigTIFF."""
+NRRD_FIELDS: Final[Mapping[str, str]] = {
+    "type": "float",
+    "dimension": "3",
+    "space": "right-anterior-superior",
+    "sizes": "",
+    "space directions": "",
+    "kinds": "domain domain domain",
+    "endian": "little",
+    "encoding": "raw",
+    "space origin": "",
+}
+"""Field of NRRD's header, in order -> its value in every file, empty where it is the
+volume's."""
+MHA_FIELDS: Final[Mapping[str, str]] = {
+    "ObjectType": "Image",
+    "NDims": "3",
+    "BinaryData": "True",
+    "BinaryDataByteOrderMSB": "False",
+    "CompressedData": "False",
+    "TransformMatrix": "-1 0 0 0 -1 0 0 0 1",
+    "Offset": "",
+    "CenterOfRotation": "0 0 0",
+    "ElementSpacing": "",
+    "DimSize": "",
+    "ElementType": "MET_FLOAT",
+    "ElementDataFile": "LOCAL",
+}
+"""The same of MetaImage's header."""
+FIELDS_OF_OTHER_VALUES: Final = (
+    "ElementNumberOfChannels",
+    "HeaderSize",
+    "byte skip",
+    "line skip",
+    "data file",
+    "datafile",
+)
+"""Fields of either header by which values are others, or lie elsewhere."""
+MAX_ASIDE: Final = 1e-6
+"""Largest component of an axis along another, relative to the longest edge: rounding."""
 
 Sink = Callable[["Float32Array"], None]
 """Takes slabs (k, ny, nx) of layers from low z to high."""
@@ -238,18 +277,12 @@ def _nrrd_header(places: VoxelPlaces) -> bytes:
     """
     nz, ny, nx = places.shape
     x, y, z = (f"{edge:.9g}" for edge in places.edges_mm)
-    lines = (
-        "NRRD0004",
-        "type: float",
-        "dimension: 3",
-        "space: right-anterior-superior",
-        f"sizes: {nx} {ny} {nz}",
-        f"space directions: ({x},0,0) (0,{y},0) (0,0,{z})",
-        "kinds: domain domain domain",
-        "endian: little",
-        "encoding: raw",
-        "space origin: ({:.9g},{:.9g},{:.9g})".format(*places.first_mm),
-    )
+    fields = dict(NRRD_FIELDS) | {
+        "sizes": f"{nx} {ny} {nz}",
+        "space directions": f"({x},0,0) (0,{y},0) (0,0,{z})",
+        "space origin": "({:.9g},{:.9g},{:.9g})".format(*places.first_mm),
+    }
+    lines = ("NRRD0004", *(f"{key}: {value}" for key, value in fields.items()))
     return ("\n".join(lines) + "\n\n").encode("ascii")
 
 
@@ -261,19 +294,10 @@ def _mha_header(places: VoxelPlaces) -> bytes:
     """
     nz, ny, nx = places.shape
     x, y, z = places.first_mm
-    fields = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "BinaryDataByteOrderMSB": "False",
-        "CompressedData": "False",
-        "TransformMatrix": "-1 0 0 0 -1 0 0 0 1",
+    fields = dict(MHA_FIELDS) | {
         "Offset": " ".join(repr(float(place)) for place in (-x, -y, z)),
-        "CenterOfRotation": "0 0 0",
         "ElementSpacing": " ".join(repr(float(edge)) for edge in places.edges_mm),
         "DimSize": f"{nx} {ny} {nz}",
-        "ElementType": "MET_FLOAT",
-        "ElementDataFile": "LOCAL",
     }
     return "".join(f"{key} = {value}\n" for key, value in fields.items()).encode("ascii")
 
@@ -351,8 +375,37 @@ def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
     return {key.strip(): value.strip() for key, _, value in fields}, len(head) + len(end)
 
 
+def _require_own(fields: Mapping[str, str], own: Mapping[str, str]) -> None:
+    """Check that a header states what each file of flexdt has: a form of values that is
+    read as it is.
+
+    Args:
+        fields: of the file.
+        own: `NRRD_FIELDS` or `MHA_FIELDS`.
+
+    Raises:
+        ValueError: names the first field that does not.
+    """
+    for key, value in own.items():
+        if value and fields.get(key, value) != value:
+            raise ValueError(f"its {key} is {fields[key]}; allowed: {value}")
+    for key in FIELDS_OF_OTHER_VALUES:
+        if key in fields:
+            raise ValueError(f"its {key} is {fields[key]}; allowed: none")
+
+
 def _map_values(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
+    """Map the values of a file, (nz, ny, nx), which end where it ends.
+
+    Raises:
+        ValueError: it has more or fewer bytes.
+    """
     nx, ny, nz = map(int, sizes.split())
+    held = path.stat().st_size - offset
+    if held != 4 * nx * ny * nz:
+        raise ValueError(
+            f"{nx} x {ny} x {nz} values take {4 * nx * ny * nz} bytes; it holds {held}"
+        )
     return np.memmap(path, "<f4", "r", offset=offset, shape=(nz, ny, nx))
 
 
@@ -361,9 +414,11 @@ def _read_nrrd(path: Path) -> Stored:
     is the first voxel's, not the centre) from an .nrrd file.
     """
     fields, begin = _header(path, ":", b"\n\n")
+    _require_own(fields, NRRD_FIELDS)
     values = _map_values(path, begin, fields["sizes"])
     rows = fields["space directions"].split()
-    edges = [float(row.strip("()").split(",")[i]) for i, row in enumerate(rows)]
+    axes = np.array([row.strip("()").split(",") for row in rows], dtype=float)
+    edges = _upright(axes)
     low = [float(v) for v in fields["space origin"].strip("()").split(",")]
     return values, edges, low, True
 
@@ -385,6 +440,7 @@ def _read_mha(path: Path) -> Stored:
     is the first voxel's, not the centre) from an .mha file; x and y of the file point the
     other way."""
     fields, begin = _header(path, "=", b"ElementDataFile = LOCAL\n")
+    _require_own(fields, MHA_FIELDS)
     values = _map_values(path, begin, fields["DimSize"])
     x, y, z = (float(v) for v in fields["Offset"].split())
     low = [-x, -y, z]
@@ -392,9 +448,35 @@ def _read_mha(path: Path) -> Stored:
 
 
 def _read_nifti(path: Path) -> Stored:
+    """Read voxels, edges [mm], the first voxel's place [mm] and True (it is the first
+    voxel's, not the centre) from a .nii.gz file, by its own scale.
+
+    Raises:
+        ValueError: another unit of length, values that are not real, or turned axes.
+    """
     image = _nibabel().load(path)
-    values = np.asarray(image.dataobj, dtype=np.float32).T
-    return values, np.diag(image.affine)[:3].tolist(), image.affine[:3, 3], True
+    length = image.header.get_xyzt_units()[0]
+    if length != "mm":
+        raise ValueError(f"its lengths are in {length}; allowed: mm")
+    values = np.asarray(image.dataobj)
+    if values.ndim != 3 or values.dtype.kind not in "fiu":
+        kind = f"{values.dtype} of shape {values.shape[::-1]}"
+        raise ValueError(f"its values are {kind}; allowed: real numbers (nz, ny, nx)")
+    edges = _upright(image.affine[:3, :3])
+    return values.astype(np.float32).T, edges, image.affine[:3, 3], True
+
+
+def _upright(axes: FloatArray) -> list[float]:
+    """Return the voxel edges of axes (3, 3) that point right, front and up [mm].
+
+    Raises:
+        ValueError: axes that are turned or mirrored.
+    """
+    edges = np.diag(axes)
+    aside = np.abs(axes - np.diag(edges)).max()
+    if not (edges > 0.0).all() or not aside <= MAX_ASIDE * edges.max():
+        raise ValueError(f"its axes are {axes.tolist()}; allowed: right, front and up")
+    return [float(edge) for edge in edges]
 
 
 def _read_hdf5(path: Path) -> Stored:
