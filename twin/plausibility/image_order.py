@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,9 @@ import numpy as np
 from flexdt.twin.plausibility.findings import Finding, Severity
 
 NUMBER: Final = re.compile(r"(?P<sign>[-+]?)(?P<whole>\d+)(?P<part>\.\d+)?")
+SCIENTIFIC: Final = re.compile(r"\d\.\d+[eE][-+]\d{2}(?!\d)")
+"""A number with a power of ten, as `%e` writes it."""
+HEXADECIMAL: Final = "0123456789abcdefABCDEF"
 SIGNED_AFTER: Final = frozenset("_ =(,")
 """Characters, or the name's beginning, after which a hyphen is a minus sign."""
 MAX_OTHERS_SHARE: Final = 0.1
@@ -63,7 +67,7 @@ def ordered(names: Sequence[str]) -> Ordered:
         ('a9.tif', 'a10.tif')
     """
     known = sorted(set(names))
-    if (evenly := _numbered(known)) is not None:
+    if (evenly := _numbered(known) or _hexadecimal(known)) is not None:
         return evenly
     keys = _keys(known)
     sorted_names = tuple(sorted(known, key=lambda name: (keys[name], name)))
@@ -113,6 +117,35 @@ def _numbered(names: list[str]) -> Ordered | None:
     return None
 
 
+def _hexadecimal(names: list[str]) -> Ordered | None:
+    """Sort names that differ only by a hexadecimal number of fixed width whose steps are
+    even.
+
+    Args:
+        names: sorted, without repetition.
+
+    Returns:
+        The names in that order, without findings. None for other names, and where no
+        number or every number has a letter.
+    """
+    if len(names) < 2 or len({*map(len, names)}) != 1:
+        return None
+    first = names[0]
+    at = next(i for i, (a, b) in enumerate(zip(first, names[-1], strict=True)) if a != b)
+    before = first[:at].rstrip("0123456789")
+    after = first[len(before) :].lstrip(HEXADECIMAL)
+    parts = [name[len(before) : len(name) - len(after)] for name in names]
+    plain = sum(map(str.isdigit, parts))
+    if not 0 < plain < len(names) or any(part.strip(HEXADECIMAL) for part in parts):
+        return None
+    if not all(n.startswith(before) and n.endswith(after) for n in names):
+        return None
+    steps = {*np.diff([int(part, 16) for part in parts]).tolist()}
+    if len(steps) == 1 and min(steps) > 0:
+        return Ordered(tuple(names))
+    return None
+
+
 def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
     """Make the warning on names that are written otherwise than those of the other
     images; its figure is their number.
@@ -150,12 +183,17 @@ def _keys(names: Sequence[str]) -> dict[str, Key]:
 
     An ending that begins with a letter (`.tif`) is removed first. Hyphens count as signs
     where that makes the texts of more names equal, points as decimal points where
-    `_decimal` decides so.
+    `_decimal` decides so. Powers of ten that all names have are written out before.
 
     Returns:
         Name -> key.
     """
     stems = {name: re.sub(r"\.[A-Za-z]\w*$", "", name) for name in names}
+    if all(SCIENTIFIC.search(stem) for stem in stems.values()):
+        stems = {
+            name: SCIENTIFIC.sub(lambda found: f"{Decimal(found[0]):f}", stem)
+            for name, stem in stems.items()
+        }
     plain = {
         name: _key(stem, signed=False, decimals=False) for name, stem in stems.items()
     }

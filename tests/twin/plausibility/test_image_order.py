@@ -20,6 +20,10 @@ TRUE = {
     "two numbers": [f"f_{x}_{y}.tif" for x in (1, 2) for y in (1, 2, 10)],
     "dates": [f"img_2024-05-01_{i}.tif" for i in (1, 2, 10)],
     "signs": [f"a_{x:+06.1f}.tif" for x in (-10.5, -1, 0, 1, 10.5)],
+    "hexadecimal": [f"p_{x:02x}.tif" for x in range(0, 40)],
+    "hexadecimal by threes": [f"frame{x:04X}_a.tif" for x in range(5, 90, 3)],
+    "powers of ten": [f"p_{x:.3e}.tif" for x in (0.25, 0.5, 1, 9.5, 10, 100, 359)],
+    "negative powers": [f"a_{x:+.1e}.tif" for x in (-200, -10, -0.5, 0.5, 20)],
     "texts": ["1b.tif", "2a.tif", "10c.tif"],
     "whole": [f"scan_{i:06d}.tif" for i in range(12)],
 }
