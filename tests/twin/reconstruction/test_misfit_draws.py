@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import misfits
-import numpy as np
 import pytest
 
 from flexdt.twin.projection import Grid
@@ -50,15 +49,18 @@ def test_small_parts_are_seen_in_the_volume_of_the_explanation() -> None:
     assert case.names & set(wrong.contradiction.kinds)
 
 
-def test_a_panel_is_tried_beyond_the_first_step_where_few_columns_overlap() -> None:
-    """A panel 2.7 px off, of which movements of a third of a pixel fit worse."""
-    case = misfits.drawn(6061, 202, right=False)
+def test_a_panel_is_tried_beyond_the_first_steps_where_few_columns_overlap() -> None:
+    """A panel 2.3 px off, of which movements of a third and two thirds of a pixel fit
+    worse and 1.4 px better."""
+    case = misfits.drawn(13131, 52, right=False)
     assert case is not None
-    middle = np.ascontiguousarray(case.images[:, 19:39])
-    scan = CoarseScan.of(middle.__getitem__, case.geometry, middle.shape[1:], None)
+    image = case.images.__getitem__
+    scan = CoarseScan.of(image, case.geometry, case.scan.shape, None)
     comparison = compared(scan)
     assert comparison is not None
-    assert comparison.contradiction() is not None
+    left_open = comparison.undecided(0.1)
+    assert left_open is not None
+    assert left_open.kinds == ("offset",)
 
 
 def test_orders_are_tried_on_all_views() -> None:

@@ -249,14 +249,19 @@ def _shift_scatter(movement: Tried) -> float:
 
 
 def _fits_better(one: Tried) -> bool:
-    """Return whether an explanation fits better than the stated geometry, by
-    `MIN_FINE_EVIDENCE_SIGMAS` and by `EQUAL_MISFIT_RATIO`.
+    """Return whether an explanation fits better than the stated geometry
+    (`_residual_is_less`).
 
     One with a figure that was found by trials (`FOUND_BY_TRIALS`) never does: the best of
     many small movements always fits a little better, and a claim covers it.
     """
-    if one.suspect.kind in FOUND_BY_TRIALS:
-        return False
+    return one.suspect.kind not in FOUND_BY_TRIALS and _residual_is_less(one)
+
+
+def _residual_is_less(one: Tried) -> bool:
+    """Return whether an explanation's residual is less than the stated geometry's, by
+    `MIN_FINE_EVIDENCE_SIGMAS` and by `EQUAL_MISFIT_RATIO`.
+    """
     less = one.residual * EQUAL_MISFIT_RATIO < 1.0
     return less and one.evidence < -MIN_FINE_EVIDENCE_SIGMAS
 
@@ -433,7 +438,7 @@ class Comparison:
             if one.evidence < self._least_evidence_against(one)
             and not (sides_known and one.suspect.kind in SIDES)
             and one.change > (MIN_CHANGE if _fits_better(one) else covered)
-            and trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
+            and (_residual_is_less(one) or trial.fits_as_well(one, EQUAL_MISFIT_RATIO))
         ]
         if not trial.whole or not rivals:
             return None

@@ -16,6 +16,7 @@ import numpy as np
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.acquisition.trajectory import narrow_overlap
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.movement import moving, wandering
 from flexdt.twin.reconstruction.consistency.reprojection import Reprojection
@@ -44,9 +45,10 @@ FAR_PROBE_COLUMNS: Final = 3.0
 MIN_EVIDENCE_SIGMAS: Final = 2.0
 """Least distance of two likelihoods, in standard errors, at which one geometry fits
 better than another."""
-DOUBTFUL_STEPS: Final = 2
-"""Least number of movements of the panel to either side if images fit less well than most:
-FDK rounds a narrow overlap to half columns, so that the first step alone may fit worse."""
+NARROW_STEPS: Final = 3
+"""Least number of movements of a panel to either side where few columns are beyond the axis:
+FDK rounds such an axis to half columns, so that the first steps may fit worse though larger
+ones fit better."""
 MAX_PROBE_STEPS: Final = 7
 """Number of further movements of the panel, each twice as far."""
 UPSIDE_DOWN: Final = frozenset({"rows", "turned"})
@@ -152,11 +154,13 @@ class Trial:
         Args:
             far: panels far aside, too, as for images that do not fit.
             doubtful: images mirrored or turned, too (a panel in the middle sees the
-                opposite rotation so), and panels moved by `DOUBTFUL_STEPS` at least.
+                opposite rotation so).
         """
         listed = suspects(self.scan, whole=self.whole)
         chosen = [one for one in listed if doubtful or one.kind not in MIRRORED]
-        steps = DOUBTFUL_STEPS if doubtful else 1
+        columns = self.scan.images.shape[2]
+        narrow = narrow_overlap(self.scan.circle, self.scan.level, columns)
+        steps = NARROW_STEPS if narrow else 1
         return [*self._beside(far, steps), *map(self._tried, chosen)]
 
     def movement(self) -> Tried:
