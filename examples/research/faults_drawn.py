@@ -851,11 +851,12 @@ def _usual(draft: Draft, rng: Rng) -> Draft:
 
 
 def _right(draft: Draft, rng: Rng) -> Draft:
-    """Draw a phantom and a scanner within their assumed tolerances, the phantom strained
-    by 0.1 % rms; findings of strain or narrow priors are allowed, none is right, too.
+    """Draw a phantom and a scanner within their assumed tolerances: the phantom's scale,
+    and each of its strains, to 0.1 % rms; findings of strain or narrow priors are
+    allowed, none is right, too.
     """
     draft = _usual(draft, rng)
-    change = np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
+    change = (1.0 + 1e-3 * rng.normal()) * np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
     world = replace(draft.world, beads=draft.world.beads @ change.T)
     return replace(draft, world=world, silent=True,
                    names=("phantom_strained|priors_narrow",))  # fmt: skip
