@@ -432,11 +432,28 @@ class _MirrorPairs:
         rest = float(np.average(np.square(self._rest()), weights=self.w))
         return rest, max(float(np.average(white, weights=self.w)), 1e-30)
 
+    def _copies_power(self) -> float:
+        """Compute the weighted mean square by which mirrored pairs of the scan's own
+        copies differ: of every second frame less those between, and of frames that are
+        missing or repeated (`Turn.doubts`).
+
+        They have the asymmetry of too few views, of noise and of flicker, and none of
+        a mean that is not symmetric.
+        """
+        total = 0.0
+        for i in range(1, len(self.own)):
+            rest = self._residual(self.here, i)
+            rest = rest - self.odd @ (self.to_odd @ rest)
+            total += float(np.average(np.square(rest), weights=self.w))
+        return total
+
     def asymmetry(self) -> float:
-        """Compute the root mean square by which mirrored pairs differ beyond noise, over
-        that of the image about its mean; 0 if noise explains it.
+        """Compute the root mean square by which mirrored pairs differ, beyond noise and
+        beyond those of the scan's own copies, over that of the image about its mean; 0 if
+        either explains it.
         """
         rest, noise = self._power()
+        noise = max(noise, self._copies_power())
         own = self.own[0] - np.average(self.own[0], weights=self.w)
         structure = max(float(np.average(own * own, weights=self.w)), 1e-30)
         return math.sqrt(max(rest - noise, 0.0) / structure)
