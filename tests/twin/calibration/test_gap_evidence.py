@@ -8,7 +8,9 @@ import natural_objects
 import numpy as np
 import pytest
 
-from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
+from flexdt.twin.calibration.without_phantom import symmetry_plane
+from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays, Profile
+from flexdt.twin.calibration.without_phantom.gap_evidence import GapFound
 
 
 def profile(shift: np.ndarray, sigma: float, columns: int = 80) -> Profile:
@@ -70,6 +72,31 @@ def test_gaps_behind_natural_objects_are_named(kind: str, seed: int) -> None:
     told = natural_objects.tried(kind, seed, gap=True)
     assert told["named"], told
     assert abs(told["pull"]) < 4, told
+
+
+@pytest.mark.slow
+def test_both_ends_of_rays_find_the_column_from_two_pixels_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Fine edges seen 4 px apart have no common slopes."""
+    seen: list[tuple[ConjugateRays, np.ndarray]] = []
+
+    def kept(rays: ConjugateRays, values: np.ndarray, *_: object) -> GapFound:
+        seen.append((rays, values))
+        return GapFound(None, None)
+
+    monkeypatch.setattr(symmetry_plane, "find_gap", kept)
+    natural_objects.tried("foam", 1009, gap=False)
+    rays, values = seen[0]
+    found, sigma = rays.column(values)
+    column = rays.scan.column(found, rays.row)
+    slope = rays.scan.slopes(values, rays.scan.scales[: len(values)])[0]
+    for off in (-2.0, 2.0):
+        begun = found.copy()
+        begun[0] += off / slope
+        again, certain = rays.column(begun)
+        assert certain < 2 * sigma
+        assert abs(rays.scan.column(again, rays.row) - column) < sigma
 
 
 @pytest.mark.slow

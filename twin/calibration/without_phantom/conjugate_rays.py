@@ -42,6 +42,9 @@ MAX_VIEWS_RATIO: Final = 4.0
 """Columns times the step between views [rad] over the smoothing's sigma, at most."""
 EDGE_VIEWS: Final = 8
 """Views repeated at both ends for the splines over the angle."""
+COARSE: Final = 4.0
+"""Factor on the smoothing where the fine one shows no column: a column that is 2 px off
+sets slopes 4 px apart, more than the width of a fine edge."""
 ROUNDS = 4
 NEAR = 0.05
 """Steps towards the axis column at most, and part of a sigma that is none."""
@@ -327,18 +330,24 @@ class ConjugateRays:
     """
 
     def __init__(
-        self, scan: CircularScan, band: FloatArray, rows: FloatArray, step: float
+        self,
+        scan: CircularScan,
+        band: FloatArray,
+        rows: FloatArray,
+        step: float,
+        coarser: float = 1.0,
     ) -> None:
         """Smooth the images along their rows and prepare splines over views and columns.
 
         The smoothing is `cols / SMOOTHING`, one column and the step between views at
-        least.
+        least, all times `coarser`.
 
         Args:
             scan: a full turn.
             band: (views, groups, cols) means of groups of rows, at even steps.
             rows: (groups,) the groups' middle rows [px].
             step: angle between views [rad].
+            coarser: factor on the smoothing.
         """
         self.scan = scan
         self.band = band
@@ -346,7 +355,7 @@ class ConjugateRays:
         self.step = step
         self.views = len(band)
         self.cols = band.shape[2]
-        self.smoothing = max(
+        self.smoothing = coarser * max(
             1.0, self.cols / SMOOTHING, step * self.cols / MAX_VIEWS_RATIO
         )
         soft = gaussian_filter1d(band, self.smoothing, axis=2, mode="nearest")
@@ -384,7 +393,8 @@ class ConjugateRays:
 
     def column(self, values: FloatArray) -> tuple[FloatArray, float]:
         """Move the first of the parameters of the plane until both ends of rays agree, in
-        up to `ROUNDS` steps.
+        up to `ROUNDS` steps; from a coarser smoothing (`COARSE`) where the fine one shows
+        no agreement.
 
         Args:
             values: parameters in the order of `circular_scan.FREE`, (k,); not changed.
@@ -393,6 +403,17 @@ class ConjugateRays:
             The parameters, and the standard deviation of the column by sectors [px]; inf
             if too little turns (`MIN_CORRELATION`), with the parameters of the last step.
         """
+        fine, sigma = self._agreement(values)
+        if math.isfinite(sigma):
+            return fine, sigma
+        coarse = ConjugateRays(self.scan, self.band, self.rows, self.step, COARSE)
+        begun, sigma = coarse._agreement(values)
+        if not math.isfinite(sigma):
+            return fine, sigma
+        return self._agreement(begun)
+
+    def _agreement(self, values: FloatArray) -> tuple[FloatArray, float]:
+        """Find the column at which both ends agree, from near it; see `column`."""
         values = values.copy()
         slope = self.scan.slopes(values, self.scan.scales[: len(values)])[0]
         for _ in range(ROUNDS):
