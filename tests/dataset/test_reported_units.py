@@ -141,6 +141,37 @@ def test_numbers_that_are_no_line_integrals(door, images, word):
     assert any(word in one for one in answer(door, images))
 
 
+@pytest.mark.parametrize("door", DOORS)
+def test_numbers_whose_products_overflow_are_refused(door):
+    """1e30 ended as an SVD that did not converge, and as NaN in every voxel."""
+    (said,) = answer(door, 1e30 * CHORDS)
+    assert "allowed: up to 1e+09" in said
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-30])
+def test_images_of_nothing_are_compared_with_nothing(scale):
+    """0 / 0 was warned of from within."""
+    scan = fx.ConeVec.circular(sod=300, sdd=500, angles=24, shape=(16, 24), pixel=2.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", UserWarning)
+        volume = fx.fdk(
+            np.full((24, 16, 24), scale, np.float32), scan, fx.Grid((4, 8, 8), 2.0)
+        )
+    assert np.nanmax(np.abs(volume.data)) <= scale
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_an_image_of_too_few_columns_shows_no_axis(columns):
+    scan = fx.ConeVec.circular(sod=300, sdd=500, angles=24, shape=(8, columns), pixel=2.0)
+    images = RNG.uniform(0.1, 1.0, (24, 8, columns)).astype(np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = fx.align(fx.DataSet.from_arrays(images, scan))
+    assert not found.identifiable
+    assert found.document["refused"]["axis_column_px"]
+
+
 @pytest.mark.parametrize("door", ["sirt", "from_arrays"])
 @pytest.mark.parametrize(
     "images",

@@ -25,6 +25,8 @@ MAX_LINE_INTEGRAL: Final = 25.0
 """Line integral above which no photon passes: fewer than 1e-10."""
 MAX_GIVEN_INTEGRAL: Final = 4 * MAX_LINE_INTEGRAL
 """Line integral above which a scale is doubted; simulations without noise have large ones."""
+MAX_COMPUTED_INTEGRAL: Final = 1e9
+"""Line integral above which single precision cannot hold products of four of them."""
 MIN_NEGATIVE_INTEGRAL: Final = -0.1
 """Line integral below which a beam that is brighter than the flat image explains no sign."""
 MAX_POSITIVE_SHARE: Final = 0.1
@@ -43,9 +45,11 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
 
     Yields at most one finding, from type and values. Integers: counts above
     `MAX_LINE_INTEGRAL` (refusal), smaller but not all zero "whole numbers" (warning).
-    Floats: an open beam at the images' edges above `MAX_LINE_INTEGRAL` (counts, refusal)
-    or near 1 with a darker object (transmission, warning); else line integrals of the
-    other sign, or above `MAX_GIVEN_INTEGRAL` (warnings). Nothing without pixels.
+    Floats: above `MAX_COMPUTED_INTEGRAL` (refusal), else an open beam at the images' edges
+    above `MAX_LINE_INTEGRAL` (counts, refusal) or near 1 with a darker object
+    (transmission, warning); else line integrals of the other sign, or above
+    `MAX_GIVEN_INTEGRAL` (warnings). Nothing without pixels, and nothing of floats that are
+    not finite, which whoever computes with them refuses.
 
     Args:
         images: some of the scan's, (k, rows, cols).
@@ -65,6 +69,17 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
         yield Finding(
             "whole numbers", cause, remedy, Severity.WARNING, float(values.max())
         )
+        return
+    largest = float(np.abs(values).max())
+    if not np.isfinite(largest):
+        return
+    if largest > MAX_COMPUTED_INTEGRAL:
+        cause = f"line integrals of up to {largest:.4g}, at which no photon passes"
+        remedy = (
+            "line integrals are -np.log of the transmission; allowed: up to "
+            f"{MAX_COMPUTED_INTEGRAL:g}"
+        )
+        yield Finding("scaled", cause, remedy, Severity.REFUSAL, largest)
         return
     beam = _beam(values)
     if beam is None or not beam > OPEN[0]:

@@ -41,6 +41,8 @@ from flexdt.twin.geometry.panel import Panel
 
 BAND: Final = 12
 """Rows above and below the source's plane that are read for opposite rays."""
+MIN_COLUMNS: Final = 3
+"""Columns that have a second difference, from which noise is estimated."""
 MOST_VIEWS: Final = 1440
 """Of more views every second, third and so on is used for opposite rays."""
 LEAST_RATIO: Final = 1.5
@@ -604,10 +606,14 @@ def _opposite_rays(
         random: for the image of noise.
 
     Raises:
-        NotIdentifiableError: there are hardly any, or the plane is too far from the
-            panel's rows.
+        NotIdentifiableError: there are hardly any, fewer than `MIN_COLUMNS` columns, or
+            the plane is too far from the panel's rows.
     """
     rows, cols = scan.shape
+    refuse_if(
+        cols < MIN_COLUMNS,
+        f"images of {cols} columns do not show their noise; allowed: {MIN_COLUMNS} or more",
+    )
     angle = (
         scan.offsets(start).angle_scale
         * scan.poses.angle[list(scan.present)]

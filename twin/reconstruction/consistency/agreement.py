@@ -69,6 +69,8 @@ RIVALS_ROWS: Final = 6
 """Least rows of a scan whose images fit, in which explanations are compared with it."""
 MIN_VIEWS: Final = 12
 """Least number of views and coarse columns; with fewer a volume fits anything."""
+MIN_SIGNAL_INTEGRAL: Final = 1e-9
+"""Least line integral of an object: far below what any detector tells from the open beam."""
 MAX_AVERAGED_COLUMNS: Final = 4
 """Largest number of coarse columns that are averaged where finer ones show only streaks
 (assumed)."""
@@ -207,10 +209,13 @@ def compared(scan: CoarseScan) -> Comparison | None:
         scan: coarse.
 
     Returns:
-        None for helices, for scans of fewer than `MIN_VIEWS` views or columns, and where
-        images fit of which the panel cuts a part off.
+        None for helices, for scans of fewer than `MIN_VIEWS` views or columns, for images
+        without an object (`MIN_SIGNAL_INTEGRAL`), and where images fit of which the panel
+        cuts a part off.
     """
     if scan.circle.rise or too_few(scan):
+        return None
+    if float(np.abs(scan.images).max()) < MIN_SIGNAL_INTEGRAL:
         return None
     thin = scan.thinned()
     trial = Trial(thin)
