@@ -123,8 +123,9 @@ class Servers:
     def stop(self) -> int | None:
         """Stop all processes, wait for them and close the log.
 
-        They get SIGTERM, and are killed if they have not ended after `STOP_TIMEOUT_S`. A
-        second call returns None. The log's file stays; a closed pipe is ignored.
+        The supervisor alone gets SIGTERM, at which it ends the servers; it alone is
+        killed if it has not ended after `STOP_TIMEOUT_S`. A second call returns None. The
+        log's file stays; a closed pipe is ignored.
 
         Returns:
             The supervisor's exit code; None if it was not running.

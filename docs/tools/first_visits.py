@@ -122,7 +122,7 @@ WITH_DATA: dict[str, Reach] = {
 
 def opened(browser: Any, url: str, size: Size, theme: str) -> Any:
     """Open the page by a browser that has never been there, and wait until it has an
-    image, a session and a live view, and its notes have faded.
+    image, a session and a live view, and then `FADED_MS` more, in which notes fade.
 
     Args:
         browser: of playwright.

@@ -188,15 +188,22 @@ def annotated(
 
 
 def write(folder: Path, seed: int = 0, views: int = 36) -> DataSet:
-    """Write a folder of float TIFFs with geometry.json and markers.csv beside it.
+    """Write radiographs of 8 balls as float TIFFs in `frames` within a folder, with
+    geometry.json (nominal) and markers.csv beside `frames`.
+
+    The annotations in markers.csv are noisy, some are missing, and they are of 12 other
+    markers, drawn apart: none of the balls in the images.
 
     Args:
-        folder: gets them.
+        folder: gets them; made if it is not there, and must not contain `frames`.
         seed: of all draws.
         views: of the turn.
 
     Returns:
-        The data set of these markers.
+        The data set of the annotations: nominal geometry, no images.
+
+    Raises:
+        FileExistsError: `frames` is there already.
     """
     import tifffile
 

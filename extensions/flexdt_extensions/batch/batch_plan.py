@@ -105,14 +105,17 @@ def _number(value: object) -> bool:
 def parse(value: object) -> Draw:
     """Parse a draw from a value of TOML.
 
-    A `Draw` is returned as it is. "choice" takes texts or numbers; every other kind takes
-    two numbers: "normal" mean and standard deviation, the others the lower one first.
+    A `Draw` is returned as it is. "choice" takes one or more texts, or one or more
+    numbers, not both; every other kind takes two numbers: "normal" mean and standard
+    deviation (0 or more), the others the lower one first, "loguniform" above 0 and
+    "integers" whole ones.
 
     Args:
         value: a number, a text, or a table of one kind and its list.
 
     Raises:
-        ValueError: another form; lists the allowed ones.
+        ValueError: another form, lists the allowed ones; or values that the kind does not
+            take, says which it takes.
     """
     if isinstance(value, Draw):
         return value

@@ -254,13 +254,14 @@ def case(name: str, tell: Callable[[str], None]) -> dict[int, Document]:
 def further(line: Callable[..., None], cases: dict[str, dict[int, Document]]) -> None:
     """Measure FDK and SIRT onto the second volume's grid, and add their targets.
 
-    They are FDK's back projection over ASTRA's (None without it); for each kind of object
+    They are FDK's back projection over ASTRA's (None without it); for each of `KINDS`
     FDK's time from host to host [s], its ratio to the first kind, and that with errors to
-    without; and SIRT's iteration over its kernels.
+    without; then for each kind the time of a SIRT iteration over that of its kernels.
 
     Args:
         line: adds a target: name, measured, accepted and wanted value.
-        cases: of `case`, by name.
+        cases: name of a size -> number of views -> figures of `case`; that of the second
+            size and `COUNTS[1]` views is read, for SIRT.
     """
     from numba import cuda
 

@@ -265,8 +265,9 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
         document: of `run_design`.
 
     Returns:
-        Name, unit, predicted and measured of both, and the ratio of the predictions, as
-        text.
+        Name, unit, predicted and measured of the design, then of the spiral, and the
+        gain, the spiral's prediction divided by the design's ("-" where the document has
+        no gain), as text.
     """
     ours = document["design"]
     theirs = document["spiral"]

@@ -449,11 +449,15 @@ def _from_texts(
     """Read a data set by the scanner's settings texts.
 
     Projections beyond the number in the text are read with a warning; fewer are missing
-    frames. A cancelled script makes the data set incomplete.
+    frames. A cancelled script makes the data set incomplete. See `rebuild` for the
+    geometry: where machine, motors or profile do not give it, the printed figures do, and
+    the data set has no profile.
 
     Args:
         content: the folder.
-        machine, profile: in place of those that the texts name, or None.
+        machine: taken whatever its name; None: the built-in one that the texts name.
+        profile: taken unchecked; None: the built-in one that reproduces the printed
+            figures, as the texts name none.
 
     Raises:
         DatasetError: no projections, two with one number, no usable text, a scan of

@@ -30,7 +30,8 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
     """Start a move of motors; with `plan` find and start a way around obstacles instead
     (see `_move_around_obstacles`).
 
-    A way that is under way is cancelled. The answer is sent at once, or with `wait` when
+    A way that is under way is cancelled once the motors have the new command; a refused
+    move that changes nothing leaves it. The answer is sent at once, or with `wait` when
     the motors rest.
 
     Returns:
