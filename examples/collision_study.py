@@ -310,11 +310,12 @@ def swept(
 
 
 def judge(case: Case) -> Outcome | None:
-    """Sweep a case three times, and compare the sweep with the reference.
+    """Sweep a case once, then three times by the clock, and compare the last sweep with
+    the reference.
 
     Returns:
-        The outcome, with the least time; None where the bodies begin within 0.1 mm of the
-        margin.
+        The outcome, with the least of the three times; None where the bodies begin nearer
+        to each other than the margin and 0.1 mm.
     """
     if reference(case, np.zeros(1))[0] < MARGIN + 0.1:
         return None

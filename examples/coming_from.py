@@ -148,8 +148,9 @@ def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
         theirs: names after its code.
 
     Returns:
-        `geometry_mm` or `mean_difference_part`; {} for other blocks, or if the code did
-        not make the result.
+        `geometry_mm`, the largest difference, or `mean_difference_part`, the mean
+        absolute difference of every tenth image divided by the mean of flexdt's; {} for
+        other blocks, or if the code did not make the result.
     """
     if caption.endswith("task 2"):
         vectors = fx.ConeVec(np.load("vectors.npy"))

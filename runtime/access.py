@@ -170,6 +170,9 @@ def is_rebound(host: str) -> bool:
     Args:
         host: the request's Host, with or without a port; "" where there is none.
 
+    Returns:
+        True unless the Host is "localhost" or a loopback address; True for "".
+
     Raises:
         ValueError: no Host that can be read.
     """

@@ -45,8 +45,8 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
     results.
 
     Order: python, packages, kernels, threads, memory, gpu, each port, disk. Each check
-    runs only when its result is requested. The error names the check, and the exception's
-    type and text.
+    runs only when its result is requested. The error of a check that fails has its name
+    ("<lambda>" for ports and disk), and the exception's type and text.
 
     Args:
         data: the data directory, which need not exist.

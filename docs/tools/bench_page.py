@@ -501,7 +501,8 @@ def renew(folder: Path, document: Document, page: Path | None = None) -> None:
     """Merge a document into the kept one, if there is one, write both files, and draw it.
 
     Args:
-        folder: of the pages; the kept document and its picture are in `images/` there.
+        folder: of the pages, must exist; the kept document (bench.json) and its picture
+            (bench.svg) are in `images/` there, which is made.
         document: of a new run.
         page: gets the figures between its marks, too.
     """

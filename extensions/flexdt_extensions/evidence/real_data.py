@@ -247,11 +247,13 @@ def needles(files: list[Path]) -> Iterator[Told]:
 
 
 def _distances(one: Array, other: Array) -> tuple[float, float]:
-    """Compare two sets of points (k, 3) after the best turn, shift and scale.
+    """Compare two sets of points (k, 3) after the best turn, shift and scale; a mirror
+    image counts as a turn.
 
     Returns:
-        Root mean square distance, and the second's size over the first's, which the two
-        scans' SDD determine to a few tenths of a per cent.
+        Root mean square distance at the first's scale and in its unit, and the second's
+        size divided by the first's, which the two scans' SDD determine to a few tenths of
+        a per cent.
     """
     from scipy.spatial import procrustes
 

@@ -133,7 +133,7 @@ def iterate(
             none.
         x: the start.
         steps: of central differences, (p,).
-        lam: initial damping.
+        lam: initial damping; 0 stays 0.
     """
     r = residual(x)
     cost = start_cost = _half_square(r)
@@ -199,7 +199,7 @@ def stacked(
         pairs: (m, 3) frame and two beads, of `bead_pairs`.
 
     Returns:
-        Coordinates of seen beads, then distances of pairs [px].
+        Predicted less measured: coordinates of seen beads, then distances of pairs [px].
     """
     frame, a, b = pairs.T
     near = np.linalg.norm(predicted[frame, a] - predicted[frame, b], axis=1)

@@ -296,8 +296,9 @@ def real_runs(
         used: numbers of projections; None is those of the logs.
 
     Returns:
-        Runs of ours; for each N the logged, the simulated and our estimates, rms and
-        iterations.
+        Runs of ours; and {"setting": name, "by_projections": N as text -> logged and
+        simulated estimates, rms [px] and iterations, and our alpha, less the nominal
+        start angle [deg], and rms [px]}.
     """
     start = author()["real"]["scans"][name]["start_deg"]
     dO_x, dO_y, dO_z, alpha, *mount = truth.values
@@ -353,10 +354,10 @@ def explained(curves: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     without such N are left out.
 
     Returns:
-        One row a scan: rms and largest difference of alpha [deg], largest difference of
-        the rms residual [%], numbers of fits compared and of those within 1 deg and 15 %,
-        the differences' rms of the other estimates [mm], and mean iterations of logs and
-        simulation.
+        One row a scan: rms and largest absolute difference of alpha [deg]; the rms
+        residual's largest difference [%], simulated over logged less 1, with its sign;
+        numbers of fits compared and of those within 1 deg and 15 %; the differences' rms
+        of the other estimates [mm]; and mean iterations, [logged, simulated].
     """
     out = []
     for curve in curves:
@@ -478,8 +479,8 @@ def found_beads(
 ) -> BeadModel:
     """Reconstruct a scan near the model's beads and find their centres in the volume.
 
-    A centre is the mean place of voxels above half the largest value, weighted by the
-    excess. The beads' tolerance is `TOLERANCE_MM`.
+    A centre is the mean place of voxels above half the 99.5 % quantile of the bead's
+    grid, weighted by the excess. The beads' tolerance is `TOLERANCE_MM`.
 
     Args:
         images: line integrals of a full turn.
