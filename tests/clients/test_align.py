@@ -17,7 +17,10 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
-from flexdt.twin.calibration.without_phantom.tile_gap import averaged_rows, local_gaps
+from flexdt.twin.calibration.without_phantom.tile_gap import (
+    averaged_rows,
+    local_gaps,
+)
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.geometry.panel import Panel
 from flexdt.twin.scanner.state import NamedCorrection

@@ -10,7 +10,7 @@ import pytest
 
 from flexdt.twin.calibration.without_phantom import symmetry_plane
 from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays, Profile
-from flexdt.twin.calibration.without_phantom.gap_evidence import GapFound
+from flexdt.twin.calibration.without_phantom.gaps.gap_evidence import GapFound
 
 
 def profile(shift: np.ndarray, sigma: float, columns: int = 80) -> Profile:

@@ -10,8 +10,8 @@ import natural_objects
 import numpy as np
 import pytest
 
-from flexdt.twin.calibration.without_phantom.gradient_step import gradient_steps
-from flexdt.twin.calibration.without_phantom.hidden_gap import (
+from flexdt.twin.calibration.without_phantom.gaps.gradient_step import gradient_steps
+from flexdt.twin.calibration.without_phantom.gaps.hidden_gap import (
     CHANCE,
     CURVED_SHARE,
     _of_outlines,

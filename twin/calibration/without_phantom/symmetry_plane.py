@@ -20,12 +20,12 @@ from flexdt.twin.calibration.without_phantom.circular_scan import (
     about_axis,
 )
 from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays
-from flexdt.twin.calibration.without_phantom.gap_evidence import (
+from flexdt.twin.calibration.without_phantom.gaps.gap_evidence import (
     SIGMAS,
     GapFound,
     find_gap,
 )
-from flexdt.twin.calibration.without_phantom.hidden_gap import HiddenGap
+from flexdt.twin.calibration.without_phantom.gaps.hidden_gap import HiddenGap
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
     REACH,
     Symmetry,

@@ -21,7 +21,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import log_softmax, logsumexp, softmax
 
 from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
-from flexdt.twin.calibration.without_phantom.gradient_step import (
+from flexdt.twin.calibration.without_phantom.gaps.gradient_step import (
     BLOCK_FRAMES,
     gradient_steps,
 )

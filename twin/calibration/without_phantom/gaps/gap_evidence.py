@@ -21,7 +21,7 @@ from flexdt.twin.calibration.without_phantom.conjugate_rays import (
     Profile,
     Step,
 )
-from flexdt.twin.calibration.without_phantom.hidden_gap import HiddenGap, hidden_gap
+from flexdt.twin.calibration.without_phantom.gaps.hidden_gap import HiddenGap, hidden_gap
 from flexdt.twin.calibration.without_phantom.tile_gap import SIDE, Gap, local_gaps
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
