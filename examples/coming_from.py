@@ -201,7 +201,9 @@ def compared(peer: str, theirs: dict[str, Any], ours: dict[str, Any]) -> dict[st
         ours: names after the code of flexdt's block.
 
     Returns:
-        Name -> difference; a result that the peer did not make is left out.
+        Name -> largest difference of geometries [mm] or projections; a `..._part` is
+        divided by the mean of flexdt's images (mean difference) or by the true volume's
+        largest value (rms error). A result that the peer did not make is left out.
     """
     out: dict[str, float] = {}
     turn, scan = ours.get("turn"), theirs.get("scan")

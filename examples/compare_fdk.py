@@ -75,8 +75,9 @@ def by_rtk(
 
 
 def main() -> None:
-    """Reconstruct a ball and a box by flexdt and RTK in turn, and print times, their
-    ratio and differences as JSON.
+    """Reconstruct a ball and a box by flexdt and RTK in turn, and print times [s], the
+    ratio of the least ones, RTK's over flexdt's, the differences of the volumes [1/mm],
+    and the ball's mean over its true value in each, as JSON.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--views", type=int, default=360)

@@ -344,8 +344,8 @@ def measured(
 
 
 def errors(found: Any, hidden: Hidden) -> dict[str, tuple[float, float]]:
-    """Compare an alignment with the truth: (error, sigma) of "column" [px], "roll" (the
-    axis's angle) and, if they were found, "yaw" [deg] and "row" [px].
+    """Compare an alignment with the truth: (found less true, sigma) of "column" [px],
+    "roll" (the axis's angle [deg]) and, if they were found, "yaw" [deg] and "row" [px].
     """
     column, angle = hidden.axis_in_image()
     p = found.parameters

@@ -181,7 +181,8 @@ def run_of(
     """Compare a fit with the truth, and let Algorithm 2 solve the same tracks.
 
     In the damping experiment the result is that of Algorithm 2, which is studied there, and
-    ours is in `beside`; elsewhere it is the other way round.
+    ours is in `beside`; elsewhere, and where our fit is not identifiable, it is the other
+    way round. Without a run of Algorithm 2 the result is ours alone.
 
     Args:
         task: experiment and setting.
@@ -323,9 +324,10 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
         runs: of all settings.
 
     Returns:
-        Rows: counts of runs, successes and failures, means and maxima of MAE, iterations
-        and cost reduction, errors and sigmas by parameter, `beside` of the other method,
-        `thesis_*`.
+        Rows: counts of runs (all, and those that succeed, are unidentifiable, fail or are
+        weak), means of MAE, iterations and cost reduction [%], maxima of MAE and
+        iterations, mean errors and sigmas by parameter, `method`, `beside` of the other
+        method, `thesis_*`.
     """
     out: list[dict[str, object]] = []
     for setting in dict.fromkeys(r.setting for r in runs):
