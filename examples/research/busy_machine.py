@@ -58,8 +58,11 @@ def cases() -> dict[str, Callable[[], object]]:
 
 @contextmanager
 def busy_loops(count: int) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Start `count` processes that loop for ever, in a session of their own, within the
-    context; killed at its end.
+    """Start `count` processes, 1 or more, that loop for ever, in a session of their own,
+    within the context; killed at its end.
+
+    Yields:
+        The first process alone; all of them are of its process group.
     """
     script = (
         f"import os\nfor _ in range({count - 1}):\n    if os.fork() == 0: break\nwhile "
@@ -82,8 +85,8 @@ def timed(work: Callable[[], object]) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Time each case on the quiet and on the busy machine in turns, and print medians,
-    their ratio and that of processor time.
+    """Time each case on the quiet and on the busy machine in turns, and print medians
+    [s], their ratio and that of processor time, each busy over quiet.
     """
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("--loops", type=int, default=8)

@@ -35,7 +35,8 @@ def bench(folder: Path, phantom: str, repeats: int = 7) -> dict[str, object]:
     Args:
         folder: a data set.
         phantom: name of the scanned one.
-        repeats: runs of each case, after one that is not counted.
+        repeats: runs from memory and from files, five times as many of the fit alone,
+            each after one that is not counted.
 
     Returns:
         `solve`, `memory` and `files`, each with best_s, median_s and cpu_s (the least);
