@@ -272,8 +272,8 @@ def thick_response() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def figures(found: dict[str, dict[str, np.ndarray]], curve: dict) -> dict[str, object]:
-    """Sum up the figures of the page: ratios to theory, largest differences, and
-    responses over the published ones.
+    """Sum up the figures of the page: measured over theory (of the noise power mean and
+    standard deviation), largest differences, and our responses over the published ones.
 
     Args:
         found: curves of `quality`.

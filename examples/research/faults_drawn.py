@@ -147,7 +147,7 @@ def shadows(world: World) -> tuple[Array, Array]:
     touch the ball.
 
     Returns:
-        Centres (n, k, 2) and radii (n, k) [px].
+        Centres (n, k, 2), and least distances of centre and outline (n, k) [px].
     """
     if world.arc:
         # Legendre's points and weights of an even turn.

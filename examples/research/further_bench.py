@@ -110,7 +110,8 @@ def adjoint(wanted: Callable[[str], bool]) -> list[Entry]:
     Both write into memory they are given; in `-new` entries `back` makes new memory.
 
     Returns:
-        Entries with the error of the dot product and the ratio of times.
+        Entries with the error of the dot product, relative to that of `forward`, and the
+        least time of `back` divided by that of `forward`.
     """
     cases = {case.name: case for case in [*peer_cases(), *untuned_cases()]}
     entries = []
@@ -219,8 +220,8 @@ def fdk_entry(
         part: peers that take part.
 
     Returns:
-        The entry: times, error of the middle's mean, processor time [ms], its ratio with
-        errors, and largest memory beside the images [MB].
+        The entry: times, error of the middle's mean, processor time [ms] without errors,
+        that with errors divided by it, and largest memory beside the images [MB].
     """
     from flexdt.twin.reconstruction import fdk
 
@@ -410,8 +411,8 @@ async def _through(host: str, port: int) -> list[Entry]:
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=True)
 def read_all(data, workers):
-    """Sum up an array in `workers` equal parts, in parallel; the sum is returned so that
-    no reading is left out.
+    """Sum up an array in `workers` equal parts, in parallel, but for what the division
+    leaves over; the sum is returned so that no reading is optimised away.
     """
     sums = np.zeros(workers * 16)
     each = data.size // workers
@@ -551,7 +552,8 @@ def _bound(
     asked: float,
     n: int,
 ) -> Entry:
-    """Time a call, and make its entry beside the least time by memory bandwidth.
+    """Time a call, and make its entry beside the least time by memory bandwidth; `share`
+    is that divided by the time of the call.
 
     Args:
         name, what: of the entry.

@@ -88,8 +88,9 @@ def compare_folder(
         shown: number of frames, evenly spread, of which difference images are made.
 
     Returns:
-        Residuals before (nominal geometry) and after correction, and difference images;
-        the document has those of the correction in force, too, if there is one.
+        Residuals before (nominal geometry) and after correction, and difference images,
+        radiograph less simulation; the document has figures of the residuals of the
+        correction in force, too, if there is one.
 
     Raises:
         DatasetError: no data set.

@@ -108,8 +108,8 @@ class FrameEvents(Device, EventCollectable):
         }
 
     def collect(self) -> Iterator[PartialEvent]:
-        """Yield one event for each image completed since the last call, with its angle
-        [deg] and start [s]; stamped with the present time.
+        """Yield one event for each image completed so far, with its angle [deg] and start
+        [s]; stamped with the present time. A further call yields them all again.
         """
         flyer = self._flyer()
         name = flyer.name

@@ -334,8 +334,9 @@ def equidistant(env: ScanEnv, frame: int) -> Action:
 
 
 def greedy(env: ScanEnv, frame: int) -> Action:
-    """Choose the action of most expected information for its time, at the nominal
-    geometry, of 36 angles (and some magnifications for "pose"); `frame` is ignored.
+    """Choose the action whose expected worth less the cost of its time is largest, at the
+    nominal geometry, of 36 angles (for "pose" each at up to four places of mag_obj);
+    `frame` is ignored.
     """
     candidates = [{"rot_obj": 360.0 * i / SECTORS} for i in range(SECTORS)]
     if env.kind == "pose":

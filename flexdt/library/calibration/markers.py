@@ -428,7 +428,8 @@ def calibrate_unknown(
 
     Raises:
         TwinError: fewer than three markers, one that is seen from too few directions,
-            neither images nor markers, or a scale with dO_z free or with one marker.
+            neither images nor markers, or a scale with dO_z free, with one marker or with
+            one that is not there.
     """
     poses = data.poses
     if markers is None:
