@@ -643,8 +643,8 @@ def _compare_with_truth(
         note: findings as text.
 
     Returns:
-        `identifiable`, `values`, `errors`, `sigmas`, `rms_px`, `iterations`, `note` and,
-        without a fit, `error`.
+        `identifiable`, `values`, `errors` (value less truth) and `sigmas` by parameter,
+        `rms_px`, `iterations`, `note` and, without a fit, `error`.
     """
     truth = item.truth.to_edge()
     if fit is None:

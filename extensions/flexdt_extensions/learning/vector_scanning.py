@@ -390,11 +390,11 @@ def _sector(angle: float) -> int:
 
 
 def _lengths(cone: ConeVec, shape: tuple[int, int]) -> tuple[VoxelArray, Float32Array]:
-    """Compute the voxels that each ray of one view crosses and its length in them, both
-    (rays, k) [mm].
+    """Compute the flat indices of the voxels that each ray of one view crosses, and its
+    lengths in them [mm], both (rays, k).
 
     A ray is cut at every plane between voxels, in the order in which it meets them;
-    pieces outside the volume have length 0.
+    pieces outside the volume have index and length 0.
 
     Args:
         cone: one view.

@@ -417,9 +417,11 @@ def reconstruct_dataset(
 
     Raises:
         UnknownNameError: unknown algorithm, window or material.
-        TwinError: beam hardening cannot be corrected, because the data set has none.
+        TwinError: a correction of beam hardening, or of scatter, for images that the twin
+            made without it.
         LimitError: another ending, one of the data set's own files, a volume too large
-            for this machine, or too little memory or room on disk.
+            for this machine, too little memory or room on disk, or a correction without
+            a stated tube voltage.
         GeometryError: a trajectory that the algorithm cannot use.
         DatasetError: a frame or the flat field cannot be read.
         OSError: the file cannot be written.
@@ -855,7 +857,8 @@ def _without_scatter(
         The frames, with the scatter to subtract and its doubts added.
 
     Raises:
-        TwinError: the twin made the images without scatter.
+        TwinError: the twin made the images without scatter, or with one energy.
+        LimitError: neither request nor data set states the tube's voltage.
     """
     from flexdt.phantoms import material
     from flexdt.twin.physics.chain import Chain
