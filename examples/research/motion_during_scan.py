@@ -165,8 +165,9 @@ def one(seed: int, kind: str, images: bool) -> dict[str, Any]:
 
 
 def summary(kind: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Sum up the rows of one kind: counts, median and largest errors, rms and largest
-    pulls.
+    """Sum up the rows of one kind, those refused left out but for their count: counts,
+    the median rms without motion and the largest with it [px], the motion's largest
+    error [um], rms and largest pulls.
     """
     good = [r for r in rows if "refused" not in r]
     pulls = np.array([r["pulls"] for r in good])

@@ -301,9 +301,9 @@ def study(
         images: calibrate from radiographs.
 
     Returns:
-        Shares [%] of truths inside the intervals and regions among the answers offered,
-        each with the binomial standard error for 95 %, and the largest error of an answer
-        offered [sigma].
+        Shares [%] of truths inside the 95 % intervals and regions among the answers
+        offered, the binomial standard error of one such share [%], the six's rms errors
+        [mm, deg], the largest error of an answer offered [sigma], and counts.
     """
     inside: dict[str, list[bool]] = {}
     worst, refused, widened, names = 0.0, 0, 0, list(REACH)

@@ -559,8 +559,8 @@ class _ScanReader(ScenarioReader):
     def _read_spectrum(self, name: object, where: str) -> Spectrum:
         """Read the spectrum of a file into the tables' bins.
 
-        More than 0.1 % of photons below the tables' energies are left out with a note;
-        above them they are an error.
+        Photons beyond the tables' energies are left out: more than 0.1 % of all below
+        them with a note, more than 0.1 % above them are an error.
 
         Args:
             name: of the file: energy [keV] and photons / (s sr mA) about it.
@@ -570,7 +570,8 @@ class _ScanReader(ScenarioReader):
             Photons per cm2 and mAs at 1 m.
 
         Raises:
-            ExchangeError: energies that do not grow or are too high, or negative photons.
+            ExchangeError: fewer than two energies, some that do not grow or are too high,
+                or negative photons.
         """
         energy, photons = self._numbers(name, where, 2).T
         if len(energy) < 2 or np.diff(energy).min() <= 0.0 or photons.min() < 0.0:
