@@ -321,7 +321,7 @@ def measured(
         photons: of the open beam, a pixel and frame.
         rng: for the noise.
         keep: which frames the data set has, in which order; default: all.
-        ramp: error of the flat images from the left end to the right one.
+        ramp: relative change of the flat images from the left end to the right one.
     """
     gain = 1.0 if photons > 1000 else 60.0
     flat = (
@@ -493,7 +493,7 @@ def spoilt(
 
     Returns:
         Line integrals, the scanner with the fault, indices of the frames that the data
-        set has, and the flat field's error.
+        set has, and the flat images' `ramp`, see `measured`.
     """
     n = hidden.views
     span = {"200 deg": 200.0, "350 deg": 350.0}.get(kind, 360.0)
