@@ -51,7 +51,8 @@ def errors(views: int, noise: float, count: int) -> list[float]:
         count: voxels a side.
 
     Returns:
-        Root mean square error of each volume [1/mm].
+        Root mean square error of each volume [1/mm]: FDK, SIRT, then TV in the order of
+        WEIGHTS.
     """
     grid, wanted = fx.Grid((count,) * 3, SIZE_MM / count), truth(count)
     scan = fx.ConeVec.circular(

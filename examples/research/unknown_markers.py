@@ -64,7 +64,8 @@ def unlike(found: Array, true: Array) -> tuple[float, float]:
     turn and scale (Umeyama 1991).
 
     Returns:
-        Largest difference of a coordinate [mm], and the scale.
+        Largest difference of a coordinate at the true scale [mm], and the factor by which
+        the found points become as large as the true ones.
     """
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, s, vt = np.linalg.svd(a.T @ b)
