@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Final, Literal
@@ -45,8 +46,8 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
     results.
 
     Order: python, packages, kernels, threads, memory, gpu, each port, disk. Each check
-    runs only when its result is requested. The error of a check that fails has its name
-    ("<lambda>" for ports and disk), and the exception's type and text.
+    runs only when its result is requested. The error of a check that fails has its name,
+    and the exception's type and text.
 
     Args:
         data: the data directory, which need not exist.
@@ -55,25 +56,21 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
     Yields:
         One result for each check.
     """
-    checks: list[Callable[[], CheckOutcome]] = [
-        python,
-        packages,
-        kernels,
-        threads,
-        memory,
-        gpu,
+    checks: list[tuple[str, Callable[[], CheckOutcome]]] = [
+        ("python", python),
+        ("packages", packages),
+        ("kernels", kernels),
+        ("threads", threads),
+        ("memory", memory),
+        ("gpu", gpu),
     ]
-    checks += [lambda what=what, port=port: listening(what, port) for what, port in ports]  # type: ignore[misc]
-    checks.append(lambda: disk(data))
-    for check in checks:
+    checks += [(f"port {port}", partial(listening, name, port)) for name, port in ports]
+    checks.append(("disk", partial(disk, data)))
+    for name, check in checks:
         try:
             yield check()
-        except (
-            Exception
-        ) as error:  # a check that fails is a finding, and the others go on
-            yield CheckOutcome(
-                check.__name__, "error", f"{type(error).__name__}: {error}"
-            )
+        except Exception as error:  # the other checks go on
+            yield CheckOutcome(name, "error", f"{type(error).__name__}: {error}")
 
 
 def python() -> CheckOutcome:

@@ -45,3 +45,19 @@ def test_lines_of_metadata_with_markers(monkeypatch: pytest.MonkeyPatch) -> None
     assert doctor.needed() == ("a-b", "c_d", "f.g")
     monkeypatch.setattr(doctor, "requires", lambda name: None)
     assert doctor.needed() == ()
+
+
+@pytest.mark.parametrize("name", ["kernels", "gpu", "listening", "disk"])
+def test_a_check_that_fails_is_told_by_the_name_that_it_has(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(*_: object) -> doctor.CheckOutcome:
+        raise OSError("no such device")
+
+    ports = [("twin", 0)]
+    right = [outcome.what for outcome in doctor.examine(tmp_path, ports)]
+    monkeypatch.setattr(doctor, name, fail)
+    outcomes = list(doctor.examine(tmp_path, ports))
+    assert [outcome.what for outcome in outcomes] == right
+    failed = [one for one in outcomes if one.found == "OSError: no such device"]
+    assert [one.verdict for one in failed] == ["error"]
