@@ -394,11 +394,12 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
             raise ds.DatasetFormatError.instead(message, size, most, path=str(path))
         wanted = np.float32 if kind.kind == "f" else np.uint16
         packing = tifffile.COMPRESSION
-        if page.compression in (packing.ADOBE_DEFLATE, packing.DEFLATE):
-            _check_inflation(path, raw, page, size)
-        elif (
-            page.compression != packing.NONE
-        ):  # LZW and others, which tifffile leaves to a codec
+        values: npt.NDArray[Any]
+        if page.compression in (packing.NONE, packing.ADOBE_DEFLATE, packing.DEFLATE):
+            if page.compression != packing.NONE:
+                _check_inflation(path, raw, page, size)
+            values = series.asarray()
+        else:  # LZW and others, which tifffile leaves to a codec
             import cv2
 
             raw.seek(0)
@@ -413,8 +414,7 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
                 raise ValueError(
                     f"its compression ({page.compression!r}) cannot be undone"
                 )
-            return np.asarray(image, dtype=wanted)
-        values = series.asarray()
+            values = image
         if kind.kind == "i" and values.size and values.min() < 0:
             said = f"{path} holds counts down to {values.min()}"
             raise ds.DatasetFormatError.instead(said, int(values.min()), "0 or more")
