@@ -147,7 +147,8 @@ class Recording:
             return files.path / file
 
     def adopt(self, folder: Path, state: State) -> int:
-        """Add the projections of a data set that the twin made, and rewrite the texts.
+        """Add the images of a data set that the twin made, flat and dark ones too, and
+        rewrite the texts.
 
         Files are linked or copied under their own names; frames that are no file of the
         folder are copied. Blocks begin at the time of `state` minus the set's duration. A
@@ -161,8 +162,8 @@ class Recording:
             The number of images.
 
         Raises:
-            DatasetError, OSError: the data set cannot be read, a name is taken, or no
-                room.
+            DatasetError, OSError: the data set cannot be read, a name is taken, no room,
+                or the recording was closed meanwhile.
         """
         source = Directory(folder.parent).folder(folder.name)
         document = read_document(source)

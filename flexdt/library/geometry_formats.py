@@ -135,10 +135,12 @@ def to_astra(cone_vec: ConeVec) -> dict[str, Any]:
 def from_tomosipo(geometry: Any) -> ConeVec:
     """Convert a cone geometry of tomosipo, or its arrays by name; see `ConeVec.from_tomosipo`.
 
-    Other geometries of tomosipo are converted by their `to_vec`.
+    Other geometries of tomosipo are converted by their `to_vec`. Pixels that look like another
+    unit are a warning.
 
     Raises:
-        GeometryError: no cone geometry; the message names what it lacks.
+        GeometryError: no cone geometry (the message names what it lacks), or impossible
+            distances or pixels.
     """
     if not isinstance(geometry, Mapping):
         if hasattr(geometry, "to_vec"):

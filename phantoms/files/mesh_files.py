@@ -440,8 +440,8 @@ def _check_ply(raw: bytes) -> None:
 
 
 def _check_glb(raw: bytes) -> None:
-    """Check that a GLB file refers to no other, claims no more than it holds, and puts
-    each node in one place.
+    """Check that a GLB file refers to no other, claims no more than it holds, puts each
+    node in one place, and has nothing else that `_check_gltf` refuses.
 
     Only the JSON part is parsed, at most `MAX_GLB_DOCUMENT` bytes.
 

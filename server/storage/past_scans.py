@@ -811,7 +811,10 @@ def _frame(
         codec: of the connection, which limits the size.
 
     Raises:
-        LimitError: no such image, a binning that leaves nothing, or no line integrals.
+        LimitError: no such image, a binning that leaves nothing, or line integrals of an
+            image that is no projection.
+        DatasetMissingError: no such data set, its file is gone, or it has no flat images
+            for line integrals.
         RpcError: -32008, too large for the connection.
     """
     scan = _opened(root, asked.name)

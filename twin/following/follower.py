@@ -527,11 +527,13 @@ class Follower:
         """Update the mirror with the end of a command: log line, range of its time,
         positions, settings.
 
-        An error is an alarm `failed`, and the command's motors count as at rest. A move
-        that has passed its trigger stays under way, as superseded. A time outside its
-        bounds by more than `SLACK_S` is a warning `range`. The end of a move records its
-        arrival, that of a question is a reading, others' settings are applied. Without a
-        record, settings and reading are taken alone. Ends count as reported from now on.
+        ERR raises an alarm `failed`, and the command's motors count as at rest; ACK ends
+        that alarm. An ACK of a command with a trigger whose reply begins with POS leaves
+        the move under way, superseded, and nothing more is updated. A time outside its
+        bounds by more than `SLACK_S` is a warning `range`, one within them ends it. The
+        end of a move records its arrival, that of a question is a reading, others'
+        settings are applied. Without a record, settings and reading are taken alone. Ends
+        count as reported from now on.
 
         Args:
             mirror: present state.

@@ -97,7 +97,8 @@ class PanelModel:
             places: (..., 2), column and row [px].
 
         Returns:
-            (..., 2, m): shifts along columns and rows, for m coefficients.
+            (..., 2, m): shifts along columns and rows, for m coefficients in the order of
+            `names`.
         """
         rows, cols = self.shape
         middle = np.array([cols - 1, rows - 1]) / 2

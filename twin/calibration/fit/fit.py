@@ -691,8 +691,9 @@ def _weighted(
         noise: start of the spread of the whitened residuals.
 
     Returns:
-        The last solution, and the spread by which its priors were weighted, `LEAST_NOISE`
-        at least if it is estimated.
+        The last solution, and the spread by which its priors were weighted; after four
+        rounds that have not settled, the one that this solution gave. `LEAST_NOISE` at
+        least if it is estimated.
     """
     for _ in range(4):
         solution = solve(problem, solver, x=x, prior_noise=noise)

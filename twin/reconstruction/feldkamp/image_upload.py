@@ -113,10 +113,11 @@ class ImageUpload:
         self._read[self._chunk] = _recorded(self._read[self._chunk], self._reader)
 
     def _room(self, name: str, shape: tuple[int, ...], some: slice = slice(None)) -> Any:
-        """Return device memory for the array `name` of this chunk.
+        """Return float32 device memory for the array `name` of this chunk.
 
-        It is kept for later chunks and enlarged where too small; so are its views, each of which
-        takes numba longer to make than a small copy.
+        It is kept for later chunks, apart for each of two that alternate, and replaced
+        where too small, which loses the content. Its views are kept, too: each takes
+        numba longer to make than a small copy.
 
         Args:
             name: of the array.

@@ -127,11 +127,12 @@ def _measured(
         values: parameters of the geometry.
         known: gaps by single frames, the best first; None: none.
         step: the most significant one of both ends of rays.
-        axis: its column [px].
+        axis: column of the rotation axis [px].
 
     Returns:
         None if nothing is known, or if the width is below `SIGMAS`; a gap whose width
-        both ends of rays do not determine is returned as it is known.
+        both ends of rays do not determine is returned as it is known. One from a step
+        has at least the step's sigma.
     """
     first = next((gap for gap in known if gap is not None), None)
     if first is not None:
