@@ -225,7 +225,8 @@ def compared(scan: CoarseScan) -> Comparison | None:
     if not trial.telling.any():
         return Comparison(trial, doubtful=False)
     if trial.excess >= MIN_DOUBTFUL_MISFIT or trial.wander > MAX_WANDER:
-        comparison = Comparison(trial, doubtful=True)
+        averaged = trial.scan.binned[1] > scan.binned[1]
+        comparison = Comparison(trial, doubtful=True, averaged=averaged)
         if comparison.contradiction() is None and len(trial.scan.images) < len(
             scan.images
         ):
@@ -234,7 +235,9 @@ def compared(scan: CoarseScan) -> Comparison | None:
     if not trial.whole:
         return None
     trial = _reliable(scan, Trial(scan.thinned(least_rows=RIVALS_ROWS)), RIVALS_ROWS)
-    return Comparison(trial, doubtful=trial.excess >= MIN_DOUBTFUL_MISFIT)
+    averaged = trial.scan.binned[1] > scan.binned[1]
+    doubtful = trial.excess >= MIN_DOUBTFUL_MISFIT
+    return Comparison(trial, doubtful=doubtful, averaged=averaged)
 
 
 def _covered(claimed: float) -> float:
@@ -325,6 +328,7 @@ class Comparison:
             named; else only those are that fit as well and change the volume.
         kinds: see `__init__`.
         excluded_from: see `__init__`.
+        averaged: see `__init__`.
     """
 
     def __init__(
@@ -334,6 +338,7 @@ class Comparison:
         doubtful: bool,
         kinds: frozenset[str] = frozenset(),
         excluded_from: float = MIN_EVIDENCE_SIGMAS,
+        averaged: bool = False,
     ) -> None:
         """Try the opposite rotation and the other suspected geometries, unless no measure
         is reliable ("telling").
@@ -349,8 +354,11 @@ class Comparison:
                 some alone no result is that nothing explains the images.
             excluded_from: least evidence against an explanation that excludes it
                 [standard errors].
+            averaged: columns are averaged (`_reliable`). Of small parts little is left:
+                no explanation is clearly better, but it may fit better.
         """
         self._trial = trial
+        self._averaged = averaged
         self._doubtful = doubtful
         fits = not doubtful or trial.excess <= MAX_MISFIT
         self._unfit = trial.whole and trial.even and not fits
@@ -465,9 +473,11 @@ class Comparison:
     def _clear_score(self) -> float:
         """Score below which an explanation is clearly better than the stated geometry:
         `MAX_BETTER_MISFIT`, or `MAX_MUCH_BETTER_MISFIT` for truncated, uneven or partly
-        unreliable scans.
+        unreliable scans; 0 in averaged columns, where none is.
         """
         trial = self._trial
+        if self._averaged:
+            return 0.0
         if trial.whole and trial.even and trial.telling.all():
             return MAX_BETTER_MISFIT
         return MAX_MUCH_BETTER_MISFIT
