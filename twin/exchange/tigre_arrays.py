@@ -65,7 +65,8 @@ def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 
     Raises:
         ExchangeError: skew pixels, several pixel sizes, an unknown shape, a horizontal
-            panel, or an object's origin that is not between source and panel.
+            panel, a source that is not before the object's origin, or a panel that is not
+            behind the source.
     """
     rows, columns = require_shape(geometry, "TIGRE")
     pitch_u, pitch_v = require_panel(geometry.cone_vec, "TIGRE")

@@ -118,15 +118,15 @@ def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
 
 
 def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
-    """Find the least cost, and how much higher the next local minimum is.
+    """Find the least cost, and the ratio of the next local minimum's cost to it.
 
     Args:
         cost: (n,) costs of equally spaced trials; inf: not tried.
         apart: least distance between two minima, in trials.
 
     Returns:
-        Index of the least cost, and the next minimum's cost over it: inf without another,
-        0 if the least cost is at an end or next to a trial that was not made.
+        Index of the least cost, and the ratio, of minima more than `apart` away: inf
+        without another, 0 if the least cost is at an end or next to a trial that was not made.
     """
     best = int(cost.argmin())
     inner = cost[1:-1]

@@ -129,7 +129,7 @@ def _linking(codegen: Any) -> Iterator[None]:
     """Link all libraries made within the context to one another; within another such
     context this one changes nothing.
 
-    A global of an environment that exists already is not set again.
+    The global of an environment is set only where the engine has it already.
     """
     if "_library_class" in vars(codegen):
         yield

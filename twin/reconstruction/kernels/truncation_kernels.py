@@ -60,6 +60,9 @@ def _edge_mean(line, before, first, last, lower, upper, share, across, high):
     """Average a row less the prisms' path lengths over columns first <= c < last of the
     panel; 0 without columns.
 
+    The lengths are those of both bands, interpolated by `share`, times the root of
+    `across` + `high`.
+
     Args:
         line: the panel's row.
         before: columns before it among the widened ones.
