@@ -426,8 +426,9 @@ class Comparison:
     def undecided(
         self, claimed: float, *, sides_known: bool = False
     ) -> Contradiction | None:
-        """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`) and would
-        change the volume by more than is claimed (`_covered`); and those that fit better
+        """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`)
+        or better by `MIN_EVIDENCE_SIGMAS` and would change the volume by more than is
+        claimed (`_covered`); and those that fit better
         (`_fits_better`) and change it by `MIN_CHANGE`.
 
         Args:
@@ -451,7 +452,10 @@ class Comparison:
             if one.evidence < self._least_evidence_against(one)
             and not (sides_known and one.suspect.kind in SIDES)
             and one.change > (MIN_CHANGE if _fits_better(one) else covered)
-            and (_residual_is_less(one) or trial.fits_as_well(one, EQUAL_MISFIT_RATIO))
+            and (
+                one.evidence < -MIN_EVIDENCE_SIGMAS
+                or trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
+            )
         ]
         if not trial.whole or not rivals:
             return None
