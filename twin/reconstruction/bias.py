@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import Final
 
@@ -28,6 +28,7 @@ from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, NODES, CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import (
+    SMOOTH_CHANGE_SHARE,
     Contradiction,
     Undetermined,
     compared,
@@ -37,8 +38,8 @@ from flexdt.twin.reconstruction.consistency.agreement import (
 from flexdt.twin.reconstruction.uniform_nodes import MIN_EVENNESS, UniformNodes
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
-SAFETY_FACTOR: Final = 3.0
-"""Factor of the bound: the smooth coarse volume shows a third of what flaws take away."""
+SAFETY_FACTOR: Final = 1.0 / SMOOTH_CHANGE_SHARE
+"""Factor of the bound, which makes up for what the smooth coarse volume does not show."""
 PRISM_ERROR_SHARE: Final = 0.15
 """Share of a prism's part beyond the edges that may be wrong if it explains the
 images."""
@@ -172,7 +173,9 @@ def bias_of(
         steep helix or of neither a circle nor a helix.
     """
 
+    @cache
     def copied(nodes: int) -> CoarseScan:
+        """Make a coarse copy, which reads all images; each once."""
         return CoarseScan.of(image, cone_vec, shape, truncation, nodes)
 
     try:
@@ -184,13 +187,13 @@ def bias_of(
 def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     """Reconstruct a coarse scan and bound its errors, cause by cause.
 
-    If images and geometry contradict each other, a misfit that nothing explains also on a
-    finer copy, nothing else is bounded. Bounds are
-    `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
-    the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
-    complete rows their level beside the object ("drift"). A whole scan whose images fit
-    another geometry as well, also those of a finer copy, or do not show whether they fit
-    their own, has a contradiction besides its causes.
+    If images and geometry contradict each other, nothing else is bounded; a misfit that
+    nothing explains must be there on a finer copy, too. Bounds are `SAFETY_FACTOR` times
+    the change of the coarse volume by each flaw: missing angles, the rungs of `ladder`,
+    another continuation of truncated rows ("beyond"), or for complete rows their level
+    beside the object ("drift"). A whole scan whose images fit another geometry as well,
+    also those of a finer copy, or do not show whether they fit their own, has a
+    contradiction besides its causes.
 
     Args:
         copied: makes a coarse copy of the whole scan, of so many nodes.

@@ -28,7 +28,7 @@ MAX_MISFIT: Final = 2.5
 """Largest residual of fitting images, over that of the volume's second reconstruction. Of
 127 right scans (`tests/studies/misfits.py --right`, seeds 7071, 8484 and 12121) half have
 1.4 and more, 1 % have 2.25 and more, and one has 2.52: above this are at most 3.7 % (95 %
-confidence), which a finer copy is asked about (`still_misfits`)."""
+confidence), and a finer copy decides (`still_misfits`)."""
 MAX_BETTER_MISFIT: Final = 0.92
 """Misfit of an explanation, relative to the stated geometry's, below which it is
 better: right scans have 0.96 and more."""
@@ -46,7 +46,7 @@ MIN_CHANGE: Final = 0.01
 """Least relative change of uniform regions by an explanation that is named: a tilted
 panel's images may fit mirrored rows better, whose volume is the same."""
 SMOOTH_CHANGE_SHARE: Final = 1.0 / 3.0
-"""Share of a volume's change that the smooth coarse one shows: that of `bias.SAFETY_FACTOR`."""
+"""Share of a volume's change by a flaw that the smooth coarse volume shows."""
 MAX_UNTOLD_CHANGE: Final = 0.1
 """Largest relative change of uniform regions by an explanation as likely that a claim of
 larger errors covers."""
@@ -225,8 +225,7 @@ def compared(scan: CoarseScan) -> Comparison | None:
     if not trial.telling.any():
         return Comparison(trial, doubtful=False)
     if trial.excess >= MIN_DOUBTFUL_MISFIT or trial.wander > MAX_WANDER:
-        averaged = trial.scan.binned[1] > scan.binned[1]
-        comparison = Comparison(trial, doubtful=True, averaged=averaged)
+        comparison = Comparison(trial, doubtful=True)
         if comparison.contradiction() is None and len(trial.scan.images) < len(
             scan.images
         ):
@@ -235,9 +234,7 @@ def compared(scan: CoarseScan) -> Comparison | None:
     if not trial.whole:
         return None
     trial = _reliable(scan, Trial(scan.thinned(least_rows=RIVALS_ROWS)), RIVALS_ROWS)
-    averaged = trial.scan.binned[1] > scan.binned[1]
-    doubtful = trial.excess >= MIN_DOUBTFUL_MISFIT
-    return Comparison(trial, doubtful=doubtful, averaged=averaged)
+    return Comparison(trial, doubtful=trial.excess >= MIN_DOUBTFUL_MISFIT)
 
 
 def _covered(claimed: float) -> float:
@@ -257,19 +254,14 @@ def _shift_scatter(movement: Tried) -> float:
 
 
 def _fits_better(one: Tried) -> bool:
-    """Return whether an explanation fits better than the stated geometry
-    (`_residual_is_less`).
-
-    One with a figure that was found by trials (`FOUND_BY_TRIALS`) never does: the best of
-    many small movements always fits a little better, and a claim covers it.
-    """
-    return one.suspect.kind not in FOUND_BY_TRIALS and _residual_is_less(one)
-
-
-def _residual_is_less(one: Tried) -> bool:
     """Return whether an explanation's residual is less than the stated geometry's, by
     `MIN_FINE_EVIDENCE_SIGMAS` and by `EQUAL_MISFIT_RATIO`.
+
+    One with a figure that was found by trials (`FOUND_BY_TRIALS`) never fits better: the
+    best of many small movements always does a little, and a claim covers it.
     """
+    if one.suspect.kind in FOUND_BY_TRIALS:
+        return False
     less = one.residual * EQUAL_MISFIT_RATIO < 1.0
     return less and one.evidence < -MIN_FINE_EVIDENCE_SIGMAS
 
@@ -328,7 +320,6 @@ class Comparison:
             named; else only those are that fit as well and change the volume.
         kinds: see `__init__`.
         excluded_from: see `__init__`.
-        averaged: see `__init__`.
     """
 
     def __init__(
@@ -338,7 +329,6 @@ class Comparison:
         doubtful: bool,
         kinds: frozenset[str] = frozenset(),
         excluded_from: float = MIN_EVIDENCE_SIGMAS,
-        averaged: bool = False,
     ) -> None:
         """Try the opposite rotation and the other suspected geometries, unless no measure
         is reliable ("telling").
@@ -354,11 +344,8 @@ class Comparison:
                 some alone no result is that nothing explains the images.
             excluded_from: least evidence against an explanation that excludes it
                 [standard errors].
-            averaged: columns are averaged (`_reliable`). Of small parts little is left:
-                no explanation is clearly better, but it may fit better.
         """
         self._trial = trial
-        self._averaged = averaged
         self._doubtful = doubtful
         fits = not doubtful or trial.excess <= MAX_MISFIT
         self._unfit = trial.whole and trial.even and not fits
@@ -426,10 +413,9 @@ class Comparison:
     def undecided(
         self, claimed: float, *, sides_known: bool = False
     ) -> Contradiction | None:
-        """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`)
-        or better by `MIN_EVIDENCE_SIGMAS` and would change the volume by more than is
-        claimed (`_covered`); and those that fit better
-        (`_fits_better`) and change it by `MIN_CHANGE`.
+        """Find explanations that fit as well (within `EQUAL_MISFIT_RATIO`, or better by
+        `MIN_EVIDENCE_SIGMAS`) and would change the volume by more than a claim covers
+        (`_covered`), or that fit better (`_fits_better`) and change it by `MIN_CHANGE`.
 
         Args:
             claimed: largest relative error that is claimed of nine of ten uniform
@@ -477,11 +463,9 @@ class Comparison:
     def _clear_score(self) -> float:
         """Score below which an explanation is clearly better than the stated geometry:
         `MAX_BETTER_MISFIT`, or `MAX_MUCH_BETTER_MISFIT` for truncated, uneven or partly
-        unreliable scans; 0 in averaged columns, where none is.
+        unreliable scans.
         """
         trial = self._trial
-        if self._averaged:
-            return 0.0
         if trial.whole and trial.even and trial.telling.all():
             return MAX_BETTER_MISFIT
         return MAX_MUCH_BETTER_MISFIT

@@ -54,6 +54,8 @@ class Reprojection:
         """Reconstruct images as of a geometry, and project the volume again coarsely; NaN
         voxels count as 0.
 
+        The object is raised or lowered by at most half a layer of the grid first (`_on_layers`).
+
         Args:
             scan: gives the grid.
             images: (n, rows, cols).
@@ -67,6 +69,7 @@ class Reprojection:
             None where FDK cannot use the geometry.
         """
         straight = images if shifts is None else shifted_back(images, shifts)
+        cone_vec = _on_layers(scan, cone_vec)
         try:
             values = scan.fdk(straight, cone_vec, truncation)
         except GeometryError:
@@ -134,6 +137,25 @@ class Reprojection:
         neighbours that the reprojection has as well are the object's.
         """
         return max(self.image_noise - noise_of(self.again), 0.0)
+
+
+def _on_layers(scan: CoarseScan, cone_vec: ConeVec) -> ConeVec:
+    """Move a geometry along z by at most half a layer, so that its rows fall on the grid's
+    layers as those of the scan do.
+
+    Else a panel that is moved along columns by half a row leaves up to two fifths less of
+    fine parts' residual, whatever the object.
+
+    Args:
+        scan: gives the grid and the stated geometry.
+        cone_vec: n views.
+    """
+    fall = scan.cone_vec.v[:, 2]
+    rows = float(((cone_vec.detector - scan.cone_vec.detector)[:, 2] / fall).mean())
+    layers = np.sign(fall.mean()) * (round(rows) - rows)
+    if layers == 0.0:
+        return cone_vec
+    return cone_vec.moved(np.eye(3), [0.0, 0.0, layers * scan.grid.voxel_xyz[2]])
 
 
 def shifted_back(images: Float32Array, shifts: FloatArray) -> Float32Array:
