@@ -20,6 +20,8 @@ import numpy as np
 from causes_named import WRONG_SIGMAS, calibrated
 from faults_drawn import drawn
 
+from flexdt.twin.errors import TwinError
+
 KIND: Final = "as_assumed"
 MOST_REFUSED: Final = 0.02
 """Largest share of right scans that may be refused."""
@@ -45,7 +47,10 @@ class Covered:
 def covered(seed: int) -> Covered | None:
     """Calibrate a drawn right scan and compare it with its truth; None if it is refused."""
     scan = drawn(KIND, seed)
-    result = calibrated(scan)
+    try:
+        result = calibrated(scan)
+    except TwinError:
+        return None
     if not result.identifiable or result.fit is None:
         return None
     certificate = result.fit.certificate

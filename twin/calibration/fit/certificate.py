@@ -9,7 +9,7 @@ states it. `diagnose` looks for the causes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -258,8 +258,8 @@ class Certificate:
     Attributes:
         estimates: column -> value and uncertainty; empty of meaning (nan) where not determined.
         covariance: (p, p) of the reported columns, edge units, enlargement included.
-        bend: (p, p) of the second-order term that the covariance lacks, edge units: the region
-            of likely values is not quite an ellipsoid (`curved_region`).
+        bend: computes the (p, p) of the second-order term that the covariance lacks, edge
+            units: the region of likely values is not quite an ellipsoid (`curved_region`).
         correlation: (p, p).
         spectrum: rank, condition, null and weak directions.
         dof: degrees of freedom of s^2, after allowing for correlated residuals.
@@ -279,7 +279,7 @@ class Certificate:
 
     estimates: dict[str, Estimate]
     covariance: FloatArray
-    bend: FloatArray
+    bend: Callable[[], FloatArray]
     correlation: FloatArray
     spectrum: Conditioning
     dof: float
@@ -362,7 +362,7 @@ class Certificate:
         names = list(self.estimates)
         at = [names.index(n) for n in truth]
         d = np.array([v - self.estimates[n].value for n, v in truth.items()])
-        whole = self.covariance + self.bend
+        whole = self.covariance + self.bend()
         return float(d @ np.linalg.solve(whole[np.ix_(at, at)], d))
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
@@ -495,11 +495,8 @@ def certify(
     shared = False
     turning = 0.0
     moving: tuple[Drift, ...] = ()
-    bend = np.zeros_like(covariance)
+    bend: Callable[[], FloatArray] = partial(np.zeros_like, covariance)
     if spec.full and noise > MAX_ROUNDING:
-        bend = bend_covariance(
-            problem, x, jac[keep] / factor, keep, factor, spec.unit_covariance, noise
-        )[:reported, :reported]
         left = Residuals(
             problem,
             jac[keep] / factor,
@@ -508,6 +505,7 @@ def certify(
             spec.unit_covariance,
             noise,
         )
+        bend = partial(bend_covariance, left, x, factor, reported)
         covariance, shared, turning, moving = _widened(
             left, predicted, covariance, prior, sampling_px
         )

@@ -11,9 +11,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from flexdt.twin.calibration.fit.problem import FitProblem
+from flexdt.twin.calibration.fit.residual_structure import Residuals
 from flexdt.twin.geometry.conventions import FloatArray
 
 MOST_DIRECTIONS: Final = 10
@@ -24,13 +23,7 @@ images by, were other columns at rest, from which its bend is computed."""
 
 
 def bend_covariance(
-    problem: FitProblem,
-    x: FloatArray,
-    rows: FloatArray,
-    keep: npt.NDArray[np.bool_],
-    factor: FloatArray,
-    unit_covariance: FloatArray,
-    noise: float,
+    left: Residuals, x: FloatArray, factor: FloatArray, reported: int
 ) -> FloatArray:
     """Compute the covariance of the second-order term that a linear fit neglects.
 
@@ -41,36 +34,35 @@ def bend_covariance(
     eigenvectors in units of what the images show.
 
     Args:
-        problem: the data.
+        left: residuals at `x`, with their derivatives, covariance and noise.
         x: (p,) column values, internal units.
-        rows: (m, p) whitened Jacobian of the used coordinates, edge units.
-        keep: (2 n k,) coordinates that are used.
         factor: (p,) edge over internal units.
-        unit_covariance: (p, p) in edge units, of unit noise, priors included.
-        noise: standard deviation of the whitened residuals.
+        reported: number of the first columns, which are returned.
 
     Returns:
-        (p, p) in edge units; 0 where nothing is open.
+        (reported, reported) in edge units; 0 where nothing is open.
     """
-    size = np.linalg.norm(rows, axis=0)
+    problem = left.problem
+    keep = left.keep
+    unit_covariance = left.unit_covariance
+    size = np.linalg.norm(left.jacobian, axis=0)
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(unit_covariance * np.outer(size, size))
     values = values[-MOST_DIRECTIONS:]
     vectors = vectors[:, -MOST_DIRECTIONS:]
     long = values > LEAST_LENGTH_SIGMAS**2
-    root = noise * np.sqrt(values[long]) * vectors[:, long] / size[:, None]
+    root = left.noise * np.sqrt(values[long]) * vectors[:, long] / size[:, None]
     steps = (root / factor[:, None]).T
     out = np.zeros_like(unit_covariance)
     mean = np.zeros(len(x))
-    here = problem.whitened(x).ravel()[keep]
     moved = [problem.whitened(x + step).ravel()[keep] for step in steps]
-    gain = unit_covariance @ rows.T
+    gain = unit_covariance @ left.jacobian.T
     for i, step in enumerate(steps):
         for j in range(i + 1):
             both = problem.whitened(x + step + steps[j]).ravel()[keep]
-            bend = gain @ (both - moved[i] - moved[j] + here)
+            bend = gain @ (both - moved[i] - moved[j] + left.values)
             share = 0.5 if i == j else 1.0
             out += share * np.outer(bend, bend)
             if i == j:
                 mean += 0.5 * bend
-    return out + np.outer(mean, mean)
+    return np.asarray((out + np.outer(mean, mean))[:reported, :reported])

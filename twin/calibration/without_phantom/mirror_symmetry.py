@@ -420,8 +420,8 @@ class _MirrorPairs:
             noise.append(float(power @ (low - high)) / width)
         return np.asarray((self.slopes.T * self.w) @ rest - np.array(noise))
 
-    def _rest(self) -> FloatArray:
-        rest = self._residual(self.here)
+    def _rest(self, which: int = 0) -> FloatArray:
+        rest = self._residual(self.here, which)
         return np.asarray(rest - self.odd @ (self.to_odd @ rest))
 
     def _power(self) -> tuple[float, float]:
@@ -441,10 +441,9 @@ class _MirrorPairs:
         a mean that is not symmetric.
         """
         total = 0.0
-        for i in range(1, len(self.own)):
-            rest = self._residual(self.here, i)
-            rest = rest - self.odd @ (self.to_odd @ rest)
-            total += float(np.average(np.square(rest), weights=self.w))
+        for copy in range(1, len(self.own)):
+            squares = np.square(self._rest(copy))
+            total += float(np.average(squares, weights=self.w))
         return total
 
     def asymmetry(self) -> float:

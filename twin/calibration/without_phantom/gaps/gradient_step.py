@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.calibration.without_phantom.turn import MEDIAN_OF_CHI_SQUARE
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -38,8 +39,6 @@ ROBUST_ROUNDS: Final = 20
 """Rounds of the reweighted line through all borders."""
 OUTLYING_SIGMAS: Final = 2.0
 """Residuals, in standard deviations, from which a border counts less in that line."""
-ROBUST: Final = 1.4826
-"""Standard deviation over the median of absolute deviations."""
 
 
 class GradientSteps(NamedTuple):
@@ -86,9 +85,7 @@ def gradient_steps(
     over = np.where(known, whole, 1.0)
     width = (excess.sum(axis=0) - line.offset - line.slope * whole) / over
     rest = excess - line.offset / frames - (line.slope + width) * power
-    blocks = np.add.reduceat(rest, np.arange(0, frames, BLOCK_FRAMES), axis=0)
-    own = np.sqrt(np.square(blocks).sum(axis=0))
-    sigma = np.hypot(own, line.scatter) / over
+    sigma = np.hypot(scatter_of_sums(rest), line.scatter) / over
     return GradientSteps(
         np.where(known, width, 0.0), np.where(known, sigma, UNKNOWN_WIDTH_PX)
     )
@@ -124,3 +121,14 @@ def _usual_line(power: FloatArray, excess: FloatArray) -> UsualLine:
         scatter = ROBUST * float(np.median(np.abs(rest))) + 1e-300
         weight = 1.0 / np.sqrt(1.0 + np.square(rest / (OUTLYING_SIGMAS * scatter)))
     return UsualLine(float(fitted[0]), float(fitted[1]), scatter)
+
+
+def scatter_of_sums(values: FloatArray) -> FloatArray:
+    """Compute the standard deviation of sums over frames, (c,), from those of blocks of
+    `BLOCK_FRAMES` neighbours: frames beside each other show the same edges.
+
+    Args:
+        values: (n, c) of n frames.
+    """
+    blocks = np.add.reduceat(values, np.arange(0, len(values), BLOCK_FRAMES), axis=0)
+    return np.asarray(np.sqrt(np.square(blocks).sum(axis=0)))

@@ -20,10 +20,11 @@ import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d
 from scipy.special import log_softmax, logsumexp, softmax
 
+from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
 from flexdt.twin.calibration.without_phantom.gaps.gradient_step import (
-    BLOCK_FRAMES,
     gradient_steps,
+    scatter_of_sums,
 )
 from flexdt.twin.calibration.without_phantom.tile_gap import (
     SIDE,
@@ -153,8 +154,8 @@ def hidden_gap(
 
     Returns:
         The range of columns in which one may be hidden, its probability, its root mean
-        square width (a share `OPEN_SHARE` of the usual width at least, where the odds
-        exceed 1 / `REPORTED_ODDS`), and the likeliest gap if its odds exceed
+        square width (a share `OPEN_SHARE` of the usual width at least, where it is
+        `open`), and the likeliest gap if its odds exceed
         `REPORTED_ODDS`; None for images of too few columns about the axis.
     """
     if profile:
@@ -296,7 +297,8 @@ def _evidence(images: FloatArray) -> Evidence:
 
     The `EDGE_SHARE` of all places with most change (at most `MOST_EDGES`) tell whether
     there is a gap. Whether one would be visible is told by the edges among them that pass
-    its border: noise shows none. The larger evidence of both counts.
+    its border: noise shows none. The larger evidence of both counts, and that of gradients
+    in smooth places (`gradient_steps`) is added.
 
     Args:
         images: frames of columns about the axis, (n, rows, c + 2 SIDE - 1).
@@ -426,9 +428,8 @@ def _beside_others(gains: FloatArray, count: FloatArray) -> Judged:
     rate = float(np.median(whole[count > 0.0] / count[count > 0.0]))
     usual = rate * count
     own = np.sqrt(passed)
-    between = 1.4826 * float(np.median((np.abs(whole - usual) / own)[count > 0.0]))
-    blocks = np.add.reduceat(gains, np.arange(0, len(gains), BLOCK_FRAMES), axis=0)
-    of_frames = np.sqrt(np.square(blocks).sum(axis=0)) / own
+    between = ROBUST * float(np.median((np.abs(whole - usual) / own)[count > 0.0]))
+    of_frames = scatter_of_sums(gains) / own
     spread = max(between, float(np.median(of_frames[count > 0.0])), 1e-6) * own
     excess = (whole - usual) / spread
     # Where the model fits, a gap gains what it loses elsewhere, and its variance is twice its
