@@ -105,7 +105,7 @@ class Pace:
             self.first, self.since_s = done, now_s
 
     def left_s(self, done: float, now_s: float) -> float | None:
-        """Estimate the time left at the pace since the first call of `advance` [s].
+        """Estimate the time left at the pace since the first fraction above 0 [s].
 
         Args:
             done: fraction.

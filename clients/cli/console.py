@@ -244,8 +244,7 @@ class ProgressBar:
     ) -> None:
         """Prepare a bar, which nothing draws yet.
 
-        None for `terminal` finds that out. Entering draws it; elapsed time counts from
-        now on.
+        None for `terminal` finds that out. Entering draws it.
 
         Args:
             title: of the work.

@@ -25,7 +25,8 @@ NO_LIGHT: Final = (
     "the flat field is nowhere brighter than the dark image: was the tube off?"
 )
 LEAST_LIGHT: Final = 1e-6
-"""Least open beam of a pixel of images on another scale, as a share of the brightest."""
+"""Open beam above which a pixel of images on another scale is live, as a share of the
+brightest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +96,7 @@ class LineIntegrals:
         np.maximum(out, np.float32(MIN_COUNTS), out=out)
         np.log(out, out=out)
         np.subtract(self.log_open, out, out=out)
-        if len(self.before):
-            flat = out.reshape(-1)
-            out[self.dead] = (1.0 - self.weight) * flat[self.before] + self.weight * flat[
-                self.after
-            ]
+        _interpolate(out, self.dead, self.before, self.after, self.weight)
         return out
 
 
@@ -132,11 +129,25 @@ def of_intensities(
     light = (np.asarray(images, dtype=np.float32) - dark) / opened
     least = np.finfo(np.float32).tiny
     out = np.asarray(-np.log(np.maximum(light, least)), dtype=np.float32)
-    before, after, weight = _neighbours(dead)
-    if len(before):
-        pixels = out.reshape(len(out), -1)
-        out[:, dead] = (1.0 - weight) * pixels[:, before] + weight * pixels[:, after]
+    _interpolate(out, dead, *_neighbours(dead))
     return out
+
+
+def _interpolate(
+    out: Float32Array,
+    dead: npt.NDArray[np.bool_],
+    before: npt.NDArray[np.intp],
+    after: npt.NDArray[np.intp],
+    weight: Float32Array,
+) -> None:
+    """Replace the dead pixels of images (..., rows, cols), in place, by those of
+    `_neighbours`; nothing without any.
+    """
+    if len(before):
+        pixels = out.reshape(*out.shape[:-2], -1)
+        out[..., dead] = (1.0 - weight) * pixels[..., before] + weight * pixels[
+            ..., after
+        ]
 
 
 def _neighbours(

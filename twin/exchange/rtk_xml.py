@@ -189,8 +189,9 @@ def read_rtk(
                 _take(entry, values, file)
             matrix = _matrix(element, where)
             numbers = tuple(values[n] for n in NAMES)
+            distances = numbers[3], numbers[4]
             if matrix is not None and not any(numbers):
-                numbers, row = view_of_matrix(matrix, pitch_mm, where)
+                distances, row = view_of_matrix(matrix, pitch_mm, where)
             elif values["SourceToDetectorDistance"] == 0.0:
                 problem = f"{where} is parallel (no source-detector distance)"
                 raise ExchangeError.instead(problem, 0.0, "a cone beam", row=len(rows))
@@ -199,7 +200,7 @@ def read_rtk(
                 if matrix is not None:
                     twice.append((where, matrix, numbers))
             rows.append(row)
-            stated.append((numbers[3], numbers[4]))
+            stated.append(distances)
         else:
             _take(element, common, file)
     _require_distances(stated, file)
@@ -250,8 +251,8 @@ def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArr
 
 def view_of_matrix(
     matrix: FloatArray, pitch_mm: tuple[float, float], where: str
-) -> tuple[tuple[float, ...], FloatArray]:
-    """Compute the nine numbers and the cone_vec row of a projection matrix; the inverse of
+) -> tuple[tuple[float, float], FloatArray]:
+    """Compute the distances and the cone_vec row of a projection matrix; the inverse of
     `matrix_of`, whatever factor the matrix has.
 
     Args:
@@ -260,7 +261,7 @@ def view_of_matrix(
         where: file and view, for messages.
 
     Returns:
-        Nine numbers in the order of `NAMES` [deg, mm], and the row (12,) [mm].
+        Distances of the source to isocentre and to detector [mm], and the row (12,) [mm].
 
     Raises:
         ExchangeError: the matrix is singular or parallel, or is that of no flat panel with
@@ -288,7 +289,7 @@ def view_of_matrix(
     centre = px * u + py * v + (sid - sdd) * normal
     parts = (source, centre, u * pitch_mm[0], v * pitch_mm[1])
     row = np.concatenate([TO_RTK.T @ part for part in parts])
-    return parameters_of(row), row
+    return (sid, sdd), row
 
 
 def _matrix(view: ElementTree.Element, where: str) -> FloatArray | None:

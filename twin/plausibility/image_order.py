@@ -20,6 +20,7 @@ from flexdt.twin.plausibility.findings import Finding, Severity
 NUMBER: Final = re.compile(r"(?P<sign>[-+]?)(?P<whole>\d+)(?P<part>\.\d+)?")
 SCIENTIFIC: Final = re.compile(r"\d\.\d+[eE][-+]\d{2}(?!\d)")
 """A number with a power of ten, as `%e` writes it."""
+DECIMAL: Final = "0123456789"
 HEXADECIMAL: Final = "0123456789abcdefABCDEF"
 SIGNED_AFTER: Final = frozenset("_ =(,")
 """Characters, or the name's beginning, after which a hyphen is a minus sign."""
@@ -89,32 +90,15 @@ def _numbered(names: list[str]) -> Ordered | None:
         unequal length, several differing parts, uneven steps, or a number next to a sign,
         decimal point or another number.
     """
-    if len(names) < 2 or len({*map(len, names)}) != 1:
+    split = _split(names, DECIMAL)
+    if split is None:
         return None
-    first = names[0]
-    last = names[-1]
-    at = next(i for i, (a, b) in enumerate(zip(first, last, strict=True)) if a != b)
-    start = len(first[:at].rstrip("0123456789"))
-    end = start + len(first[start:]) - len(first[start:].lstrip("0123456789"))
-    before = first[:start]
-    after = first[end:]
-    if (
-        end == start
-        or before.endswith(("-", "+", "."))
-        or NUMBER.match(after[:2].lstrip("."))
-    ):
+    before, parts, after = split
+    if before.endswith(("-", "+", ".")) or NUMBER.match(after[:2].lstrip(".")):
         return None
-    parts = [name[start:end] for name in names]
     if not all(map(str.isdigit, parts)):
         return None
-    if not all(n.startswith(before) and n.endswith(after) for n in names):
-        return None
-    numbers = [*map(int, parts)]
-    step, rest = divmod(numbers[-1] - numbers[0], len(names) - 1)
-    even = not rest and numbers == [*range(numbers[0], numbers[-1] + 1, step)]
-    if even:
-        return Ordered(tuple(names))
-    return None
+    return _even(names, [*map(int, parts)])
 
 
 def _hexadecimal(names: list[str]) -> Ordered | None:
@@ -128,22 +112,46 @@ def _hexadecimal(names: list[str]) -> Ordered | None:
         The names in that order, without findings. None for other names, and where no
         number or every number has a letter.
     """
+    split = _split(names, HEXADECIMAL)
+    if split is None:
+        return None
+    _, parts, _ = split
+    plain = sum(map(str.isdigit, parts))
+    if not 0 < plain < len(names) or any(part.strip(HEXADECIMAL) for part in parts):
+        return None
+    return _even(names, [int(part, 16) for part in parts])
+
+
+def _split(names: list[str], digits: str) -> tuple[str, list[str], str] | None:
+    """Split names of one length around the number in which they differ.
+
+    Args:
+        names: sorted, without repetition.
+        digits: of which the number is, after its first decimal ones.
+
+    Returns:
+        The text before it, the numbers, and the text after it. None for fewer than two
+        names, unequal lengths, or several differing parts.
+    """
     if len(names) < 2 or len({*map(len, names)}) != 1:
         return None
     first = names[0]
     at = next(i for i, (a, b) in enumerate(zip(first, names[-1], strict=True)) if a != b)
-    before = first[:at].rstrip("0123456789")
-    after = first[len(before) :].lstrip(HEXADECIMAL)
-    parts = [name[len(before) : len(name) - len(after)] for name in names]
-    plain = sum(map(str.isdigit, parts))
-    if not 0 < plain < len(names) or any(part.strip(HEXADECIMAL) for part in parts):
-        return None
+    before = first[:at].rstrip(DECIMAL)
+    after = first[len(before) :].lstrip(digits)
     if not all(n.startswith(before) and n.endswith(after) for n in names):
         return None
-    steps = {*np.diff([int(part, 16) for part in parts]).tolist()}
-    if len(steps) == 1 and min(steps) > 0:
-        return Ordered(tuple(names))
-    return None
+    return before, [n[len(before) : len(n) - len(after)] for n in names], after
+
+
+def _even(names: list[str], numbers: list[int]) -> Ordered | None:
+    """Return names as they are if their numbers, two at least, rise in even steps, else
+    None.
+    """
+    step, rest = divmod(numbers[-1] - numbers[0], len(numbers) - 1)
+    if rest or step <= 0 or numbers != [*range(numbers[0], numbers[-1] + 1, step)]:
+        return None
+    return Ordered(tuple(names))
 
 
 def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:

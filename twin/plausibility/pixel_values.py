@@ -92,9 +92,10 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
             f"line integrals of {beam:.4g} at the images' edges, less behind the object"
         )
         yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, beam)
-    elif OPEN[0] < beam < OPEN[1] and darker > 1e-3 and brighter < MAX_BRIGHT_SHARE:
+    elif beam < OPEN[1] and darker > TAIL and brighter < MAX_BRIGHT_SHARE:
         open_share = float(((values > OPEN[0] * beam) & (values < OPEN[1] * beam)).mean())
-        if open_share > MIN_BEAM_SHARE and float(np.quantile(values, 1e-3)) > -0.1:
+        lowest = float(np.quantile(values, TAIL))
+        if open_share > MIN_BEAM_SHARE and lowest > MIN_NEGATIVE_INTEGRAL:
             cause = (
                 f"values are {beam:.3g} at the images' edges and less behind the object, as "
                 "transmission is"

@@ -259,12 +259,12 @@ def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
     gap as many `TIMES_USUAL` that mean. Yields at most one finding, its figure the gap
     [deg]. Opposite directions count as one. Views that do not turn about z leave out a
     plane if all beams are more than `UNSEEN_DEG` from it, its figure that angle [deg].
-    Nothing for fewer than 3 views or directions about z.
+    Nothing for fewer than 3 views, or directions about z.
     """
+    if len(cone_vec) < 3:
+        return
     if not about_z(cone_vec):
         yield from _plane_findings(cone_vec)
-        return
-    if len(cone_vec) < 3:
         return
     at = np.unique((azimuths(cone_vec) % math.pi).round(6) % round(math.pi, 6))
     if len(at) < 3:
@@ -294,10 +294,8 @@ def _plane_findings(cone_vec: ConeVec) -> Iterator[Finding]:
     beam [deg]; nothing for so few views that they would leave it out by chance.
 
     Args:
-        cone_vec: n views.
+        cone_vec: 3 views or more.
     """
-    if not len(cone_vec):
-        return
     beams = cone_vec.detector - cone_vec.source
     beams = beams / np.linalg.norm(beams, axis=1, keepdims=True)
     sines = np.abs(_normals(PROBES) @ beams.T).min(axis=1)

@@ -265,18 +265,18 @@ def _geometry(
     if rows is not None:
         return ConeVec(rows[:]), []
     angles = _angles(file, name, projections)
-    lengths = {what: _length(file, name, *places) for what, places in LENGTHS.items()}
+    lengths = {
+        what: _length(file, name, *places)
+        for what, places in LENGTHS.items()
+        if distances is None or "size" in what
+    }
+    missing = [w for w, length in lengths.items() if w in NEEDED_LENGTHS and not length]
     if distances is not None:
         sod, sdd = distances
         impossible = distance_findings(sod, sdd, lengths["x_pixel_size"] or 1e-9 * sdd)
         settled(impossible, DatasetFormatError, f"{path}: distances={distances}")
         lengths |= {"source distance": sod, "detector distance": sdd - sod}
     pixel = lengths["x_pixel_size"]
-    missing = [
-        what
-        for what, length in lengths.items()
-        if what in NEEDED_LENGTHS and not length and (distances is None or "size" in what)
-    ]
     if angles is None:
         missing.insert(0, "rotation_angle")
     if missing or angles is None or pixel is None:

@@ -376,15 +376,15 @@ def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
 
 
 def _require_own(fields: Mapping[str, str], own: Mapping[str, str]) -> None:
-    """Check that a header states what each file of flexdt has: a form of values that is
-    read as it is.
+    """Check that a header contradicts nothing that each file of flexdt states: a form of
+    values that is read as it is. Fields that are missing pass.
 
     Args:
         fields: of the file.
         own: `NRRD_FIELDS` or `MHA_FIELDS`.
 
     Raises:
-        ValueError: names the first field that does not.
+        ValueError: names the first field that does.
     """
     for key, value in own.items():
         if value and fields.get(key, value) != value:

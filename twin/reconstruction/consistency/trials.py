@@ -19,7 +19,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.acquisition.trajectory import narrow_overlap
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.movement import moving, wandering
-from flexdt.twin.reconstruction.consistency.reprojection import Reprojection
+from flexdt.twin.reconstruction.consistency.reprojection import Reprojection, lowered
 from flexdt.twin.reconstruction.consistency.suspects import (
     Suspect,
     moved,
@@ -281,7 +281,8 @@ class Trial:
         nodes = self._nodes
         values = shown.values
         if suspect.kind in UPSIDE_DOWN:
-            values = values[::-1]
+            # Images are mirrored about the panel's middle, the grid about the copy's.
+            values = lowered(values[::-1], self.scan.rest[0])
         if better:
             theirs = UniformNodes.of(values, self.scan.rim)
             sides = [(nodes, theirs.found), (theirs, nodes.found)]
