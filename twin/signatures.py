@@ -211,12 +211,14 @@ def _type(value: Any) -> Any:
     """Return what decides whether a value is allowed: its type, for an array (dtype,
     ndim), for a tuple those of its members; None where the content decides, too.
 
-    That is so for mappings, lists, texts and arrays of one dimension.
+    That is so for mappings, lists, texts, arrays of one dimension and masked arrays.
     """
     if type(value) is tuple:
         inner = tuple(map(_type, value))
         return None if None in inner else inner
     if isinstance(value, Mapping | list | tuple | str) or getattr(value, "ndim", 0) == 1:
+        return None
+    if hasattr(value, "mask"):
         return None
     if hasattr(value, "ndim"):
         return (value.dtype, value.ndim)

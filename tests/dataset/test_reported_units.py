@@ -142,6 +142,16 @@ def test_numbers_that_are_no_line_integrals(door, images, word):
 
 
 @pytest.mark.parametrize("door", DOORS)
+def test_masked_values_are_refused_after_others_of_their_type(door):
+    """Types that were allowed once are not checked again."""
+    for _ in range(2):
+        assert not answer(door, CHORDS)
+        assert any(
+            "masked" in one for one in answer(door, np.ma.masked_less(CHORDS, 0.1))
+        )
+
+
+@pytest.mark.parametrize("door", DOORS)
 def test_numbers_whose_products_overflow_are_refused(door):
     """1e30 ended as an SVD that did not converge, and as NaN in every voxel."""
     (said,) = answer(door, 1e30 * CHORDS)
