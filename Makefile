@@ -128,8 +128,8 @@ campaigns: $(TEST_STAMP)
 
 # What failed in the last of these, once more and one after the other.
 failed: lint typecheck $(TEST_STAMP)
-	@echo "Failed in the last run:"; $(BIN)/python .ci/last_failed.py || echo "  nothing that pytest knows of"
-	$(BIN)/pytest --last-failed --last-failed-no-failures none
+	@echo "Failed in the last run:"
+	$(BIN)/python .ci/last_failed.py --run
 
 # What follows from the table of methods, and the page from its TypeScript.
 web: install $(WEB_STAMP)

@@ -277,6 +277,40 @@ def test_a_failure_that_is_no_tests_is_not_repeated(tmp_path: Path) -> None:
     assert "no test did" in done.stderr
 
 
+@pytest.mark.parametrize(("second", "code"), [("assert True", 0), ("assert False", 1)])
+def test_what_failed_is_run_again_wherever_it_is_and_nothing_else(
+    tmp_path: Path, second: str, code: int
+) -> None:
+    """pytest's own `--last-failed` runs all of `testpaths` where it meets none of the failed."""
+    (tmp_path / "pytest.ini").write_text("[pytest]\ntestpaths = inside\n")
+    for folder in ("inside", "outside"):
+        (tmp_path / folder).mkdir()
+    noted = "from pathlib import Path\n\ndef note():\n    Path('ran').open('a').write('.')\n"
+    (tmp_path / "inside" / "test_all.py").write_text(
+        f"{noted}\ndef test_other():\n    note()\n"
+    )
+    outside = tmp_path / "outside" / "test_one.py"
+    outside.write_text(
+        "import pytest\n@pytest.mark.parametrize('x', ['a b', '[c]'])\n"
+        "def test_one(x): assert False\n"
+    )
+
+    def python(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+
+    assert python("-m", "pytest", "outside").returncode == 1
+    outside.write_text(outside.read_text().replace("assert False", second))
+    again = python(str(ROOT / ".ci" / "last_failed.py"), "--run")
+    assert again.returncode == code
+    assert not (tmp_path / "ran").exists()
+    assert "2 passed" in again.stdout or "2 failed" in again.stdout
+    assert "outside/test_one.py::test_one[a b]" in again.stdout
+    names = python(str(ROOT / ".ci" / "last_failed.py"))
+    assert names.returncode == 1 - code
+
+
 @pytest.mark.parametrize("part", ["slow", "tes", "--help"])
 def test_an_unknown_part_is_refused_with_those_there_are(
     part: str, tmp_path: Path

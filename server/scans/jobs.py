@@ -167,7 +167,7 @@ class Jobs:
         """
         # One that was aborted while it was being opened will not run.
         job = self.current
-        opening = self._preparing and job is not None and job.phase == "queued"
+        opening = self._preparing and job is not None and not job.aborting
         # While its remainder is swept it is paused still, with its settings back in force.
         going_on = job is not None and job.runner is not None and not job.runner.paused
         if self.current is not None and (going_on or opening):
@@ -300,6 +300,8 @@ class Jobs:
             error=None,
             ended=None,
             ended_by=None,
+            aborting=False,
+            aborted_for=None,
             speed_up=speed_up,
             frames_total=plan.frames,
             duration_s=plan.duration_s,
@@ -361,8 +363,9 @@ class Jobs:
     def abort(self, job: Job, reason: str | None = None, by: str | None = None) -> None:
         """End a job in any phase; its data set stays, incomplete, with the reason.
 
-        A waiting job ends at once, a running one at its next wait, with X-rays off; one
-        that is being opened, before it runs. The first requester stays `ended_by`.
+        A waiting job ends at once, a running one at its next wait, with X-rays off. One
+        that is being opened stays queued until its data set is marked incomplete, and does
+        not run. The first requester stays `ended_by`.
 
         Args:
             job: to end; one that has ended stays as it is.
@@ -374,9 +377,13 @@ class Jobs:
         job.ended_by = job.ended_by or by
         if job.runner is not None:
             job.runner.abort(reason)
-        elif job.phase == "queued":
-            job.phase = "aborted"
+        elif job is self.current and self._preparing:
+            # Its data set is being written: "aborted" would be a promise that it is at rest.
+            job.aborting = True
             job.aborted_for = reason
+            self._tell(job)
+        else:
+            job.phase = "aborted"
             job.ended = self._today()
             self._tell(job)
 
@@ -561,7 +568,7 @@ class Jobs:
 
     async def _run(self, job: Job) -> JobPhase:
         """Wait for the motors' rest, prepare one job, run it, and finish its data set or
-        mark it incomplete.
+        mark it incomplete. A job aborted while it waits for the rest has no data set.
 
         A stop from outside that came since its turn pauses it at once. An aborted job
         that has begun switches X-rays off. Errors are stored in the job, and logged
@@ -582,6 +589,8 @@ class Jobs:
             await self._clock.at_rest(
                 self._scanner.rest_time
             )  # of motion from before the job
+            if job.phase != "queued":  # aborted while it waited
+                return "aborted"
             assert job.prepare is not None
             self._preparing = True
             if job.start is None:
@@ -595,7 +604,7 @@ class Jobs:
         job.duration_s = scan.plan.duration_s
         try:
             runner = await self._make_runner(job, scan)
-            if job.phase != "queued":  # aborted while it was being prepared
+            if job.aborting:
                 raise JobAborted(job.aborted_for)
             job.runner = runner
             job.phase = "running"

@@ -54,7 +54,10 @@ class Job:
     phase: JobPhase = "queued"
     error: dict[str, object] | None = None
     runner: ScanRunner | None = None
+    aborting: bool = False
+    """Whether it was aborted while it was being opened, and has not ended yet."""
     aborted_for: str | None = None
+    """Reason of that abort."""
     last: Progress | None = None
     published_at: float = 0.0
     frames_seen: int = 0

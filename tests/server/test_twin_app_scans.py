@@ -3,12 +3,16 @@ again."""
 
 from __future__ import annotations
 
+import asyncio
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 from in_process import ROI, Lab, digest, run, script
+
+from flexdt.server.scans.scan_job import JobInputs
 
 
 def test_a_script_becomes_a_data_set_with_the_same_bytes_at_any_speed_up(
@@ -299,6 +303,44 @@ def test_jobs_queue_and_a_queued_one_can_be_aborted(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
+def test_a_scan_that_is_being_opened_ends_when_its_data_set_is_at_rest(tmp_path: Path) -> None:
+    """Whoever reads "aborted" may delete the data set: nothing writes to it any more."""
+
+    async def body(lab: Lab) -> None:
+        c, anyone = lab.client(), lab.client()
+        await c.call("clock.set", speed_up=1.0)  # the scan waits for a slow move to end
+        await c.call("axes.move", targets={"tra_obj": 1.0})
+        name = (await c.call("script.submit", text=script(), name="early"))["job"]
+        job = lab.twin.jobs.get(name)
+        prepare = job.prepare
+        assert prepare is not None
+        opened, written = asyncio.Event(), asyncio.Event()
+
+        async def slow() -> JobInputs:
+            made = await prepare()
+            opened.set()
+            await written.wait()
+            return made
+
+        job.prepare = slow
+        await opened.wait()
+        answer = await anyone.call("job.abort", job=name, reason="no")
+        assert answer["state"] == "queued"
+        assert (await c.error("job.forget", job=name)).code == -32003
+        assert (await c.error("job.resume", job=name)).code == -32003
+        assert (await c.call("job.forget", days=0.0))["jobs"] == []
+        await c.call("axes.move", targets={"mag_obj": 401.0})  # it does not run any more
+        written.set()
+        assert (await lab.ended(c, name))["state"] == "aborted"
+        document = json.loads((lab.root / "early" / "flexdt.json").read_text())
+        assert document["reason"] == "aborted: no"
+        shutil.rmtree(lab.root / "early")
+        assert (await c.call("job.forget", days=0.0))["jobs"] == [name]
+        assert not list((lab.root / "jobs").glob("*.json"))
+
+    run(tmp_path, body, virtual=True)
+
+
 def test_a_scan_that_is_being_prepared_can_be_aborted_and_stopped(tmp_path: Path) -> None:
     """Before a scan's first motion there is a while of checking and opening files."""
 
@@ -317,8 +359,7 @@ def test_a_scan_that_is_being_prepared_can_be_aborted_and_stopped(tmp_path: Path
         assert state["axes"]["rot_obj"]["target"] == 0.0
         assert state["axes"]["tra_obj"]["target"] < 100.0
         assert (await c.call("job.status", job=job))["state"] == "aborted"
-        document = json.loads((lab.root / "early" / "flexdt.json").read_text())
-        assert document["reason"] == "aborted: no"
+        assert not (lab.root / "early").exists(), "it had not begun"
 
         await c.call("axes.move", targets={"tra_obj": 100.0})
         job = (await c.call("script.submit", text=script()))["job"]
