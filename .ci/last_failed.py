@@ -23,7 +23,9 @@ def main() -> int:
     for name in names:
         print(f"  {name}", flush=True)
     if sys.argv[1:] == ["--run"] and names:
-        return subprocess.run([sys.executable, "-m", "pytest", *names], check=False).returncode
+        return subprocess.run(
+            [sys.executable, "-m", "pytest", *names], check=False
+        ).returncode
     return 0 if failed else 1
 
 

@@ -285,7 +285,9 @@ def test_what_failed_is_run_again_wherever_it_is_and_nothing_else(
     (tmp_path / "pytest.ini").write_text("[pytest]\ntestpaths = inside\n")
     for folder in ("inside", "outside"):
         (tmp_path / folder).mkdir()
-    noted = "from pathlib import Path\n\ndef note():\n    Path('ran').open('a').write('.')\n"
+    noted = (
+        "from pathlib import Path\n\ndef note():\n    Path('ran').open('a').write('.')\n"
+    )
     (tmp_path / "inside" / "test_all.py").write_text(
         f"{noted}\ndef test_other():\n    note()\n"
     )
@@ -297,7 +299,11 @@ def test_what_failed_is_run_again_wherever_it_is_and_nothing_else(
 
     def python(*words: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+            [sys.executable, *words],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
         )
 
     assert python("-m", "pytest", "outside").returncode == 1

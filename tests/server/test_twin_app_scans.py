@@ -303,7 +303,9 @@ def test_jobs_queue_and_a_queued_one_can_be_aborted(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
-def test_a_scan_that_is_being_opened_ends_when_its_data_set_is_at_rest(tmp_path: Path) -> None:
+def test_a_scan_that_is_being_opened_ends_when_its_data_set_is_at_rest(
+    tmp_path: Path,
+) -> None:
     """Whoever reads "aborted" may delete the data set: nothing writes to it any more."""
 
     async def body(lab: Lab) -> None:
