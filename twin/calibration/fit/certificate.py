@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import fdtri, stdtrit
 
-from flexdt.twin.calibration.fit.curved_region import bend_covariance
+from flexdt.twin.calibration.fit.curved_region import Bend, bend_of
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor
 from flexdt.twin.calibration.fit.residual_structure import (
     SIGNIFICANT,
@@ -258,8 +258,8 @@ class Certificate:
     Attributes:
         estimates: column -> value and uncertainty; empty of meaning (nan) where not determined.
         covariance: (p, p) of the reported columns, edge units, enlargement included.
-        bend: computes the (p, p) of the second-order term that the covariance lacks, edge
-            units: the region of likely values is not quite an ellipsoid (`curved_region`).
+        bend: computes the second-order term that the covariance lacks: the region of
+            likely values is not quite an ellipsoid.
         correlation: (p, p).
         spectrum: rank, condition, null and weak directions.
         dof: degrees of freedom of s^2, after allowing for correlated residuals.
@@ -279,7 +279,7 @@ class Certificate:
 
     estimates: dict[str, Estimate]
     covariance: FloatArray
-    bend: Callable[[], FloatArray]
+    bend: Callable[[], Bend]
     correlation: FloatArray
     spectrum: Conditioning
     dof: float
@@ -351,7 +351,7 @@ class Certificate:
 
     def mahalanobis2(self, truth: Mapping[str, float]) -> float:
         """Compute the squared distance of some values from the estimates, in the
-        covariance of those columns, widened by the bend of their region.
+        covariance of those columns, along the bend of their region.
 
         Args:
             truth: column -> value, edge units, some or all reported columns.
@@ -362,11 +362,10 @@ class Certificate:
         names = list(self.estimates)
         at = [names.index(n) for n in truth]
         d = np.array([v - self.estimates[n].value for n, v in truth.items()])
-        whole = self.covariance + self.bend()
-        return float(d @ np.linalg.solve(whole[np.ix_(at, at)], d))
+        return self.bend().distance2(d, at, self.covariance[np.ix_(at, at)])
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
-        """Check whether values are in the joint 95 % ellipsoid of their columns
+        """Check whether values are in the joint 95 % region of their columns
         (Hotelling: F distribution); arguments as `mahalanobis2`.
         """
         p = len(truth)
@@ -495,7 +494,7 @@ def certify(
     shared = False
     turning = 0.0
     moving: tuple[Drift, ...] = ()
-    bend: Callable[[], FloatArray] = partial(np.zeros_like, covariance)
+    bend: Callable[[], Bend] = partial(Bend.none, len(covariance))
     if spec.full and noise > MAX_ROUNDING:
         left = Residuals(
             problem,
@@ -505,7 +504,7 @@ def certify(
             spec.unit_covariance,
             noise,
         )
-        bend = partial(bend_covariance, left, x, factor, reported)
+        bend = partial(bend_of, left, x, factor, reported)
         covariance, shared, turning, moving = _widened(
             left, predicted, covariance, prior, sampling_px
         )
