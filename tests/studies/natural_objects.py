@@ -7,8 +7,9 @@
 Every scan is a full turn of an object as people scan them: foam in a cylinder, a bottle, a
 circuit board, toy bricks, a bone, a printed part, a stone, a bundle of wires; sizes, places,
 scanner, noise, hardening, blur, rings and numbers of views are drawn. `--gaps` sets the right
-part of the panel .8 to 2 px aside, `--near` does so within five columns of the axis, where both
-ends of rays say nothing: such a gap need not be named, but must be in the column's sigma.
+part of the panel .8 to 2 px aside, at a column that the object passes. `--near` does so within
+five columns of the axis, where both ends of rays say nothing: such a gap need not be named, but
+must be in the column's sigma.
 `--fans` are half turns and the fan of wires that harden the beam.
 `--json` prints a line for each scan.
 
@@ -45,6 +46,8 @@ ACROSS, DOWN = 3, 2
 """Rays across and down each pixel."""
 ELLIPSOID, CYLINDER, BOX = 0, 1, 2
 SIGMAS: Final = 4.0
+LEAST_SHADOW: Final = 0.02
+"""Line integral from which an object passes a column."""
 NEAR_COLUMNS: Final = 5
 """Columns from the axis within which `--near` begins gaps."""
 
@@ -414,6 +417,14 @@ class Scan:
             )
         return out
 
+    def crosses(self, column: int) -> bool:
+        """Whether anything passes a border of the panel while it turns, on both sides.
+
+        A gap beside the object moves all of it alike, and nothing in the images tells it.
+        """
+        seen = self.lines()[:, :, column - 1 : column + 1].max(axis=(0, 1))
+        return bool(seen.min() > LEAST_SHADOW)
+
     def light(self, aside: float = 0.0) -> np.ndarray:
         """Light in front of a panel that stands `aside` to the right [px]: blurred there, not
         by the panel, whose gap it does not know."""
@@ -543,6 +554,8 @@ def drawn(kind: str, rng: Rng, gap: bool = False, near: bool = False) -> Scan:
     )  # fmt: skip
     if gap:
         scan.gap = int(cols * rng.uniform(0.35, 0.65)), rng.uniform(0.8, 2)
+        while not scan.crosses(scan.gap[0]):
+            scan.gap = int(cols * rng.uniform(0.35, 0.65)), scan.gap[1]
     if near:
         beside = int(rng.integers(-NEAR_COLUMNS, NEAR_COLUMNS + 1))
         scan.gap = round(scan.column()) + beside, rng.uniform(0.8, 2)
