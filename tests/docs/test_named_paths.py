@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 import subprocess
+from inspect import isclass
 from pathlib import Path
 
 import pytest
 from doc_pages import evidence
+
+import flexdt as fx
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (
@@ -121,6 +124,22 @@ def test_modules_that_look_others_up_by_name_are_in_the_table() -> None:
     }
     assert len(looking) >= 8
     assert {path for path in looking if f"`{path}`" not in text} == set()
+
+
+def test_members_of_public_classes_are_in_the_named_modules() -> None:
+    """A reader goes from the table of `flexdt/__init__.py` to a class; a base class in
+    another file is a step that ARCHITECTURE has to save."""
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    classes = [value for name in fx.__all__ if isclass(value := getattr(fx, name))]
+    assert len(classes) > 10
+    elsewhere = {
+        f"{base.__module__.removeprefix('flexdt.').replace('.', '/')}.py": cls.__name__
+        for cls in classes
+        for base in cls.__mro__[1:]
+        if base.__module__.startswith("flexdt.") and base.__module__ != cls.__module__
+        if any(not name.startswith("_") for name in vars(base))
+    }
+    assert {file: cls for file, cls in elsewhere.items() if file not in text} == {}
 
 
 def test_commits_given_as_examples_exist() -> None:
