@@ -2,7 +2,7 @@
 FDB, ACK, ERR.
 
 A command is an event whose `reply type` is empty (some programs write SEND or SENT).
-Whoever executes it answers with events that bear the same UUID: RCV at once, FDB while it
+The program that executes it answers with events that bear the same UUID: RCV at once, FDB while it
 lasts, then one ACK or ERR. The interface's description requires the command's tick count
 in replies as well, but programs renew it or leave it out. Time is an argument.
 """
@@ -102,7 +102,7 @@ class AcquilaEvent:
 
     @property
     def is_command(self) -> bool:
-        """Whether the event asks its component to do something."""
+        """Whether the event is a command to its component."""
         return self.reply_type is ReplyType.SEND
 
     @property

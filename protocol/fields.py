@@ -81,7 +81,7 @@ Voltage = Annotated[float, Ge(1e-3), Le(1e4)]
 Power = Annotated[float, Ge(1e-6), Le(1e6)]
 """[W]"""
 Shift = Annotated[float, Ge(-1e4), Le(1e4)]
-"""Of a sample from where it stands by itself [mm]."""
+"""Shift of a sample from its default place [mm]."""
 Turn = Annotated[float, Ge(-3600), Le(3600)]
 """[deg]"""
 Distance = Annotated[float, Ge(1e-3), Le(1e5)]
@@ -120,7 +120,7 @@ ShortText = Annotated[
 Material = Annotated[ShortText, MaxLen(100)]
 """A name, or a formula and a density."""
 VolumeName = Annotated[ShortText, Len(1, 300)]
-"""Of what the projector keeps."""
+"""Name of a body in the projector."""
 Comment = Annotated[str, MaxLen(1000), AfterValidator(lines)]
 """Some lines."""
 TopicName = Literal["state", "projection", "job", "log"]

@@ -388,7 +388,7 @@ class Correlation(Generic[_W]):
             params: by name; a value that cannot be encoded is found when the message is
                 sent.
             waiter: returned with the answer.
-            trace: prefix of the id, so that the server's log shows what caused the
+            trace: prefix of the id, so that the server's log shows the cause of the
                 request.
 
         Raises:

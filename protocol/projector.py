@@ -67,7 +67,7 @@ def _rows(value: object) -> object:
         raise ValueError("cone_vec holds a truth value; allowed: [n, 12] numbers")
     if not 0 < len(array) <= MAX_VIEWS:
         raise ValueError(f"{len(array)} rows of cone_vec; allowed: 1 to {MAX_VIEWS}")
-    sound = (np.abs(array) <= MAX_MM).all(axis=1)  # false for what is not finite
+    sound = (np.abs(array) <= MAX_MM).all(axis=1)  # false for NaN and inf
     if not sound.all():
         raise ValueError(
             f"cone_vec row {int(np.argmin(sound))} is not finite and within {MAX_MM:g} mm"
@@ -258,7 +258,7 @@ class PutResult(f.Result):
 
 
 class VolumeList(f.Result):
-    """What is there and what room is left [bytes]."""
+    """Stored volumes, memory used and its limit [bytes]."""
 
     volumes: list[VolumeInfo]
     memory_used: int
@@ -272,14 +272,14 @@ class Removed(f.Result):
 
 
 class Array(f.Result):
-    """An image value, or (with `parts`) the description of what came in parts."""
+    """An image value, or (with `parts`) the description of one sent in parts."""
 
     dtype: Literal["float32"]
     shape: list[int]
     parts: int | None = None
     data: Buffer | None = None
     warnings: list[str] = Field(default_factory=list)
-    """doubts about a geometry and what it projects, such as metres for mm"""
+    """doubts about a geometry and its volume, such as metres for mm"""
 
 
 class Cancelled(f.Result):
@@ -307,7 +307,7 @@ class Health(f.Result):
     memory_used: int
     memory_limit: int
     memory_evictable: int | None = None
-    """of what is used: what makes room where it is needed"""
+    """part of memory_used that is freed when needed"""
 
 
 PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {

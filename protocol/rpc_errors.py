@@ -82,7 +82,7 @@ def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
     """Make the error -32601 for an unknown method, with all methods in its data;
     returned, not raised.
 
-    The name that was sent is cut after 200 characters; the data has the keys asked and
+    The name is cut after 200 characters; the data has the keys asked and
     allowed (sorted).
     """
     names = sorted(allowed)
@@ -113,7 +113,7 @@ def invalid_params(
 
 
 def problem(path: str, message: str, asked: object) -> dict[str, object]:
-    """Make one entry of `invalid_params`: the parameter's path, what is wrong,
+    """Make one entry of `invalid_params`: the parameter's path, the problem,
     the value given."""
     return {"path": path, "message": message, "asked": asked}
 
@@ -207,8 +207,8 @@ def _brief(value: object, limit: int) -> str:
         limit: number of characters that are needed; the text may be longer.
 
     Returns:
-        A text that agrees with `repr(value)` in about `limit` characters; "..." stands
-        for skipped members.
+        A text that agrees with `repr(value)` in about `limit` characters; "..." replaces
+        skipped members.
     """
     some = limit // 2
     match value:

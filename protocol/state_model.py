@@ -58,7 +58,7 @@ class TubeState(Result):
 
 
 class CameraState(Result):
-    """The camera's settings and what follows from them."""
+    """The camera's settings, and image shape and pitch that follow from them."""
 
     mode: str
     exposure_ms: float
@@ -83,7 +83,7 @@ class SamplePlacement(Result):
 
 
 class SampleState(Result):
-    """What stands on the stage."""
+    """The sample on the stage."""
 
     name: str | None
     material: str | None = None
@@ -95,7 +95,7 @@ class SampleState(Result):
 
 
 class GeometryState(Result):
-    """What follows from the positions: nominal plus the correction in force."""
+    """Geometry at the present positions: nominal plus the correction in force."""
 
     SOD_mm: float
     """source to rotation axis"""
@@ -145,7 +145,7 @@ class Correction(Result):
     source: str | None = None
     """data sets or method it came from"""
     sides_known: bool = False
-    """found from beads of known places, which tell the direction of rotation"""
+    """found from beads of known places, which determine the direction of rotation"""
 
 
 class ClockState(Result):
@@ -153,7 +153,7 @@ class ClockState(Result):
 
     time_s: float
     speed_up: SpeedUp
-    """asked for: twin seconds per real second, or max"""
+    """requested: twin seconds per real second, or max"""
     real_time_factor: float | None = None
     """achieved, over the last seconds"""
 
@@ -177,22 +177,22 @@ class JobStatus(Result):
     error: dict[str, object] | None = None
     """{code, message, data} when failed"""
     retry_s: float | None = None
-    """paused by what may mend by itself: real seconds to the next try"""
+    """paused by a fault that may pass: real seconds to the next try"""
     warnings: list[str] = Field(default_factory=list)
     step: int | None = None
     """index of the current step"""
     line: int | None = None
     """line of the script being run"""
     what: str = ""
-    """what is being done now, for people"""
+    """present command, for people"""
     ended_by: str | None = None
-    """connection that aborted it, named as in `controller`; null where nobody did"""
+    """connection that aborted it, named as in `controller`; null if none did"""
     start: dict[str, float] | None = None
-    """where the motors stood when it began [mm, deg]; null before that"""
+    """positions of the motors when it began [mm, deg]; null before that"""
 
 
 class ImageFlags(Result):
-    """What is wrong with an image at first sight, judged as though X-rays were on."""
+    """Saturation, starvation and truncation of an image, judged as though X-rays were on."""
 
     time: float | None = None
     """of the pose, on the twin's clock [s]"""
@@ -223,7 +223,7 @@ class State(Result):
     correction: Correction | None = None
     clock: ClockState
     controller: str | None = None
-    """who may move; None: nobody holds control"""
+    """session that may move; null: no session holds control"""
     image: ImageFlags | None = None
     """the image made last, by anyone's request or by a scan"""
     unsaved: str | None = None
@@ -231,7 +231,7 @@ class State(Result):
     server that is killed now comes back without it; null where it is, or is being written"""
     projector: str | None = None
     """why no image can be computed now, as where no projector answers; null where nothing is
-    wrong, or nobody looks"""
+    wrong, or without subscribers to the state"""
 
 
 class Stopping(Result):

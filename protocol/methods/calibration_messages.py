@@ -18,7 +18,7 @@ DataSetName = Annotated[ShortText, Len(1, 255)]
 ImageKind = Literal["dark", "flat", "projection"]
 Parameters = Annotated[list[f.AxisName], MaxLen(17)]
 FIT_LIMITS: Final[Mapping[str, float]] = {"seconds": 300, "memory_bytes": 6 << 30}
-"""What a calibration from images may cost."""
+"""Limits of a calibration from images: time [s] and memory [bytes]."""
 
 
 class DatasetList(Params):
@@ -35,16 +35,16 @@ class DatasetList(Params):
 
 
 class DatasetGet(Params):
-    """A data set, and what to say of it."""
+    """A data set, and the parts of its answer."""
 
     name: DataSetName
     """of its folder"""
     points: Annotated[int, Ge(2), Le(2000)] = 400
-    """images at most, evenly chosen, of which poses and times are told"""
+    """largest number of images, evenly chosen, with their poses and times"""
     measure: bool = False
-    """tell their mean counts and clearances, too"""
+    """include their mean counts and clearances"""
     script: bool = False
-    """tell its script, too"""
+    """include its script"""
 
 
 class DatasetFrame(Params):
@@ -60,7 +60,7 @@ class DatasetFrame(Params):
 
 
 class DatasetInfo(Result):
-    """A data set in a few words; what is not known of it is null."""
+    """Summary of a data set; unknown values are null."""
 
     name: str
     """of its folder"""
@@ -97,7 +97,7 @@ class DatasetListResult(Result):
     total: int
     """data sets that the search finds"""
     unread: int = 0
-    """of those, not read yet for lack of time: ask again"""
+    """of those, not read yet for lack of time: repeat the request"""
     left_out: int = 0
     """older folders, and folders whose names no data set may have"""
 
@@ -124,7 +124,7 @@ class DatasetResult(Result):
     clearance_mm: list[float | None] | None = None
     """of the nearest parts that may not touch"""
     clearance_of: str = ""
-    """what the clearances are of"""
+    """objects between which the clearances are"""
     script: str | None = None
     warnings: list[str] = Field(default_factory=list)
     """contradictions of its files and its geometry"""
@@ -171,7 +171,7 @@ class CalibrationApply(f.Params):
     comment: f.Comment = ""
     source: f.ShortText | None = None
     sides_known: bool = False
-    """found from beads of known places, which tell the direction of rotation"""
+    """found from beads of known places, which determine the direction of rotation"""
 
 
 class CalibrationDelete(f.Params):
@@ -208,27 +208,27 @@ class Mark(f.Params):
 
 
 class CalibrationFit(f.Params):
-    """Data sets of a bead phantom, and what to estimate from them."""
+    """Data sets of a bead phantom, and the parameters to estimate from them."""
 
     datasets: Annotated[list[DataSetName], Len(1, 8)]
     """of their folders"""
     phantom: f.Name
-    """one that ships, a TOML or JSON file among the data sets, or unknown: markers of which
-    nobody knows where they are, in one data set"""
+    """one that ships, a TOML or JSON file among the data sets, or unknown: markers in
+    unknown places, in one data set"""
     free: Annotated[Parameters, MinLen(1)] | None = None
-    """what is estimated; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown markers dO_x"""
+    """estimated parameters; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown markers dO_x"""
     priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(17), few(17)] = Field(
         default_factory=dict
     )
     """name -> standard deviation [mm or deg]; 0: exactly known"""
     per_frame: Parameters = Field(default_factory=list)
-    """what may also move during the scan"""
+    """parameters that may also move during the scan"""
     steps: Annotated[int, Ge(0), Le(50)] = 0
-    """covariances after so many parts of the frames are told"""
+    """include covariances after so many parts of the frames"""
     residuals: bool = False
-    """tell those of every bead in every frame"""
+    """include those of every bead in every frame"""
     tracks: bool = False
-    """tell where beads are, and were put before and after"""
+    """include measured bead positions, and those predicted before and after"""
     markers: Annotated[list[Mark], Len(1, 10_000)] | None = None
     """where beads were seen in the one data set; default: found there"""
     scale: Annotated[f.ShortText, MaxLen(300)] | None = None
@@ -245,9 +245,9 @@ class CalibrationAlign(f.Params):
 
 
 class CorrectionResult(f.Result):
-    """The correction in force (or asked for), if there is one.
+    """The correction in force (or the requested one), if there is one.
 
-    Warnings: parts that its geometry brings within the safety margin where they stand.
+    Warnings: parts that its geometry brings within the safety margin at the present pose.
     """
 
     correction: Correction | None
@@ -255,7 +255,7 @@ class CorrectionResult(f.Result):
 
 
 class Estimated(f.Result):
-    """An estimate [mm, deg, px or 1]; None where the images do not tell or must not be
+    """An estimate [mm, deg, px or 1]; None where the images do not determine it or must not be
     trusted."""
 
     value: float | None
@@ -264,7 +264,7 @@ class Estimated(f.Result):
 
 
 class CalibrationStep(f.Result):
-    """What the first frames of a fit would know by themselves."""
+    """Uncertainty of a fit to the first frames alone."""
 
     frames: int
     covariance: list[list[float]] | None
@@ -299,17 +299,17 @@ class CalibrationFitResult(f.Result):
 
 
 class CalibrationAlignResult(f.Result):
-    """The geometry that an ordinary scan tells; nothing is applied."""
+    """The geometry that an ordinary scan determines; nothing is applied."""
 
     identifiable: bool
     parameters: dict[str, Estimated]
     refused: dict[str, str]
-    """what such a scan cannot tell, and why"""
+    """parameters that such a scan cannot determine, and why"""
     warnings: list[str]
     correction: dict[str, float] | None = None
     """for calibration.apply"""
     motion: list[dict[str, JsonValue]] | None = None
-    """shifts of single frames, as `flexdt align --json` tells them"""
+    """shifts of single frames, as in `flexdt align --json`"""
 
 
 class CorrectionListResult(f.Result):

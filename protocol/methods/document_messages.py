@@ -53,7 +53,7 @@ class CameraPart(f.Params):
 
 
 class SamplePart(f.Params):
-    """What stood on the stage; the empty name for nothing."""
+    """The sample on the stage; the empty name for none."""
 
     name: Literal[""] | f.Name
     material: f.Material | None = None
@@ -68,7 +68,7 @@ class CorrectionPart(f.Params):
     parameters: Annotated[dict[f.AxisName, Kept], MaxLen(64), few(64)]
     comment: f.Comment = ""
     sides_known: bool = False
-    """found from beads of known places, which tell the direction of rotation"""
+    """found from beads of known places, which determine the direction of rotation"""
 
 
 class Scene(f.Params):

@@ -17,22 +17,22 @@ from flexdt.protocol.state_model import GeometryResult, ImageFlags, SamplePlacem
 LayerText = Annotated[f.ShortText, MaxLen(100)]
 ScanKind = Literal["fly", "step", "tiled", "helical", "calibration"]
 PREDICTION_LIMITS: Final[Mapping[str, float]] = {"seconds": 60, "memory_bytes": 4 << 30}
-"""What a prediction of image quality may cost."""
+"""Limits of a prediction of image quality: time [s] and memory [bytes]."""
 
 
 class ProjectionGet(f.Params):
-    """What kind of image, at the current pose, or as though it stood and were set otherwise.
+    """Kind of image, at the current pose and settings, or at other ones.
 
-    Such an image is predicted: from the geometry of `geometry.get`, without noise.
+    An image at other ones is predicted: from the geometry of `geometry.get`, without noise.
     """
 
     kind: Literal["line_integral", "counts"] = "line_integral"
     binning: Annotated[int, Ge(1), Le(32)] = 1
     """mean over so many pixels a side, beyond the camera's mode"""
     marks: bool = False
-    """say which pixels are saturated, starved or cut off as well"""
+    """include which pixels are saturated, starved or cut off"""
     positions: f.Targets | None = None
-    """motor -> [mm, deg] there, beyond its travel too; others stand as they do"""
+    """motor -> [mm, deg] there, beyond its travel too; others stay"""
     tube: TubeSet | None = None
     """as though set so"""
     camera: CameraSet | None = None
@@ -47,7 +47,7 @@ class RayGet(f.Params):
 
 
 class ExposurePredict(f.Params):
-    """A scan to predict; what is left out is as it is now."""
+    """A scan to predict; missing parameters are the present ones."""
 
     sample: f.Name | None = None
     """default: the one on the stage"""
@@ -64,18 +64,18 @@ class ExposurePredict(f.Params):
     kind: ScanKind | None = None
     """of a script, of which time and bytes are then; default: images"""
     sod_mm: f.Distance | None = None
-    """default: as it stands"""
+    """default: the present one"""
     sdd_mm: f.Distance | None = None
-    """default: as it stands"""
+    """default: the present one"""
     detail: LayerText = "void:0.5"
     """MATERIAL:MM or void:MM on the darkest ray, to be seen"""
 
 
 class ImageOrigin(f.Result):
-    """What an image was made of, beside its geometry: compare it with the state."""
+    """Sample and settings of an image; compare them with the state."""
 
     sample: str | None
-    """name of what it shows; null for an empty stage"""
+    """name of the sample in it; null for an empty stage"""
     revision: str | None = None
     """of an upload, as in the state"""
     material: str | None = None
@@ -101,14 +101,14 @@ class Projection(f.ImageValue):
     """of the pose, on the twin's clock [s]"""
     flags: ImageFlags | None = None
     origin: ImageOrigin | None = None
-    """what it was made of"""
+    """its sample and settings"""
     marks: f.ImageValue | None = None
-    """uint8, as large as the image, where asked for: sum of 1 saturated, 2 starved, 4 sample
+    """uint8, as large as the image, on request: sum of 1 saturated, 2 starved, 4 sample
     cut off at this pixel of the edge; judged as though X-rays were on"""
 
 
 class RayResult(f.Result):
-    """What the ray of a pixel goes through, in the geometry of geometry.get."""
+    """Materials on the ray of a pixel, in the geometry of geometry.get."""
 
     paths_mm: dict[str, float]
     """material -> path through it"""
@@ -129,7 +129,7 @@ class TransmissionShares(f.Result):
 
 
 class PredictedSetting(f.Result):
-    """Tube and camera, and what they give on the darkest ray."""
+    """Settings of tube and camera, and the contrast on the darkest ray."""
 
     kV: float
     filter: str
@@ -143,7 +143,7 @@ class PredictedSetting(f.Result):
 
 
 class ExposurePrediction(f.Result):
-    """What a circular scan of a sample will look like, without scattered radiation."""
+    """Predicted image quality of a circular scan, without scattered radiation."""
 
     sample: str
     transmission: TransmissionShares
@@ -161,7 +161,7 @@ class ExposurePrediction(f.Result):
     bytes: int
     """of the frames; of a kind, with dark and flat images"""
     assumed: list[str]
-    """what is not known of the sample"""
+    """assumptions about the sample"""
 
 
 PROJECTION_GET = read(

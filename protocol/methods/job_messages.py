@@ -32,7 +32,8 @@ CHECK_LIMITS: Final[Mapping[str, float]] = {
     "report_bytes_json": MAX_ANSWER[Codec.JSON],
     "report_bytes_msgpack": MAX_ANSWER[Codec.MSGPACK],
 }
-"""What parsing, planning and sweeping a script or poses may cost."""
+"""Limits of parsing, planning and sweeping a script or poses: time [s], memory and report
+[bytes]."""
 
 
 class ScriptInput(f.Params):

@@ -90,7 +90,7 @@ class Reset(f.Params):
 
 
 class MoveResult(f.Result):
-    """What the motion will take."""
+    """Duration and moves of the motion."""
 
     duration_s: f.NonNegative
     """of the twin's clock"""
@@ -132,7 +132,7 @@ class ClockSet(Params):
 
 
 class TubeSet(Params):
-    """X-ray tube settings; what is left out stays."""
+    """X-ray tube settings; missing ones stay."""
 
     kV: Voltage | None = None
     power_W: Power | None = None
@@ -140,7 +140,7 @@ class TubeSet(Params):
 
 
 class CameraSet(Params):
-    """Camera settings; what is left out stays."""
+    """Camera settings; missing ones stay."""
 
     exposure_ms: Exposure | None = None
     mode: ShortText | None = None
@@ -160,7 +160,7 @@ CAMERA_SET = by_hand(
 
 
 class SampleSet(f.Params):
-    """Which sample stands on the stage: a shipped phantom's name, or an uploaded file's."""
+    """The sample to put on the stage: a shipped phantom's name, or an uploaded file's."""
 
     name: f.Name | None = None
     file: f.Name | None = None
@@ -238,11 +238,11 @@ class SampleDelete(f.Params):
     """Which upload to delete."""
 
     name: f.Name
-    """of an upload that neither stands on the stage nor is in a scan that has not ended"""
+    """of an upload that is neither on the stage nor in a scan that has not ended"""
 
 
 class SampleDeleteResult(f.Result):
-    """What was deleted."""
+    """The deleted upload."""
 
     name: str
     bytes: int
@@ -250,7 +250,7 @@ class SampleDeleteResult(f.Result):
 
 
 class SampleResult(f.Result):
-    """What stands on the stage now."""
+    """The sample on the stage now."""
 
     sample: SampleState
     warnings: list[str] = Field(default_factory=list)

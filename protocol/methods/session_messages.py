@@ -1,4 +1,4 @@
-"""session.* and state.*: who is connected, and what it hears of."""
+"""session.* and state.*: connections, control and subscriptions."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ ControlAction = Literal["acquire", "release", "force"]
 
 
 class Control(Params):
-    """Take control, give it back, or take it from whoever has it."""
+    """Take control, give it back, or take it from the client that has it."""
 
     action: ControlAction
 
@@ -86,7 +86,7 @@ class HelloResult(Result):
     physics: str | None = None
     """how images are made: ideal, mono or poly"""
     instance: str | None = None
-    """made up when the server started: what was made of another one may not hold any more"""
+    """made up when the server started: results of another instance may be out of date"""
 
 
 class ControlResult(Result):
