@@ -111,7 +111,7 @@ class _Collected:
     metrics: list[Metric]
 
     def collect(self) -> list[Metric]:
-        """Return the metrics given, as prometheus_client asks for them."""
+        """Return the metrics given, in the form that prometheus_client collects."""
         return self.metrics
 
 

@@ -84,7 +84,7 @@ class JsonLines(logging.Formatter):
 
 class Apart(QueueHandler):
     """Writes records from a thread of its own, so that a blocked reader of the
-    log blocks nobody.
+    log does not block the loop.
 
     Args:
         target: formats and writes.
@@ -143,7 +143,7 @@ class _Listener(QueueListener):
 
 
 def dropped() -> int:
-    """Return how many records were dropped because nobody read the log."""
+    """Return how many records were dropped while the log's reader was blocked."""
     return sum(h.dropped for h in LOGGER.handlers if isinstance(h, Apart))
 
 

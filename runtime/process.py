@@ -141,7 +141,7 @@ class ServerLoop(asyncio.SelectorEventLoop):
         lines = Sparing(burst=1)
 
         def complain(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-            """Log what asyncio reports, at most one line of each kind and then one at
+            """Log reports of asyncio, at most one line of each kind and then one at
             intervals.
 
             A report without an error, or of an OSError, is a warning; others are errors
@@ -338,7 +338,7 @@ def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None
     """
     loop = asyncio.get_running_loop()
     if isinstance(loop, ServerLoop):
-        # What is there now stays: looking through it for garbage would take 0.1 s each time.
+        # These objects stay: a pass of the garbage collector over them takes 0.1 s.
         gc.collect()
         gc.freeze()
         loop.holds.begin()  # no client has waited for it yet
@@ -361,8 +361,8 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
     INVALID after a TwinError, ValueError or an OSError of a file, REFUSED after another
     OSError. Other errors are raised.
 
-    SIGINT ends the process at once until the work calls `stop_signal`: nobody has been
-    promised anything yet, and an exception within asyncio's loop can lose the turn of a
+    SIGINT ends the process at once until the work calls `stop_signal`: no client has
+    been answered yet, and an exception within asyncio's loop can lose the turn of a
     task, which then never ends. An ignored SIGINT stays ignored.
 
     Args:

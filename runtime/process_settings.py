@@ -1,7 +1,7 @@
-"""The settings of each server process, and the values that their words stand for.
+"""The settings of each server process, and the parsers of their words.
 
-Each process has a frozen dataclass of settings; what is derived from it:
-`flexdt.runtime.settings`.
+Each process has a frozen dataclass of settings; `flexdt.runtime.settings` derives options,
+keys and help from it.
 """
 
 # ruff: noqa: RUF009  (the calls make fields; they are not values shared by all instances)
@@ -149,7 +149,7 @@ def tcp_port(
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessSettings(Settings):
-    """What every process has.
+    """Settings of every process.
 
     Attributes:
         host: Listen on this address.
@@ -162,7 +162,7 @@ class ProcessSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ServerSettings(ProcessSettings):
-    """What twin, projector and viewer share.
+    """Settings of twin, projector and viewer.
 
     Attributes:
         token_file: Require the token in this file of every client.
@@ -201,7 +201,7 @@ class ProjectorSettings(ServerSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ScannerSettings(ServerSettings):
-    """What `flexdt twin` and `flexdt up` share; None leaves the choice to the twin.
+    """Settings of `flexdt twin` and `flexdt up`; None leaves the choice to the twin.
 
     Attributes:
         port: Listen on this port as the twin; 0 is any free one.
@@ -230,7 +230,7 @@ class ScannerSettings(ServerSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class FarProjectorSettings(Settings):
-    """What `flexdt twin` and `flexdt up` share of projectors on other machines.
+    """Settings of `flexdt twin` and `flexdt up` about projectors on other machines.
 
     Attributes:
         projectors: Deal the views among these projectors, too.
@@ -285,7 +285,7 @@ class TwinSettings(FarProjectorSettings, ScannerSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class TwinClientSettings(ProcessSettings):
-    """What viewer and gateway share: where the twin is and what they know of it.
+    """Settings of viewer and gateway: where the twin is, and copies of its files.
 
     Attributes:
         data: Read the twin's data directory here.
@@ -344,7 +344,7 @@ class GatewaySettings(TwinClientSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class UpSettings(FarProjectorSettings, ScannerSettings):
-    """`flexdt up`: those of the twin, and what the other processes need.
+    """Settings of `flexdt up`: those of the twin and of the other processes.
 
     Attributes:
         projector_port: Give the projector this port; 0 is any free one.

@@ -11,7 +11,7 @@ from typing import Any, Final, Protocol
 WIDTH_CHARS: Final = 24
 """Characters of a bar on a terminal."""
 NARROWEST_CHARS: Final = 20
-"""Columns of a terminal that is taken for one that does not say its width, if it has fewer."""
+"""Columns; a terminal with fewer counts as one of unknown width."""
 
 
 class Shown(Protocol):
@@ -58,7 +58,7 @@ def time_words(done: float | None, seconds: float, left_s: float | None) -> str:
     """Format how far work is and how long it takes.
 
     Args:
-        done: fraction; None where nobody knows.
+        done: fraction; None if unknown.
         seconds: since it began.
         left_s: estimate of the time left [s]; None where there is none.
 

@@ -1,7 +1,7 @@
 """Show work that takes seconds: a bar on terminals and in notebooks, lines of the log
 elsewhere.
 
-`shown_work` is what `flexdt.twin.long_work.during` is in a process with a clock. Work that ends
+`shown_work` replaces `flexdt.twin.long_work.during` in a process with a clock. Work that ends
 within `SILENT_S` shows nothing. Work within other work of the same thread lends it its name
 only: there is one bar. Where a program handles the records of the logger `flexdt`, it gets
 lines, not a bar; a level above WARNING of the logger `flexdt.progress` silences both.
@@ -39,7 +39,7 @@ class _Work:
         what: its name.
         begun: when it began, or the first of the works of its kind that follow each other [s].
         due: when it is shown next [s].
-        done: fraction; None where nobody says.
+        done: fraction; None if unknown.
         pace: how fast it goes on.
         inner: name of the work within it, "" if there is none.
         shown: the bar; None before it is drawn.
@@ -177,7 +177,7 @@ class _Entered:
     Attributes:
         what: its name.
         advance: takes the fraction done.
-        work: what is shown; None for work that shows nothing, or that its caller shows.
+        work: the shown work; None for work that shows nothing, or that its caller shows.
     """
 
     what: str

@@ -176,7 +176,7 @@ class Supervisor:
         """Start a service, and again whenever it ends, after a growing pause; end only by
         cancellation or at a failed first start.
 
-        What is left of its processes is killed before each new start. Ends are noted in
+        Remaining processes of it are killed before each new start. Ends are noted in
         words as `Ends.reported` allows. A first start that a signal ends is tried again.
 
         Args:
@@ -326,8 +326,8 @@ class Supervisor:
                         return
 
     def _forget(self, service: Service) -> None:
-        """Kill what is left of a service's process group, whose children may hold its
-        port or its files, and forget its process.
+        """Kill the remaining processes of a service's group, which may hold its port or
+        its files, and forget its process.
 
         Nothing happens if none is recorded.
         """
@@ -337,7 +337,7 @@ class Supervisor:
                 os.killpg(process.pid, signal.SIGKILL)
 
     async def _stop_all(self) -> None:
-        """Stop all services in reverse order, one by one, and kill what is left of their
+        """Stop all services in reverse order, one by one, and kill the rest of their
         process groups.
 
         One that takes over `STOP_GRACE_S` is killed, which is noted.

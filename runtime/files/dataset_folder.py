@@ -45,7 +45,7 @@ BLANK_SAMPLE_BYTES: Final = 4096
 """Bytes in the middle of an image's file that are examined first for other values than 0."""
 _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
 
-# What tifffile logs of a damaged file is in our error; it reaches whoever sets up logging.
+# Our error has the reason of a damaged file; tifffile's log is for callers that set up logging.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
@@ -436,7 +436,7 @@ def _check_kind(
         kinds: that are allowed: u, f.
 
     Raises:
-        DatasetFormatError: another type or number of dimensions; names what is allowed,
+        DatasetFormatError: another type or number of dimensions; names the allowed ones,
             and how several images in one file are read.
     """
     allowed = [np.dtype(k) for k in (*COUNTS, "f4", "f8") if k[0] in kinds or k in COUNTS]

@@ -633,7 +633,7 @@ def free_bytes(path: Path) -> int | None:
 def memory_bytes() -> int:
     """Return the machine's memory, or the container's limit if that is less [bytes].
 
-    `FALLBACK_MEMORY_BYTES` stands for a machine's memory that the system does not report.
+    Where the system does not report it, it is `FALLBACK_MEMORY_BYTES`.
     """
     memory = FALLBACK_MEMORY_BYTES
     with suppress(AttributeError, ValueError):
@@ -645,7 +645,7 @@ def memory_bytes() -> int:
 
 def free_memory_bytes() -> int:
     """Estimate the memory that new work can have, cached files included [bytes]; in a
-    container at most what its limit leaves.
+    container at most the rest of its limit.
 
     It is at least 0. Where the system does not report it (not Linux), it is half of the
     memory.

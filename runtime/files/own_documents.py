@@ -54,7 +54,7 @@ class _Change:
 
     Attributes:
         folder, name: where it is.
-        data: what is there now; None for nothing.
+        data: present content; None without a file.
         before: the name under which the replaced file is kept; None where nothing was, or
             is.
         old: instead, the replaced content.
@@ -124,8 +124,8 @@ class Changes:
                 data then.
 
         Raises:
-            DatasetWriteError: the system cannot write; `undo` restores what was written
-                before.
+            DatasetWriteError: the system cannot write; `undo` restores the earlier
+                changes.
         """
         before = self._before()
         old = None
@@ -268,7 +268,7 @@ def read_or_set_aside(
     Args:
         folder, name: of the file; an entry that is no regular file is damaged, too.
         read: parses its bytes; whatever it raises means damage.
-        without: what the twin does without the file, for the log.
+        without: how the twin goes on without the file, for the log.
 
     Returns:
         The result of `read`, or None if there is no file or a damaged one.
@@ -286,8 +286,8 @@ def set_aside(folder: Directory, name: str, error: object, without: str) -> None
     """Rename a damaged file, or another entry of its name, to STEM.unreadable.SUFFIX, and
     log an error; raises nothing.
 
-    An earlier one under that name is replaced. If it cannot be renamed, the log line says
-    so.
+    An earlier one under that name is replaced. If it cannot be renamed, the log line has
+    the reason.
 
     Args:
         folder: of the file.

@@ -16,7 +16,7 @@ NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FULL_BYTES: Final = 64 << 10
 """Free bytes below which a disk is full for a library that gives no number with its error."""
 OF_LIBRARIES: Final = re.compile(r"No space left|errno = (\d+)|requested and \d+ written")
-"""How HDF5 (with the system's number), tifffile and NumPy say that a write was refused."""
+"""Texts by which HDF5 (with the system's number), tifffile and NumPy report a refused write."""
 
 
 def require_bytes(path: Path, needed: int) -> None:
