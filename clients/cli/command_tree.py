@@ -99,8 +99,8 @@ KNOWN: Final[Mapping[str, str]] = {
     "job watch": "End a scan of beads once its calibration is sure enough.",
     "phantom design": "Choose bead places that determine the geometry best.",
 }
-"""Command of `flexdt-extensions` -> its line of the help page, which needs no look at what is
-installed: an entry point is looked up when its command is on the command line."""
+"""Command of `flexdt-extensions` -> its line of the help page, which imports no other
+distribution: an entry point is looked up when its command is on the command line."""
 NUMBERS_WITH_SIGN: Final = ("jog", "clock")
 """Commands whose arguments may begin with a minus."""
 SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -325,8 +325,8 @@ def _add_others(
 ) -> None:
     """Add other distributions' commands, which take no name of ours.
 
-    One that is known but not installed gets a placeholder that tells how to install it. A
-    command that nobody knows is not added. All known ones are on the help page.
+    One that is known but not installed gets a placeholder that explains how to install it. An
+    unknown command is not added. All known ones are on the help page.
 
     Args:
         app: the command line.

@@ -79,7 +79,7 @@ _silences: list[Callable[[], None]] = []
 
 
 def _end_silence() -> None:
-    """Show no longer that a command has said nothing."""
+    """End the display of a command without output."""
     while _silences:
         _silences.pop()()
 
@@ -90,7 +90,7 @@ def waited_for(words: Sequence[str]) -> Iterator[None]:
 
     Without a terminal on stderr, without words, or while the shell completes words
     nothing is shown. The display is taken off by the first output, or at the end; the
-    help option is told by a leading minus.
+    help option is recognised by a leading minus.
 
     Args:
         words: of the command line; nothing is shown of help, completion, servers and
@@ -320,10 +320,10 @@ class ProgressBar:
         note(self._line(text or self._title, done, total, now))
 
     def _line(self, text: str, done: float, total: float | None, now: float) -> str:
-        """Make a line of text with what is done, its share [%] and an estimate of the
+        """Make a line of text with the amount done, its share [%] and an estimate of the
         time left.
 
-        Without a total only what is done; amounts that are not whole are left out; no
+        Without a total only the amount done; amounts that are not whole are left out; no
         estimate at the beginning and end. `now` is the time [s]; the time left assumes the
         pace since the first unit.
         """

@@ -40,7 +40,7 @@ CHECK_S = 1.0
 """Interval at which the work of an ending process is measured [s]."""
 MIN_WORKING_SHARE = 0.5
 """Least share of the time for which a process that works has a processor or waits for one;
-what only ticks has less."""
+a process that only runs timers has less."""
 IMPORT_FILE = "<frozen importlib._bootstrap>"
 
 _heard = 0

@@ -52,7 +52,7 @@ PATHS: Final = ("FILE", "DIR")
 
 @dataclass(frozen=True, kw_only=True)
 class Configuration(Settings):
-    """Defaults of commands; None where neither file nor environment says anything.
+    """Defaults of commands; None where neither file nor environment has a value.
 
     Attributes:
         server: HOST:PORT of the twin.

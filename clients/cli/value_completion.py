@@ -43,7 +43,7 @@ def bead_phantom_names(typed: str) -> list[str]:
 
 
 def calibration_targets(typed: str) -> list[str]:
-    """List what a calibration may be of, as completions: phantoms with beads, and the
+    """List the subjects of a calibration, as completions: phantoms with beads, and the
     word for markers at unknown places."""
     return [*bead_phantom_names(typed), *_beginning(typed, [UNKNOWN_MARKERS])]
 

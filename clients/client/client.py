@@ -280,7 +280,7 @@ class Core:
 
         Raises:
             ConnectionLost: no connection, or the client was closed meanwhile.
-            NoTwinError, TimeoutError: what answers, or is silent, is no twin.
+            NoTwinError, TimeoutError: another program answers, or is silent.
             RpcError: the server refuses the client; the connection is closed.
         """
         await self.transport.open()
@@ -378,7 +378,7 @@ class ClientMethod(Generic[_P, _R]):
         """Make the blocking and the asynchronous method of a function, with its
         signature.
 
-        Awaited in a coroutine, a call shows no progress bar unless asked to. Only a
+        Awaited in a coroutine, a call shows no progress bar by default. Only a
         parameter named `progress` whose annotation is in `SHOWN` makes a bar; `help()`
         shows the signature with self and without Flow.
 

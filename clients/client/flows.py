@@ -134,7 +134,7 @@ async def perform(effect: Effect, call: Callable[[Ask], Awaitable[object]]) -> o
     """Perform an effect on an event loop and return its result.
 
     Only `Ask` has a result: that of `call`. `Sleep` waits, `Tell` calls the function and
-    awaits what it returns if that is awaitable; both return None.
+    awaits its result if that is awaitable; both return None.
 
     Args:
         effect: a request, a pause or a call of the caller's function.

@@ -60,7 +60,7 @@ class ConnectionLost(ConnectionError):
 
 
 class NoTwinError(ConnectionError):
-    """What answers at the address is another program than a twin."""
+    """Another program than a twin answers at the address."""
 
 
 class Transport(Protocol):
@@ -261,7 +261,7 @@ class Link:
 
     Attributes:
         alive: until the connection has ended.
-        calls: its open requests; `calls.reason` is what the server reported about the
+        calls: its open requests; `calls.reason` is the server's report about the
             connection.
     """
 

@@ -376,7 +376,7 @@ def upload_scene(
         progress: called with bytes sent and bytes in all.
 
     Raises:
-        PhantomError: the file does not hold; names the key path and what is allowed.
+        PhantomError: the file does not hold; names the key path and the allowed values.
 
     Example:
         >>> from flexdt.phantoms import load_phantom
@@ -959,8 +959,8 @@ def apply_calibration(
 ) -> Flow[corrections.CorrectionResult]:
     """Put a correction (mm, deg; true minus nominal) in force; it replaces the last.
 
-    `sides_known` says that it was found from beads of known places, which tell the direction
-    of rotation and mirrored images.
+    `sides_known` means that it was found from beads of known places, which determine the
+    direction of rotation and mirrored images.
 
     Example:
         >>> twin.apply_calibration({"det_roll": 0.1}, "rolled").correction.name
@@ -1045,7 +1045,7 @@ def fit_calibration(
     Args:
         datasets: their names.
         phantom: one that ships, a TOML or JSON file among the data sets, or "unknown": markers
-            of which nobody knows where they are.
+            in unknown places.
         free: parameters to estimate; default: the six of a phantom on a stage, dO_x of unknown
             markers.
         priors: name -> standard deviation [mm, deg]; 0 is exactly known.

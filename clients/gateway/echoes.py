@@ -98,7 +98,7 @@ class Echoes:
 
         Nothing is yielded at the first call, and no changes while a script of a job is
         echoed. A move ends when its axis rests; a new target makes the former one fail.
-        Components in `own` get no events. X-rays are told as command xrayon or xrayoff
+        Components in `own` get no events. X-rays are reported as command xrayon or xrayoff
         without argument. All other changes end at once with their value; a move gives
         feedback when it is due. The state is stored as known in any case.
 

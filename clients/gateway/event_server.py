@@ -112,7 +112,7 @@ class Gateway:
         """Components on which commands of clients run."""
 
     async def run(self) -> None:
-        """Serve until cancelled: receive events, and echo what others do; then cancel
+        """Serve until cancelled: receive events, and echo changes by others; then cancel
         tasks, close recording and sockets.
 
         An event that fails is logged, and serving goes on after `PAUSE_S`. Cancelled
@@ -282,7 +282,7 @@ class Gateway:
         """Carry out a command and return its reply; it waits for earlier commands of its
         component unless it is one of `AT_ONCE`.
 
-        Axes are asked for first if they are unknown. Raises Refusal for an unknown
+        Unknown axes are requested from the twin first. Raises Refusal for an unknown
         command, before any wait.
         """
         if not self.twin.axes:

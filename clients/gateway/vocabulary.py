@@ -137,7 +137,7 @@ def _extra(event: AcquilaEvent, name: str) -> c.Command:
         name: of the component, as the twin calls it.
 
     Raises:
-        Refusal: the component does not know it; the message lists what it knows.
+        Refusal: the component does not know it; the message lists the known ones.
     """
     table = _EXTRA.get(name, _EXTRA[""])
     asked = " ".join(event.command.lower().split())

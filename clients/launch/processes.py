@@ -41,7 +41,7 @@ class ServersError(CommandError):
 
 
 class Servers:
-    """Projector, twin and, if asked for, viewer (`flexdt up`) as a context manager.
+    """Projector, twin and, on request, viewer (`flexdt up`) as a context manager.
 
     Args:
         options: name -> value for `flexdt up`, without dashes; ports default to any free one.
@@ -202,7 +202,7 @@ class LocalTwin:
         machine: description of the scanner, a shipped name or a file; None for the FleX-ray.
         profile: calibration profile; None for the machine's default.
         physics: how images are made: ideal, mono or poly.
-        scatter: what the sample scatters onto the panel, of mono and poly: off or mc.
+        scatter: scattered radiation, with physics mono and poly: off or mc.
         speed_up: the twin's seconds for each of yours, or "max".
         truth: file with a hidden misalignment.
         viewer: whether to start the viewer as well; see `viewer_url`.

@@ -1,4 +1,4 @@
-"""What servers are started with, checked before any process is started."""
+"""Checks of servers' settings before any process is started."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Exports of the viewer: pictures of a view, the current scene, and a scan as a replay.
 
 A replay is drawn in a viser server of its own without clients, so that recording does not
-disturb the live scene. Both file formats open without any server. The page saves what it
-receives; nothing is written here.
+disturb the live scene. Both file formats open without any server. The page saves the files;
+nothing is written here.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ def viewer_pages(viewer: Viewer) -> Pages:
 
     def figures() -> list[Metric]:
         """List the metrics: open pages and views, pages ever opened, dropped messages,
-        drawn states, connection to the twin, wrong tokens; 0 for what the front counts
+        drawn states, connection to the twin, wrong tokens; 0 for counts of the front
         while there is none.
 
         Counters only grow.
@@ -151,7 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the viewer with the options of `argv` (default: the command line) until it is
     ended; return the exit code.
 
-    Standard output gets only the ready line: what viser prints there is dropped.
+    Standard output gets only the ready line; viser's own output is dropped.
     """
     options = parse(ViewerSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)

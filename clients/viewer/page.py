@@ -98,7 +98,7 @@ class Page:
         self.kind = "line_integral"
         self.dark = self.live = False
         self.fine = True
-        """Whether a graphics processor draws, as far as the page has said."""
+        """Whether the page has reported that a graphics processor draws; True before."""
         self.shown = Shown()
         self.plan: Any = None
         self.orbit: Any = None
@@ -228,10 +228,10 @@ class Page:
             await asyncio.sleep(DRAG_S)
 
     async def _send(self) -> None:
-        """Send what waits for the page, in order of its slots, whenever there is
+        """Send waiting messages to the page, in order of its slots, whenever there is
         something; returns when the connection closes.
 
-        What is still unsent then is dropped.
+        Messages that are unsent then are dropped.
         """
         with contextlib.suppress(ConnectionClosed):
             while True:

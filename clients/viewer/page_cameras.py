@@ -98,7 +98,7 @@ class SceneClients:
     def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
         """Set the nodes of a page's frames, from one thread only.
 
-        Only nodes that differ from what the frame shows are sent. `built` is also
+        Only nodes that differ from those in the frame are sent. `built` is also
         compared with the number at the last call: nodes built since are compared with
         `plain` as well.
 
@@ -222,7 +222,7 @@ class SceneClients:
         """Set a client's camera, unless it was put there last and has not been moved
         since.
 
-        The camera is stored as put, so that a person's move can be told.
+        The camera is stored as put, so that a person's move is recognised.
         """
         if self._sent.get(client.client_id) == camera and self._untouched(client):
             return

@@ -37,7 +37,7 @@ def token_form(wrong: bool) -> bytes:
     """Make the page (HTML) with the form for the viewer's token.
 
     Args:
-        wrong: whether a wrong one was given, which the page then says.
+        wrong: whether a wrong one was given; the page then has a message.
     """
     if wrong:
         said = b'<p id="wrong" role="alert">This is not it.</p>'

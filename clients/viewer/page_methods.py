@@ -326,7 +326,7 @@ async def window(viewer: Viewer, page: Page, params: Window) -> object:
 
 
 async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
-    """Show this page the ray of a pixel, and return what it passes through.
+    """Show this page the ray of a pixel, and return the materials on it.
 
     Without a pixel, or before the twin's state is known, the ray is hidden.
 
@@ -658,7 +658,7 @@ async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
 
 
 async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
-    """Compose a script for the requested scan, from where motors stand.
+    """Compose a script for the requested scan, from the present positions.
 
     Distances are those of the motors alone: a script moves motors, and the correction in
     force, in which SOD and SDD are a little different, may not lead beyond their travel.
@@ -691,7 +691,7 @@ async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
 def scan_request(
     params: Compose, machine: Machine, profile: Profile, state: State | None
 ) -> ScanRequest:
-    """Make the request of a scan: as wished, and for the rest as the twin stands.
+    """Make the request of a scan: as wished, and for the rest from the twin's state.
 
     Distances [mm] are rounded; a wished voxel [um] sets the SOD. A voltage or power that
     is None is the present one; mode and region are the present ones.

@@ -58,7 +58,7 @@ def window_of(image: ShownImage) -> tuple[float, float]:
     """Choose the values of black and white: all matter but the densest 2 %, so that beads
     do not set them.
 
-    For line integrals the lower value is at most 0 and matter is what exceeds `AIR`;
+    For line integrals the lower value is at most 0 and matter is above `AIR`;
     other images use the percentiles 0.2 and 99.8. Only every fourth row and column is
     looked at.
 

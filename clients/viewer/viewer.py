@@ -571,7 +571,7 @@ class Viewer:
 
         Args:
             asked: the page's query: view, page, and those of `Stills`. The view "sample"
-                shows only what turns with it.
+                shows only the parts that turn with it.
 
         Returns:
             The picture; None if nothing is placed or the view is not known.

@@ -2,9 +2,9 @@
 
 viser accepts any connection and obeys any message, up to opening a public tunnel. So it listens
 on a Unix socket in a folder that only this user can open, and on no port: every byte has passed
-the front's checks, and `page_messages` filters what pages send. Everything that relies on
+the front's checks, and `page_messages` filters messages of pages. Everything that relies on
 viser's private parts is in this module (viser 1.1; the version is pinned), and
-`tests/viewer/test_viewer_gate.py` shows what a new version has changed.
+`tests/viewer/test_viewer_gate.py` fails where a new version has changed them.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Scenes:
 
         Sockets of viewers that were killed are removed first; on a failure the folder is
         removed. The folder for temporary files is /tmp if the usual one's path exceeds
-        `LONGEST_TMP` bytes. What viser prints is dropped.
+        `LONGEST_TMP` bytes. viser's own output is dropped.
 
         Args:
             label: of the server.

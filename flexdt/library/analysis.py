@@ -60,8 +60,8 @@ def calibrate(
         calibrate`.
 
     Raises:
-        TwinError: a folder is no data set, the phantom has no beads, `free` names what does not
-            exist, or a file does not hold.
+        TwinError: a folder is no data set, the phantom has no beads, `free` has an unknown
+            name, or a file does not hold.
 
     Example:
         >>> import flexdt as fx

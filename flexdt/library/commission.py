@@ -181,7 +181,7 @@ def commission(
 
     The machine to begin with is the shipped one that most texts name; else the one whose
     motors have the limits of an executed script; else the FleX-ray. Where no text names
-    one, that is a question; so are limits and times that no executed script tells (fewer
+    one, that is a question; so are limits and times that no executed script has (fewer
     than `MIN_DURATIONS` commands of a kind). Scans are sorted by date, those without one
     last; a folder given twice counts once.
 
@@ -295,7 +295,7 @@ def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
         ask: takes each warning, and a text that cannot be read, as a question.
 
     Returns:
-        The scan with what could be read.
+        The scan with the readable parts.
     """
     content = list_folder(folder)
     warnings = list[str]()
@@ -455,7 +455,7 @@ def _with_alignment(
         ask: called with the failure as a question.
 
     Returns:
-        The scan with poses and alignment; without what failed.
+        The scan with poses and alignment, as far as both succeeded.
     """
     try:
         scan = tells.standing(scan, machine)

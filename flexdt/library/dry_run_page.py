@@ -131,7 +131,7 @@ def _clearance(clearance: Clearance | None) -> list[str]:
 
 def _steps(report: CheckReport) -> list[str]:
     """Make heading and HTML table of a plan's steps: line, start and duration [s], its 90
-    % range, the part of it that is assumed and from what, and effect."""
+    % range, the assumed part of it with its source, and effect."""
     timing = report.plan.machine.timing
     rows = [
         (

@@ -62,8 +62,8 @@ def calibrate(
     """Calibrate the geometry from scans of a bead phantom or of unknown markers.
 
     A data set may be a folder of TIFFs with the two settings texts alone; --frames and
-    --geometry are for those of any other scanner, --markers for what was marked by hand. Exit
-    code 5 when the data cannot determine what was asked for; then nothing is pushed.
+    --geometry are for those of any other scanner, --markers for beads marked by hand. Exit
+    code 5 when the data cannot determine the parameters; then nothing is pushed.
 
     Args:
         phantom: Use this phantom's beads; unknown: markers anywhere.
@@ -117,7 +117,7 @@ def calibrate(
         _require_answer(twin)
     if report is not None and report.suffix.lower() != ".json":
         require_plots()
-    request_of(target, options)  # what cannot be asked for is said before images are read
+    request_of(target, options)  # refuses impossible options before images are read
     given = _load_inputs(
         datasets or [],
         frames,
@@ -253,9 +253,9 @@ def align(
 ) -> Answer:
     """Find axis and source plane of an ordinary scan, without a phantom.
 
-    Axis column and, if the object tells them, roll and yaw of the panel and row of the plane in
-    which the source turns. Exit code 5 when the scan cannot tell the column; then there is no
-    correction.
+    Axis column and, if the object determines them, roll and yaw of the panel and row of the
+    plane in which the source turns. Exit code 5 when the scan cannot determine the column;
+    then there is no correction.
 
     Args:
         out: Write the report, for flexdt reconstruct --correction.
@@ -263,8 +263,8 @@ def align(
 
     Yields:
         The report as document of --json, then tables and lines; warnings go to standard
-        error. Raises CommandError with NOT_IDENTIFIABLE if the axis column cannot be
-        told; --out has to end with .json.
+        error. Raises CommandError with NOT_IDENTIFIABLE if the axis column is not
+        determined; --out has to end with .json.
     """
     if out is not None:
         option_values.require_ending(out, ".json")
@@ -393,7 +393,7 @@ def push_correction(client: TwinClient, correction: NamedCorrection, source: str
 def show(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield a calibration's document as text: its use first, then images and offsets.
 
-    Without a fit only the verdict, next steps and what was seen are shown; without a
+    Without a fit only the verdict, next steps and detected beads are shown; without a
     scale no markers. Offsets are shown only if identifiable.
 
     Args:

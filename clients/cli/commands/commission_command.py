@@ -15,7 +15,7 @@ def commission(
     traffic: Path | None = option(None, metavar="FILE"),
     out: Path = option(..., metavar="DIR"),
 ) -> Answer:
-    """Fit a machine, its zero offsets and their drift to past scans, and say what disagrees.
+    """Fit a machine, its zero offsets and their drift to past scans, and report contradictions.
 
     Args:
         folders: Past scans.

@@ -254,7 +254,7 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
 
     None as `named` gives (None, None); "none", or a twin without a calibration in force,
     gives zero offsets without report; a file gives its offsets and its report. The twin
-    is asked only for "twin", and gives no report.
+    is used only for "twin", and gives no report.
 
     Args:
         named: a report's file, "twin" or "none"; None for the scan's own.
@@ -407,7 +407,7 @@ def apply_motion(data: DataSet, report: Report) -> DataSet:
     set.
 
     Returned as it is without a motion, and if nothing moves. A report lists one motion
-    for each of its data sets, told apart by their folders; exactly one must be of this
+    for each of its data sets, distinguished by their folders; exactly one must be of this
     one.
 
     Args:
@@ -462,7 +462,8 @@ def export(
 ) -> Answer:
     """Write a data set's geometry in another program's format; nxtomo holds its images, too.
 
-    What the format cannot carry is an error, and nothing is written: docs/exchange.md.
+    A geometry that the format cannot express is an error, and nothing is written:
+    docs/exchange.md.
 
     Args:
         format: Write this program's format.
@@ -542,7 +543,7 @@ def import_(
         pixel: Set the pixel pitch where FILE does not say it (RTK).
         views: Set the number of projections (flexDATA).
         rows: Count rows down or up; up: v is negated.
-        real: Take, of a CTSimU file, what is so, or what reconstruction knows.
+        real: Take, of a CTSimU file, the true geometry, or the one known to reconstruction.
 
     Yields:
         The document of --json (format, file, out, views, shape, pixel_mm, notes), then

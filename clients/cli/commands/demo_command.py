@@ -65,7 +65,7 @@ def demo(
     """Do the main job: script, scan, data set, calibration.
 
     Starts the servers on free ports, scans the LEGO bead phantom with the example script,
-    accelerated, calibrates from the data set, and says what was done, where the files are and
+    accelerated, calibrates from the data set, and prints the steps, where the files are and
     how the result compares with the hidden truth. With the viewer it stays up until Ctrl-C.
 
     Args:
@@ -422,7 +422,7 @@ def _compare_with_truth(
 ) -> bool:
     """Compare the calibration with the hidden truth; a miss is called a miss.
 
-    A table is printed, then one line that says inside or miss. A parameter that the truth
+    A table is printed, then one line with inside or miss. A parameter that the truth
     lacks counts as 0 (angle_scale as 1). Only the calibration's parameters are in the
     table.
 

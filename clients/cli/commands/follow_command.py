@@ -39,7 +39,7 @@ def follow(
     seconds: float | None = option(None, "--for", metavar="S", min=0.0),
     json: bool = False,
 ) -> Answer:
-    """Follow a real scanner: hear its messages, compare, and say what leaves the prediction.
+    """Follow a real scanner: compare its messages with predictions and report deviations.
 
     Nothing is ever sent to the scanner. Ends with Ctrl-C or after --for. Exit code 4 if there
     was no connection.
@@ -184,7 +184,7 @@ async def _run(
 
 async def _status(session: FollowSession) -> None:
     """Print every `STATUS_S` seconds, until cancelled: connection, age of the last
-    message, commands under way, number of alarms, and what is unread.
+    message, commands under way, number of alarms, and unread messages.
 
     It goes to standard error.
     """

@@ -112,7 +112,7 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
         Its last status.
 
     Raises:
-        CommandError: Ctrl-C; the job goes on, and the message says how to steer it. Of an
+        CommandError: Ctrl-C; the job goes on, and the message explains how to steer it. Of an
             own job: it is paused because of an error.
         KeyboardInterrupt: Ctrl-C, of an own job.
     """
@@ -125,7 +125,7 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
         text names it.
 
         Raises:
-            CommandError: the job is paused, and nobody else can resume it.
+            CommandError: the job is paused, and only this command could resume it.
         """
         nonlocal shown
         if status.state != "running":
@@ -243,7 +243,7 @@ def forget(
 def describe(status: JobStatus) -> str:
     """Format a job as one line: name, state, frames done of all.
 
-    Then, where known: script line, what runs, time left on the twin's clock (only while
+    Then, where known: script line, present command, time left on the twin's clock (only while
     queued, running or paused), the error's message, and the data set. An error without
     message is shown whole.
     """

@@ -95,7 +95,7 @@ def fit(
     Args:
         logs: Logs, or recordings of follow; oldest first.
         out: Write the machine to this file.
-        base: Take what the logs do not tell from this machine.
+        base: Take values that are not in the logs from this machine.
 
     Yields:
         The fit as document of --json, then tables of axes and times, and lines. Commands

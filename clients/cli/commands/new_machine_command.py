@@ -36,7 +36,7 @@ def new(
         None, metavar="AXIS", proposes=value_completion.axis_names
     ),
 ) -> Answer:
-    """Write a short file for a machine of your own; asks for what is not said, on a terminal.
+    """Write a short file for a machine of your own; asks for missing values on a terminal.
 
     Args:
         name: One word.
@@ -130,7 +130,7 @@ def _ask_or_default(question: str, given: str | None, usual: str) -> str | None:
     """Return the given value, else the answer of a person at a terminal; None for the
     usual one.
 
-    Without a terminal on stdin, what is given is returned, None too. The question is on
+    Without a terminal on stdin, the given value is returned, None too. The question is on
     standard error; an answer equal to `usual` gives None.
     """
     if given is not None or not sys.stdin.isatty():

@@ -67,7 +67,7 @@ def make(
         stl: Write its surfaces, too, to print it.
 
     Yields:
-        The summary as document of --json, then a line; what is assumed goes to standard
+        The summary as document of --json, then a line; assumptions go to standard
         error. Exactly one of --like, --size and --mesh, else a usage error; an existing
         file is replaced.
     """
@@ -101,7 +101,7 @@ def _size(text: str) -> tuple[float, float, float]:
 
 def _summary(name: str, phantom: Phantom) -> dict[str, object]:
     """Describe a phantom for `--json`: name, size [mm], number of beads, their radii
-    [mm], description, and what is assumed of it.
+    [mm], description, and assumptions about it.
 
     Radii are a list, empty without beads.
     """

@@ -138,7 +138,7 @@ def tube(
     power_W: float | None = option(None, "--power", metavar="W"),
     on: bool | None = option(None, "--on/--off"),
 ) -> Answer:
-    """Set the X-ray tube, or show it; what is left out stays.
+    """Set the X-ray tube, or show it; missing settings stay.
 
     Args:
         kV: Set the tube's voltage.
@@ -171,7 +171,7 @@ def camera(
     roi: options.Roi = None,
     averages: int | None = option(None),
 ) -> Answer:
-    """Set the camera, or show it; what is left out stays.
+    """Set the camera, or show it; missing settings stay.
 
     Args:
         exposure_ms: Set the exposure time.
@@ -426,10 +426,10 @@ def sample(
     unit: str | None = option(None, among=lambda: UNITS_MM),
     material: str | None = option(None, proposes=value_completion.material_names),
 ) -> Answer:
-    """Put a sample on the stage, or list what there is.
+    """Put a sample on the stage, or list the samples.
 
     Args:
-        name: A mesh, phantom or scene file is sent first. Lists what there is if left out.
+        name: A mesh, phantom or scene file is sent first. Lists the samples if left out.
         unit: Read a mesh in this unit; default: mm, for GLB m.
         material: Fill a mesh with this material; default: abs.
 
@@ -482,7 +482,7 @@ def _named_sample(client: TwinClient, name: str) -> SampleResult:
         name: of a sample of the twin.
 
     Returns:
-        What stands on the stage, with warnings.
+        The sample on the stage, with warnings.
 
     Raises:
         CommandError: the twin has no such sample, and the name is that of a file, which is
@@ -547,9 +547,9 @@ def snap(
 ) -> Answer:
     """Take a projection at the current pose.
 
-    A TIFF holds the values as they come: uint16 counts unless said. A PNG is windowed to 8 bit,
-    dense parts dark, and shows line integrals unless said, so X-rays may be off. It shows in
-    colour what would be wrong with the exposure: saturated red, starved blue, cut-off edges
+    A TIFF holds the values as they come: uint16 counts by default. A PNG is windowed to 8 bit,
+    dense parts dark, and shows line integrals by default, so X-rays may be off. It marks in
+    colour pixels of a wrong exposure: saturated red, starved blue, cut-off edges
     yellow.
 
     Args:

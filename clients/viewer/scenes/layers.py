@@ -105,7 +105,7 @@ class Shown:
 
     @property
     def told(self) -> dict[str, object]:
-        """Return what the page gets: "shown" (layer -> bool, of all layers) and
+        """Return the page's copy: "shown" (layer -> bool, of all layers) and
         "opacity".
         """
         return {

@@ -101,7 +101,7 @@ def names_of_image(world: World, top_mm: float | None = None) -> list[Name]:
     """List the names X-ray source, sample and detector with their places [m]; "detector"
     is beside the panel's centre.
 
-    The sample's place is above its origin, so that its name does not lie over it where the
+    The sample's place is above its origin, so that its name does not cover it where the
     camera is near; "detector" is a quarter of the image's width to the side.
 
     Args:

@@ -159,7 +159,7 @@ class MeshCache:
         `NOTHING` for an empty stage.
 
         No sample has the empty look. A named phantom is loaded and kept at its first use;
-        what cannot be loaded is a box, too.
+        a body that cannot be loaded is a box, too.
         """
         if sample.name is None:
             return NOTHING

@@ -170,7 +170,7 @@ class Held:
         """Store a volume (nz, ny, nx), from which requests get slices, and its size for their
         answers.
 
-        Other volumes are dropped. Only the largest of the three voxel sides [mm] is told;
+        Other volumes are dropped. Only the largest of the three voxel sides [mm] is sent;
         nothing is printed.
         """
         self.grid = grid

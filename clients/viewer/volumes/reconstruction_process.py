@@ -79,7 +79,7 @@ class LiveReconstruction:
         self._task = watched(self._follow(*asked), "a live reconstruction")
 
     def stop(self) -> None:
-        """End the running reconstruction, if there is one, and forget what was requested;
+        """End the running reconstruction, if there is one, and forget the request;
         its task is cancelled, not waited for.
 
         Open requests are cancelled (`ask` returns None), and the newest line is cleared.

@@ -134,7 +134,7 @@ def placement(folder: Path) -> StagePlacement:
 def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[str, Any]:
     """Measure figures of a volume, and the same of the truth.
 
-    The main material is what the truth has within `ALIKE_SHARE` (10 %) of its main level,
+    The main material is where the truth is within `ALIKE_SHARE` (10 %) of its main level,
     without its outermost voxels where any remain. Solid is above half the level, measured
     and true alike. Voxels that no data cover are left out.
 

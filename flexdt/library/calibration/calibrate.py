@@ -77,7 +77,7 @@ class Outcome(Generic[Images_co]):
     phantom: Phantom
 
     def __repr__(self) -> str:
-        """Format the phantom's name with the number of asked parameters, of frames, the
+        """Format the phantom's name with the number of requested parameters, of frames, the
         rms [px] and the verdict; or just "not identifiable".
         """
         d = self.document
@@ -90,7 +90,7 @@ class Outcome(Generic[Images_co]):
         )
 
     def _repr_html_(self) -> str:
-        """Make HTML of the verdict and a table of the asked parameters with value, sigma
+        """Make HTML of the verdict and a table of the requested parameters with value, sigma
         and unit.
         """
         heads = ("parameter", "value", "sigma", "unit")
@@ -568,7 +568,7 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
     If it is not to be used, one sentence with the first error, weak direction or lack of
     a fit. Sharp is an axis known to `SHARP_PX`. With a saturated flat field the images
     are not to be reconstructed, sharp or not. The second sentence is about the least
-    certain length that was asked for, and is left out if none was.
+    certain requested length, and is left out if there is none.
 
     Args:
         result: of a calibration.

@@ -16,13 +16,13 @@ class CalibrationOptions(TypedDict, total=False):
         free: the parameters to estimate; default: the thesis's six, for unknown markers dO_x.
         per_scan: those of them with a value of their own in every data set.
         per_frame: parameters that may also move during the scan (dO_x, dO_y, dO_z, alpha, dS_x,
-            dS_y, dD_x, dD_y, dD_z). What moves is in the geometry of the result's `datasets`,
+            dS_y, dD_x, dD_y, dD_z). The motion is in the geometry of the result's `datasets`,
             not in its `correction`: `found.datasets[0].with_correction(found.correction)` has
             both.
         reading: how the thesis's equation 5.4 is read: with the axis at O + tau ("axis", the
             default), or as R (b - tau) + O ("mount").
         bead_tolerance: beads' places are estimated, too, known to this standard deviation [mm];
-            0: they are exact; default: estimated where the residuals ask for it.
+            0: they are exact; default: estimated where the residuals require it.
         priors: how well other offsets are known, parameter -> standard deviation [mm, deg, 1],
             in place of the machine's and the profile's; 0 is exactly, "none" is all exactly.
         start: offsets to begin with [mm, deg, 1], about which priors are centred.
@@ -31,7 +31,7 @@ class CalibrationOptions(TypedDict, total=False):
             themselves: (frame, marker, column, row, sigma), sigma None where it is not known;
             default: they are detected in the images.
         scale: distance of two unknown markers, "A-B=MM" or "A-B=MM+-SIGMA".
-        radius: of the spots of beads [px]; default: what the phantom says, or any.
+        radius: of the spots of beads [px]; default: the phantom's, or any.
     """
 
     free: Sequence[str] | None

@@ -410,7 +410,7 @@ def calibrate_unknown(
     The markers define the object's frame: its height, turn and place on the axis (dO_y,
     alpha, tau_x, tau_z) are those of the request's start. Images determine only the ratio
     of their scale and the distance of the axis; one of these states it: `scale`, a prior
-    on dO_z, or dO_z among what is free. Without any, dO_z has a wide prior, of
+    on dO_z, or a free dO_z. Without any, dO_z has a wide prior, of
     `FREE_SCALE` times the SOD. With `scale` markers and axis are scaled and fitted up to
     four times.
 

@@ -2,7 +2,7 @@
 read.
 
 `FORMATS` lists them once. The command line takes its choices from it before it imports
-anything heavy, so each function imports what it needs.
+anything heavy, so each function has its own imports.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def imported() -> tuple[str, ...]:
 def _export_ctsimu(
     dataset: ImageSet, out: Path, parameters: Offsets | None, real: Offsets | None
 ) -> None:
-    """Write a data set's geometry as a CTSimU scenario; `real` adds the deviations from what is
-    known.
+    """Write a data set's geometry as a CTSimU scenario; `real` adds the deviations from the
+    known one.
 
     Raises:
         TwinError: flexdt-extensions is not installed.
@@ -109,7 +109,7 @@ def _read_rtk(path: Path, given: Given) -> ScanGeometry:
     from flexdt.twin.exchange.geometry import ExchangeError
     from flexdt.twin.exchange.rtk_xml import read_rtk
 
-    # Whether it is RTK's file at all is said before what such a file lacks.
+    # That it is no file of RTK is reported before a missing pitch or shape.
     geometry = read_rtk(
         text_of(path), given.pitch_mm or (1.0, 1.0), given.shape, str(path)
     )

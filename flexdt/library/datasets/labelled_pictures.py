@@ -23,7 +23,7 @@ FONT_SCALE: Final = 0.42
 """Size of the letters, in units of OpenCV's font."""
 PAPER_GREY: Final = 255
 INK_GREY: Final = 0
-"""Grey of the strips and of what is written on them."""
+"""Grey of text and scale bar on the strips."""
 
 
 def labelled(

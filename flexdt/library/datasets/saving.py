@@ -131,7 +131,7 @@ def _require_room_for(
 def unfinished(path: Path) -> str:
     """Describe a folder in which saving was interrupted.
 
-    Numbers that its note does not tell are "?".
+    Numbers that are missing in its note are "?".
 
     Args:
         path: of a folder with the file `UNFINISHED`.
@@ -144,8 +144,8 @@ def unfinished(path: Path) -> str:
 
 
 def _read_note(path: Path) -> Mapping[str, object]:
-    """Read the note of what an unfinished folder was to hold; {} where it is missing or
-    damaged.
+    """Read the note about the planned content of an unfinished folder; {} where it is
+    missing or damaged.
     """
     try:
         noted = json.loads((path / UNFINISHED).read_text(encoding="utf-8"))

@@ -200,7 +200,7 @@ class _Drawing:
     """A parallel projection of the object's frame onto a square.
 
     Attributes:
-        middle: of what is drawn (x, y, z) [mm].
+        middle: of the drawn bodies (x, y, z) [mm].
         millimetres: along the square's side.
         radius_mm: of the circle drawn for the sample.
     """

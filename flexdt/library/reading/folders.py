@@ -1,8 +1,8 @@
 """Read and save data sets in folders: frames, geometry, completeness.
 
 Works on folders that this package wrote and on a scanner's own (TIFFs and the two settings
-texts alone). Errors are typed and name the file; what leaves the rest usable is a warning in
-`warnings`. Missing frames are listed, and reading one is an error.
+texts alone). Errors are typed and name the file; a defect that leaves the rest usable is a
+warning in `warnings`. Missing frames are listed, and reading one is an error.
 """
 
 from __future__ import annotations
@@ -232,8 +232,8 @@ def read_tiffs(
 
 
 def _without_flat(folder: str, names: Sequence[str], pattern: str) -> str:
-    """Say what a scan without flat images lacks, and name the first file that looks like
-    one.
+    """Write the warning that a scan lacks flat images, with the first file that looks
+    like one.
 
     Args:
         folder: name of the folder.

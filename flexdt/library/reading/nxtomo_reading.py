@@ -175,7 +175,7 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
 
     Raises:
         DatasetFormatError: images and keys do not fit each other, or images are missing,
-            exceed the memory, or are more than what is stored can hold.
+            exceed the memory, or are larger than the stored bytes allow.
     """
     data = group["data"]
     keys = np.asarray(group["image_key"])
@@ -394,7 +394,7 @@ def _stated_figures(
     """Compare the angles and the pixel that the file states with the geometry.
 
     Only the first pixel size found counts (next to the images, then at the entry and its
-    groups). What is in an unknown unit is a finding, too.
+    groups). A value in an unknown unit is a finding, too.
 
     Args:
         file: open.

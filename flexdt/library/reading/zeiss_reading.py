@@ -189,7 +189,8 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
             raise DatasetFormatError(
                 f"images of floats; allowed: with {REFERENCES[0]}/Image"
             )
-        with np.errstate(all="ignore"):  # what is not finite is refused by its name
+        # NaN and inf are rejected later with the file's name.
+        with np.errstate(all="ignore"):
             images = images / np.maximum(flats.mean(axis=0), 1e-6 * flats.max())
             images = -np.log(np.maximum(images, np.finfo(np.float32).tiny))
             flats = None

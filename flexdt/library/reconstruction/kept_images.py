@@ -155,7 +155,7 @@ class CountsOnce:
     def read_by(self, dataset: ImageSet) -> ImageSet:
         """Return the data set with its counts read through this object, each once.
 
-        A data set in memory is returned as it is, and what was looked at is forgotten.
+        A data set in memory is returned as it is, and images looked at before are dropped.
         """
         held = dataset.arrays or Arrays(None)
         if held.counts is not None:  # in memory already

@@ -107,8 +107,8 @@ def _plan(grid: Grid, kept: int, most_pixels: int, memory: int) -> MemoryPlan:
         memory: free bytes.
     """
     need = 4 * kept * most_pixels
-    # Fewer slabs are better than images in memory: the file's parts are there as long as nobody
-    # else needs the memory.
+    # Fewer slabs are better than images in memory: the file's parts are cached until
+    # another program needs the memory.
     on_disk = need > KEPT_SHARE * memory or memory - need < grid.bytes <= memory
     slabs = grid.slabs(memory if on_disk else memory - need)
     return MemoryPlan(tuple(slabs), kept, most_pixels, on_disk, prepared=len(slabs) > 1)

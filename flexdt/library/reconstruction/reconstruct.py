@@ -1,10 +1,10 @@
 """`flexdt reconstruct` without its command line: a data set in, a volume file out.
 
 FDK goes slab by slab and prepares images in parts, so memory stays bounded whatever the
-volume's size, and each image is read once: `memory_plan` decides what is in memory at a time,
-and images that are needed again are in `kept_images`. The iterative algorithms hold everything
-and are for small or binned problems. Missing frames are left out, and the outcome states how
-many.
+volume's size, and each image is read once: `memory_plan` decides which parts are in memory
+at a time, and images that are needed again are in `kept_images`. The iterative algorithms
+hold everything and are for small or binned problems. Missing frames are left out, and the
+outcome states how many.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class ScanFrames:
         scatter: of each of the m frames, to subtract, or None.
         doubts: about the images, the trajectory and the corrections.
         kept: store of images that are needed again; None reads them again.
-        sides_known: their geometry is corrected by beads, which have told the direction of
+        sides_known: their geometry is corrected by beads, which determine the direction of
             rotation and mirrored images.
     """
 
@@ -201,7 +201,7 @@ class ScanFrames:
     def view(self, number: int, *, again: bool = True) -> Float32Array:
         """Return one frame's line integrals, binned and corrected.
 
-        Corrected are scatter, rings and beam hardening, in this order, where asked for.
+        Corrected are scatter, rings and beam hardening, in this order, where requested.
 
         Args:
             number: of the frame among those that are reconstructed.
@@ -272,7 +272,7 @@ def views_of(
 
 
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
-    """Choose the grid of a requested volume; what is not requested is that of the field
+    """Choose the grid of a requested volume; missing values are those of the field
     of view.
 
     A requested shape without centre is centred at the origin.
@@ -805,7 +805,7 @@ def _apply_corrections(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
         request: the volume.
 
     Returns:
-        The frames with what corrects them as they are read.
+        The frames with their corrections, applied as they are read.
     """
     panel = views.dataset.panel
     if views.kept is not None and panel is not None and panel.lag:

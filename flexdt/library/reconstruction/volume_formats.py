@@ -72,7 +72,7 @@ FIELDS_OF_OTHER_VALUES: Final = (
     "data file",
     "datafile",
 )
-"""Fields of either header by which values are others, or lie elsewhere."""
+"""Fields of either header that change the values or their place."""
 MAX_ASIDE: Final = 1e-6
 """Largest component of an axis along another, relative to the longest edge: rounding."""
 
@@ -194,7 +194,7 @@ def _write_headed(
     """
 
     def write(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
-        """Write header and voxels to a file, compressed by gzip if asked for; yields the
+        """Write header and voxels to a file, compressed by gzip on request; yields the
         function that takes the slabs.
         """
         first = header(places)

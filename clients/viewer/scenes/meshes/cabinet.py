@@ -64,8 +64,8 @@ class Room(NamedTuple):
 
 
 def room_of(machine: Machine) -> Room:
-    """Compute the `Room` of a machine: corners of what its parts reach [mm], its scale
-    over the FleX-ray, and the floor's height [mm].
+    """Compute the `Room` of a machine: corners of the box that its parts can reach [mm],
+    its scale over the FleX-ray, and the floor's height [mm].
 
     The scale is the smaller ratio of horizontal and vertical reach to `DRAWN_FOR_MM`; the
     floor lies `BELOW_MM` times the scale below the lowest part.
@@ -115,9 +115,9 @@ def reach_of(machine: Machine) -> tuple[FloatArray, FloatArray]:
 def cabinet(room: Room) -> tuple[list[PaintedMesh], FloatArray]:
     """Build the cabinet around all that the machine's parts reach.
 
-    Walls, floor, door and what is on it are seen from within only. Walls and floor are
-    the inside of a box, `ROOM_MM` beyond the machine; the ceiling is left out. Door,
-    window, handle and sign are on the wall at lowest x; four steel kerbs surround the
+    Walls, floor, and door with handle, window and sign are seen from within only. Walls and
+    floor are the inside of a box, `ROOM_MM` beyond the machine; the ceiling is left out.
+    Door, window, handle and sign are on the wall at lowest x; four steel kerbs surround the
     floor. All lengths scale with `room.scale`. The lamp itself is not among the pieces.
 
     Args:
