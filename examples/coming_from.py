@@ -121,7 +121,8 @@ def run(code: str, names: dict[str, Any]) -> dict[str, object]:
 
 
 def spread_mm(rows: np.ndarray, wanted: fx.ConeVec, upwards: bool) -> float:
-    """Largest difference of two geometries [mm]; v of the other may point upwards."""
+    """Compute the largest difference of two geometries [mm]; `upwards`: v of the other points
+    upwards."""
     ours = wanted.rows.copy()
     ours[:, 9:] *= -1 if upwards else 1
     return float(np.abs(rows - ours).max()) if rows.shape == ours.shape else float("nan")
@@ -201,9 +202,10 @@ def compared(peer: str, theirs: dict[str, Any], ours: dict[str, Any]) -> dict[st
         ours: names after the code of flexdt's block.
 
     Returns:
-        Name -> largest difference of geometries [mm] or projections; a `..._part` is
-        divided by the mean of flexdt's images (mean difference) or by the true volume's
-        largest value (rms error). A result that the peer did not make is left out.
+        Largest differences `geometry_mm`, `there_and_back_mm` (tomosipo's geometry converted
+        and back) and `projections`; `mean_difference_part` and, with its images mirrored,
+        `mean_difference_part_if_mirrored`, over the mean of flexdt's; `rms_error_part`, over
+        the true volume's largest value. A result that the peer did not make is left out.
     """
     out: dict[str, float] = {}
     turn, scan = ours.get("turn"), theirs.get("scan")

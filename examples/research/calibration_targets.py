@@ -231,10 +231,13 @@ TARGETS: Final = (
 
 
 def collected(folders: Sequence[Path]) -> dict[str, Document]:
-    """Read the JSON documents of studies below some folders, by study name; of two with
-    one name the later file counts.
+    """Read the JSON documents of studies below some folders; of two of one study the file
+    that was changed later counts.
 
     Files that are no JSON or no known document are skipped.
+
+    Returns:
+        Study -> document: `EXPERIMENT-FIDELITY`, `coverage_CAMERA`, `robustness` or `bench`.
     """
     out: dict[str, Document] = {}
     files = {f for folder in folders for f in folder.rglob("*.json")}

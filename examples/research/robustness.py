@@ -41,7 +41,7 @@ it is only there that a wrong answer can be a confident one."""
 def cases(
     sets: int, kinds: Sequence[str] = tuple(KINDS)
 ) -> Iterator[tuple[str, int, str]]:
-    """(kind, seed, phantom) of each data set."""
+    """List (kind, seed, phantom) of each data set."""
     order = [k for k in kinds for _ in range(2 if k in SURVIVABLE else 1)]
     for i in range(sets):
         yield order[i % len(order)], i, PHANTOMS[(i // len(order) + i) % len(PHANTOMS)]
@@ -79,7 +79,8 @@ def run(
         kinds: ways of spoiling, taken in turn.
 
     Returns:
-        counts, one row a kind, and every confident wrong answer with its seed.
+        Document of `summary`: counts, one row a kind, and every confident wrong answer with
+        its seed.
     """
     work = list(cases(sets, kinds))
     kept = {} if keep is None else _kept(keep)
@@ -191,7 +192,7 @@ def kinds_table(document: Mapping[str, Any]) -> list[str]:
 
 
 def coverage_case(task: tuple[int, str]) -> Draw:
-    """One seed of the coverage study, LEGO phantom."""
+    """Simulate and calibrate one scan of the LEGO phantom; `task` is seed and camera."""
     seed, camera = task
     phantom = load_phantom("lego")
     return draw(seed, bead_model(phantom), phantom.scene, CAMERAS[camera])
@@ -200,16 +201,20 @@ def coverage_case(task: tuple[int, str]) -> Draw:
 def coverage(
     seeds: int, camera: str, jobs: int | None = None, keep: Path | None = None
 ) -> dict[str, object]:
-    """Calibrate simulated scans and count how often the truth is inside the 95 % regions.
+    """Calibrate simulated scans and count how often the truth is inside the 95 % regions;
+    print progress every 100 scans.
 
     Args:
         seeds: number of scans.
         camera: of CAMERAS.
         jobs: processes; None is one for each core.
-        keep: as in `run`.
+        keep: file of draws that are not repeated, and to which each new one is added.
 
     Returns:
-        Counts, shares [%], findings and the largest distance.
+        `seeds`, `camera`, `offered` (calibrations with a result), and of these `inside_95`,
+        `share_pct` and `intervals_pct` (mean share of single intervals that hold the truth)
+        [%]; `findings` (code -> number), and `worst_distance`, the largest
+        squared Mahalanobis distance.
     """
     draws: list[Draw] = []
     if keep is not None and keep.is_file():

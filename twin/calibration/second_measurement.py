@@ -75,7 +75,7 @@ def _measured(
     first round only and removed in each, if seen, and blur and size only in drafts and in a
     first round.
 
-    Windows of frames that are not usable become NaN.
+    Windows of frames that are not usable become NaN. Dead pixels are filled, see `mended`.
 
     Args:
         state: the scans, identified.

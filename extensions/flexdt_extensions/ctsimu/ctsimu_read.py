@@ -55,6 +55,18 @@ class PerFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Deviation:
+    """A translation or rotation of a part; see `_deviation`.
+
+    Attributes:
+        turn: whether it is a rotation.
+        reference: coordinate system of the axis: world, stage, or the part's own.
+        axis: direction (3,), unit length.
+        pivot_reference: coordinate system of the pivot.
+        pivot: point on the axis of rotation (3,) [mm].
+        amount: for each frame [mm or rad].
+        known: whether reconstruction knows it.
+    """
+
     turn: bool
     reference: str
     axis: FloatArray
@@ -66,7 +78,15 @@ class _Deviation:
 
 @dataclass(frozen=True, eq=False)
 class PlacedPart:
-    """Where something is: centre [mm], axes as columns (3, 3), and how it moves."""
+    """Source, detector, stage or sample of a scenario, with its motion.
+
+    Attributes:
+        center: at the first frame (3,) [mm].
+        axes: u, v, w as columns (3, 3).
+        moves: drifts of the three coordinates of the centre [mm], added to it.
+        deviations: in the order in which they are applied.
+        on_stage: whether centre and axes are in the stage's coordinates, not the world's.
+    """
 
     center: FloatArray
     axes: FloatArray
@@ -202,6 +222,10 @@ class ScenarioReader:
             angle: (n,) of the stage [rad].
             pitch: pixel edges along u and v [mm].
             real: with the deviations unknown to reconstruction.
+
+        Returns:
+            Tuples of a frame: source, detector, u, v, stage's centre (3,), and its axes
+            as columns (3, 3).
         """
         still = np.zeros(self._count)
         out: list[Pose] = []
@@ -249,7 +273,7 @@ class ScenarioReader:
         references.
 
         Its vectors need not be of unit length, but at right angles and in the reference
-        of the centre.
+        of the centre. Keys of file formats before 1.0 (`centre`, `deviation`) are errors.
 
         Args:
             part: its object in the scenario.
@@ -257,7 +281,8 @@ class ScenarioReader:
             allowed: references, each the names of three axes.
 
         Returns:
-            Centre [mm], axes, drifts of the centre and deviations.
+            The part: centre [mm], axes, drifts of the centre and deviations, in the
+            reference of its centre.
 
         Raises:
             ExchangeError: names file, key and the allowed values.
@@ -315,6 +340,9 @@ class ScenarioReader:
         Args:
             value: its object in the scenario.
             where: its place, for errors.
+
+        Returns:
+            The deviation, with known and real amounts (n,) [mm or rad].
 
         Raises:
             ExchangeError: names file, key and the allowed values.

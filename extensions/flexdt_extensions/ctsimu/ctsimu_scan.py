@@ -885,7 +885,8 @@ class _ScanReader(ScenarioReader):
     def _series(
         self, units: Mapping[Any, float], *path: str, default: float | None = None
     ) -> FloatArray:
-        """Read a number above 0 for each frame, as it really is.
+        """Read the true values of a number above 0, one for each frame, drifts that
+        reconstruction does not know included.
 
         Only a missing value takes the default; without a default it is an error.
 

@@ -563,7 +563,8 @@ def image_runs(
     frames: int = FRAMES,
     counts: Sequence[int] = COUNTS,
 ) -> list[Run]:
-    """Calibrate one scan from N of its images, with the beads as they were found.
+    """Simulate the images of one scan, with hidden mount and bead places, and calibrate it
+    from N of them, with the beads as they were found.
 
     A run that fails has its error as a note, and its estimates are compared with the
     truth in the printed reading.
@@ -575,7 +576,10 @@ def image_runs(
         beam: effective energies of the images.
         seed: of beads and noise.
         frames: images of the scan.
-        counts: numbers of images to calibrate from.
+        counts: numbers of images to calibrate from, evenly spread.
+
+    Returns:
+        A run for each count.
     """
     really, _ = hidden_phantom(scene, model, seed)
     poses = nominal_poses(name, frames)

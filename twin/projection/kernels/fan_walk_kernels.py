@@ -526,6 +526,14 @@ def prefetch_slab(flat, spans, grid, fan, j, transposed):
     beside it that are to be opened.
 
     Levels that the fan cannot touch, and forward those that hold nothing, are left out.
+
+    Args:
+        flat: voxels; not changed.
+        spans: occupied levels of each voxel column; transposed, marks of the open ones.
+        grid: the box as seen along the fan.
+        fan: of the rays.
+        j: number of the slab.
+        transposed: see above.
     """
     x = grid.sl + fan.m0 * (j - grid.st)
     w0, w1 = levels_between(grid, fan, j, j + 1)
@@ -550,7 +558,16 @@ def prefetch_slab(flat, spans, grid, fan, j, transposed):
 @inline
 def open_slab(flat, marks, grid, j, i0, i1):
     """Open the voxel columns l = i0 to i1 (inclusive, those outside the grid left out) of
-    slab j, so that they may be added to; see `siddon_kernels.open_column`."""
+    slab j, so that they may be added to; see `siddon_kernels.open_column`.
+
+    Args:
+        flat: voxels; columns that are opened are set to 0.
+        marks: of the voxel columns, changed: 0 until one is open.
+        grid: the box as seen along the fan.
+        j: number of the slab.
+        i0: first column.
+        i1: last column.
+    """
     for i in range(max(i0, 0), min(i1, grid.nl - 1) + 1):
         mark = mark_of(grid, j, i)
         if marks[mark] == 0:

@@ -352,8 +352,8 @@ def _evidence_of(
     frames: int,
     evenly: bool,
 ) -> Evidence:
-    """Judge gaps by some of the differences of neighbouring columns, for all WIDTHS_PX,
-    averaged over BLURS_PX.
+    """Judge gaps by some of the differences of neighbouring columns, for all WIDTHS_PX;
+    likelihoods of a gap are averaged over BLURS_PX.
 
     Args:
         around: differences about each border, (m, c, 2 SIDE - 1).
@@ -363,7 +363,8 @@ def _evidence_of(
         evenly: a gap would be as visible at each border; else by the number that counts.
 
     Returns:
-        By width and border; zero evidence if no difference counts.
+        By width and border: the evidence of a gap, and of its width, which counts less
+        where the model fits badly (`Judged.trust`); zeros if no difference counts.
     """
     row, border = np.nonzero(seen)
     places = power.shape[1]
