@@ -36,7 +36,7 @@ class Acquila:
         self.commands = context.socket(zmq.PUB)
         self.commands.connect(f"tcp://{host}:{into}")
         self.numbers = itertools.count(time.time_ns() % 2**48)
-        time.sleep(0.5)  # ZeroMQ drops what is sent before both sides know each other
+        time.sleep(0.5)  # ZeroMQ drops messages before both sides know each other
 
     def send(
         self, component: str, command: str, arg1: object = "", arg2: object = ""

@@ -3,9 +3,9 @@
 Needs `pip install gvxr` and, without a graphics card, Mesa's software OpenGL (`apt install
 libegl1 libgl1 libxcb-res0 libxcb-ewmh2 libxcb-icccm4 libxcb-composite0 libxcb-xinerama0
 libxcb-keysyms1`). Both get the same spectrum and the same geometry and see the signal of a
-detector that measures energy. gVirtualXRay uses meshes and its own attenuation tables. Which
-way its rows and columns run is asked of it with one ball whose shadow is worked out by hand, so
-an image of ours that were mirrored would not pass. Prints the differences of the transmissions
+detector that measures energy. gVirtualXRay uses meshes and its own attenuation tables. The
+direction of its rows and columns is found with one ball whose shadow is worked out by hand, so
+a mirrored image of ours would not pass. Prints the differences of the transmissions
 of all pixels and of those off the edges.
 
     python examples/compare_gvxr.py
@@ -111,7 +111,7 @@ def theirs(folder: Path) -> np.ndarray:
 
 
 def transmission() -> np.ndarray:
-    """Of what gVirtualXRay has been told of so far."""
+    """Compute the transmission image of gVirtualXRay's present scene, 1 in the open beam."""
     image = np.array(gvxr.computeXRayImage(), dtype=np.float64)
     return image / float(gvxr.getTotalEnergyWithDetectorResponse())
 

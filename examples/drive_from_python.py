@@ -1,5 +1,5 @@
-"""Drive the scanner from Python: move two axes, take a projection, see where its geometry
-stands.
+"""Drive the scanner from Python: move two axes, take a projection, print its
+geometry.
 
 Start `flexdt up` in another terminal, then run `python examples/drive_from_python.py`.
 """
@@ -31,7 +31,7 @@ def main(host: str = "127.0.0.1", port: int = 55000) -> None:
             f"projection {taken.image.shape}, largest line integral {taken.image.max():.3f}"
         )
 
-        # The geometry that came with the image says where every point of the sample falls.
+        # With the image's geometry the shadow of any point of the sample is computed.
         column, row = ConeVec(taken.cone_vec).project_points(
             [[0, 0, 0]], taken.image.shape
         )[0, 0]

@@ -1,10 +1,10 @@
-"""A data set's geometry in every format there is, read back, and what each lost.
+"""A data set's geometry in every format there is, read back, and the loss of each.
 
     python examples/exchange.py DATASET [OUT_DIR]
 
 Writes the files into OUT_DIR (default: exchange) and prints one line a format: the largest
 difference of any number of cone_vec [mm] and of any projected point [px]. A format that cannot
-carry the geometry says so.
+express the geometry is reported.
 """
 
 import sys

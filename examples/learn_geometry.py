@@ -1,4 +1,4 @@
-"""A misalignment learnt back from images by gradients, and what the gradients cost.
+"""A misalignment learnt back from images by gradients, and the gradients' cost.
 
     python examples/learn_geometry.py [--trials 10] [--views 32] [--voxels 80] [--sharp]
     [--peer] python examples/learn_geometry.py --cost 256
@@ -9,8 +9,8 @@ scanner whose detector is shifted and rolled and whose rotation axis is off. The
 voxels are the model. From starts drawn at random, Gauss-Newton finds shift, roll and axis: each
 alone, then all three. Errors are in pixels: of the roll at the end of a row, of the axis as it
 moves the image. With all three free, the distance between images of points by the found and by
-the true geometry is what counts; the singular values of the Jacobian name the direction that
-the images say least about.
+the true geometry counts; the singular values of the Jacobian name the direction that
+the images determine least.
 
 With --peer the same task, by the same optimiser (L-BFGS on loss and gradient), for diffdrr
 (pip install diffdrr) beside flexdt. Prints JSON.
@@ -35,7 +35,7 @@ NEAR_PX = (0.03, 0.1, 0.2)
 
 @dataclass(frozen=True)
 class Task:
-    """Model, images and what is true.
+    """Model, images and the true geometry.
 
     Attributes:
         nominal: geometry without misalignment.
@@ -59,7 +59,7 @@ class Task:
             self.nominal.rows[:, i : i + 3].copy() for i in (0, 3, 6, 9)
         )
         angle = roll / (0.5 * width)  # a px at the end of a row
-        aside = axis * SOD_MM / SDD_MM * u  # what moves the image by a px
+        aside = axis * SOD_MM / SDD_MM * u  # moves the image by a px
         turned = (
             np.cos(angle) * u + np.sin(angle) * v,
             np.cos(angle) * v - np.sin(angle) * u,

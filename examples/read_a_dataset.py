@@ -1,5 +1,4 @@
-"""Read a data set: normalised projections, the geometry of each, and what the scanner wrote
-down.
+"""Read a data set: its size, normalised projections, and the geometry of each.
 
 Run `flexdt demo --no-viewer`, then `python examples/read_a_dataset.py
 flexdt-demo/data/lego-...`.

@@ -4,7 +4,7 @@
     python examples/reconstruct_with_rtk.py DATASET geometry.xml OUT.npy [VOXEL_MM] [VOXELS]
 
 Needs itk-rtk. The images go in as they are, row 0 on top. The volume comes out in the order z,
-y, x, layers from the lowest up, so it lies on what `flexdt reconstruct` gives.
+y, x, layers from the lowest up, as a volume by `flexdt reconstruct`.
 """
 
 import sys

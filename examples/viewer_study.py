@@ -1,4 +1,4 @@
-"""Measure what the browser gets: rates, latency, memory (docs/evidence/viewer.json).
+"""Measure the messages to a browser: rates, latency, memory (docs/evidence/viewer.json).
 
     python examples/viewer_study.py                   # rates and latency, about a minute
     python examples/viewer_study.py --minutes 30      # and memory under half an hour of motion
@@ -64,7 +64,7 @@ def servers() -> Iterator[dict[str, Any]]:
 
 
 class Page:
-    """What a browser's page is to the viewer, without a browser."""
+    """A page of the viewer without a browser: counts and confirms messages as one does."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self.socket, self.states, self.images, self.bytes = socket, 0, 0, 0
@@ -237,9 +237,7 @@ def memory(page: Any, minutes: float, pid: int) -> list[dict[str, float]]:
         resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf(
             "SC_PAGE_SIZE"
         )
-        session.send(
-            "HeapProfiler.collectGarbage"
-        )  # what is in use, not what is not yet swept
+        session.send("HeapProfiler.collectGarbage")  # memory in use, without garbage
         heap = session.send("Runtime.getHeapUsage")["usedSize"]
         samples.append(
             {

@@ -1,17 +1,17 @@
-"""`flexdt align` on scans of known geometry: errors, sigmas and refusals beside what was aimed
-at.
+"""`flexdt align` on scans of known geometry: errors, sigmas and refusals beside the
+targets.
 
     python examples/research/align_targets.py [--views 180] [--binning 2] [--geometries 10]
     [--json] python examples/research/align_targets.py --spoilt
     python examples/research/align_targets.py --jitter 1
     python examples/research/align_targets.py --edge
 
-`--jitter` shifts every frame at random and tells what is left of the shifts after
-`align(per_frame=True)`. `--edge` reconstructs a ball (FDK) as the data set says it was scanned,
-as aligned and as it really was, and tells how wide its edge is (10 to 90 %).
+`--jitter` shifts every frame at random and prints the rest of the shifts after
+`align(per_frame=True)`. `--edge` reconstructs a ball (FDK) with the data set's geometry, the
+aligned and the true one, and prints the width of its edge (10 to 90 %).
 
 Objects are sums of ellipsoids and boxes, whose line integrals are closed forms, written out
-here with kinematics of their own: nothing is shared with what is tested. Geometries are drawn
+here with kinematics of their own: nothing is shared with the tested code. Geometries are drawn
 by a seed. Errors are in pixels of the binned panel; the table also gives them in those of the
 default mode (956 x 760 of 0.1496 mm).
 """
@@ -519,7 +519,7 @@ def spoilt(
 
 def main() -> None:
     """Align drawn scans and print a line of errors and pulls for each object, kind and
-    number of photons, or what the options choose.
+    number of photons, or those that the options choose.
     """
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--views", type=int, default=180)

@@ -3,7 +3,7 @@
     python examples/research/busy_machine.py --loops 8 --rounds 5
 
 Rounds take turns: each runs every case once while the loops are stopped and once while they
-run, and says how long that took (some 5 s of processor time each, two thirds of it `tv`). A
+run, and prints how long that took (some 5 s of processor time each, two thirds of it `tv`). A
 line a case: median wall time of both [s], their ratio, and processor time beside the loops as a
 multiple of that without them. A fair scheduler gives n threads beside m loops on c cores c /
 (n + m) of a core each, where it shares by process; Linux with `sched_autogroup_enabled` shares

@@ -1,10 +1,10 @@
 """Targets of calibration, our figures and the thesis's, in one table.
 
-`python examples/research/calibration_targets.py FOLDER...` reads what `flexdt study --out`,
-`robustness.py --out` and `calibration_speed.py --json` wrote under the folders. `--run points`
-(seconds) or `--run images` (hours) first runs the studies that are missing, into the first
-folder. A figure that is missing is listed with the command that makes it. Exit code 1 if a
-target is missed.
+`python examples/research/calibration_targets.py FOLDER...` reads the documents of `flexdt
+study --out`, `robustness.py --out` and `calibration_speed.py --json` under the folders.
+`--run points` (seconds) or `--run images` (hours) first runs the studies that are missing,
+into the first folder. A figure that is missing is listed with the command that makes it.
+Exit code 1 if a target is missed.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Target:
     """One line of the table.
 
     Attributes:
-        text: what was to be reached.
+        text: the target in words.
         source: key of the document it is read from.
-        command: what makes that document.
+        command: makes that document.
         read: the document to the figures.
     """
 

@@ -34,10 +34,10 @@ class Draw:
     Attributes:
         seed: which.
         offered: the calibration was identifiable.
-        inside: the truth lies in the joint 95 % ellipsoid.
+        inside: the truth is in the joint 95 % ellipsoid.
         intervals: share of the six 95 % intervals that hold their truth.
         distance2: squared Mahalanobis distance.
-        warnings: codes of what was found.
+        warnings: codes of the calibration's findings.
     """
 
     seed: int

@@ -1,10 +1,10 @@
-"""What `flexdt bench` leaves out: the adjoint, scenes and meshes, FDK, growth, cold start,
-memory, what memory allows, and the way through the projector server.
+"""Measurements beyond `flexdt bench`: the adjoint, scenes and meshes, FDK, growth, cold start,
+memory, sizes that memory allows, and the way through the projector server.
 
     python examples/research/further_bench.py --out out/further [--only FDK growth] [--no-peers]
 
 writes `bench.json`, of the form that `flexdt bench` writes: `docs/tools/bench_page.py` takes
-both. `--list` names what there is.
+both. `--list` names the cases.
 
 Growth is time against the number of rays, voxels along an edge and threads; the points of a
 curve are timed in rotation, so that a disturbance affects all of them alike.
@@ -88,7 +88,7 @@ FIRST = next(iter(KINDS))
 MIDDLE_MM = 10.0
 """Radius about the axis in which a volume's mean is compared with the truth."""
 RTK_PADDING = 0.5
-"""Of rows that RTK is told are cut off, over their length."""
+"""Extension of rows given to RTK as cut off, over their length."""
 ADJOINT = (
     "C1", "C1x36", "C1-tilt", "C2", "C3", "C2-tilt", "C3-tilt", "cone-60", "cone-60-tilt",
     "tilt-45", "roll-90", "roll-90-tilt", "near", "flat", "anisotropic", "on-axis", "C1x1000",
@@ -99,7 +99,7 @@ INTO_NEW = ("C1", "C1-tilt")
 
 
 def adjoint_names() -> list[str]:
-    """Names of what `adjoint` measures."""
+    """List the names of the cases of `adjoint`."""
     return [f"adjoint-{n}" for n in ADJOINT] + [f"adjoint-{n}-new" for n in INTO_NEW]
 
 
@@ -165,8 +165,8 @@ def fdk_scan(size: str = "FDK") -> tuple[ConeVec, Volume]:
 
 
 def fdk_names(size: str) -> list[str]:
-    """Names of what `fdk_entries` measures; the size's own is of an object that is seen
-    whole."""
+    """List the names of the cases of `fdk_entries`; the size alone names the object that is
+    entirely in view."""
     return [size if kind == FIRST else f"{size}-{kind}" for kind in KINDS]
 
 
@@ -411,8 +411,8 @@ async def _through(host: str, port: int) -> list[Entry]:
 
 @njit(parallel=True, nogil=True, cache=True, fastmath=True)
 def read_all(data, workers):
-    """Sum up an array in `workers` equal parts, in parallel, but for what the division
-    leaves over; the sum is returned so that no reading is optimised away.
+    """Sum up an array in `workers` equal parts, in parallel, without the
+    remainder of the division; the sum is returned so that no reading is optimised away.
     """
     sums = np.zeros(workers * 16)
     each = data.size // workers
@@ -616,8 +616,7 @@ SERIES = (("level", NONE), ("tilted", TILT_DEG))
 
 @dataclass(frozen=True)
 class Point:
-    """A point of a curve: which curve, where on it, what is timed, how many views that
-    makes."""
+    """A point of a curve: curve, abscissa, timed call and number of views."""
 
     series: str
     x: int
@@ -891,7 +890,7 @@ GROUPS: Mapping[tuple[str, ...], Callable[[Wanted, frozenset[str]], Iterable[Ent
     BOUNDS: lambda wanted, part: bounds(wanted),
     ("bodies",): lambda wanted, part: bodies(),
 }
-"""Names of cases -> what measures them, given the names of peers taking part."""
+"""Names of cases -> function that measures them, given the names of peers taking part."""
 
 CURVES: Mapping[str, Callable[[], list[Entry]]] = {
     "rays": lambda: growth_with_rays(),

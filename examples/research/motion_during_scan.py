@@ -8,9 +8,9 @@ and images are those of the rays, planes and balls of `prior_coverage`; nothing 
 model is in them.
 
 For each kind: the beads' distance from where the geometry has them before and after [px rms],
-the error of the deviations [um rms] without what turns once with the table (an object that
-stands aside does the same), errors over sigmas of the six parameters and of the deviations, and
-how often a parameter that does not move was said to.
+the error of the deviations [um rms] without the part that turns once with the table (an object
+beside the axis does the same), errors over sigmas of the six parameters and of the deviations, and
+how often a parameter at rest was reported to move.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ASKED: Final = {
     "runout": ("dO_x", "dO_y"), "screw": ("dO_y", "alpha"), "spot": ("dS_x", "dO_y"),
     "jitter": ("dO_x", "dO_y"), "nothing": ("dO_x", "alpha"),
 }  # fmt: skip
-"""What is allowed to move; only the first does (and nothing of the last)."""
+"""Parameters that are allowed to move; only the first does (and none of the last)."""
 SIX: Final = tuple(REACH)
 
 

@@ -2,7 +2,7 @@
 
 `python examples/research/panel_distortion.py [--each 25] [--seed 100]` calibrates scans whose
 panel is distorted as `faults_drawn` draws it (radially, decentred, by any cubic, or with a gap
-between tiles; panel and axis elsewhere than is said, by the usual amounts) and prints how far
+between tiles; panel and axis off their nominal places by the usual amounts) and prints how far
 the distortion that was found is from the true one, and pulls and coverage of the offsets.
 
 Shifts, turns, scales and perspective belong to the offsets; they are removed from the

@@ -5,7 +5,7 @@ makes bead tracks with detector shifts, tilts and axis tilts drawn from the prio
 how often the truth lies in the 95 % intervals and in the joint 95 % region. `--wider 2` draws
 them twice as wide as the fit believes, `--skewed` from a one-sided distribution of the same
 mean square. `--images` makes radiographs instead of tracks, of five balls, and calibrates from
-them without being told which ball is which. Tracks and images come from rays, planes and balls
+them without knowing which ball is which. Tracks and images come from rays, planes and balls
 written out here; nothing of the fit's model is in them.
 """
 
@@ -49,7 +49,7 @@ REACH: Final = {
     "tau_x": 2.0,
     "tau_z": 2.0,
 }
-"""Half the range [mm, deg] of what is estimated freely."""
+"""Half the range of freely estimated parameters [mm, deg]."""
 RADIUS: Final = 1.0
 ATTENUATION: Final = 0.4
 PHOTONS: Final = 10_000.0
@@ -254,8 +254,8 @@ def scan(
     tracks += NOISE_PX * rng.normal(size=tracks.shape)
 
     def fitted(priors: Mapping[str, float]) -> FitResult:
-        """Fit the geometry to the tracks with these priors; no sigma is too large to be
-        told.
+        """Fit the geometry to the tracks with these priors; a sigma of any size
+        is reported.
         """
         return estimate_geometry(
             tracks,

@@ -25,7 +25,7 @@ from flexdt.twin.calibration.bead_model import bead_model
 from flexdt_extensions.executors import executor
 
 PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
-"""Scanned in turn; with three beads or fewer nobody can say which of them is off."""
+"""Scanned in turn; with three beads or fewer it is undecidable which of them is off."""
 OTHER = "compact-4"
 SURVIVABLE = (
     "control", "frames_missing", "frames_dark", "half_dark", "frames_repeated", "bead_lost",

@@ -30,7 +30,7 @@ WRONG_SIGMAS: Final = 4.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one spoilt scan.
+    """Judgement of the calibration of one spoilt scan.
 
     Attributes:
         kind, seed: which.
@@ -38,7 +38,7 @@ class Outcome:
         wrong: numbers were offered, and one is more than four sigmas off.
         worst: largest error of a parameter or of the axis's image in sigmas; nan if refused.
         mae: mean absolute error; nan if refused.
-        findings: codes of what was found.
+        findings: codes of the calibration's findings.
     """
 
     kind: str
@@ -128,7 +128,7 @@ def judge(kind: str, seed: int, spoilt: Spoilt) -> tuple[Outcome, Calibration]:
         return Outcome(kind, seed, True, False, math.nan, math.nan, codes), result
     errors = errors_of(result.fit.values, spoilt.truth)
     worst = max(errors[n] / result.fit.sigmas[n] for n in errors)
-    # What the images know best must be right too: priors do not widen it.
+    # The best determined direction must be right too: priors do not widen it.
     middle = (np.array(SHAPE[::-1]) - 1) / 2
     # Where something moves during the scan, the right value is the mean over its frames.
     moving = [

@@ -2,7 +2,7 @@
 
 `python examples/research/unknown_markers.py [--scans 10] [--drawn 200] [--hand 200] [--write
 DIR]` renders scans of 5 to 20 balls (rays and planes of `prior_coverage`, nothing of the fit's
-model), finds and links their spots without being told how many there are, and compares the
+model), finds and links their spots without knowing how many there are, and compares the
 positions found with the true ones up to place, turn and scale. `--drawn` does the same with 36
 views of 12 markers of 0.05 px noise instead of images, `--hand` with annotations: 10 views of
 12 markers, 0.5 px noise and a fifth missing. Each prints errors over sigmas. `--write` makes a

@@ -1,4 +1,4 @@
-"""The ways of spoiling a scan: changes of what is scanned and where, and of the images
+"""The ways of spoiling a scan: changes of the object, its places, and of the images
 themselves.
 
 Each function takes a scan and a random generator and returns the scan spoilt at a random
@@ -39,13 +39,13 @@ class Spoilt:
     """A scan on its way to being spoilt.
 
     Attributes:
-        scene, model: what is really scanned.
-        believed_scene, believed: what calibration is told it is.
-        poses: where everything really stands; nominal: what calibration is told.
+        scene, model: the scanned object.
+        believed_scene, believed: the object that calibration is given.
+        poses: the true ones; nominal: those that calibration is given.
         truth: offsets the images are made with.
         camera: how the images are made.
         images: line integrals, None where missing; empty until they are made.
-        request: what calibration is asked for.
+        request: of the calibration.
     """
 
     scene: Scene
@@ -77,7 +77,7 @@ def _moved(scan: Spoilt, shift: npt.NDArray[np.float64]) -> Spoilt:
 
 
 def _kept_beads(scan: Spoilt, keep: npt.NDArray[np.bool_]) -> Spoilt:
-    """Remove beads from the scanned object; `keep` (k,) says which stay."""
+    """Remove beads from the scanned object; `keep` (k,) selects those that stay."""
     solids = [
         s
         for s in scan.scene.solids
@@ -298,8 +298,8 @@ def _some_held(scan: Spoilt, rng: Rng, off: Callable[[], float]) -> Spoilt:
 
 
 def _held_off(scan: Spoilt, rng: Rng) -> Spoilt:
-    """Hold some of the six off by 1e-5 to 1 mm or deg, from what no data can show to what
-    anybody sees.
+    """Hold some of the six off by 1e-5 to 1 mm or deg, from invisible in any data to
+    obvious.
     """
     return _some_held(
         scan,

@@ -60,7 +60,8 @@ def main(
         for i in range(VIEWS)
     ]
     # `flat` is true if it is left out: the server moves the sample beside the beam and back, on
-    # a path without a contact. A pose instead says where the beam is free; false takes no flat.
+    # a path without a contact. A pose instead is a place where the beam is
+    # free; false takes no flat.
     job = twin.call("trajectory.submit", poses=poses, exposure_ms=20.0, name=name)
     for warning in job["warnings"]:
         print("warning:", warning)

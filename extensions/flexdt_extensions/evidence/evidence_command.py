@@ -16,10 +16,10 @@ def evidence(
 ) -> Answer:
     """Compare real, public data with their published answers.
 
-    NAME: cate, htc2022, tooth, zeiss, carm, delft; all that are at hand where none is given.
-    The data are not part of flexdt: each case says where they come from. What cannot be read is
-    said, and no missed figure. The command fails if a named case is not at hand, and, after all
-    results, if a figure is missed.
+    NAME: cate, htc2022, tooth, zeiss, carm, delft; all that are at hand where none is
+    given. The data are not part of flexdt: each case names their source. Unreadable data
+    are reported, and are no missed figure. The command fails if a named case is not at
+    hand, and, after all results, if a figure is missed.
 
     Yields:
         For each case its source and licence, a table of published and own figures, and what
