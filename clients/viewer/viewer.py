@@ -401,9 +401,10 @@ class Viewer:
         """Draw a state: sample, cameras, scene; then send it to the pages with framing,
         nearest parts and time.
 
-        A new machine or sample is built first, and the first state starts the images. All
-        views get new presets, but cameras move for a new machine only; the beam's eye
-        always follows. Travel ranges are drawn only if a page shows them.
+        A new machine or sample is built first, and pages get the link's state with a new
+        machine. The first state starts the images. All views get new presets, but cameras
+        move for a new machine only; the beam's eye always follows. Travel ranges are drawn
+        only if a page shows them.
 
         Args:
             raw: the state as the twin sends it.
