@@ -12,10 +12,11 @@ from causes_named import calibrated, scored, worst_error
 from faults_drawn import drawn
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.tiles import likely_border
+from flexdt.twin.calibration.diagnose.tiles import alike_places, likely_border
 from flexdt.twin.calibration.fit.evidence import Table, averaged
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.problem import STRAINS, build_problem
+from flexdt.twin.geometry.panel import Border
 from flexdt.twin.geometry.poses import Poses
 
 BEADS = np.array([[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]])
@@ -135,12 +136,27 @@ def test_a_tile_has_a_least_width(axis: int) -> None:
             assert 95 <= found.at <= side - 95
 
 
+def test_borders_without_positions_between_them_are_one() -> None:
+    """Their probabilities over all borders of the panel add up to 1."""
+    rng = np.random.default_rng(5)
+    places = rng.uniform(0, 1, (30, 2)) ** 2 * SHAPE[::-1]
+    for axis in (0, 1):
+        side = SHAPE[1 - axis]
+        ends = np.sort(places[:, axis])
+        wide = np.diff(ends) > 1.0
+        middle = (0.5 * (ends[:-1] + ends[1:]))[wide]
+        shares = [alike_places(Border(axis, at), places, SHAPE) for at in middle.tolist()]
+        assert np.allclose(np.array(shares) * sum(SHAPE), np.diff(ends)[wide])
+        rim = alike_places(Border(axis, side - 0.5), places, SHAPE)
+        assert rim * sum(SHAPE) == pytest.approx(max(side - ends[-1], 1.0))
+
+
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
         ("strain_z", 1), ("strain_x", 2), ("exposed_long", 2), ("as_assumed", 3),
         ("frame_doubled", 4), ("frame_doubled", 1011), ("frame_lost", 5), ("frame_lost", 1008),
-        ("exposed_again", 6), ("tiles_apart", 58000),
+        ("exposed_again", 6), ("tiles_apart", 58000), ("bead_tolerance", 73003),
     ],
 )  # fmt: skip
 def test_a_drawn_cause_is_named_and_what_is_offered_holds(kind: str, seed: int) -> None:
@@ -161,9 +177,11 @@ def test_no_drawn_cause_is_offered_wrong(kind: str, seed: int) -> None:
     assert not scored(kind, 500 + seed).wrong
 
 
-def test_beads_freed_for_a_tile_are_not_given_up_for_a_loose_prior() -> None:
-    """Of 2 x 2 tiles one border passes few beads: it was refused as a pitch of 2.6 deg."""
-    found = scored("four_tiles", 3009)
+@pytest.mark.parametrize("seed", [3009, 72022])
+def test_beads_freed_for_a_tile_are_not_given_up_for_a_loose_prior(seed: int) -> None:
+    """Of 2 x 2 tiles one border passes few beads: it was refused as a pitch of 2.6 deg. Where
+    it passes none, free beads explain it as well: they were offered 5.2 sigma off."""
+    found = scored("four_tiles", seed)
     assert found.offered, found.said
     assert found.worst < 4.0
 

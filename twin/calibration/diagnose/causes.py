@@ -17,7 +17,11 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose.tiles import GAP_WIDTHS_PX, likely_border
+from flexdt.twin.calibration.diagnose.tiles import (
+    GAP_WIDTHS_PX,
+    alike_places,
+    likely_border,
+)
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.evidence import Judged, Table, averaged
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, FitResult
@@ -63,6 +67,8 @@ PRIOR_LOG_CHANCE: Final = math.log(1e-3)
 assumed."""
 MIN_MOVING_FRAMES: Final = 12
 """Least number of frames in which motion is separable from noise."""
+LEAST_BEADS: Final = 3
+"""Number of beads that a calibration needs."""
 MOST_ROUNDS: Final = 4
 MOST_BORDERS: Final = 2
 MAX_EVIDENCE_LOSS: Final = 12.0
@@ -111,12 +117,15 @@ class Found:
         applied: names of causes that are columns of the fit.
         open: names of causes that the data neither show nor exclude.
         strain: of the phantom, (10,) and its covariance (10, 10); None: it is not judged.
+        elsewhere: whether some beads alone that the first fit left out, three at least being
+            left, are more likely to be elsewhere than all beads to be off.
     """
 
     odds: dict[str, float] = field(default_factory=dict)
     applied: tuple[str, ...] = ()
     open: tuple[str, ...] = ()
     strain: tuple[FloatArray, FloatArray] | None = None
+    elsewhere: bool = False
 
     def named(self, name: str) -> bool:
         """Check whether a cause of the fit is beyond doubt."""
@@ -272,10 +281,11 @@ class Candidates:
             first = layout.panel_column
             bent = len(panel.names) - 2 * len(panel.borders)
             columns = tuple(range(first, first + bent))
+            places = self._places()
             out.append(Cause("panel", columns, PANEL_WIDTHS_PX))
             for i, border in enumerate(panel.borders):
                 at = first + bent + 2 * i
-                chance = LOG_CHANCE - math.log(sum(panel.shape))
+                chance = LOG_CHANCE + math.log(alike_places(border, places, panel.shape))
                 out.append(
                     Cause(border_name(border), (at, at + 1), GAP_WIDTHS_PX, chance)
                 )
@@ -287,6 +297,11 @@ class Candidates:
             first += WAVES
         out.append(Cause("priors", (), PRIOR_FACTORS, PRIOR_LOG_CHANCE))
         return tuple(out)
+
+    def _places(self) -> FloatArray:
+        """Return the predicted column and row of each position that counts, (m, 2) [px]."""
+        problem = self.fit.problem
+        return problem.residuals(self.fit.solution.x)[0][problem.seen]
 
     def judged(self, choice: Choice) -> Judged | None:
         """Judge a choice, once (cached).
@@ -302,24 +317,55 @@ class Candidates:
             The judged model; None if its columns are not separable.
         """
         if choice not in self._judged:
-            factor = choice[-1] or 1.0
-            columns = list(range(self.count))
-            widths = [self.fit.problem.prior_sigma[: self.count] * factor]
-            chance = 0.0
-            for cause, pick in zip(self.causes, choice, strict=True):
-                width = pick or cause.always
-                if cause.columns and width > 0:
-                    columns += cause.columns
-                    widths.append(np.full(len(cause.columns), width))
-                if pick:
-                    chance += cause.chance - math.log(len(cause.widths))
-            model = self.table.judged(
-                columns, np.concatenate(widths), self.noise, self.means[columns]
-            )
-            if model is not None:
-                model = replace(model, evidence=model.evidence + chance)
-            self._judged[choice] = model
+            columns, widths, chance = self._model(choice)
+            self._judged[choice] = self._judged_model(columns, widths, chance)
         return self._judged[choice]
+
+    def _model(self, choice: Choice) -> tuple[list[int], FloatArray, float]:
+        """Return the columns of a choice, the widths of their priors, and the logarithm of
+        its probability.
+        """
+        factor = choice[-1] or 1.0
+        columns = list(range(self.count))
+        widths = [self.fit.problem.prior_sigma[: self.count] * factor]
+        chance = 0.0
+        for cause, pick in zip(self.causes, choice, strict=True):
+            width = pick or cause.always
+            if cause.columns and width > 0:
+                columns += cause.columns
+                widths.append(np.full(len(cause.columns), width))
+            if pick:
+                chance += cause.chance - math.log(len(cause.widths))
+        return columns, np.concatenate(widths), chance
+
+    def _judged_model(
+        self, columns: list[int], widths: FloatArray, chance: float
+    ) -> Judged | None:
+        """Judge free columns with priors, and add the logarithm of their probability to the
+        evidence; None if they are not separable.
+        """
+        model = self.table.judged(columns, widths, self.noise, self.means[columns])
+        if model is None:
+            return None
+        return replace(model, evidence=model.evidence + chance)
+
+    def elsewhere(self, choice: Choice, beads: Sequence[int]) -> bool:
+        """Check whether it is more likely that some beads alone are anywhere in the phantom
+        than that all are off by the width of a choice.
+
+        Args:
+            choice: with the cause "beads".
+            beads: indices.
+        """
+        at = next(i for i, cause in enumerate(self.causes) if cause.name == "beads")
+        size = float(np.ptp(self.fit.problem.model.beads, axis=0).max())
+        every = self.causes[at].columns
+        own = [every[3 * bead + axis] for bead in beads for axis in range(3)]
+        columns, widths, chance = self._model(with_pick(choice, at, 0.0))
+        free = dict(zip(columns, widths.tolist(), strict=True)) | dict.fromkeys(own, size)
+        chance += LOG_CHANCE - math.log(math.comb(len(every) // 3, len(beads)))
+        model = self._judged_model(list(free), np.array(list(free.values())), chance)
+        return model is not None and model.evidence > self.evidence(choice)
 
     def evidence(self, choice: Choice) -> float:
         """Return the logarithm of a choice's probability, up to a constant; -inf if it
@@ -330,12 +376,15 @@ class Candidates:
             return -math.inf
         return model.evidence
 
-    def best(self) -> Choice:
+    def best(self, more: Sequence[Choice] = ()) -> Choice:
         """Find the choice of causes and widths with the most evidence, by changing one
         cause at a time (`_climbed`).
 
-        Starts are no cause and the three best single causes. If no single cause has a
-        tenth of the probability of none, the result is no cause.
+        Starts are no cause, the three best single causes, and the best of `more`. If no
+        single cause has a tenth of the probability of none, the result is no cause.
+
+        Args:
+            more: other choices, such as those with one cause in exchange for another.
         """
         nothing: Choice = (0.0,) * len(self.causes)
         singles = [
@@ -352,12 +401,11 @@ class Candidates:
             for s in tops.values()
             if self.evidence(s) > self.evidence(nothing) - math.log(10.0)
         ]
-        if likely:
-            starts = [nothing, *likely[:3]]
-        else:
-            starts = [nothing]
         if not likely:
             return nothing
+        starts = [nothing, *likely[:3]]
+        if more:
+            starts.append(max(more, key=self.evidence))
         return max((self._climbed(start) for start in starts), key=self.evidence)
 
     def _climbed(self, choice: Choice) -> Choice:
@@ -436,6 +484,18 @@ class Candidates:
                 return pick
         return 0.0
 
+    def with_border(self, table: Candidates, choice: Choice) -> list[Choice]:
+        """List the choices of a wider table that have its last border, at each width, in
+        addition to a choice of this one.
+        """
+        widths = dict(zip([c.name for c in self.causes], choice, strict=True))
+        name = border_name(table.borders[-1])
+        border = next(c for c in table.causes if c.name == name)
+        return [
+            tuple((widths | {name: width}).get(c.name, 0.0) for c in table.causes)
+            for width in border.widths
+        ]
+
     def parts(self, choice: Choice) -> list[Choice]:
         """List a choice, and what it leaves without one of its causes."""
         parts = [with_pick(choice, i, 0.0) for i, pick in enumerate(choice) if pick]
@@ -467,7 +527,6 @@ class Candidates:
         if model is None or shape is None:
             return None
         problem = self.fit.problem
-        predicted = problem.residuals(self.fit.solution.x)[0][problem.seen]
         widths = np.concatenate(
             [np.full(self.count, np.inf)]
             + [
@@ -482,7 +541,7 @@ class Candidates:
             self.values,
             widths,
             model.noise * math.sqrt(self.alike),
-            predicted,
+            self._places(),
             problem.whiten[problem.seen],
             shape,
             self.borders,
@@ -565,7 +624,13 @@ def explained_by_causes(
         for n, o in odds.items()
         if -OPEN_LOG_ODDS < o < NAMED_LOG_ODDS and not n.startswith(RIVALS)
     )
-    found = Found(odds, names, doubtful, candidates.strain(choice))
+    lost = lost_beads(first)
+    elsewhere = (
+        "beads" in names
+        and 0 < len(lost) <= len(first.problem.model) - LEAST_BEADS
+        and candidates.elsewhere(choice, lost)
+    )
+    found = Found(odds, names, doubtful, candidates.strain(choice), elsewhere)
     return _widened(fit, candidates, choice), found
 
 
@@ -576,7 +641,8 @@ def _searched(
 
     A border is looked for in what the most likely causes leave of the residuals, and in
     what they leave without one of them: places of beads that keep their rows in all
-    frames explain a border along rows completely. The search ends with the first border
+    frames explain a border along rows completely, and step by step the border does not
+    take their place. The search ends with the first border
     that is not chosen. That border stays in the table if it is open.
 
     Args:
@@ -591,13 +657,16 @@ def _searched(
     candidates = Candidates(fit, known, borders, alike)
     choice = candidates.best()
     while len(candidates.borders) < MOST_BORDERS:
-        found = {candidates.border(c): None for c in candidates.parts(choice)}
-        some = [
-            (table, table.best())
-            for border in found
-            if border is not None
-            for table in [Candidates(fit, known, (*candidates.borders, border), alike)]
-        ]
+        found: dict[Border, list[Choice]] = {}
+        for part in candidates.parts(choice):
+            border = candidates.border(part)
+            if border is not None:
+                found.setdefault(border, []).append(part)
+        some = []
+        for border, parts in found.items():
+            table = Candidates(fit, known, (*candidates.borders, border), alike)
+            more = [c for part in parts for c in candidates.with_border(table, part)]
+            some.append((table, table.best(more)))
         if not some:
             break
         wider, chosen = max(some, key=lambda one: one[0].rank(one[1]))
@@ -663,6 +732,15 @@ def _options(
         "bead_tolerance_mm": beads or None,
         "panel": panel,
     }
+
+
+def lost_beads(fit: FitResult) -> list[int]:
+    """List the beads that are seen in three frames at least and that a fit left out of more
+    than half of them.
+    """
+    seen = fit.problem.seen.sum(axis=0)
+    used = fit.certificate.used.sum(axis=0)
+    return np.flatnonzero((seen >= 3) & (used < 0.5 * seen)).tolist()
 
 
 def image_shape(fit: FitResult) -> tuple[int, int] | None:

@@ -17,7 +17,13 @@ from scipy.special import chdtri
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose import Finding, error, warning
-from flexdt.twin.calibration.diagnose.causes import Known, Refit, explained_by_causes
+from flexdt.twin.calibration.diagnose.causes import (
+    LEAST_BEADS,
+    Known,
+    Refit,
+    explained_by_causes,
+    lost_beads,
+)
 from flexdt.twin.calibration.diagnose.frame_numbers import frame_numbers
 from flexdt.twin.calibration.diagnose.named_causes import named_causes
 from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
@@ -46,8 +52,6 @@ MISFIT_CHANCE: Final = 0.01
 its residuals are explained."""
 EXPLAINED_CHANCE: Final = 0.001
 """The same of what may remain of a motion that is named."""
-AS_GOOD = 1.5
-"""A fit whose residuals are at most so many times as large explains the data as well."""
 BLOCK_SHARE = 0.7
 """Part of the frames of a block, from the first or to the last of a scan, that do not fit."""
 MOST_USED = 0.9
@@ -324,7 +328,7 @@ def explain_residuals(
     plain = fit
     fit, causes = explained_by_causes(fit, known, refit)
     named = named_causes(fit, causes)
-    if "beads" in causes.applied and _one_is_elsewhere(plain, fit):
+    if causes.elsewhere:
         fit = plain
         named = []
     certificate = fit.certificate
@@ -346,19 +350,6 @@ def explain_residuals(
         per_frame=UNEXPLAINED_MOTION,
     )
     return fit, [*_lost_beads(fit), explained]
-
-
-def _one_is_elsewhere(plain: FitResult, moved: FitResult) -> bool:
-    """Check whether a fit that left out some beads, three at least being left, explains
-    as much (within `AS_GOOD`) as fitted places of all beads.
-
-    Args:
-        plain: without free beads.
-        moved: with free beads.
-    """
-    left_out = _lost_beads(plain)
-    enough = bool(left_out) and not any(f.forbids for f in left_out)
-    return enough and plain.certificate.rms_px < AS_GOOD * moved.certificate.rms_px
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
@@ -424,12 +415,10 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
     """
     problem = fit.problem
     used = fit.certificate.used
-    seen = problem.seen.sum(axis=0)
-    used_frames = used.sum(axis=0)
-    lost = np.flatnonzero((seen >= 3) & (used_frames < 0.5 * seen)).tolist()
+    lost = lost_beads(fit)
     if lost:
         text = f"bead {', '.join(map(str, lost))} is not where the phantom's model has it and was"
-        if len(problem.model) - len(lost) >= 3:
+        if len(problem.model) - len(lost) >= LEAST_BEADS:
             judged = warning
         else:
             judged = error

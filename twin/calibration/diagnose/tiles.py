@@ -100,6 +100,28 @@ def likely_border(
     return None
 
 
+def alike_places(border: Border, places: FloatArray, shape: tuple[int, int]) -> float:
+    """Return the share of all borders that part the positions as one does.
+
+    Where no position is between two borders, both explain the same; together they are as
+    probable as the stretch is long.
+
+    Args:
+        border: along columns or rows.
+        places: (m, 2) column and row of each position.
+        shape: (rows, cols) of the image.
+
+    Returns:
+        The stretch between the positions next to the border, a pixel at least, over all
+        rows and columns.
+    """
+    side = shape[1 - border.axis]
+    at = np.append(places[:, border.axis], [0.0, side])
+    before = float(at[at <= border.at].max())
+    behind = float(at[at > border.at].min())
+    return max(behind - before, 1.0) / sum(shape)
+
+
 def _allowed(at: FloatArray, side: int, known: Sequence[float]) -> npt.NDArray[np.bool_]:
     """Mark borders that leave every panel tile its least width (`LEAST_TILE`): from the
     ends of a side and from the known borders.
