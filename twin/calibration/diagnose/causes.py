@@ -11,7 +11,7 @@ cause is named where its odds exceed NAMED_LOG_ODDS.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -484,17 +484,19 @@ class Candidates:
                 return pick
         return 0.0
 
-    def with_border(self, table: Candidates, choice: Choice) -> list[Choice]:
-        """List the choices of a wider table that have its last border, at each width, in
-        addition to a choice of this one.
-        """
-        widths = dict(zip([c.name for c in self.causes], choice, strict=True))
-        name = border_name(table.borders[-1])
-        border = next(c for c in table.causes if c.name == name)
-        return [
-            tuple((widths | {name: width}).get(c.name, 0.0) for c in table.causes)
-            for width in border.widths
-        ]
+    def widths(self, choice: Choice) -> dict[str, float]:
+        """Return the widths of a choice by the names of their causes, for other tables."""
+        return dict(zip([c.name for c in self.causes], choice, strict=True))
+
+    def choice(self, widths: Mapping[str, float]) -> Choice:
+        """Return the choice of this table with given widths; 0 for causes not given."""
+        return tuple(widths.get(c.name, 0.0) for c in self.causes)
+
+    def with_last_border(self, widths: Mapping[str, float]) -> list[Choice]:
+        """List the choices with given widths of other causes and each of the last border."""
+        name = border_name(self.borders[-1])
+        border = next(c for c in self.causes if c.name == name)
+        return [self.choice({**widths, name: width}) for width in border.widths]
 
     def parts(self, choice: Choice) -> list[Choice]:
         """List a choice, and what it leaves without one of its causes."""
@@ -590,10 +592,12 @@ def explained_by_causes(
     first = fit
     borders: tuple[Border, ...] = ()
     applied: tuple[object, ...] = ()
+    before: Mapping[str, float] = {}
     # Before a cause is fitted, it correlates the residuals itself.
     alike = 1.0
     for _ in range(MOST_ROUNDS):
-        candidates, choice = _searched(fit, known, borders, alike)
+        candidates, choice = _searched(fit, known, borders, alike, before)
+        before = candidates.widths(choice)
         borders = candidates.chosen_borders(choice)
         options = _options(candidates, choice, borders)
         chosen = tuple(options.values())
@@ -635,7 +639,11 @@ def explained_by_causes(
 
 
 def _searched(
-    fit: FitResult, known: Known, borders: tuple[Border, ...], alike: float
+    fit: FitResult,
+    known: Known,
+    borders: tuple[Border, ...],
+    alike: float,
+    before: Mapping[str, float],
 ) -> tuple[Candidates, Choice]:
     """Find the most likely causes, borders of the panel's tiles among them.
 
@@ -650,12 +658,13 @@ def _searched(
         known: statements on the phantom and the positions.
         borders: found before.
         alike: number of neighbouring frames whose residuals count as one.
+        before: width of each cause of the fit, from which the search starts, too.
 
     Returns:
         The table, with at most `MOST_BORDERS` borders, and its most likely choice.
     """
     candidates = Candidates(fit, known, borders, alike)
-    choice = candidates.best()
+    choice = candidates.best([candidates.choice(before)])
     while len(candidates.borders) < MOST_BORDERS:
         found: dict[Border, list[Choice]] = {}
         for part in candidates.parts(choice):
@@ -665,7 +674,11 @@ def _searched(
         some = []
         for border, parts in found.items():
             table = Candidates(fit, known, (*candidates.borders, border), alike)
-            more = [c for part in parts for c in candidates.with_border(table, part)]
+            more = [
+                other
+                for part in parts
+                for other in table.with_last_border(candidates.widths(part))
+            ]
             some.append((table, table.best(more)))
         if not some:
             break
