@@ -14,7 +14,7 @@ import types
 import typing
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, wraps
+from functools import cached_property, lru_cache, wraps
 from numbers import Real
 from typing import (
     Annotated,
@@ -40,6 +40,10 @@ REAL_KINDS: Final = "biuf"
 """Kinds of numpy's types that hold real numbers or truth values."""
 MAX_SHOWN_CHARS: Final = 60
 """Characters of a value that a message repeats."""
+PLAIN_TYPES: Final = frozenset({bool, int, float, type(None)})
+"""Types of values that have no content."""
+MAX_KNOWN_TYPES: Final = 256
+"""Types of arguments that are remembered."""
 MAX_CHECKED_MEMBERS: Final = 100
 """Members of a list that are compared with the annotation: mistakes stand at the beginning."""
 
@@ -213,16 +217,27 @@ def _type(value: Any) -> Any:
 
     That is so for mappings, lists, texts, arrays of one dimension and masked arrays.
     """
-    if type(value) is tuple:
+    kind = type(value)
+    if kind in PLAIN_TYPES:
+        return kind
+    if kind is tuple:
         inner = tuple(map(_type, value))
         return None if None in inner else inner
-    if isinstance(value, Mapping | list | tuple | str) or getattr(value, "ndim", 0) == 1:
+    # A type has a hash, whatever mypy says of its metaclass.
+    if _has_content(kind) or hasattr(value, "mask"):  # type: ignore[arg-type]
         return None
-    if hasattr(value, "mask"):
-        return None
-    if hasattr(value, "ndim"):
-        return (value.dtype, value.ndim)
-    return type(value)
+    dimensions = getattr(value, "ndim", None)
+    if dimensions is None:
+        return kind
+    return None if dimensions == 1 else (value.dtype, dimensions)
+
+
+@lru_cache(MAX_KNOWN_TYPES)
+def _has_content(kind: type) -> bool:
+    """Return whether values of a type are mappings, lists, tuples or texts, whose content
+    decides; asking abstract classes at every call would cost more than all else here.
+    """
+    return issubclass(kind, Mapping | list | tuple | str)
 
 
 class Known:

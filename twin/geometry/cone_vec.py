@@ -26,6 +26,7 @@ from flexdt.twin.geometry.conventions import (
     UP,
     FloatArray,
     as_numbers,
+    cross,
     rotation_z,
     turn_detector,
 )
@@ -121,12 +122,12 @@ class ConeVec:
             >>> len(c), c.detector.tolist()
             (2, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
         """
-        parts = np.broadcast_arrays(
-            *(
-                np.atleast_2d(np.asarray(p, dtype=np.float64))
-                for p in (source, detector, u, v)
-            )
-        )
+        parts: Sequence[npt.NDArray[Any]] = [
+            np.atleast_2d(np.asarray(p, dtype=np.float64))
+            for p in (source, detector, u, v)
+        ]
+        if len({part.shape for part in parts}) > 1:
+            parts = np.broadcast_arrays(*parts)
         return cls(np.concatenate(parts, axis=1), shape)
 
     @classmethod
@@ -709,7 +710,7 @@ class ConeVec:
     def normal(self) -> FloatArray:
         """Unit normal u x v of each view, (n, 3): away from the source
         where v points downwards."""
-        n = np.cross(self.u, self.v)
+        n = cross(self.u, self.v)
         return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True), dtype=np.float64)
 
     @property
@@ -771,7 +772,7 @@ class ConeVec:
         if p.ndim != 2 or p.shape[1] != 3:
             raise GeometryError.of_shape("points", p.shape, ("k", 3), " [mm]")
         ray = p[None, :, :] - self.source[:, None, :]
-        normal = np.cross(self.u, self.v)
+        normal = cross(self.u, self.v)
         offset = self.source - self.detector
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = -np.einsum("ni,ni->n", offset, normal)[:, None] / np.einsum(
@@ -1009,7 +1010,7 @@ def check_spread(cone_vec: ConeVec) -> ConeVec:
             part / np.linalg.norm(part, axis=1, keepdims=True)
             for part in (cone_vec.u, cone_vec.v, cone_vec.detector - cone_vec.source)
         )
-        normal = np.cross(u, v)
+        normal = cross(u, v)
         flat = ~(np.linalg.norm(normal, axis=1) > MIN_SINE)
         level = ~(np.abs(np.einsum("ni,ni->n", normal, beam)) > MIN_SINE)
     bad = np.flatnonzero(flat | level)

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import FloatArray, cross
 
 MOVED_BEHIND: Final = 1.001
 """Distance of a moved panel from the source, relative to the far side of the object."""
@@ -33,7 +33,7 @@ def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
     """
     if not len(points) or not len(cone_vec):
         return np.ones(len(cone_vec))
-    normal = np.cross(cone_vec.u, cone_vec.v)
+    normal = cross(cone_vec.u, cone_vec.v)
     panel = np.einsum("ni,ni->n", cone_vec.detector - cone_vec.source, normal)
     depth = normal @ points.T - np.einsum("ni,ni->n", cone_vec.source, normal)[:, None]
     with np.errstate(all="ignore"):
