@@ -372,8 +372,9 @@ class CoarseScan:
         Returns:
             (n, rows, cols) line integrals.
         """
-        higher = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
-        volume = Volume(higher, self.grid.voxel_mm, self.grid.center_mm)
+        if self.more:
+            thing = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
+        volume = Volume(thing, self.grid.voxel_mm, self.grid.center_mm)
         if not fine:
             return forward(volume, views, shape)
         finer = ConeVec.from_vectors(views.source, views.detector, 0.5 * views.u, views.v)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +49,8 @@ GAP_RAMP_RAD = 0.35
 either side is wide, so that views behind a gap that cover it do so for any panel
 [rad]."""
 TURN = 2 * np.pi
+MAX_KEPT_CIRCLES = 16
+"""Number of circles that are remembered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +132,20 @@ def circle_of(cone_vec: ConeVec) -> Circle:
         GeometryError: fewer than three views, sources on a line, or neither a circle nor
             a helix.
     """
-    s = cone_vec.source
+    return _circle_of(cone_vec.source.tobytes())
+
+
+@lru_cache(MAX_KEPT_CIRCLES)
+def _circle_of(sources: bytes) -> Circle:
+    """Fit the circle of sources, once for the many geometries that differ in their panels.
+
+    Args:
+        sources: bytes of float64 (n, 3) [mm].
+
+    Raises:
+        GeometryError: see `circle_of`.
+    """
+    s = np.frombuffer(sources).reshape(-1, 3)
     if len(s) < 3:
         raise GeometryError.instead(
             f"{len(s)} views", len(s), "for FDK a circle of at least 3"
@@ -271,14 +287,13 @@ def _helix(
         deviates by more than `MAX_HELIX_DEVIATION` of a turn's rise, or has an arc
         without views.
     """
+    if np.ptp(height) <= MAX_CIRCLE_RISE * radius:
+        return None
     order = np.argsort(height, kind="stable")
     run = np.empty(len(order))
     run[order] = np.unwrap(azimuth[order])
     span = float(np.ptp(run))
-    if (
-        np.ptp(height) <= MAX_CIRCLE_RISE * radius
-        or span * len(run) / (len(run) - 1) < TURN - 1e-6
-    ):
+    if span * len(run) / (len(run) - 1) < TURN - 1e-6:
         return None
     slope, level = np.polyfit(run, height, 1)
     if np.abs(height - level - slope * run).max() > MAX_HELIX_DEVIATION * TURN * abs(

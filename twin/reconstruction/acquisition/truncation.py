@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -123,13 +124,11 @@ class Prism:
 
     def rim(self) -> FloatArray:
         """Compute 72 points, evenly spaced in angle of the unit disc, on the prism's
-        outline at z = 0, (72, 3) [mm].
+        outline, (72, 2) [mm].
         """
         turn = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
         disc = np.stack([np.cos(turn), np.sin(turn)])
-        return np.pad(
-            np.linalg.solve(self.to_disc, disc).T + self.centre, ((0, 0), (0, 1))
-        )
+        return np.asarray(np.linalg.solve(self.to_disc, disc).T + self.centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,13 +200,18 @@ class Truncation:
         most = 2.0 * cols
         before = 0.5 * cols
         after = 0.5 * cols
-        middle_row = ConeVec(cone_vec.rows)  # without the shape of the panel
-        for prism in (one for one in self.prisms if one is not None):
-            at = middle_row.project_points(prism.rim(), (1, cols))[..., 0]
+        if len(self._rims):
+            at = _columns_of(self._rims, cone_vec) + (cols - 1) / 2.0
             at = np.where(np.isfinite(at), at, most)
             before = max(before, -float(at.min()))
             after = max(after, float(at.max()) - cols + 1)
         return int(min(before + 2.0, most)), int(min(after + 2.0, most))
+
+    @cached_property
+    def _rims(self) -> FloatArray:
+        """Outlines of all prisms, (k, 2) [mm]."""
+        rims = [prism.rim() for prism in self.prisms if prism is not None]
+        return np.concatenate([np.zeros((0, 2)), *rims])
 
     def continuation(
         self, cone_vec: ConeVec, first_row: int, shape: tuple[int, int], panel: slice
@@ -634,6 +638,35 @@ def _fit(
 def _edge(cols: int) -> int:
     """Compute the number of columns whose mean is the value at an edge."""
     return max(1, cols // SAMPLES)
+
+
+def _columns_of(points: FloatArray, cone_vec: ConeVec) -> FloatArray:
+    """Project points onto the rows of upright panels, whatever their height.
+
+    Args:
+        points: (k, 2) [mm].
+        cone_vec: n upright panels.
+
+    Returns:
+        (n, k) columns from the panel's middle; not finite for points beside the source.
+    """
+    source = cone_vec.source[:, :2]
+    panel = cone_vec.detector[:, :2] - source
+    u = cone_vec.u[:, :2]
+    normal = np.column_stack([-u[:, 1], u[:, 0]])
+    depth, aside, panel_depth, panel_aside = (
+        one[:, None]
+        for one in (
+            (source * normal).sum(axis=1),
+            (source * u).sum(axis=1),
+            (panel * normal).sum(axis=1),
+            (panel * u).sum(axis=1),
+        )
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = panel_depth / (normal @ points.T - depth)
+        along = scale * (u @ points.T - aside) - panel_aside
+    return np.asarray(along / (u * u).sum(axis=1)[:, None])
 
 
 def _rays(

@@ -41,7 +41,7 @@ from flexdt.twin.reconstruction.acquisition.truncation import Continuation, Trun
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views, view_table
 from flexdt.twin.reconstruction.feldkamp.filtering import ramp
 
-FEW_ROWS: Final = 5
+FEW_ROWS: Final = 8
 """Rows of a panel for which voxels side by side are computed at a time. The panel
 decides, not the rows that a grid needs: slabs equal the complete volume to the bit."""
 MAX_SIDEWAYS_SHARE: Final = 0.1
@@ -266,7 +266,8 @@ def plan_fdk(
     widths = _widths(circle, panels, like, truncation)
     beyond = truncation is not None and truncation.beyond
     weights = redundancy(circle, whole, cols, beyond=beyond)
-    weights = np.pad(weights, ((0, 0), (widths.before, widths.after)), "edge")
+    if widths.wide > cols:
+        weights = np.pad(weights, ((0, 0), (widths.before, widths.after)), "edge")
     rows = (widths.first, widths.last)
     near = widths.near
     backed = window_of(whole, panels.shape, rows, (-near[0], cols + near[1]))
