@@ -226,9 +226,9 @@ def compared(scan: CoarseScan) -> Comparison | None:
         return Comparison(trial, doubtful=False)
     if trial.excess >= MIN_DOUBTFUL_MISFIT or trial.wander > MAX_WANDER:
         comparison = Comparison(trial, doubtful=True)
-        if comparison.contradiction() is None and len(trial.scan.images) < len(
-            scan.images
-        ):
+        fewer = len(trial.scan.images) < len(scan.images)
+        # Of a scan that is cut off no orders are suspected.
+        if trial.whole and fewer and comparison.contradiction() is None:
             return _with_orders(scan, comparison)
         return comparison
     if not trial.whole:

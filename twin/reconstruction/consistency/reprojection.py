@@ -21,6 +21,8 @@ NOISE_VARIANCE_RATIO = 1.5
 """Variance of noise relative to the estimate by its median: few photons deviate more."""
 NOISE_OF_CHANGES = np.array([1.0, 0.25])
 """Variance of white noise in the values, and in their changes, over that in the values."""
+SPLINE_MARGIN = 12
+"""Values that repeat the end of a line before it is interpolated by splines."""
 MIN_SIGNAL_SHARE = 0.3
 """Share of a residual that is kept whatever the noise, so that of two in much noise
 none is far better than the other."""
@@ -50,6 +52,7 @@ class Reprojection:
         cone_vec: ConeVec,
         truncation: Truncation | None,
         shifts: FloatArray | None = None,
+        noise: float | None = None,
     ) -> Reprojection | None:
         """Reconstruct images as of a geometry, and project the volume again coarsely; NaN
         voxels count as 0.
@@ -64,6 +67,7 @@ class Reprojection:
             shifts: (n, 2) by which each image is to the right and below [pixels]: images
                 are shifted back before the reconstruction, and its projections shifted as
                 the images; None for none.
+            noise: variance of white noise in the images; None: estimated.
 
         Returns:
             None where FDK cannot use the geometry.
@@ -82,8 +86,9 @@ class Reprojection:
         again = scan.projected(np.nan_to_num(values), seen_from, shape, fine=False)
         if layers:
             values = lowered(values, layers)
-        known = images is scan.images
-        return cls(images, values, again, scan.noise if known else noise_of(images))
+        if noise is None:
+            noise = scan.noise if images is scan.images else noise_of(images)
+        return cls(images, values, again, noise)
 
     def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
         """Compute the root mean square of the residual, less noise, over that of the
@@ -105,13 +110,22 @@ class Reprojection:
         """Mean squares of the residual in `ARCS` arcs of neighbouring views: of its
         values, and of their changes along rows, (2, ARCS); above 0.
         """
-        rest = self.again - self.images
-        least = np.finfo(np.float32).tiny
+        count = len(self.images)
+        arcs = np.arange(min(ARCS, count))
+        # The first arcs have a view more where they cannot all have as many.
+        starts = count // ARCS * arcs + np.minimum(arcs, count % ARCS)
         parts = [
-            [max(_mean_square(arc), least) for arc in np.array_split(values, ARCS)]
-            for values in (rest, _changes(rest))
+            np.add.reduceat(_sums_of_squares(values), starts)
+            / np.add.reduceat(np.full(len(values), values[0].size), starts)
+            for values in self._rest
         ]
-        return np.array(parts)
+        return np.maximum(parts, np.finfo(np.float32).tiny)
+
+    @cached_property
+    def _rest(self) -> tuple[Float32Array, Float32Array]:
+        """Residual in the values, and in their changes along rows."""
+        rest = self.again - self.images
+        return rest, _changes(rest)
 
     @cached_property
     def centroid_variance(self) -> float:
@@ -128,10 +142,10 @@ class Reprojection:
         their changes along rows. Noise is the images' less the reprojection's, at least
         0, times `NOISE_VARIANCE_RATIO`.
         """
-        rest = self.again - self.images
+        signals = self.images, _changes(self.images)
         residual, signal = (
-            np.array([_mean_square(values), _mean_square(_changes(values))])
-            for values in (rest, self.images)
+            np.array([_mean_square(values), _mean_square(changes)])
+            for values, changes in (self._rest, signals)
         )
         noise = NOISE_VARIANCE_RATIO * self._noise * NOISE_OF_CHANGES
         return residual, signal, noise
@@ -141,7 +155,12 @@ class Reprojection:
         """Variance of white noise in the images, at least 0: differences between
         neighbours that the reprojection has as well are the object's.
         """
-        return max(self.image_noise - noise_of(self.again), 0.0)
+        return max(self.image_noise - self.noise_again, 0.0)
+
+    @cached_property
+    def noise_again(self) -> float:
+        """Variance that differences between neighbours in the reprojection show as noise."""
+        return noise_of(self.again)
 
 
 def _layers_off(scan: CoarseScan, cone_vec: ConeVec) -> float:
@@ -180,13 +199,47 @@ def shifted_back(images: Float32Array, shifts: FloatArray) -> Float32Array:
         images: (n, rows, cols).
         shifts: (n, 2) to the left and up [pixels].
     """
-    from scipy.ndimage import shift
+    rows, cols = images.shape[1:]
+    down = _interpolation(shifts[:, 1], rows)
+    across = _interpolation(shifts[:, 0], cols)
+    back = down @ images.astype(np.float64) @ across.transpose(0, 2, 1)
+    return np.asarray(back, np.float32)
 
-    back = [
-        shift(image, (-up, -left), order=3, mode="nearest")
-        for image, (left, up) in zip(images, shifts.tolist(), strict=True)
-    ]
-    return np.array(back, np.float32)
+
+def _interpolation(shifts: FloatArray, size: int) -> FloatArray:
+    """Compute the matrices that shift lines of `size` values towards their first, as
+    `scipy.ndimage.shift` does by cubic splines and repeated ends, image by image.
+
+    Args:
+        shifts: (n,) [values].
+        size: of a line.
+
+    Returns:
+        (n, size, size): each new value's shares of the line's.
+    """
+    from scipy.ndimage import spline_filter1d
+
+    padded = np.pad(np.eye(size), ((SPLINE_MARGIN, SPLINE_MARGIN), (0, 0)), "edge")
+    coefficients = spline_filter1d(padded, 3, axis=0, mode="nearest")
+    last = len(padded) - 1
+    at = SPLINE_MARGIN + np.arange(size) + shifts[:, None]
+    at = np.clip(at, 0.0, last)
+    first = np.floor(at)
+    t = at - first
+    s = 1.0 - t
+    shares = s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3
+    line, place = np.indices(at.shape)
+    weights = np.zeros((*at.shape, last + 1))
+    for step, share in enumerate(shares, -1):
+        index = np.abs(first.astype(np.intp) + step)
+        weights[line, place, last - np.abs(last - index)] += share / 6.0
+    return np.asarray(weights @ coefficients)
+
+
+def _sums_of_squares(images: Float32Array) -> FloatArray:
+    """Compute the sum of squares of each image, (n,)."""
+    lines = images.reshape(len(images), -1)
+    return np.asarray(np.einsum("ij,ij->i", lines, lines, dtype=np.float64))
 
 
 def _mean_square(values: Float32Array) -> float:

@@ -208,19 +208,11 @@ def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
     """
     shape = (scan.images.shape[1], scan.images.shape[2])
     x, y = scan.circle.centre
-    foot = np.column_stack(
-        [
-            np.full(len(scan.angles), x),
-            np.full(len(scan.angles), y),
-            scan.cone_vec.source[:, 2],
-        ]
-    )
-    at = np.array(
-        [
-            scan.cone_vec[k : k + 1].project_points(foot[k : k + 1], shape)[0, 0]
-            for k in range(0, len(foot), max(1, len(foot) // 8))
-        ]
-    )
+    views = scan.cone_vec[:: max(1, len(scan.angles) // 8)]
+    foot = views.source.copy()
+    foot[:, :2] = x, y
+    each = np.arange(len(views))
+    at = views.project_points(foot, shape)[each, each]
     middle = (np.array(shape[::-1]) + scan.rest[::-1] - 1.0) / 2.0
     along, down = at.mean(axis=0) - middle
     return float(along), float(down)

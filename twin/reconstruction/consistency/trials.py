@@ -7,6 +7,7 @@ scatter gives the standard error of its mean.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -71,8 +72,7 @@ class Tried:
         score: its misfit over that of the stated geometry.
         residual: the same with noise, from which the evidence is.
         evidence: by how many standard errors the stated geometry fits better.
-        change: what nine of ten uniform nodes change by at most, relative to their
-            values (`Trial._change`).
+        find_change: computes `change`, which few explanations need.
     """
 
     suspect: Suspect
@@ -80,7 +80,14 @@ class Tried:
     score: float = np.inf
     residual: float = np.inf
     evidence: float = np.inf
-    change: float = 0.0
+    find_change: Callable[[], float] = float
+
+    @cached_property
+    def change(self) -> float:
+        """What nine of ten uniform nodes change by at most, relative to their values
+        (`Trial._change`); 0 where FDK cannot use the geometry.
+        """
+        return self.find_change()
 
 
 class Trial:
@@ -113,7 +120,9 @@ class Trial:
             raise GeometryError("FDK cannot use the views of a coarse copy of the scan")
         self.own = own
         self._seconds: dict[Tried, FloatArray] = {}
-        second = Reprojection.of(scan, own.again, scan.cone_vec, None)
+        second = Reprojection.of(
+            scan, own.again, scan.cone_vec, None, noise=own.noise_again
+        )
         self.expected = _misfit_of(second)
         self.wander = 0.0
         if self.whole and second is not None:
@@ -214,7 +223,9 @@ class Trial:
             cone_vec: n views.
             shifts: (n, 2) of the projections, or None.
         """
-        again = Reprojection.of(self.scan, shown.again, cone_vec, None, shifts)
+        again = Reprojection.of(
+            self.scan, shown.again, cone_vec, None, shifts, shown.noise_again
+        )
         return _misfit_of(again)
 
     def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
@@ -250,8 +261,11 @@ class Trial:
         spread = max(float(each.std(ddof=1)), np.finfo(np.float32).tiny)
         evidence = float(each.mean()) * np.sqrt(len(each)) / spread
         residual = float(np.exp(each.mean()))
-        change = self._change(suspect, shown, better=residual < 1.0)
-        return Tried(suspect, shown, score, residual, evidence, change)
+
+        def find_change() -> float:
+            return self._change(suspect, shown, better=residual < 1.0)
+
+        return Tried(suspect, shown, score, residual, evidence, find_change)
 
     def _shown(self, suspect: Suspect) -> Reprojection | None:
         """Reproject a suspect; None where FDK cannot use its geometry.
