@@ -144,6 +144,22 @@ class SafetyError(TwinError):
     """Refused because of the safety state (E-stop in force, move aborted)."""
 
 
+MAX_REPEATED_CHARACTERS: Final = 200
+"""Largest number of characters of another program's error that a message repeats."""
+
+
+def words_of(error: BaseException) -> str:
+    """Return what an error says, in one line of at most `MAX_REPEATED_CHARACTERS`; the name
+    of its type if it says nothing.
+
+    Example:
+        >>> words_of(OSError("no such\\n  file")), words_of(KeyError())
+        ('no such file', 'KeyError')
+    """
+    said = " ".join(str(error).split())
+    return said[:MAX_REPEATED_CHARACTERS] or type(error).__name__
+
+
 SUGGESTION: Final = "did you mean"
 """Words before the proposal of a name."""
 LONGEST_NAME: Final = 80

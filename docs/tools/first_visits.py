@@ -19,6 +19,7 @@ import io
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -155,19 +156,15 @@ def pictured(page: Any) -> Image.Image:
     return Image.open(raw).convert("RGB")
 
 
-def fresh(browser: Any, url: str, size: Size, theme: str) -> dict[str, Image.Image]:
+def fresh(page: Any) -> dict[str, Image.Image]:
     """Make a picture of each state of `FRESH`, those without data, in one visit.
 
     Args:
-        browser: of playwright.
-        url: of the page.
-        size: of the window (width, height) [px].
-        theme: of the page.
+        page: just `opened`; it is closed with its context.
 
     Returns:
         State -> picture.
     """
-    page = opened(browser, url, size, theme)
     pictures = {}
     for state, reach in FRESH.items():
         reach(page)
@@ -176,22 +173,17 @@ def fresh(browser: Any, url: str, size: Size, theme: str) -> dict[str, Image.Ima
     return pictures
 
 
-def with_data(
-    browser: Any, url: str, sizes: list[Size], theme: str
-) -> dict[Size, dict[str, Image.Image]]:
+def with_data(page: Any, sizes: list[Size]) -> dict[Size, dict[str, Image.Image]]:
     """Make a picture of each state of `WITH_DATA` at each size, in one visit: all sizes
     of a state before the next one.
 
     Args:
-        browser: of playwright.
-        url: of the page.
-        sizes: of the window (width, height) [px], the first when the page is opened.
-        theme: of the page.
+        page: just `opened`; it is closed with its context.
+        sizes: of the window (width, height) [px].
 
     Returns:
         Size -> state -> picture.
     """
-    page = opened(browser, url, sizes[0], theme)
     pictures: dict[Size, dict[str, Image.Image]] = {size: {} for size in sizes}
     for state, reach in WITH_DATA.items():
         for width, height in sizes:
@@ -241,8 +233,9 @@ def main() -> None:
         sync_playwright() as play,
     ):
         browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        first = {size: fresh(browser, url, size, chosen.theme) for size in chosen.sizes}
-        later = with_data(browser, url, chosen.sizes, chosen.theme)
+        visit = partial(opened, browser, url, theme=chosen.theme)
+        first = {size: fresh(visit(size)) for size in chosen.sizes}
+        later = with_data(visit(chosen.sizes[0]), chosen.sizes)
         for size in chosen.sizes:
             name = f"{size[0]}x{size[1]}"
             pictures = {**first[size], **later[size]}

@@ -9,22 +9,20 @@ from typing import Final
 
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import TwinError, words_of
 
 MAX_HEAD_BYTES: Final = 16 << 20
 """Of a text that describes a scan."""
 UTF_16_MARKS: Final = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks of UTF-16, as programs of Windows begin a text."""
-MAX_REPEATED_CHARACTERS: Final = 200
-"""Largest number of characters of a parser's error that a message repeats."""
 
 
 @contextmanager
 def parsing(path: Path, form: str) -> Iterator[None]:
     """Run the body of a `with`, and turn any error of a parser into the file's error.
 
-    A TwinError passes as it is; lack of memory has its own message. At most
-    `MAX_REPEATED_CHARACTERS` of the parser's words are repeated.
+    A TwinError passes as it is; lack of memory has its own message. The parser's words
+    are repeated as `words_of` shortens them.
 
     Args:
         path: the file.
@@ -43,10 +41,7 @@ def parsing(path: Path, form: str) -> Iterator[None]:
     except (
         Exception
     ) as error:  # A third party's parser on a damaged file: anything may come.
-        words = (
-            " ".join(str(error).split())[:MAX_REPEATED_CHARACTERS] or type(error).__name__
-        )
-        said = f"{path} is no {form} file, or a damaged one ({words})"
+        said = f"{path} is no {form} file, or a damaged one ({words_of(error)})"
         raise DatasetFormatError(said, {"path": str(path)}) from error
 
 

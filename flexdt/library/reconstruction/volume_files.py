@@ -25,12 +25,10 @@ from flexdt.library.reconstruction.volume_formats import (
     VoxelPlaces,
 )
 from flexdt.runtime.files.whole_files import require_bytes, room_named
-from flexdt.twin.errors import LimitError
+from flexdt.twin.errors import LimitError, words_of
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.signatures import File
 
-MAX_REPEATED_CHARACTERS: Final = 200
-"""Characters of a reader's error that a message repeats."""
 NO_PLACE: Final = (
     "NumPy's files have no room for the voxel size; write with numpy.save(FILE, "
     "volume.data) and "
@@ -166,10 +164,9 @@ def read_volume(file: File) -> Volume:
         cubes = along_x == along_y == along_z
         return Volume(values, along_x if cubes else edges, (x, y, z))
     except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        why = " ".join(str(error).split())[:MAX_REPEATED_CHARACTERS]
         raise LimitError(
-            f"{path}: not a volume of flexdt reconstruct ({why}); values of other programs: "
-            "fx.Volume(array, voxel_mm)",
+            f"{path}: not a volume of flexdt reconstruct ({words_of(error)}); "
+            "values of other programs: fx.Volume(array, voxel_mm)",
             {"file": str(path)},
         ) from None
 
