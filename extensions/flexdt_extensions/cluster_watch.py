@@ -12,6 +12,8 @@ from flexdt_extensions.slurm_jobs import Tend
 
 EVERY_S: Final = 10.0
 """Interval between looks at the workers, and so between lines of a wait [s]."""
+LOOK_S: Final = 10.0
+"""Time after which a look that is not answered is given up, so that the end waits no longer [s]."""
 
 
 class ClusterWatch(threading.Thread):
@@ -45,10 +47,11 @@ class ClusterWatch(threading.Thread):
 
     def run(self) -> None:
         """Call `tend` every `EVERY_S` with the present workers and print its lines, until
-        closed or the scheduler is lost.
+        closed.
 
-        A CommandError ends it: it is kept in `error`, and the client is closed, which
-        ends the waiting for results.
+        A look that the scheduler does not answer is left out: it may be busy. Whether it is
+        lost the waiting for results learns by itself. A CommandError ends the watch: it is
+        kept in `error`, and the client is closed, which ends the waiting.
         """
         while not self._over.wait(EVERY_S):
             try:
@@ -58,12 +61,12 @@ class ClusterWatch(threading.Thread):
                 self._client.close()  # ends the waiting with cancelled futures
                 return
             except OSError:
-                return  # the scheduler is lost, which the waiting learns too
+                continue
             for line in lines:
                 note(line)
 
     def _workers(self) -> Collection[str]:
-        known = self._client.run_on_scheduler(_names)
+        known = self._client.run_on_scheduler(_names, callback_timeout=LOOK_S)
         return [str(name) for name in known]
 
 

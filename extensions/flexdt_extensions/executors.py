@@ -18,7 +18,9 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import threading
+import time
 import tomllib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
@@ -71,7 +73,10 @@ SINGLE: Final[Mapping[str, str]] = {f"{name}_THREADS": "1" for name in _NUMBERED
 """Environment of workers that share a machine: one thread each, so sums have one order."""
 
 SCHEDULER_S = 10.0
-"""Time limit for reaching a dask scheduler [s]."""
+"""Time for which nothing may listen at a scheduler's address before that is an error [s]."""
+ANSWER_S = 600.0
+"""Time that a scheduler or worker that is there may take for an answer [s]: it may have work, and
+its machine may pause. A connection that breaks is told at once."""
 
 
 def executor(
@@ -164,7 +169,9 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
     for name in ("distributed", "distributed.client", "tornado.application", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
-        client = distributed.Client(address, timeout=SCHEDULER_S)
+        if isinstance(address, str):
+            _wait_for_listener(address)
+        client = distributed.Client(address, timeout=ANSWER_S)
     except OSError as error:
         raise CommandError(f"no dask scheduler at {address}: {error}", REFUSED) from None
     except ValueError as error:
@@ -187,6 +194,32 @@ def dask_executor(address: Any, tend: Tend | None = None) -> Iterator[Executor]:
         if told is None:
             raise
         raise told from None
+
+
+def _wait_for_listener(address: str) -> None:
+    """Wait until connections to a dask address are accepted, `SCHEDULER_S` at most.
+
+    The system accepts them for a process that is busy or stopped; where there is none it refuses.
+    Nothing is asked of an address without host and port.
+
+    Raises:
+        OSError: nothing listens there.
+        ValueError: `address` is not valid.
+    """
+    from distributed.comm.addressing import get_address_host_port, parse_address
+
+    if parse_address(address)[0] not in ("tcp", "tls", "ws", "wss"):
+        return
+    place = get_address_host_port(address)
+    until = time.monotonic() + SCHEDULER_S
+    while True:
+        try:
+            socket.create_connection(place, timeout=SCHEDULER_S).close()
+            return
+        except OSError:
+            if time.monotonic() >= until:
+                raise
+        time.sleep(0.1)
 
 
 def _readable_error(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import math
 import os
 import signal
@@ -11,11 +13,12 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, wait
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from flexdt.extending import CommandError
-from flexdt_extensions import cluster_watch, slurm_jobs
+from flexdt_extensions import cluster_watch, executors, slurm_jobs
 from flexdt_extensions.executors import Slurm, dask_executor, slurm_executor
 from flexdt_extensions.slurm_jobs import PLACEHOLDER, SlurmJobs, lifetime_s
 
@@ -154,13 +157,51 @@ def test_a_scheduler_without_workers_is_told(
         ) as cluster,
         dask_executor(cluster.scheduler_address) as pool,
     ):
-        waiting = pool.submit(math.sqrt, 16.0)
-        time.sleep(0.9)
+        there = cluster.scheduler_address
+        line = f"waits for workers of the dask scheduler at {there}: it has none"
+        waiting, said = pool.submit(math.sqrt, 16.0), []
+        while said.count(line) < 2:
+            time.sleep(0.1)
+            said += capsys.readouterr().err.splitlines()
         cluster.scale(1)
         assert waiting.result() == 4.0
-    said = capsys.readouterr().err.splitlines()
-    line = f"waits for workers of the dask scheduler at {cluster.scheduler_address}: it has none"
-    assert said.count(line) >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+def test_a_scheduler_that_is_slow_is_waited_for(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time limit is for an address where nothing listens, and for no answer of one that is."""
+    from distributed import LocalCluster
+
+    monkeypatch.setattr(executors, "SCHEDULER_S", 0.3)
+    monkeypatch.setattr(cluster_watch, "EVERY_S", 0.2)
+    monkeypatch.setattr(cluster_watch, "LOOK_S", 0.3)
+    with LocalCluster(
+        n_workers=0, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        answers = cluster.scheduler.handlers
+        at_once = {name: answers[name] for name in ("identity", "run_function")}
+
+        def slowly(name: str) -> Callable[..., Any]:
+            async def answer(*given: Any, **named: Any) -> Any:
+                await asyncio.sleep(1.0)
+                done = at_once[name](*given, **named)
+                return await done if inspect.isawaitable(done) else done
+
+            return answer
+
+        answers |= {name: slowly(name) for name in at_once}
+        with dask_executor(cluster.scheduler_address) as pool:
+            waiting, said = pool.submit(math.sqrt, 16.0), ""
+            time.sleep(1.0)  # the first looks are given up
+            answers |= at_once
+            while "it has none" not in said:  # the watch goes on
+                time.sleep(0.1)
+                said += capsys.readouterr().err
+            cluster.scale(1)
+            assert waiting.result() == 4.0
 
 
 def test_signal_handlers_stay_as_they_were() -> None:
