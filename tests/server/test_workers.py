@@ -7,6 +7,7 @@ import json
 import os
 import pickle
 import signal
+import time
 from collections.abc import Awaitable, Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -195,11 +196,14 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
     """A process that is stopped for most of the time is one of a busy machine."""
 
     async def stutter(pid: int) -> None:
+        """Stop the process for 0.4 s each time that it has worked for a moment."""
         while True:
             os.kill(pid, signal.SIGSTOP)
             await asyncio.sleep(0.4)
+            worked = process_seconds(pid)
             os.kill(pid, signal.SIGCONT)
-            await asyncio.sleep(0.05)
+            while process_seconds(pid) == worked:
+                await asyncio.sleep(0.005)
 
     some = check_input(ScanSource(long_script(4_000)))
 
@@ -211,9 +215,11 @@ def test_work_on_a_busy_machine_has_the_time_that_it_has_alone() -> None:
         after = process_seconds(pid)
         assert before is not None
         assert after is not None
-        workers.seconds = 3.0 * (after - before)
+        workers.seconds = max(2.0, 3.0 * (after - before))
         busy = asyncio.create_task(stutter(pid))
+        began = time.monotonic()
         await workers.ask(checking.in_pieces, some)
+        assert time.monotonic() - began > workers.seconds
         busy.cancel()
         os.kill(pid, signal.SIGCONT)
 
