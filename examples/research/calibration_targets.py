@@ -218,7 +218,7 @@ TARGETS: Final = (
         for name in ("beads", "phantoms", "detector", "damping")
     ),
     *(
-        Target(f"joint 95 % ellipsoid covers 93 to 97 %, camera {camera}", f"coverage_{camera}",
+        Target(f"joint 95 % region covers 93 to 97 %, camera {camera}", f"coverage_{camera}",
                f"{_ROBUST} --coverage 1000 --camera {camera}", _covered)
         for camera in ("demo", "blurred")
     ),

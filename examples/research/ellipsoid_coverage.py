@@ -1,4 +1,4 @@
-"""Does the joint 95 % ellipsoid contain the truth 95 times in a hundred?
+"""Does the joint 95 % region contain the truth 95 times in a hundred?
 
 Each seed has a truth, a noise and images of its own, and runs through the whole pipeline with
 unknown identities. Seeds for which no answer was offered are listed separately.
@@ -34,7 +34,7 @@ class Draw:
     Attributes:
         seed: which.
         offered: the calibration was identifiable.
-        inside: the truth is in the joint 95 % ellipsoid.
+        inside: the truth is in the joint 95 % region.
         intervals: share of the six 95 % intervals that hold their truth.
         distance2: squared Mahalanobis distance.
         warnings: codes of the calibration's findings.

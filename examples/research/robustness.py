@@ -1,4 +1,4 @@
-"""Two long studies: scans spoilt on purpose, and the coverage of the joint 95 % ellipsoid.
+"""Two long studies: scans spoilt on purpose, and the coverage of the joint 95 % region.
 
 `python examples/research/robustness.py --sets 1000 --out DIR` writes `robustness.json` and
 prints a table of kinds (`--kinds scanner_off held_right`: of these); run again after an

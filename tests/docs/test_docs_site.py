@@ -75,7 +75,7 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
     )
     # Evidence is rendered, old addresses forward, and the figures are made anew.
     coverage = (html / "_generated" / "evidence" / "calibration.html").read_text()
-    assert 'id="coverage-of-the-joint-95-ellipsoid"' in coverage
+    assert 'id="coverage-of-the-joint-95-region"' in coverage
     assert "itk-rtk" in (html / "_generated" / "evidence" / "bench.html").read_text()
     assert 'url=use.html"' in (html / "how-to.html").read_text()
     made = json.loads((DOCS / "_generated" / "figures" / "figures.json").read_text())

@@ -432,7 +432,7 @@ def _compare_with_truth(
         tell: called with each line of progress.
 
     Returns:
-        Whether the truth is inside the joint 95 % ellipsoid.
+        Whether the truth is inside the joint 95 % region.
     """
     from flexdt.library.calibration.calibrate import inside_95
     from flexdt.twin.geometry.offsets import MEANINGS
@@ -445,7 +445,7 @@ def _compare_with_truth(
     tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit", "meaning")))
     inside = inside_95(outcome, truth)
     if inside:
-        tell("the truth lies inside the joint 95 % ellipsoid")
+        tell("the truth lies inside the joint 95 % region")
     else:
-        tell("a miss: the truth lies outside the joint 95 % ellipsoid")
+        tell("a miss: the truth lies outside the joint 95 % region")
     return inside

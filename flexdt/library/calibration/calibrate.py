@@ -494,7 +494,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
 
 
 def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:
-    """Return whether a truth is in the joint 95 % ellipsoid of the estimated parameters.
+    """Return whether a truth is in the joint 95 % region of the estimated parameters.
 
     Args:
         outcome: of a calibration.
