@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import FloatArray, cross
 from flexdt.twin.plausibility.findings import Finding, Severity
 
 SOME_VIEWS: Final = 16
@@ -102,7 +102,7 @@ def geometry_findings(
     """
     if not len(cone_vec):
         return
-    normal = np.cross(cone_vec.u, cone_vec.v)
+    normal = cross(cone_vec.u, cone_vec.v)
     with np.errstate(all="ignore"):
         beam = np.einsum("ni,ni->n", cone_vec.detector - cone_vec.source, normal)
         distance = np.nan_to_num(

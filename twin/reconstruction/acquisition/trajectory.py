@@ -399,7 +399,8 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
     Returns:
         New geometry; each view is moved by its own amount.
     """
-    at = cone_vec.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
+    axis = np.array([[*circle.centre, 0.0]])
+    at = cone_vec.project_points(axis, shape)[:, 0, 0]
     moved = np.round(2.0 * at) / 2.0 - at
     return ConeVec.from_vectors(
         cone_vec.source,

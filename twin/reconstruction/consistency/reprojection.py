@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -23,6 +23,8 @@ NOISE_OF_CHANGES = np.array([1.0, 0.25])
 """Variance of white noise in the values, and in their changes, over that in the values."""
 SPLINE_MARGIN = 12
 """Values that repeat the end of a line before it is interpolated by splines."""
+MAX_KEPT_SIZES = 8
+"""Lengths of lines whose spline coefficients are remembered."""
 MIN_SIGNAL_SHARE = 0.3
 """Share of a residual that is kept whatever the noise, so that of two in much noise
 none is far better than the other."""
@@ -217,11 +219,8 @@ def _interpolation(shifts: FloatArray, size: int) -> FloatArray:
     Returns:
         (n, size, size): each new value's shares of the line's.
     """
-    from scipy.ndimage import spline_filter1d
-
-    padded = np.pad(np.eye(size), ((SPLINE_MARGIN, SPLINE_MARGIN), (0, 0)), "edge")
-    coefficients = spline_filter1d(padded, 3, axis=0, mode="nearest")
-    last = len(padded) - 1
+    coefficients = _spline_coefficients(size)
+    last = len(coefficients) - 1
     at = SPLINE_MARGIN + np.arange(size) + shifts[:, None]
     at = np.clip(at, 0.0, last)
     first = np.floor(at)
@@ -234,6 +233,17 @@ def _interpolation(shifts: FloatArray, size: int) -> FloatArray:
         index = np.abs(first.astype(np.intp) + step)
         weights[line, place, last - np.abs(last - index)] += share / 6.0
     return np.asarray(weights @ coefficients)
+
+
+@lru_cache(MAX_KEPT_SIZES)
+def _spline_coefficients(size: int) -> FloatArray:
+    """Compute the coefficients of cubic splines through lines whose values are 0 but for one, and
+    whose ends are repeated `SPLINE_MARGIN` times, (size + 2 `SPLINE_MARGIN`, size).
+    """
+    from scipy.ndimage import spline_filter1d
+
+    lines = np.pad(np.eye(size), ((SPLINE_MARGIN, SPLINE_MARGIN), (0, 0)), "edge")
+    return np.asarray(spline_filter1d(lines, 3, axis=0, mode="nearest"))
 
 
 def _sums_of_squares(images: Float32Array) -> FloatArray:

@@ -338,7 +338,8 @@ def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> Non
     Raises:
         GeometryError: the panel moves sideways during the scan, as in a tiled one.
     """
-    columns = level.project_points([[*circle.centre, 0.0]], shape)[:, 0, 0]
+    axis = np.array([[*circle.centre, 0.0]])
+    columns = level.project_points(axis, shape)[:, 0, 0]
     moved = float(np.ptp(columns))
     if not moved <= MAX_SIDEWAYS_SHARE * shape[1]:
         most = MAX_SIDEWAYS_SHARE * shape[1]
