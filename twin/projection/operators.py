@@ -146,6 +146,8 @@ def level_axes(
     through = (np.array(counts[::-1]) / np.maximum(size[:, 4], 1e-9)).min(axis=1)
     times = np.empty((len(rays), 4))
     times[:, NO_FANS] = through * RAY_VOXEL_NS * every.sum(axis=1)
+    if (times[:, NO_FANS] < PLAN_VIEW_NS).all():  # less than any fans take
+        return np.full(len(rays), NO_FANS)
     for i, (a, b, w) in enumerate(ORDERS):
 
         def across(step: FloatArray, a: int = a, b: int = b) -> FloatArray:

@@ -44,7 +44,12 @@ def leans(cone_vec: ConeVec) -> bool:
 
 def is_upright(cone_vec: ConeVec) -> bool:
     """Return whether all rows are horizontal and all columns point down."""
-    return not leans(cone_vec) and bool((cone_vec.v[:, 2] < 0).all())
+    return columns_fall(cone_vec) and not leans(cone_vec)
+
+
+def columns_fall(cone_vec: ConeVec) -> bool:
+    """Return whether all columns point down."""
+    return bool((cone_vec.v[:, 2] < 0).all())
 
 
 def on_its_side(cone_vec: ConeVec) -> bool:

@@ -19,7 +19,7 @@ from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction.acquisition.coverage import Sharing, normalise_coverage
 from flexdt.twin.reconstruction.acquisition.rectify import (
     FINER,
-    is_upright,
+    columns_fall,
     leans,
     on_its_side,
     rectified,
@@ -316,9 +316,10 @@ def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels
         )
     seen = shape
     level = cone_vec
-    if leans(cone_vec):
+    leaning = leans(cone_vec)
+    if leaning:
         shape = (shape[0], round(FINER * shape[1]))
-    if not is_upright(cone_vec):
+    if leaning or not columns_fall(cone_vec):
         level = upright(cone_vec, shape[1] / seen[1])
     _check_steady(circle, level, shape)
     if narrow_overlap(circle, level, shape[1]):

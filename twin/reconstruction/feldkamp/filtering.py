@@ -5,11 +5,17 @@ Rows are padded so far that the convolution does not wrap.
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Final
+
 import numpy as np
 
 from flexdt.twin.algorithms import PLAIN, WINDOWS
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+MAX_KEPT_RESPONSES: Final = 8
+"""Number of responses of the filter that are remembered."""
 
 
 def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
@@ -34,15 +40,26 @@ def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
         raise UnknownNameError.among(
             f"unknown filter {window!r}; there are", window, WINDOWS
         )
-    length = _even_length(2 * reach)
+    response = _unit_ramp(_even_length(2 * reach), window)
+    return np.asarray(response / pitch_mm, dtype=np.float32)
+
+
+@lru_cache(MAX_KEPT_RESPONSES)
+def _unit_ramp(length: int, window: str) -> FloatArray:
+    """Compute the response for a pitch of 1, (length / 2 + 1,); many scans share it.
+
+    Args:
+        length: of a padded row [columns], even.
+        window: of `WINDOWS`.
+    """
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.zeros(length)
     odd = n % 2 == 1
-    kernel[odd] = -1.0 / (np.pi * n[odd] * pitch_mm) ** 2
-    kernel[0] = 0.25 / pitch_mm**2
-    response = np.fft.rfft(kernel).real * pitch_mm
+    kernel[odd] = -1.0 / (np.pi * n[odd]) ** 2
+    kernel[0] = 0.25
+    response = np.fft.rfft(kernel).real
     shape = WINDOWS[window](np.linspace(0.0, 1.0, len(response)))
-    return np.asarray(response * shape, dtype=np.float32)
+    return np.asarray(response * shape)
 
 
 def _even_length(least: int) -> int:
