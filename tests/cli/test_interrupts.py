@@ -3,6 +3,7 @@ short."""
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -100,6 +101,56 @@ console_script._command = command
 console_script.main()
 """
 
+IN_KERNELS = """
+import os, signal, sys, threading, time
+import numpy as np
+import flexdt as fx
+from flexdt.clients.cli import console_script
+from flexdt.library.reconstruction import memory_plan, reconstruct, slab_fdk
+
+folder = sys.argv[1]
+N = 256
+scan = fx.ConeVec.circular(sod=600, sdd=900, angles=360, shape=(N, N), pixel=0.8)
+volume = fx.Volume(np.ones((N, N, N), np.float32), 0.5)
+fx.forward(volume, fx.ConeVec(scan.rows[:1]), (N, N))  # compiled or loaded
+
+used = []
+def press():
+    used.append(time.process_time())
+    os.kill(os.getpid(), signal.SIGINT)
+
+threading.Timer(0.1, press).start()
+try:
+    fx.forward(volume, scan, (N, N))
+    print("ended")
+except KeyboardInterrupt:
+    print(time.process_time() - used[0])
+
+# FDK in slabs, of which the first is in the file when somebody presses Ctrl-C.
+few = fx.ConeVec.circular(sod=600, sdd=900, angles=40, shape=(32, 32), pixel=6.4)
+counts = np.full((40, 32, 32), 9000, np.uint16)
+fx.DataSet.from_arrays(counts, few, flat=np.full((32, 32), 10000)).save(folder + "/scan")
+memory_plan.WORKING_IMAGES = 0
+reconstruct.free_memory_bytes = lambda: 2 * 40_000
+parts, slabs = slab_fdk.fdk_parts, []
+def second(*args, **options):
+    slabs.append(os.listdir(folder + "/out"))
+    if len(slabs) == 2:
+        print(slabs[1], flush=True)
+        press()
+    return parts(*args, **options)
+slab_fdk.fdk_parts = second
+os.mkdir(folder + "/out")
+sys.argv = ["flexdt", "-q", "reconstruct", folder + "/scan", "--out", folder + "/out/v.mha"]
+console_script.main()
+"""
+"""Interrupts a projection in its kernel, and then the command that reconstructs. Prints the
+processor time of all threads from the signal to KeyboardInterrupt [s], and the files of which
+the command had begun to write one."""
+MOST_IN_KERNEL_S = 1.2
+"""Processor time from the signal to KeyboardInterrupt: a portion of two threads takes 0.5 s by
+estimate; the projection as a whole would go on for 2.5 s."""
+
 
 @pytest.mark.parametrize("where", STUCK)
 def test_the_main_thread_is_interrupted_wherever_it_is(
@@ -112,6 +163,23 @@ def test_the_main_thread_is_interrupted_wherever_it_is(
 def test_an_end_that_works_is_waited_for(tmp_path: Path) -> None:
     code = WORKING.format(work_s=2 * STUCK_END_S)
     assert interrupted_end(code, tmp_path) == (0, "written\n", "")
+
+
+def test_work_in_kernels_ends_at_once_and_leaves_no_file(
+    tmp_path: Path,
+) -> None:  # numba#2324, #5551
+    done = subprocess.run(
+        [sys.executable, "-c", IN_KERNELS, str(tmp_path)],
+        env={**os.environ, "NUMBA_NUM_THREADS": "2"}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    used, written = done.stdout.splitlines()
+    assert float(used) < MOST_IN_KERNEL_S
+    assert written == "['.v.mha.part.mha']"
+    assert done.returncode == 130
+    assert done.stderr.endswith("flexdt: interrupted\n")
+    assert "Traceback" not in done.stderr
+    assert not list((tmp_path / "out").iterdir())
 
 
 def interrupted_end(code: str, folder: Path) -> tuple[int, str, str]:
