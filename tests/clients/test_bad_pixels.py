@@ -60,6 +60,17 @@ def spoilt(counts: np.ndarray, kind: str, seed: int) -> tuple[np.ndarray, np.nda
     return made, bad
 
 
+def found_in(counts: np.ndarray) -> np.ndarray:
+    """The bad pixels that are found in counts, (rows, cols)."""
+    integrals = -np.log(np.maximum(counts, 0.5) / OPEN).astype(np.float32)
+
+    def views(many: int) -> np.ndarray:
+        return integrals[np.unique(np.linspace(0, len(integrals) - 1, many).astype(int))]
+
+    found = bad_pixels(views, (SHAPE[1] - 1) / 2)
+    return np.zeros(SHAPE, bool) if found is None else found.mask
+
+
 def reconstructed(counts: np.ndarray, **options: bool) -> tuple[Volume, list[str]]:
     flat = np.full(SHAPE, OPEN)
     data = DataSet.from_arrays(counts, SCAN, flat=flat, dark=np.zeros(SHAPE))
@@ -93,6 +104,41 @@ def test_bad_pixels_leave_no_rings(kind: str, seed: int) -> None:
     assert int(told.split()[0]) == pytest.approx(int(bad.sum()), abs=1 + 0.1 * bad.sum())
     assert not any("starved" in one or "saturated" in one for one in said)
     assert body(found).std() <= 1.3 * body(clean).std()
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        *(("flickering", seed) for seed in (103, 109, 144, 171, 241)),
+        *(("hot", seed) for seed in (145, 161, 193, 198)),
+    ],
+)
+def test_all_bad_pixels_are_found_and_no_other(kind: str, seed: int) -> None:
+    """Flicker before the axis, and groups of bad pixels above, below and beside each other
+    that hide each other, at the panel's edges, too."""
+    made, bad = spoilt(counts_of(seed), kind, seed)
+    np.testing.assert_array_equal(found_in(made), bad)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.01])
+@pytest.mark.parametrize("axis", [31.5, 30.9])
+def test_a_thin_ring_about_the_axis_is_no_pair_of_bad_pixels(
+    sigma: float, axis: float
+) -> None:
+    """Wires of a pixel, bent to rings: rays along them see much, always on the same two
+    pixels, which are as far from the axis."""
+    columns = abs(np.arange(64) - axis)
+    views = np.random.default_rng(3).normal(0.0, sigma, (40, 30, 64)).astype(np.float32)
+    for row, radius in ((6, 12.0), (11, 20.0), (17, 7.0), (25, 24.0)):
+        inner, outer = (
+            np.sqrt(np.maximum(r**2 - columns**2, 0.0)) for r in (radius - 1.0, radius)
+        )
+        views[:, row] += (0.2 * (outer - inner)).astype(np.float32)
+    assert bad_pixels(lambda _: views, axis) is None
+    views[:, 20, 44] += 0.5
+    found = bad_pixels(lambda _: views, axis)
+    assert found is not None
+    assert np.argwhere(found.mask).tolist() == [[20, 44]]
 
 
 @pytest.mark.parametrize(
@@ -138,9 +184,9 @@ def test_what_stands_still_on_the_axis_is_no_bad_pixel() -> None:
     views = np.zeros((20, 30, 61), np.float32)
     views[:, 12:, 30:32] += 0.8
     views += np.random.default_rng(2).normal(0.0, 0.004, views.shape).astype(np.float32)
-    assert bad_pixels(lambda: views, 30.5) is None
+    assert bad_pixels(lambda _: views, 30.5) is None
     views[:, 4, 12] += 0.5
-    found = bad_pixels(lambda: views, 30.5)
+    found = bad_pixels(lambda _: views, 30.5)
     assert found is not None
     assert np.argwhere(found.mask).tolist() == [[4, 12]]
 
@@ -163,4 +209,4 @@ def test_a_thin_layer_of_the_object_is_no_row_of_bad_pixels(width: int) -> None:
         middle = 30.0 + 24.0 * np.sin(turn)
         first, last = (int(np.clip(middle + side * width / 2, 0, 61)) for side in (-1, 1))
         view[14, first : max(last, first + 1)] += 0.6
-    assert bad_pixels(lambda: views, 30.0) is None
+    assert bad_pixels(lambda _: views, 30.0) is None

@@ -1,6 +1,6 @@
 """Dead, hot and flickering pixels, and dead columns: what is found, and what noise is left.
 
-    python tests/studies/bad_pixel_table.py --count 12 --seed 100
+    python tests/studies/bad_pixel_table.py --count 40 --seed 4000
 
 Counts of `tests/clients/test_bad_pixels.py`, whose places and numbers (1 to 50, or a column) are
 drawn. Prints, a kind: pixels found over those there are, and the standard deviation of the
@@ -40,8 +40,8 @@ def left_as_it_is(counts: np.ndarray) -> float:
 def main() -> int:
     """Draw, reconstruct and compare."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--count", type=int, default=12, help="scans of each kind")
-    parser.add_argument("--seed", type=int, default=100)
+    parser.add_argument("--count", type=int, default=40, help="scans of each kind")
+    parser.add_argument("--seed", type=int, default=4000)
     chosen = parser.parse_args()
     begun = time.process_time()
     worst = 0.0

@@ -8,13 +8,17 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
-from flexdt.library.datasets.image_doubts import MAX_FROM_DISK
 from flexdt.library.datasets.image_set import Counts, ImageSet
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.reconstruction.acquisition.rectify import on_its_side
-from flexdt.twin.reconstruction.consistency.pixels import BadPixels, bad_pixels
+from flexdt.twin.reconstruction.consistency.pixels import (
+    SCREENED_VIEWS,
+    BadPixels,
+    bad_pixels,
+)
 
 MIN_VIEWS: Final = 12
 """Smallest number of views in which bad pixels are separable from a turning object."""
@@ -49,11 +53,11 @@ def without_bad_pixels(
 def _bad_pixels(
     dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
 ) -> BadPixels | None:
-    """Find pixels that differ from their neighbours in all views.
+    """Find pixels that do not respond as their neighbours do.
 
-    At most `MAX_FROM_DISK` views are read, evenly spread; they are kept in memory for the
-    next pass if they need at most `MAX_KEPT_BYTES`. For a panel on its side rows and
-    columns are exchanged meanwhile.
+    Views are read evenly spread; they are kept in memory for the next pass as far as they
+    need at most `MAX_KEPT_BYTES`. For a panel on its side rows and columns are exchanged
+    meanwhile.
 
     Args:
         dataset: with its flat image.
@@ -68,8 +72,7 @@ def _bad_pixels(
     present = np.array(dataset.present)
     if len(present) < MIN_VIEWS or not (dataset.flat > dataset.dark).any():
         return None
-    some = present[np.unique(np.linspace(0, len(present) - 1, MAX_FROM_DISK).astype(int))]
-    views = cone_vec[some]
+    views = cone_vec[_some(present, SCREENED_VIEWS)]
     spread = np.ptp(views.source[:, :2], axis=0).max()
     if spread < MIN_TURN_SHARE * np.linalg.norm(views.source, axis=1).max():
         return None
@@ -79,22 +82,35 @@ def _bad_pixels(
     if not np.isfinite(axis_column):
         return None
 
-    held: list[Float32Array] = []
-    keeps = 4 * len(some) * math.prod(dataset.shape) <= MAX_KEPT_BYTES
+    held: dict[int, Float32Array] = {}
+    most = MAX_KEPT_BYTES // (4 * math.prod(dataset.shape))
 
-    def images() -> Iterator[Float32Array]:
-        """Yield some line integrals, rows along the axis; kept for the next pass if they
-        fit the memory.
+    def images(many: int) -> Iterator[Float32Array]:
+        """Yield line integrals of so many views, rows along the axis; kept for the next
+        pass as far as they fit the memory.
         """
-        yield from held
-        for index in some[len(held) :].tolist():
+        for index in _some(present, many).tolist():
+            if index in held:
+                yield held[index]
+                continue
             made = dataset.normalisation(counts(index))
             image = made.T if lies else made
-            if keeps:
-                held.append(image)
+            if len(held) < most:
+                held[index] = image
             yield image
 
     pixels = bad_pixels(images, axis_column)
     if pixels is not None and lies:
         return BadPixels(pixels.mask.T)
     return pixels
+
+
+def _some(present: npt.NDArray[np.intp], many: int) -> npt.NDArray[np.intp]:
+    """Choose so many of the present frames, or all if there are fewer, spread evenly.
+
+    Args:
+        present: indices of frames.
+        many: at least 1.
+    """
+    chosen = np.unique(np.linspace(0, len(present) - 1, many).astype(np.intp))
+    return np.asarray(present[chosen])

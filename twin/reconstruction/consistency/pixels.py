@@ -1,12 +1,14 @@
 """Pixels that do not respond as their neighbours do: dead, stuck, hot and flickering ones.
 
-An object turns, so that what it gives to a pixel beyond its neighbours in the row it
-gives in few views. A pixel that is beyond them by far more than other pixels, in the root
-of the mean square over all but a few views, is a bad one; so is a column of such pixels.
-Near the rotation axis an object hardly moves: there a pixel must also be beyond its
-neighbours in the column, or the complete column is bad. Elsewhere a pixel beyond its
-neighbours in the column is bad, too, such as three in a row that hide each other, unless it
-belongs to a layer of the object.
+Suspects are pixels beyond their neighbours in the row, or in the column, by far more than
+other pixels, in the root of the mean square over all but a few views. They are then
+compared with good neighbours alone, in row and column, view by view. An object turns, so
+that what it gives to a pixel it gives to others as well: to those between it and the axis
+as often, and, what stands still about the axis, to the pixel as far from it on the other
+side. A suspect is bad if it deviates in nearly all views and its counterpart does not, or
+if it deviates so often, and changes so much, that a pixel like its neighbours does so with
+a probability below `MAX_CHANCE`. A feature on the axis itself stands before one pixel:
+there, only values that no object explains, or a complete column, are bad.
 """
 
 from __future__ import annotations
@@ -20,9 +22,17 @@ import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
+SCREENED_VIEWS: Final = 32
+"""Largest number of views in which suspects are searched."""
+JUDGED_VIEWS: Final = 96
+"""Largest number of views in which they are judged: random flicker then hardly ever looks
+like the few visits of a feature."""
 NEIGHBOURS: Final = 2
 """Columns on either side that a pixel is compared with: each of two bad columns has
 good ones."""
+MAX_GROUP: Final = 5
+"""Largest number of neighbouring bad pixels in a row or column; longer groups are layers and
+edges of the object, or complete columns."""
 BAD_RESPONSE_RATIO: Final = 8.0
 """Response of a bad pixel over the usual one about it."""
 MIN_BAD_RESPONSE: Final = 0.02
@@ -32,6 +42,9 @@ EDGE_SLOPE_FACTOR: Final = 3.0
 side alone."""
 MIN_EDGE_RESPONSE: Final = 0.3
 """Least response of a bad pixel at the panel's edges."""
+WORST_RATIO: Final = 0.75
+"""Least response of the worst pixels over the largest about them; a good pixel that bad
+neighbours surround in one direction has half of theirs, who deviate in two."""
 VIEWS_AN_OUTLIER: Final = 5
 """One of this many views is left out, that where a pixel is farthest beyond its
 neighbours."""
@@ -48,21 +61,30 @@ MIN_LASTING_SHARE: Final = 0.75
 of its orbit does so in less than half of them."""
 AXIS_BAND_PX: Final = 2.0
 """Distance from the axis within which a small feature of the object is always there [pixels]."""
+AXIS_REACH_PX: Final = 2
+"""Largest distance from the stated axis at which the centre of symmetry may be [pixels]."""
 EXPLAINED_ABOVE: Final = 0.5
 """Attenuation above all others that a feature at the axis may have, over their range."""
 EXPLAINED_BELOW: Final = 0.1
 """Attenuation below all others that one may have, over their range."""
-MIN_CHANGES_RATIO: Final = 3.0
-"""Least changes of a flickering pixel over the median of those about."""
 COMPARED_COLUMNS: Final = 4
-"""Columns on either side whose changes are compared."""
+"""Pixels on either side whose deviations are compared."""
 MIN_SLOPE_RATIO: Final = 0.5
-"""Least distance of a lasting bad pixel beyond its neighbours, over their own range."""
+"""Least distance of a bad pixel beyond its neighbours, over their own range."""
+MIN_ALIKE_RATIO: Final = 0.25
+"""Least deviation of a suspect's counterpart across the axis, over its own: a peak between
+two pixels has half of its height in each."""
 MIN_CHANGES_SHARE: Final = 0.25
-"""Least share of views at which a flickering pixel changes between deviating and not;
-an object's feature comes and goes once."""
-MIN_AXIS_CHANGES_SHARE: Final = 0.375
-"""The same before the axis, where a bead stays longer; random flicker has half."""
+"""Least share of views at which a flickering pixel changes between deviating and not; a
+feature of the object comes and goes twice a turn, random flicker has half."""
+MAX_CHANCE: Final = 1e-4
+"""Largest probability with which a pixel like its neighbours deviates as often as a
+flickering one, and varies as much."""
+MAX_PAIRS_CHANCE: Final = 0.05
+"""Largest probability with which scattered bad pixels would make as many counterparts
+across the axis as an object that stands still does."""
+MAX_UNEXPLAINED_PAIRS_CHANCE: Final = 1e-3
+"""The same of pixels whose values no other pixel has, as dead and hot ones."""
 MAX_BAD_SHARE: Final = 0.05
 """Largest share of bad pixels; above it none is bad: the images are of another kind."""
 
@@ -101,41 +123,40 @@ class BadPixels:
         )
 
 
-def bad_pixels(
-    views: Callable[[], Iterable[Float32Array]], axis_column: float
-) -> BadPixels | None:
+Views = Callable[[int], Iterable[Float32Array]]
+"""Gives line integrals (rows, cols) of at most so many views, spread evenly, in order."""
+
+
+def bad_pixels(views: Views, axis_column: float) -> BadPixels | None:
     """Find pixels that do not respond as their neighbours do: dead, hot or flickering.
 
-    Pixels at the axis that a feature of the object may explain are left out.
+    Pixels that a feature of the object may explain are left out.
 
     Args:
-        views: gives line integrals of some views of a scan, (rows, cols) each; called
-            once, and where there may be bad ones for each of two or three further passes:
-            the worst make their neighbours look bad as well.
+        views: gives line integrals of a scan; called for `SCREENED_VIEWS` of them and,
+            where there may be bad pixels, once more for these, as the worst make their
+            neighbours look bad as well, and once for `JUDGED_VIEWS`.
         axis_column: where the axis falls.
 
     Returns:
-        None if no pixel is bad, or more than `MAX_BAD_SHARE` are: such images are of
+        None if no pixel is bad, or more than `MAX_BAD_SHARE` may be: such images are of
         another kind.
     """
-    first, response = _outliers(views(), axis_column)
+    first, response = _outliers(views(SCREENED_VIEWS), axis_column)
     if not first.any():
         return None
     worst = first & (
-        response >= _largest_about(np.where(first, response, np.float32(0.0)))
+        response > _largest_about(np.where(first, response, np.float32(0.0)))
     )
-    second, _ = _outliers((_interpolated(view, worst) for view in views()), axis_column)
-    columns = np.arange(first.shape[1])
-    at_axis = np.broadcast_to(abs(columns - axis_column) < AXIS_BAND_PX, first.shape)
-    lasting, flickering = _lasting_and_flickering(views(), worst | second, at_axis)
-    if (lasting & at_axis).any():
-        lasting &= ~at_axis | _no_feature(views(), lasting, at_axis)
-    mask = lasting | flickering
+    mended = (_interpolated(view, worst) for view in views(SCREENED_VIEWS))
+    second, _ = _outliers(mended, axis_column)
+    suspects = worst | second
+    if suspects.mean() > MAX_BAD_SHARE:
+        return None
+    mask = _Judged.of(views(JUDGED_VIEWS), suspects, axis_column).bad()
     if not mask.any():
         return None
-    if mask.mean() <= MAX_BAD_SHARE:
-        return BadPixels(mask)
-    return None
+    return BadPixels(mask)
 
 
 def _outliers(
@@ -143,10 +164,11 @@ def _outliers(
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
     """Find pixels far beyond their neighbours in the root mean square over the views.
 
-    Neighbours are those in the row; a pixel within a group of two to five in its row is
-    found by its column. Near the axis (`AXIS_PART` of the columns) a pixel must stand out
-    from both, or be in a column that is bad in `MIN_COLUMN_SHARE` of its rows, as rings
-    of the object end there.
+    Neighbours are those in the row; a pixel within a group of two to five in its row, or
+    at the panel's sides, is found by its column. Near the axis (`AXIS_PART` of the
+    columns) the object's edges stay in a column: there, a pixel must stand out from its
+    column as well, or be of at most `MAX_GROUP` that do so one above the other, or in a
+    column that is bad in `MIN_COLUMN_SHARE` of its rows.
 
     Args:
         views: line integrals (rows, cols); those of at most 4 rows or columns are not
@@ -154,9 +176,12 @@ def _outliers(
         axis_column: column of the rotation axis.
 
     Returns:
-        The outliers, and the excess of all pixels over their neighbours, (rows, cols)
-        each; (1, 1) of False and 0 without views or of too small ones.
+        The outliers, and the excess of all pixels over their neighbours in the row plus
+        that over those in the column, (rows, cols) each; (1, 1) of False and 0 without
+        views or of too small ones.
     """
+    from scipy.ndimage import binary_opening
+
     along = _Usual()
     down = _Usual()
     near = slice(0, 0)
@@ -177,14 +202,15 @@ def _outliers(
     cluster[:, near] = False
     if mask[:, near].size:
         whole = mask[:, near].mean(axis=0) > MIN_COLUMN_SHARE
-        mask[:, near] &= whole | in_column[:, near]
-    response = np.where(cluster, np.maximum(response, down.root()), response)
-    return mask | cluster, response
+        longer = binary_opening(mask[:, near], np.ones((MAX_GROUP + 1, 1), np.bool_))
+        mask[:, near] &= whole | in_column[:, near] | ~longer
+    return mask | cluster, response + down.root()
 
 
 def _short_groups(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Keep marked pixels of short groups in a row: with another one within `NEIGHBOURS`
-    columns, but not part of a run longer than 5.
+    columns, or as near to the panel's side, but not part of a run longer than
+    `MAX_GROUP`.
 
     A thin layer of the object gives longer runs.
 
@@ -198,92 +224,376 @@ def _short_groups(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
     window = np.ones(2 * NEIGHBOURS + 1, np.uint8)
     several = convolve1d(mask.astype(np.uint8), window, axis=1, mode="constant") >= 2
-    longer = binary_opening(mask, np.ones((1, 2 * NEIGHBOURS + 2), np.bool_))
+    several[:, :NEIGHBOURS] = True
+    several[:, -NEIGHBOURS:] = True
+    longer = binary_opening(mask, np.ones((1, MAX_GROUP + 1), np.bool_))
     return np.asarray(mask & several & ~longer)
 
 
-def _lasting_and_flickering(
-    views: Iterable[Float32Array],
-    mask: npt.NDArray[np.bool_],
-    at_axis: npt.NDArray[np.bool_],
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Find pixels that deviate in nearly all views, and those that do now and then.
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """The nearest pixels in the row on either side of some pixels that are not suspects.
 
-    A flickering pixel deviates from its row and from its column at once; one of a bad
-    column from the row alone, and one beside other bad ones in its row from the column
-    alone. Edges and thin walls of the object deviate from one of the two. Its beads
-    deviate from both, and visit the pixels about as often: a pixel flickers if it does so
-    more often than they do (`_flickers`). The top of a round body at the axis is always
-    there, but less beyond its neighbours than they are apart.
+    Attributes:
+        row: of each pixel.
+        col: of each pixel.
+        others: columns of its four neighbours, (4, pixels); the two of one side twice
+            where the other has none.
+        known: whether there are any within `MAX_GROUP` + `NEIGHBOURS` columns.
+        one_sided: whether they are on one side alone.
+    """
+
+    row: npt.NDArray[np.intp]
+    col: npt.NDArray[np.intp]
+    others: npt.NDArray[np.intp]
+    known: npt.NDArray[np.bool_]
+    one_sided: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        suspects: npt.NDArray[np.bool_],
+        row: npt.NDArray[np.intp],
+        col: npt.NDArray[np.intp],
+    ) -> _Beside:
+        """Find the neighbours.
+
+        Args:
+            suspects: (rows, cols), passed over.
+            row: of each pixel.
+            col: of each pixel.
+        """
+        steps = range(1, MAX_GROUP + NEIGHBOURS + 1)
+        left, on_left = _nearest(~suspects, row, col, [-step for step in steps])
+        right, on_right = _nearest(~suspects, row, col, list(steps))
+        has_left = on_left.all(axis=0)
+        has_right = on_right.all(axis=0)
+        others = np.concatenate(
+            [np.where(has_left, left, right), np.where(has_right, right, left)]
+        )
+        known = np.asarray(has_left | has_right)
+        return cls(row, col, others, known, has_left != has_right)
+
+    def residuals(self, view: Float32Array) -> Float32Array:
+        """Subtract from the pixels' transmissions that of their neighbours, (pixels,); 0
+        where these are not known.
+
+        Noise of a transmission does not grow with attenuation, as that of line integrals
+        does.
+
+        Args:
+            view: line integrals (rows, cols).
+        """
+        usual = np.exp(-view[self.row, self.others].mean(axis=0))
+        own = np.exp(-view[self.row, self.col])
+        return np.where(self.known, own - usual, np.float32(0.0))
+
+    def distances(
+        self, view: Float32Array, slopes: float = MIN_SLOPE_RATIO
+    ) -> Float32Array:
+        """Compute how far pixels are above or below all but one of their neighbours, less
+        how far these may differ as they do among themselves.
+
+        On one side alone, the range is widened by `EDGE_SLOPE_FACTOR` times itself.
+
+        Args:
+            view: (rows, cols).
+            slopes: part of the neighbours' own range that is subtracted.
+
+        Returns:
+            (pixels,); infinite where no neighbours are known.
+        """
+        own = view[self.row, self.col]
+        least, low, high, most = np.sort(view[self.row, self.others], axis=0)
+        span = np.where(self.one_sided, np.float32(EDGE_SLOPE_FACTOR), 0) * (high - low)
+        beyond = np.maximum(low - span - own, own - high - span)
+        clear = np.maximum(beyond, 0) - np.float32(slopes) * (most - least)
+        return np.where(self.known, clear, np.float32(np.inf))
+
+
+def _nearest(
+    allowed: npt.NDArray[np.bool_],
+    row: npt.NDArray[np.intp],
+    col: npt.NDArray[np.intp],
+    steps: list[int],
+    wanted: int = NEIGHBOURS,
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+    """Find the first allowed pixels among those some steps away in the row.
 
     Args:
-        views: line integrals (rows, cols).
-        mask: pixels that are beyond their neighbours; only these are returned.
-        at_axis: pixels before the axis, where a feature of the object comes and goes
-            slowly.
+        allowed: (rows, cols).
+        row: of each pixel.
+        col: of each pixel.
+        steps: columns away, in the order in which they are tried.
+        wanted: number of pixels.
 
     Returns:
-        Lasting ones (deviating in `MIN_LASTING_SHARE` of the views) and flickering ones,
-        each (rows, cols).
+        Their columns, 0 where there are fewer, and whether there are, (wanted, pixels)
+        each.
     """
-    from scipy.ndimage import binary_dilation
-
-    area = binary_dilation(mask, np.ones((1, 2 * COMPARED_COLUMNS + 1), np.bool_))
-    along = []
-    clear_along = []
-    clear_down = []
-    for view in views:
-        beyond = _beyond_neighbours(view)
-        along.append(beyond[area])
-        clear_along.append((beyond - _slopes(view))[area])
-        clear_down.append((_beyond_neighbours(view.T) - _slopes(view.T)).T[area])
-    in_row = np.array(along)
-    clear_in_row = np.array(clear_along)
-    clear_in_column = np.array(clear_down)
-    in_bad_column = np.broadcast_to(_bad_columns(mask), mask.shape)
-    share = np.where(at_axis, MIN_AXIS_CHANGES_SHARE, MIN_CHANGES_SHARE)
-    flickers = _flickers(np.minimum(clear_in_row, clear_in_column), area, share)
-    flickers |= in_bad_column & _flickers(in_row, area, share)
-    flickers |= _short_groups(mask) & _flickers(clear_in_column, area, share)
-    lasts = np.zeros_like(mask)
-    clear = np.maximum(clear_in_row, clear_in_column)
-    lasts[area] = _deviates(clear).mean(axis=0) >= MIN_LASTING_SHARE
-    return mask & lasts, mask & flickers
+    width = allowed.shape[1]
+    found = np.zeros((wanted, len(row)), np.intp)
+    count = np.zeros(len(row), np.intp)
+    for step in steps:
+        at = col + step
+        inside = (at >= 0) & (at < width) & (count < wanted)
+        take = np.flatnonzero(inside)
+        take = take[allowed[row[take], at[take]]]
+        found[count[take], take] = at[take]
+        count[take] += 1
+    return found, np.arange(wanted)[:, None] < count
 
 
-def _no_feature(
-    views: Iterable[Float32Array],
-    mask: npt.NDArray[np.bool_],
-    at_axis: npt.NDArray[np.bool_],
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """Suspects and the pixels that they are compared with, over the views.
+
+    All images are (rows, cols), 0 where nothing is compared.
+
+    Attributes:
+        suspects: which pixels are.
+        axis_column: where the axis falls.
+        views: number of views.
+        often: number of views in which a pixel deviates from row and column, or from that
+            of the two in which it has neighbours.
+        changes: number of views at which it changes between deviating and not.
+        variance: of its transmission less that of its neighbours, from differences between
+            successive views: what an object's edges change, they change slowly.
+        mean_distance: distance of its mean over the views beyond its neighbours'.
+        mean_peak: the larger one of the distances in row and column, with no regard to
+            slopes.
+        unexplained: whether its mean over the views is farther beyond all values elsewhere
+            than a feature of the object may be.
+    """
+
+    suspects: npt.NDArray[np.bool_]
+    axis_column: float
+    views: int
+    often: FloatArray
+    changes: FloatArray
+    variance: FloatArray
+    mean_distance: FloatArray
+    mean_peak: FloatArray
+    unexplained: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        views: Iterable[Float32Array],
+        suspects: npt.NDArray[np.bool_],
+        axis_column: float,
+    ) -> _Judged:
+        """Compare suspects with good pixels in each view.
+
+        Values elsewhere are those of no suspect, `AXIS_BAND_PX` and more from the axis;
+        `EXPLAINED_ABOVE` or `EXPLAINED_BELOW` their range, with 0 in it, may be added.
+
+        Args:
+            views: line integrals (rows, cols), at least one.
+            suspects: (rows, cols), one at least.
+            axis_column: where the axis falls.
+        """
+        columns = np.arange(suspects.shape[1])
+        elsewhere = ~suspects & (abs(columns - axis_column) >= AXIS_BAND_PX)
+        area = _compared_area(suspects, axis_column)
+        row, col = np.nonzero(area)
+        in_row = _Beside.of(suspects, row, col)
+        in_column = _Beside.of(suspects.T, col, row)
+        distances = []
+        residuals = []
+        lows = []
+        highs = []
+        total = np.zeros(suspects.shape, np.float64)
+        for view in views:
+            along = in_row.distances(view)
+            distances.append(np.minimum(along, in_column.distances(view.T)))
+            beside = in_row.residuals(view)
+            residuals.append(np.where(in_row.known, beside, in_column.residuals(view.T)))
+            lows.append(float(view[elsewhere].min(initial=0.0)))
+            highs.append(float(view[elsewhere].max(initial=0.0)))
+            total += view
+        mean = np.asarray(total / len(lows), np.float32)
+        span = max(highs) - min(lows)
+        beyond = mean > max(highs) + EXPLAINED_ABOVE * span
+        beyond |= mean < min(lows) - EXPLAINED_BELOW * span
+        ways = (in_row.distances(mean), in_column.distances(mean.T))
+        peaks = (in_row.distances(mean, 0.0), in_column.distances(mean.T, 0.0))
+        peak = np.maximum(*(np.where(np.isfinite(one), one, 0.0) for one in peaks))
+        deviates = _deviates(np.array(distances))
+
+        def image(values: npt.NDArray[np.generic]) -> FloatArray:
+            """Place values of the area's pixels in an image."""
+            made = np.zeros(area.shape)
+            made[area] = values
+            return made
+
+        return cls(
+            suspects=suspects,
+            axis_column=axis_column,
+            views=len(distances),
+            often=image(deviates.sum(axis=0)),
+            changes=image((deviates[1:] != deviates[:-1]).sum(axis=0)),
+            variance=image(0.5 * np.square(np.diff(residuals, axis=0)).mean(axis=0)),
+            mean_distance=image(np.minimum(*ways)),
+            mean_peak=image(peak),
+            unexplained=image(beyond[area]),
+        )
+
+    def bad(self) -> npt.NDArray[np.bool_]:
+        """Find the suspects that no feature of the object explains, (rows, cols)."""
+        mask = self._lasting()
+        while True:
+            more = self._flickering(mask) & ~mask
+            if not more.any():
+                return mask
+            mask |= more
+
+    def _at_axis(self) -> npt.NDArray[np.bool_]:
+        """Find columns before the axis, (cols,), where small features stand still."""
+        columns = np.arange(self.suspects.shape[1])
+        return np.asarray(abs(columns - self.axis_column) < AXIS_BAND_PX)
+
+    def _lasting(self) -> npt.NDArray[np.bool_]:
+        """Find suspects that deviate in `MIN_LASTING_SHARE` of the views and are no
+        feature that stands still, (rows, cols).
+
+        The mean over a turn of what an object gives is alike on both sides of the axis. A
+        suspect whose counterpart is alike (`MIN_ALIKE_RATIO`) is of the object where
+        there are more such pairs than bad pixels scattered over the panel would make. At
+        the axis, a suspect is bad in a bad column, or if it is unexplained.
+        """
+        lasting = self.suspects & (self.often >= MIN_LASTING_SHARE * self.views)
+        at_axis = self._at_axis()
+        defect = _bad_columns(self.suspects) | (self.unexplained > 0.0)
+        alike = np.zeros_like(lasting)
+        strange = self.unexplained > 0.0
+        for kind, most in (
+            (~strange, MAX_PAIRS_CHANCE),
+            (strange, MAX_UNEXPLAINED_PAIRS_CHANCE),
+        ):
+            row, col = np.nonzero(lasting & kind & ~at_axis)
+            paired = self._has_counterpart(row, col)
+            if self._chance_of_pairs(len(row), int(paired.sum())) < most:
+                alike[row, col] = paired
+        return np.asarray(lasting & np.where(at_axis, defect, ~alike))
+
+    def _has_counterpart(
+        self, row: npt.NDArray[np.intp], col: npt.NDArray[np.intp]
+    ) -> npt.NDArray[np.bool_]:
+        """Find whether a pixel within `AXIS_REACH_PX` of that across the axis deviates
+        alike in the mean over the views, (pixels,).
+
+        Args:
+            row: of each pixel.
+            col: of each pixel.
+        """
+        width = self.suspects.shape[1]
+        least = MIN_ALIKE_RATIO * self.mean_distance[row, col]
+        across = np.rint(2.0 * self.axis_column - col).astype(np.intp)
+        alike = np.zeros(len(row), np.bool_)
+        for step in range(-AXIS_REACH_PX, AXIS_REACH_PX + 1):
+            at = across + step
+            inside = (at >= 0) & (at < width)
+            peak = self.mean_peak[row, np.clip(at, 0, width - 1)]
+            alike |= inside & (peak > least)
+        return alike
+
+    def _chance_of_pairs(self, many: int, paired: int) -> float:
+        """Compute the probability that of pixels scattered over the panel so many have
+        counterparts (Poisson).
+
+        Args:
+            many: number of pixels.
+            paired: number of those with a counterpart, or more.
+        """
+        from scipy.stats import poisson
+
+        reached = 2 * AXIS_REACH_PX + 1
+        expected = 0.5 * many * many * reached / self.suspects.size
+        return float(poisson.sf((paired + 1) // 2 - 1, expected))
+
+    def _flickering(self, bad: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Find suspects that deviate and cease often, and more so than their neighbours,
+        (rows, cols).
+
+        If a pixel deviates as often as each of `COMPARED_COLUMNS` others, one of so many
+        deviations and one more is its own (binomial); if it varies as they do, the ratio
+        of variances is Fisher's F. Both must be less probable than `MAX_CHANCE`.
+
+        Args:
+            bad: pixels known to be bad, with which none is compared.
+        """
+        from scipy.stats import binom, f
+
+        changes = self.changes >= MIN_CHANGES_SHARE * (self.views - 1)
+        row, col = np.nonzero(self.suspects & changes)
+        own = self.often[row, col]
+        others = COMPARED_COLUMNS * self._usual(self.often, bad, row, col)
+        chance = binom.sf(own - 1, own + others, 1.0 / (COMPARED_COLUMNS + 1))
+        # A variance from n differences is as sure as one from 2 n / 3 values.
+        freedom = max(2.0 * (self.views - 1) / 3.0, 1.0)
+        noise = f.isf(MAX_CHANCE, freedom, freedom)
+        usual = self._usual(self.variance, bad, row, col)
+        found = (chance < MAX_CHANCE) & (self.variance[row, col] > noise * usual)
+        mask = np.zeros_like(self.suspects)
+        mask[row[found], col[found]] = True
+        return mask
+
+    def _usual(
+        self,
+        values: FloatArray,
+        bad: npt.NDArray[np.bool_],
+        row: npt.NDArray[np.intp],
+        col: npt.NDArray[np.intp],
+    ) -> FloatArray:
+        """Compute the usual value beside pixels: the second smallest of the nearest
+        `COMPARED_COLUMNS` that are not bad, on the side where it is larger.
+
+        A feature that turns before a pixel is seen on one side of it. Away from the axis
+        that pixel's counterpart across it is a third side.
+
+        Args:
+            values: (rows, cols).
+            bad: (rows, cols), passed over.
+            row: of each pixel.
+            col: of each pixel.
+        """
+
+        def second(middle: npt.NDArray[np.intp], steps: list[int]) -> FloatArray:
+            """Find the second smallest value of those some steps away from columns."""
+            at, known = _nearest(~bad, row, middle, steps, COMPARED_COLUMNS)
+            nearby = np.where(known, values[row, at], 0.0)
+            return np.asarray(np.sort(nearby, axis=0)[1])
+
+        outwards = range(1, 2 * COMPARED_COLUMNS + 1)
+        right = second(col, list(outwards))
+        left = second(col, [-step for step in outwards])
+        across = np.rint(2.0 * self.axis_column - col).astype(np.intp)
+        about = sorted(range(-COMPARED_COLUMNS, COMPARED_COLUMNS + 1), key=abs)
+        there = np.where(self._at_axis()[col], 0.0, second(across, about))
+        return np.maximum(np.maximum(left, right), there)
+
+
+def _compared_area(
+    suspects: npt.NDArray[np.bool_], axis_column: float
 ) -> npt.NDArray[np.bool_]:
-    """Find pixels that no feature of the object explains.
-
-    A bead on the axis stands before one pixel in all views, as a defect does. Columns
-    that are bad over more than half of their rows are defects, and so are means over the
-    views that exceed the range of values elsewhere, with 0 in it, by `EXPLAINED_ABOVE`,
-    or fall below it by `EXPLAINED_BELOW`, of that range.
+    """Find suspects, twice `COMPARED_COLUMNS` on either side, and the same about their
+    counterparts across the axis, (rows, cols).
 
     Args:
-        views: line integrals (rows, cols), at least one.
-        mask: pixels that seem bad, left out of the range.
-        at_axis: pixels before the axis, left out of the range that the object gives.
-
-    Returns:
-        (rows, cols) bool of the whole panel, also beside `mask` and away from the axis.
+        suspects: (rows, cols).
+        axis_column: where the axis falls.
     """
-    elsewhere = ~mask & ~at_axis
-    lows = []
-    highs = []
-    total = np.zeros(mask.shape, np.float64)
-    for view in views:
-        lows.append(float(view[elsewhere].min(initial=0.0)))
-        highs.append(float(view[elsewhere].max(initial=0.0)))
-        total += view
-    span = max(highs) - min(lows)
-    mean = total / len(lows)
-    beyond = mean > max(highs) + EXPLAINED_ABOVE * span
-    beyond |= mean < min(lows) - EXPLAINED_BELOW * span
-    return np.asarray(_bad_columns(mask) | beyond)
+    width = suspects.shape[1]
+    area = suspects.copy()
+    row, col = np.nonzero(suspects)
+    across = np.rint(2.0 * axis_column - col).astype(np.intp)
+    for step in range(-2 * COMPARED_COLUMNS, 2 * COMPARED_COLUMNS + 1):
+        for middle in (col, across):
+            at = middle + step
+            inside = (at >= 0) & (at < width)
+            area[row[inside], at[inside]] = True
+    return area
 
 
 def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
@@ -301,44 +611,20 @@ def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
     return np.asarray(distances > least)
 
 
-def _flickers(
-    distances: Float32Array | FloatArray,
-    area: npt.NDArray[np.bool_],
-    least_share: npt.NDArray[np.float64],
-) -> npt.NDArray[np.bool_]:
-    """Find pixels that deviate and cease often, and `MIN_CHANGES_RATIO` times as often as
-    the median of `COMPARED_COLUMNS` columns on either side, (rows, cols).
-
-    Args:
-        distances: beyond the neighbours, (views, pixels of the area).
-        area: the pixels, (rows, cols); others have no changes.
-        least_share: changes of a flickering pixel over the views, (rows, cols).
-    """
-    from scipy.ndimage import median_filter
-
-    deviates = _deviates(distances)
-    changes = np.zeros(area.shape, np.float32)
-    changes[area] = (deviates[1:] != deviates[:-1]).sum(axis=0)
-    about = np.ones((1, 2 * COMPARED_COLUMNS + 1), np.bool_)
-    about[0, COMPARED_COLUMNS] = False
-    usual = median_filter(changes, footprint=about, mode="reflect")
-    least = np.maximum(least_share * len(distances), MIN_CHANGES_RATIO * usual)
-    return np.asarray(changes >= least)
-
-
 def _bad_columns(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Find columns that are bad over more than half of their rows, (cols,)."""
     return np.asarray(mask.mean(axis=0) > 0.5)
 
 
 def _largest_about(response: Float32Array) -> Float32Array:
-    """Compute half of the largest response among a pixel and `NEIGHBOURS` on each side in
-    the row.
+    """Compute `WORST_RATIO` of the largest response among a pixel and `NEIGHBOURS` on each
+    side in the row.
     """
     from scipy.ndimage import maximum_filter
 
     size = (1, 2 * NEIGHBOURS + 1)
-    return np.asarray(0.5 * maximum_filter(response, size, mode="nearest"), np.float32)
+    largest = maximum_filter(response, size, mode="nearest")
+    return np.asarray(WORST_RATIO * largest, np.float32)
 
 
 def _interpolated(view: Float32Array, mask: npt.NDArray[np.bool_]) -> Float32Array:
@@ -420,14 +706,6 @@ def _neighbours(view: Float32Array) -> list[Float32Array]:
     cols = view.shape[1]
     wide = np.pad(view, ((0, 0), (NEIGHBOURS, NEIGHBOURS)), "reflect")
     return [wide[:, k : k + cols] for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
-
-
-def _slopes(view: Float32Array) -> Float32Array:
-    """Compute how far a pixel may be beyond its neighbours in the row, as these differ among
-    themselves, (rows, cols).
-    """
-    others = _neighbours(view)
-    return np.float32(MIN_SLOPE_RATIO) * np.asarray(np.ptp(others, axis=0), np.float32)
 
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
