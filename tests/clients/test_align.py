@@ -156,11 +156,19 @@ def pulls(found: object, scanner: Scanner) -> tuple[float, float]:
 
 
 def aligned(k: int, photons: float, column: float, roll: float) -> tuple[object, Scanner]:
-    """What is found in scan `k`, its sigmas [px, deg] below those allowed."""
+    """What is found in scan `k`, its sigmas [px, deg] below those allowed.
+
+    Images of 100 photons do not exclude a gap of the panel beside the axis (the likelihood of
+    one of half a pixel is no less than that of none): the column's sigma has to contain it.
+    """
     scanner, lines = scan(k)
     found = data_set(lines, DEGREES, photons, np.random.default_rng(k)).align()
     assert found.identifiable
-    assert found.parameters["axis_column_px"]["sigma"] < column
+    sigma = found.parameters["axis_column_px"]["sigma"]
+    if photons < 1000 and any("do not exclude that a tile" in w for w in found.warnings):
+        assert 0.25 < sigma < 0.4
+    else:
+        assert sigma < column
     assert found.parameters["det_roll"]["sigma"] < roll
     return found, scanner
 
@@ -189,6 +197,8 @@ def test_column_and_roll_are_where_they_are_within_their_sigmas(
         if "source_row_px" in found.parameters:
             rows.append(row_pull(found, scanner))
         off.append(pulls(found, scanner))
+        # An open gap widens the sigma, not the error.
+        assert abs(off[-1][0]) * found.parameters["axis_column_px"]["sigma"] < column
     assert np.abs(off).max() < 4
     assert (np.sqrt(np.mean(np.square(off), axis=0)) < 1.7).all()
     if photons < 1000:  # the row cannot be told, and nothing is told of it

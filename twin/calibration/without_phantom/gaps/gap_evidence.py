@@ -88,7 +88,7 @@ def find_gap(
     if closed:
         hidden = None
     else:
-        hidden = hidden_gap(frames, axis, profile, rays.smoothing)
+        hidden = hidden_gap(frames, axis, profile, rays.smoothing, rays)
     if profile is None:
         return GapFound(None, hidden)
     seen = [

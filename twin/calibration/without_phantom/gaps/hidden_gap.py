@@ -21,10 +21,17 @@ from scipy.ndimage import maximum_filter1d
 from scipy.special import log_softmax, logsumexp, softmax
 
 from flexdt.twin.calibration.repeated_frames import ROBUST
-from flexdt.twin.calibration.without_phantom.conjugate_rays import Profile
+from flexdt.twin.calibration.without_phantom.conjugate_rays import (
+    ConjugateRays,
+    Profile,
+)
 from flexdt.twin.calibration.without_phantom.gaps.gradient_step import (
     gradient_steps,
     scatter_of_sums,
+)
+from flexdt.twin.calibration.without_phantom.gaps.turn_modes import (
+    ModeSteps,
+    mode_steps,
 )
 from flexdt.twin.calibration.without_phantom.tile_gap import (
     SIDE,
@@ -70,6 +77,12 @@ OUTLINE_COLUMNS: Final = 1
 CURVED_SHARE: Final = 0.25
 """Standard deviation of a width by gradients, as a share of it: a gap moves its two sides
 apart, and bodies that curve there change the gradient (drawn ones by up to that)."""
+FOOLED_CHANCE: Final = 0.002
+"""Probability that what turns with the object passes for a gap at a column in single frames:
+2 of 30 drawn scans of natural objects have such a column among 40."""
+MODES_SHARE: Final = 0.3
+"""Standard deviation of a width by the modes of the turn, as a share of it: it is that of a
+small displacement (drawn gaps of 1 to 2 px by up to that)."""
 MIN_HIDDEN_PX: Final = 0.3
 """Width of gaps that are not hidden where both ends of rays determine steps to a third of
 it [px]."""
@@ -137,7 +150,11 @@ class Evidence:
 
 
 def hidden_gap(
-    frames: Sequence[Float32Array], axis: float, profile: Profile | None, smoothing: float
+    frames: Sequence[Float32Array],
+    axis: float,
+    profile: Profile | None,
+    smoothing: float,
+    rays: ConjugateRays | None = None,
 ) -> HiddenGap | None:
     """Judge the gaps between panel tiles that both ends of rays do not reveal, near the
     axis.
@@ -151,6 +168,7 @@ def hidden_gap(
         profile: distances between both ends of rays; None: too little of the object
             turns.
         smoothing: sigma of the columns' smoothing in the profile [px].
+        rays: of the turn, whose angular modes are compared; None: frames alone.
 
     Returns:
         The range of columns in which one may be hidden, its probability, its root mean
@@ -171,6 +189,9 @@ def hidden_gap(
     columns = np.arange(low + SIDE, end - SIDE + 1)
     evidence = _evidence(stack[:, :, low:end])
     evidence = evidence.beside(-_of_outlines(evidence.found, columns - 0.5 - axis))
+    steps = mode_steps(rays, axis, reach) if rays is not None else None
+    if steps is not None:
+        evidence = _with_modes(evidence, columns, steps)
     if profile is not None:
         evidence = evidence.beside(_evidence_of_rays(columns, axis, profile))
     hidden = np.abs(columns - 0.5 - axis) <= reach
@@ -270,6 +291,32 @@ def _evidence_of_rays(
     width = np.array([step.width for step in steps]) * np.sign(beside)
     sigma = np.array([step.sigma for step in steps])
     return _evidence_of_widths(width, sigma)
+
+
+def _with_modes(
+    of_frames: Evidence, columns: npt.NDArray[np.intp], steps: ModeSteps
+) -> Evidence:
+    """Add the evidence of the turn's modes to that of single frames, which count as far as
+    `FOOLED_CHANCE` lets them: a wall passes for a gap to frames.
+
+    Args:
+        of_frames: evidence by width and column, (w, c).
+        columns: (c,) first columns beyond a gap.
+        steps: widths by the modes; columns that they do not judge add nothing.
+
+    Returns:
+        Evidence of both.
+    """
+    judged = np.isin(columns, steps.columns)
+    place = np.searchsorted(steps.columns, columns[judged])
+    of_modes = np.zeros_like(of_frames.found)
+    of_modes[:, judged] = _evidence_of_widths(
+        steps.width[place], steps.sigma[place], MODES_SHARE
+    )
+    trusted = of_frames.found - np.logaddexp(
+        0.0, of_frames.found + math.log(FOOLED_CHANCE)
+    )
+    return Evidence(trusted + of_modes, of_frames.width + of_modes)
 
 
 def _evidence_of_widths(
