@@ -370,8 +370,8 @@ class _Level:
 
         Args:
             slope: of the differences with the column, (m,).
-            excess: squares of the differences less those of noise, (m,); negative sums
-                count as 0.
+            excess: squares of the differences less those of noise, (m,). Noise alone gives
+                as many patches too little as too much, so negative ones count as such.
             w: weights, (m,).
             pairs: of views, (q, 2).
             values: parameters, (k,).
@@ -384,7 +384,7 @@ class _Level:
             np.bincount(patch, (w * one).reshape(len(pairs), -1).sum(axis=1))
             for one in (excess, np.square(slope))
         )
-        return math.sqrt(float((own * power.clip(0.0)).sum()))
+        return math.sqrt(max(float((own * power).sum()), 0.0))
 
     def _scatter(
         self,
