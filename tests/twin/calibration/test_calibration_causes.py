@@ -12,6 +12,7 @@ from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.diagnose import fitted
 from flexdt.twin.calibration.diagnose.data import explain_identification
 from flexdt.twin.calibration.identify import identify
 from flexdt.twin.geometry.poses import Poses
@@ -179,6 +180,21 @@ def test_what_is_held_exactly_and_wrongly_is_never_offered_in_silence(kind: str)
 def test_what_once_had_another_name_beside_or_instead(kind: str, seed: int) -> None:
     found = scored(kind, seed)
     assert found.verdict == "right", found.said
+
+
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("kind", ["wobble", "runout"])
+@pytest.mark.campaign(1)
+def test_an_axis_that_wobbles_is_named_and_one_that_runs_out_is_another(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A runout is no wobble even where no motion is looked for."""
+    if kind == "runout":
+        monkeypatch.setattr(fitted, "moving", lambda *_: None)
+    found = scored(kind, 71500)
+    codes = [said.split(":")[0] for said in found.said]
+    assert codes == ["wobble" if kind == "wobble" else "misfit"], found.said
+    assert not found.offered
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from flexdt.twin.calibration.diagnose.causes import (
 )
 from flexdt.twin.calibration.diagnose.frame_numbers import frame_numbers
 from flexdt.twin.calibration.diagnose.named_causes import named_causes
+from flexdt.twin.calibration.diagnose.wobble import wobble
 from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit, derivative, follow_motion
@@ -309,8 +310,8 @@ def explain_residuals(
 
     A single displaced bead is left out rather than all beads fitted. If the residuals
     exceed the limit, or too many positions were left out, a factor on the angles is
-    tried; then, beyond the limit, a motion, else the error "misfit" is given, beside which
-    only lost beads are reported.
+    tried; then, beyond the limit, a motion, a wobble of the axis, else the error "misfit"
+    is given, beside which only lost beads are reported.
 
     Args:
         fit: to be judged; nothing is judged if it is not identifiable.
@@ -342,7 +343,9 @@ def explain_residuals(
     if not bad:
         return fit, out
     # What else the residuals show has no meaning where no cause explains them.
-    explained = moving(plain, lambda motion: refit(motion=motion)) or error(
+    explained = moving(plain, lambda motion: refit(motion=motion))
+    explained = explained or wobble(plain, limit)
+    explained = explained or error(
         "misfit",
         f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
         "looked for explains them: check that nothing is loose, or let frames differ, "
