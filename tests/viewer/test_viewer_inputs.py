@@ -510,7 +510,7 @@ def test_designer_and_script_wish_the_same_scan(
     page.evaluate("flexdt.call('sample.set', {name: 'lego'}).then(() => null)")
     page.click("#designer summary")
     newest = "name => window.sent.filter((r) => r.method === name).at(-1)?.params"
-    for ms, frames, typed in ((150, 91, None), (400, 45, None), (400, 60, 80)):
+    for ms, frames, typed in ((150, 19, None), (400, 9, None), (400, 12, 80)):
         page.evaluate(
             "ms => flexdt.call('camera.set', {exposure_ms: ms}).then(() => null)", ms
         )

@@ -679,7 +679,7 @@ def test_a_bar_of_the_designer_rewrites_the_script(
     page.click("#designer summary")
     page.locator("#design-quality .verdict").wait_for()
     told = []
-    for frames in (123, 376):
+    for frames in (41, 123):
         page.fill("#wish-frames", str(frames))
         wait(lambda n=frames: f"\t{n}\t" in page.input_value("#script"), "the script")
         size = f"{(frames + 2) * 956 * 760 * 2 / 1e6:.1f} MB"  # a dark and a flat beside them

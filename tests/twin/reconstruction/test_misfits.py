@@ -339,7 +339,7 @@ def test_an_open_beam_that_is_not_the_flat_is_no_truncation(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.campaign(2)
-@pytest.mark.parametrize("count", [14, 40])
+@pytest.mark.parametrize("count", [10, 40])
 @pytest.mark.parametrize(("right", "most"), [(False, 0.15), (True, 0.02)])
 def test_the_study_in_its_short_form(right: bool, most: float, count: int) -> None:
     """Drawn scans that chose no constant."""
