@@ -33,7 +33,7 @@ from flexdt.clients.viewer.scenes.world import World, placed
 from flexdt.protocol.state_model import SampleState
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, profile_of
-from tests.viewer.looking import changed, picture, until
+from tests.viewer.looking import changed, picture, settled, until
 
 HOME = {
     "ver_tube": 26.29,
@@ -207,15 +207,19 @@ def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
     assert painted.size == (asked["w"], asked["h"])
     page.locator(".view.live").wait_for()
     page.locator("#still").wait_for(state="hidden")
-    # Both pictures are of one scene, from one place: edges of the one are edges of the other.
-    page.wait_for_timeout(1500)
-    live = picture(box).mean(axis=2)
-    # The bar above may have wrapped to a second row since: one picture of the pane as it is now.
-    size = f"w={live.shape[1]}&h={live.shape[0]}"
-    painted = still_of(page, re.sub(r"w=\d+&h=\d+", size, url))
-    own = np.asarray(painted.convert("L"), dtype=np.float32)
-    part = np.s_[60:-130, 130:-20]  # without buttons, tag and the sample's picture
-    assert np.corrcoef(live[part].ravel(), own[part].ravel())[0, 1] > 0.8
+
+    def same(live: Any) -> bool:
+        # The bar above may have wrapped to a second row since: one picture of the pane as it is.
+        size = f"w={live.shape[1]}&h={live.shape[0]}"
+        painted = still_of(page, re.sub(r"w=\d+&h=\d+", size, url))
+        own = np.asarray(painted.convert("L"), dtype=np.float32)
+        part = np.s_[60:-130, 130:-20]  # without buttons, tag and the sample's picture
+        both = live.mean(axis=2)[part].ravel(), own[part].ravel()
+        return bool(np.corrcoef(*both)[0, 1] > 0.8)
+
+    # Both pictures are of one scene, from one place: edges of the one are edges of the other,
+    # once the live one has faded in.
+    settled(box, same)
     inset = page.locator(".view .inset")
     inset.click()
     inset.wait_for(state="hidden")  # the view itself shows the sample now

@@ -742,7 +742,7 @@ def test_the_designer_says_what_the_report_says_in_every_mode(
     page.click("#designer summary")
     page.locator("#design-quality .verdict").wait_for()
     page.fill("#wish-exposure", "350")
-    page.fill("#wish-frames", "61")
+    page.fill("#wish-frames", "21")
     for mode in ("HW4SW1High", "HW2SW1High"):
         page.evaluate("mode => flexdt.call('camera.set', {mode})", mode)
         seen(page, twin)

@@ -96,7 +96,7 @@ def scrolls_and_turns(page: Any) -> None:
     """Slices a second, and pictures of the whole in software GL, with what is cut away."""
     page.click("#volume-large")
     per_s = page.evaluate(
-        "() => new Promise((done) => { const v = flexdt.volume().three, n = 60; let k = 0;"
+        "() => new Promise((done) => { const v = flexdt.volume().three, n = 20; let k = 0;"
         " const begun = performance.now(); const next = () => { v.go([k, 2 * k, k]);"
         " requestAnimationFrame(() => ++k < n ? next()"  # after the slices of this picture
         " : done(1000 * n / (performance.now() - begun))); }; next(); })"
@@ -106,7 +106,7 @@ def scrolls_and_turns(page: Any) -> None:
     ms = page.evaluate(
         "() => new Promise((done) => { const s = flexdt.volume().solid, all = [];"
         " const next = () => { s.yaw += 0.1; s.draw(); requestAnimationFrame(() =>"
-        " requestAnimationFrame(() => { all.push(s.ms); all.length < 30 ? next() : "
+        " requestAnimationFrame(() => { all.push(s.ms); all.length < 8 ? next() : "
         "done(all); }));"
         " }; next(); })"
     )
