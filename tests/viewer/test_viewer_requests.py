@@ -37,6 +37,7 @@ from flexdt.runtime.settings import parse
 pytestmark = pytest.mark.slow
 
 PATIENCE_S = 240.0
+"""Silence after which no answer is expected any more [s]."""
 NOWHERE = TwinAddress("127.0.0.1", 1)
 
 
@@ -46,8 +47,10 @@ TOOK = ('{"took":"state"}', '{"took":"image"}')
 
 async def hear(page: ClientConnection, what: Callable[[Any], bool]) -> Any:
     """The first message that is `what`: decoded JSON, or an image's bytes."""
-    async with asyncio.timeout(PATIENCE_S):
+    now = asyncio.get_running_loop().time
+    async with asyncio.timeout(PATIENCE_S) as limit:
         async for message in page:
+            limit.reschedule(now() + PATIENCE_S)
             value = message if isinstance(message, bytes) else json.loads(message)
             if isinstance(value, bytes) or value["type"] == "state":
                 await page.send(TOOK[isinstance(value, bytes)])
@@ -304,6 +307,7 @@ HUGE = "camera\tset number of frames\t1000000\t\tACK\t\t\r\n" + "".join(
 )
 
 
+@pytest.mark.timeout(900)
 def test_a_plan_that_takes_too_much_is_refused_and_the_pages_go_on(lab: Any) -> None:
     """Sixty million images: planned in a process of its own, with limits."""
 
