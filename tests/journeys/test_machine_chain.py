@@ -35,6 +35,8 @@ from flexdt.twin.script.scan_request import ScanRequest
 from tests.support.bead_scan import bead_in_volume, bead_scan_on
 
 SHIPPED = ("flexray", "micro_ct", "unitom_xl", "xyzr_cabinet")
+CHAINED = ("unitom_xl", "flexray", "micro_ct", "xyzr_cabinet")
+"""The first and third are in CI: the second is the demonstration's, the last the saturated one."""
 TRUTH = {"dO_x": 0.35, "dD_x": -0.4, "dD_z": 0.3}
 FRAMES = 25
 
@@ -135,8 +137,8 @@ def assert_beads_in_volume(outcome: Outcome, root: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*SHIPPED[1:], SHIPPED[0]])  # the demonstration is of it
-@pytest.mark.campaign(3)
+@pytest.mark.parametrize("name", CHAINED)
+@pytest.mark.campaign(2)
 def test_a_shipped_machine_goes_through_the_chain_at_its_own_defaults(
     name: str, tmp_path: Path
 ) -> None:
