@@ -115,9 +115,9 @@ studies: $(TEST_STAMP)
 	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'slow and not browser and not night' \
 	  --junitxml=build/durations/studies.xml
 
-# The page in a browser: the tests wait for motors, clocks and pictures half of their time.
+# The page in a browser, which draws on all cores: nothing else runs beside it.
 page: $(TEST_STAMP)
-	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'browser and not night' tests/viewer \
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'browser and not night' tests/viewer \
 	  --junitxml=build/durations/page.xml
 
 # Every seed and every case: hours in all, weekly on a runner. Nothing waits for it. CAMPAIGNS takes a part of it.
