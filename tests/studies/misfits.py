@@ -3,11 +3,13 @@ alone?
 
     python tests/studies/misfits.py --count 200 --seed 1
     python tests/studies/misfits.py --count 200 --seed 1 --right
+    python tests/studies/misfits.py --count 60 --seed 1 --helical
 
 Scans of `bias_bound.py`, seen whole, whose images or geometry are then made wrong: mirrored,
 turned the other way, interlaced, in alphabetical order, a panel on the wrong side or moved by
 some pixels, motion. With `--right` they are made difficult instead: beam hardening, scatter,
-noise, few views, wires, foam, bodies that are almost symmetric. A contradiction counts as
+noise, few views, wires, foam, bodies that are almost symmetric. With `--helical` the source
+rises, along objects that end within the helix or go on beyond it. A contradiction counts as
 answered where its kind is named, where no accuracy is claimed, or where means of small balls
 are right within 10 %. "Not decided" are scans whose images fit another geometry as well, "not
 comparable" those of too few views or columns to show whether they fit: both are true of right
@@ -119,6 +121,21 @@ def moving(images, geometry, rng):
     return np.stack([np.roll(one, k, axis=axis) for one, k in pairs]), geometry
 
 
+def other_hand(images, geometry, rng):
+    """Turn each view back by twice the angle since the first: a helix of the other hand."""
+    x, y = geometry.source[:, 0], geometry.source[:, 1]
+    turn = 2.0 * (np.arctan2(y[0], x[0]) - np.arctan2(y, x))
+    cos, sin = np.cos(turn), np.sin(turn)
+
+    def about(v):
+        return np.column_stack(
+            [cos * v[:, 0] - sin * v[:, 1], sin * v[:, 0] + cos * v[:, 1], v[:, 2]]
+        )
+
+    parts = geometry.source, geometry.detector, geometry.u, geometry.v
+    return images, fx.ConeVec.from_vectors(*map(about, parts))
+
+
 TURN = frozenset({"direction", "columns", "turned"})
 WRONG: dict[str, tuple[Wrong, frozenset[str]]] = {
     "mirrored": (mirrored, TURN),
@@ -129,6 +146,11 @@ WRONG: dict[str, tuple[Wrong, frozenset[str]]] = {
     "other side": (other_side, frozenset({"sign", "columns", "turned", "offset"})),
     "moving": (moving, frozenset({"movement"})),
 }
+
+
+HELICAL: dict[str, tuple[Wrong, frozenset[str]]] = {
+    kind: WRONG[kind] for kind in ("mirrored", "alphabetical", "shifted", "moving")
+} | {"other hand": (other_hand, TURN)}
 
 
 def hardened(images, geometry, rng):
@@ -206,24 +228,59 @@ def thing(scan: bias_bound.Scan, rng: np.random.Generator) -> bias_bound.Scan:
     return replace(scan, solids=[replace(body, mu=0.3 * body.mu), *bricks])
 
 
-def drawn(seed: int, number: int, *, right: bool) -> Case | None:
+def risen(scan: bias_bound.Scan, rng: np.random.Generator) -> bias_bound.Scan:
+    """Make the scan a helix of 1.5 to 4 turns with the same panel and source; every third
+    object goes on beyond it, the others end where all of its rows see them.
+    """
+    one = scan.geometry[0]
+    sod = float(np.hypot(*one.source[0, :2]))
+    sdd = sod + float(np.hypot(*one.detector[0, :2]))
+    pixel = float(np.linalg.norm(one.v[0]))
+    rows, cols = scan.shape
+    field = sod * np.sin(np.arctan2(0.5 * cols * pixel, sdd))
+    steepest = (rows - 1) * pixel * (sod - field) / sdd
+    rise = steepest * float(rng.uniform(0.3, 0.9)) * float(rng.choice([-1.0, 1.0]))
+    turns = float(rng.uniform(1.5, 4.0))
+    aside = float(rng.choice([0.0, rng.uniform(-0.3, 0.3)])) * 0.5 * cols * pixel
+    views = int(turns * rng.uniform(1.2, 2.6) * cols)
+    angles = float(rng.choice([-1.0, 1.0])) * 360.0 * turns * np.arange(views) / views
+    helix = fx.ConeVec.helical(
+        sod=sod, sdd=sdd, angles=angles, rise=rise, shape=scan.shape, pixel=pixel,
+        offset=(aside, 0.0),
+    )  # fmt: skip
+    wanted = 0.5 * turns * abs(rise)
+    wanted = wanted + steepest if rng.uniform() < 1.0 / 3.0 else 0.8 * wanted
+    times = np.array([1.0, 1.0, wanted / scan.solids[0].half[2]])
+    solids = [
+        replace(one, centre=one.centre * times, half=one.half * times)
+        for one in scan.solids
+    ]
+    said = f"helix of {turns:.1f} turns, {views} views, rise {rise / steepest:.2f}; {scan.said}"
+    return replace(scan, geometry=helix, solids=solids, said=said)
+
+
+def drawn(seed: int, number: int, *, right: bool, helical: bool = False) -> Case | None:
     """Draw a case.
 
     Args:
         seed, number: the same give the same case.
         right: a change that is no mistake, without noise; otherwise one that is.
+        helical: the source rises.
 
     Returns:
         None where the drawn scan is not seen whole, or its views are not along a circle.
     """
     rng = np.random.default_rng([seed, number, 59])
     scan = bias_bound.drawn(seed, number)
-    if " cut " in scan.said or not (right or scan.said.startswith(CIRCULAR)):
+    circular = right or helical or scan.said.startswith(CIRCULAR)
+    if " cut " in scan.said or (helical and " middle " not in scan.said) or not circular:
         return None
     scan = thing(replace(scan, counts=0.0 if right else scan.counts), rng)
+    scan = risen(scan, rng) if helical else scan
     images = scan.images()
-    kind = str(rng.choice(list(RIGHT if right else WRONG)))
-    change, names = (RIGHT[kind], frozenset()) if right else WRONG[kind]
+    wrong = HELICAL if helical else WRONG
+    kind = str(rng.choice(list(RIGHT if right else wrong)))
+    change, names = (RIGHT[kind], frozenset()) if right else wrong[kind]
     if kind == "other side" and " aside " not in scan.said:
         kind, (change, names) = "shifted", WRONG["shifted"]
     made, geometry = change(images, scan.geometry, rng)
@@ -278,12 +335,13 @@ def main() -> int:
     parser.add_argument(
         "--right", action="store_true", help="right scans, made difficult"
     )
+    parser.add_argument("--helical", action="store_true", help="the source rises")
     chosen = parser.parse_args()
     counts: Counter[str] = Counter()
     tried = bad = 0
     begun = time.process_time()
     for number in range(chosen.first, chosen.first + chosen.count):
-        case = drawn(chosen.seed, number, right=chosen.right)
+        case = drawn(chosen.seed, number, right=chosen.right, helical=chosen.helical)
         if case is None:
             continue
         try:

@@ -125,7 +125,7 @@ class CoarseScan:
             cone_vec = swapped(cone_vec)
             shape = (shape[1], shape[0])
         at, same = distinct_angles(circle)
-        chosen = np.arange(0, len(at), -(-len(at) // VIEWS))
+        chosen = _every(cone_vec[at], -(-len(at) // VIEWS), circle)
         low, high = panel_reach(circle, upright(cone_vec), shape[1])
         overlap = min(low, high) / (low + high) * shape[1]
         wide = -(-shape[1] // nodes)
@@ -167,15 +167,16 @@ class CoarseScan:
         least_rows: int = COMPARED_ROWS,
         across: int = 1,
     ) -> CoarseScan:
-        """Take fewer views and rows of a circle: enough to compare images with the
-        projections of a volume made from them.
+        """Take fewer views and rows: enough to compare images with the projections of a
+        volume made from them.
 
-        About `COMPARED_VIEWS` views a column are chosen, and rows and columns averaged; a
-        rest of rows or columns is left out.
+        About `COMPARED_VIEWS` views a column are chosen of each turn, more where these
+        would leave arcs out (`_every`), and rows and columns averaged; a rest of rows or
+        columns is left out. A helix keeps its rows, which say how steep it may be.
 
         Args:
             all_views: keep every view.
-            least_rows: that are left, if the panel has so many.
+            least_rows: that are left of a circle, if the panel has so many.
             across: columns over which a column of the result is the mean.
         """
         count, rows, cols = self.images.shape
@@ -183,11 +184,11 @@ class CoarseScan:
         if all_views:
             each = 1
         else:
-            each = max(1, round(count / (COMPARED_VIEWS * cols)))
-        down = max(1, rows // least_rows)
+            each = max(1, round(count / (COMPARED_VIEWS * cols * self.turns)))
+        down = 1 if self.circle.rise else max(1, rows // least_rows)
         rows -= rows % down
         cols -= cols % across
-        chosen = slice(None, None, each)
+        chosen = _every(self.cone_vec, each, self.circle)
         part = window(self.cone_vec[chosen], self.images.shape[1:], (0, rows), (0, cols))
         views = ConeVec.from_vectors(
             part.source, part.detector, part.u * across, part.v * down
@@ -207,6 +208,57 @@ class CoarseScan:
             binned=(self.binned[0] * down, self.binned[1] * across),
             rest=((ends[0] - rows) / down, (ends[1] - cols) / across),
         )
+
+    @property
+    def complete(self) -> Truncation | None:
+        """The truncation of an object that the panel sees completely; not None where rays
+        that a shifted panel's near edge hides (`Truncation.beyond`) are weighed as in the
+        scan.
+        """
+        if self.truncation is None or not self.truncation.beyond:
+            return None
+        return self.truncation.nothing
+
+    @property
+    def turns(self) -> float:
+        """Turns of a helix, at least 1; 1 for a circle."""
+        if not self.circle.rise:
+            return 1.0
+        return max(1.0, float(np.ptp(self.circle.angle)) / (2.0 * np.pi))
+
+    @cached_property
+    def seen_rows(self) -> npt.NDArray[np.bool_] | None:
+        """Mark the rows of a helix whose rays stay among the layers that FDK gives values
+        to, (n, rows) bool; None for a circle, and if the object ends within them.
+
+        Beyond them no volume says what a longer object is like.
+        """
+        if not self.circle.rise:
+            return None
+        values = self.fdk(self.images, self.cone_vec, self.truncation)[:, ~self.rim]
+        known = np.flatnonzero(np.isfinite(values).all(axis=1))
+        if not len(known):
+            return np.zeros(self.images.shape[:2], bool)
+        sizes = np.abs(values[known]).mean(axis=1)
+        if sizes[[0, -1]].max() <= ACCURACY * sizes.mean():
+            return None
+        z = self.grid.centers()[2][known]
+        half = 0.5 * self.grid.voxel_xyz[2]
+        views = self.level
+        place = np.arange(self.images.shape[1] + 1) - 0.5 * self.images.shape[1]
+        source = views.source[:, 2, None]
+        fall = views.detector[:, 2, None] + place * views.v[:, 2, None] - source
+        away = np.linalg.norm((views.detector - views.source)[:, :2], axis=1)[:, None]
+        reach = max(self.ends)
+        heights = np.array(
+            [
+                source + (self.circle.radius + side * reach) / away * fall
+                for side in (-1.0, 1.0)
+            ]
+        )
+        inside = (heights >= z.min() - half) & (heights <= z.max() + half)
+        edges = inside.all(axis=0)
+        return np.asarray(edges[:, :-1] & edges[:, 1:])
 
     @cached_property
     def noise(self) -> float:
@@ -342,12 +394,7 @@ class CoarseScan:
         Returns:
             (nz, ny, nx), 0 where unseen.
         """
-        truncation = self.truncation
-        if truncation is not None:
-            if rung.flaw and truncation.beyond:
-                truncation = truncation.nothing
-            else:
-                truncation = None
+        truncation = self.complete if rung.flaw else None
         images = self.projected(thing, rung.cone_vec, rung.shape)
         return np.nan_to_num(self.fdk(images, rung.cone_vec, truncation))
 
@@ -445,3 +492,25 @@ class CoarseScan:
         if rows > 1:
             rungs.append(Rung("rows" if self.more else cone, self.level, (rows, cols)))
         return rungs if len(rungs) > 1 else []
+
+
+def _every(cone_vec: ConeVec, each: int, circle: Circle) -> npt.NDArray[np.intp]:
+    """Choose every so many-th view, or views that are closer, so that they leave arcs out
+    ("gaps") if and only if the scan does.
+
+    Of views at random angles some have a gap that all have not. FDK weighs the rays of a
+    panel aside otherwise with gaps: the copy of a right scan did not fit its images.
+
+    Args:
+        cone_vec: n views in order of angle.
+        each: largest step.
+        circle: of the scan.
+
+    Returns:
+        (k,) numbers of views; all if no step is right.
+    """
+    for step in range(each, 1, -1):
+        chosen = np.arange(0, len(cone_vec), step)
+        if circle_of(cone_vec[chosen]).full == circle.full:
+            return chosen
+    return np.arange(len(cone_vec))

@@ -16,6 +16,7 @@ import pytest
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid
 from flexdt.twin.reconstruction import bias_warnings, fdk
+from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
 from flexdt.twin.reconstruction.bias import Bias
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import (
@@ -161,6 +162,78 @@ def test_movement_of_thin_wires_is_seen_by_their_centroids() -> None:
     assert bias.contradiction.kinds == ("movement",)
 
 
+def test_an_explanation_that_the_images_refute_is_not_named() -> None:
+    """Views too few for the misfit to contradict by itself, a panel 4 px off, and line
+    integrals that swing by 40 %: the right offset fits far better, and badly."""
+    scan = brick()
+    scan = replace(scan, geometry=scan.geometry[::3])
+    swing = 1.0 + 0.4 * np.sin(10.0 * np.pi * np.arange(34) / 34)
+    images = (scan.images() * swing[:, None, None]).astype(np.float32)
+    moved = misfits._moved(scan.geometry, 4.0)
+    case = misfits.Case("shifted", images, moved, scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert isinstance(bias.contradiction, Contradiction)
+    assert not bias.contradiction.kinds
+    assert not bias.contradiction.by_misfit_alone
+    assert bias.accuracy(Grid((16, 30, 30), 1.0)) is None
+
+
+def helix(rise: float, hand: float = 1.0) -> ConeVec:
+    """Three turns over 3 times the rise; the hand is the sign of the angles."""
+    return ConeVec.helical(
+        sod=110.0,
+        sdd=220.0,
+        angles=hand * np.arange(300) * 3.6,
+        rise=hand * rise,
+        shape=SHAPE,
+        pixel=1.6,
+    )
+
+
+def rod(half_mm: float, geometry: ConeVec) -> bias_bound.Scan:
+    """A box so high with a rod in its upper and a hole in its lower half."""
+    scan = brick()
+    times = np.array([1.0, 1.0, half_mm / 8.0])
+    sides = np.array([0.0, 0.4, -0.4]) * half_mm
+    solids = [
+        replace(one, centre=np.array([*one.centre[:2], z]), half=one.half * times)
+        for one, z in zip(scan.solids, sides, strict=True)
+    ]
+    return replace(scan, solids=solids, geometry=geometry)
+
+
+@pytest.mark.parametrize("rise", [12.0, -12.0])
+@pytest.mark.parametrize("half_mm", [11.0, 60.0])
+@pytest.mark.daily(4)
+def test_a_helix_of_the_other_hand_is_named(half_mm: float, rise: float) -> None:
+    """Of an object that ends within the helix, and one that goes on beyond it."""
+    scan = rod(half_mm, helix(rise))
+    images = scan.images()
+    grid = Grid((10, 30, 30), 1.0)
+    case = misfits.Case("", images, scan.geometry, scan, frozenset())
+    right = misfits.looked_at(case)
+    assert right is not None
+    assert right.contradiction is None
+    assert right.accuracy(grid) is not None
+    wrong = misfits.looked_at(replace(case, geometry=helix(rise, -1.0)))
+    assert wrong is not None
+    assert wrong.contradiction is not None
+    assert set(wrong.contradiction.kinds) == {"direction", "columns"}
+    assert wrong.accuracy(grid) is None
+
+
+def test_a_helix_whose_rows_leave_its_volume_is_not_compared() -> None:
+    """A turn and a tenth along a longer object: hardly a row stays among known layers."""
+    steep = helix(17.0)[:110]
+    scan = rod(80.0, steep)
+    case = misfits.Case("", scan.images(), steep, scan, frozenset())
+    bias = misfits.looked_at(case)
+    assert bias is not None
+    assert isinstance(bias.contradiction, Undetermined)
+    assert "of a short helix" in str(bias.contradiction)
+
+
 def drum(rod_mm: float) -> bias_bound.Scan:
     """A cylinder with a rod and a hole in one half, in a beam of 9 degrees: reversed images are
     nearly those of the mirrored body."""
@@ -304,6 +377,20 @@ def test_nothing_is_claimed_of_images_that_fit_any_volume() -> None:
         assert isinstance(bias.contradiction, Undetermined)
         assert cause in str(bias.contradiction)
         assert bias.accuracy(Grid((16, 30, 30), 1.0)) is None
+
+
+@pytest.mark.parametrize("aside", [0.0, 30.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_some_views_leave_arcs_out_only_where_all_do(seed: int, aside: float) -> None:
+    """FDK weighs the rays of a panel aside otherwise where views leave arcs out."""
+    angles = np.random.default_rng([seed, 7]).uniform(0.0, 360.0, 130)
+    geometry = ConeVec.circular(
+        sod=110, sdd=220, angles=angles, shape=SHAPE, pixel=1.6, offset=(aside, 0.0)
+    )
+    blank = np.zeros(SHAPE, np.float32)
+    scan = CoarseScan.of(lambda _: blank, geometry, SHAPE, None)
+    assert circle_of(scan.cone_vec).full == scan.circle.full
+    assert circle_of(scan.thinned().cone_vec).full == scan.circle.full
 
 
 def test_volumes_of_voxels_that_hold_no_region_claim_nothing() -> None:

@@ -8,7 +8,7 @@ the panel itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -31,40 +31,45 @@ pixels]."""
 
 def moving(
     scan: CoarseScan,
-    own: Reprojection,
+    starts: Sequence[tuple[FloatArray, Reprojection]],
     shown: Callable[[Suspect], Reprojection | None],
-) -> Suspect:
+) -> tuple[Suspect, Reprojection | None]:
     """Estimate how far each image is shifted along its rows and columns.
 
-    Registration begins with the images' centroids or without shifts, whichever fit
-    better.
+    Registration begins with the images' centroids or one of the given shifts, whichever
+    fit better. A panel at another place is such a start: movement includes it, and shall
+    not seem to fit worse because its registration is less advanced.
 
     Args:
         scan: coarse, n views.
-        own: of the stated geometry, without shifts.
+        starts: shifts (n, 2) and the reprojection with them, one at least.
         shown: reprojects a suspect; None where FDK cannot use its geometry.
 
     Returns:
-        The scan with the shifts found in `MOVEMENT_ROUNDS` registrations, or before
-        `shown` gives None.
+        The scan with the shifts that fit best of those from which registration begins,
+        unless all are 0, and of `MOVEMENT_ROUNDS` registrations, and its reprojection;
+        None without one (`shown`).
     """
-    shifts = np.zeros((len(scan.angles), 2))
-    latest: Reprojection | None = own
+    shifts, latest = min(starts, key=lambda start: start[1].arcs.sum())
     from_centroids = without_placement(centroids(scan.images), scan.angles)
     by_centroids = shown(_suspect(scan, from_centroids))
-    if by_centroids is not None and by_centroids.arcs.sum() < own.arcs.sum():
+    if by_centroids is not None and by_centroids.arcs.sum() < latest.arcs.sum():
         shifts = from_centroids
         latest = by_centroids
-    suspect = _suspect(scan, shifts)
-    for past in range(MOVEMENT_ROUNDS):
-        if past:
-            latest = shown(suspect)
-        if latest is None:
-            break
+    best = latest if shifts.any() else None
+    found = _suspect(scan, shifts)
+    for _ in range(MOVEMENT_ROUNDS):
         shifts = shifts + registered(latest)
         shifts = without_placement(shifts, scan.angles, only_same_volume=True)
         suspect = _suspect(scan, shifts)
-    return suspect
+        again = shown(suspect)
+        if again is None:
+            break
+        latest = again
+        if best is None or again.arcs.sum() < best.arcs.sum():
+            best = again
+            found = suspect
+    return found, best
 
 
 def centroids(images: Float32Array) -> FloatArray:
@@ -88,7 +93,7 @@ def centroids(images: Float32Array) -> FloatArray:
     return np.column_stack(places)
 
 
-def wandering(scan: CoarseScan, own: Reprojection, second: Reprojection) -> float:
+def wandering(angles: FloatArray, own: Reprojection, second: Reprojection) -> float:
     """Compute how far centroids of images along rows are from those of the volume's
     projections, relative to what a volume's second reconstruction, noise and
     `CENTROID_FLOOR_PX` explain.
@@ -97,8 +102,8 @@ def wandering(scan: CoarseScan, own: Reprojection, second: Reprojection) -> floa
     subtracted. Meaningful only for an object that the panel sees complete.
 
     Args:
-        scan: coarse, n views.
-        own: of the stated geometry.
+        angles: (n,) of the views [rad].
+        own: of the stated geometry or an explanation, without shifts.
         second: of the projections of `own`.
 
     Returns:
@@ -107,10 +112,10 @@ def wandering(scan: CoarseScan, own: Reprojection, second: Reprojection) -> floa
         `tests/studies/misfits.py --seed 6061`).
     """
     images, first, again = (
-        centroids(one)[:, :1] for one in (scan.images, own.again, second.again)
+        centroids(one)[:, :1] for one in (own.images, own.again, second.again)
     )
-    found = without_placement(images - first, scan.angles)
-    expected = without_placement(first - again, scan.angles)
+    found = without_placement(images - first, angles)
+    expected = without_placement(first - again, angles)
     variance = float(np.square(expected).mean()) + own.centroid_variance
     variance += CENTROID_FLOOR_PX**2
     return float(np.sqrt(np.square(found).mean() / variance))

@@ -39,12 +39,18 @@ class Reprojection:
         values: of the volume, (nz, ny, nx), NaN where no data cover it [1/mm].
         again: line integrals through the volume, (n, rows, cols).
         image_noise: variance of white noise in the images.
+        seen: share of the pixels that are compared; in others (`CoarseScan.seen_rows`)
+            `again` is as the images.
+        own_noise: variance of white noise in the projections, None to measure it in
+            `again`.
     """
 
     images: Float32Array
     values: Float32Array
     again: Float32Array
     image_noise: float
+    seen: float = 1.0
+    own_noise: float | None = None
 
     @classmethod
     def of(
@@ -90,7 +96,12 @@ class Reprojection:
             values = lowered(values, layers)
         if noise is None:
             noise = scan.noise if images is scan.images else noise_of(images)
-        return cls(images, values, again, noise)
+        rows = scan.seen_rows
+        if rows is None:
+            return cls(images, values, again, noise)
+        own_noise = noise_of(again)
+        again = np.where(rows[:, :, None], again, images)
+        return cls(images, values, again, noise, float(rows.mean()), own_noise)
 
     def misfit(self, least: float = MIN_SIGNAL_SHARE) -> FloatArray:
         """Compute the root mean square of the residual, less noise, over that of the
@@ -110,16 +121,22 @@ class Reprojection:
     @cached_property
     def arcs(self) -> FloatArray:
         """Mean squares of the residual in `ARCS` arcs of neighbouring views: of its
-        values, and of their changes along rows, (2, ARCS); above 0.
+        values, and of their changes along rows, (2, ARCS); above 0. Views of which no row
+        is compared are left out.
         """
-        count = len(self.images)
+        rest, changes = self._rest
+        some = rest.any(axis=(1, 2))
+        if self.seen < 1.0 and some.any():
+            rest = rest[some]
+            changes = changes[some]
+        count = len(rest)
         arcs = np.arange(min(ARCS, count))
         # The first arcs have a view more where they cannot all have as many.
         starts = count // ARCS * arcs + np.minimum(arcs, count % ARCS)
         parts = [
             np.add.reduceat(_sums_of_squares(values), starts)
             / np.add.reduceat(np.full(len(values), values[0].size), starts)
-            for values in self._rest
+            for values in (rest, changes)
         ]
         return np.maximum(parts, np.finfo(np.float32).tiny)
 
@@ -149,7 +166,7 @@ class Reprojection:
             np.array([_mean_square(values), _mean_square(changes)])
             for values, changes in (self._rest, signals)
         )
-        noise = NOISE_VARIANCE_RATIO * self._noise * NOISE_OF_CHANGES
+        noise = self.seen * NOISE_VARIANCE_RATIO * self._noise * NOISE_OF_CHANGES
         return residual, signal, noise
 
     @cached_property
@@ -161,8 +178,8 @@ class Reprojection:
 
     @cached_property
     def noise_again(self) -> float:
-        """Variance that differences between neighbours in the reprojection show as noise."""
-        return noise_of(self.again)
+        """Variance that differences between neighbours in the projections show as noise."""
+        return noise_of(self.again) if self.own_noise is None else self.own_noise
 
 
 def _layers_off(scan: CoarseScan, cone_vec: ConeVec) -> float:

@@ -106,16 +106,22 @@ def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
         yield Suspect("height", images, moved(cone_vec, 0.0, 2.0 * above))
 
 
-def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
+def turned(scan: CoarseScan, turn: FloatArray, *, rising: bool = False) -> ConeVec:
     """Rotate source and panel of each view about the scan's axis, each by its own angle;
     the images stay.
 
     Args:
         scan: n views.
-        turn: (n,) [rad], counter-clockwise.
+        turn: (n,) along the scan's angles [rad]: counter-clockwise, and of a helix that
+            rises clockwise the other way.
+        rising: along the helix, if it is one, not at the same height.
     """
-    cos = np.cos(turn)
-    sin = np.sin(turn)
+    sense = _sense(scan)
+    cos = np.cos(sense * turn)
+    sin = np.sin(sense * turn)
+    up = np.zeros((len(turn), 3))
+    if rising:
+        up[:, 2] = scan.circle.rise * turn / (2.0 * np.pi)
     centre = np.append(scan.circle.centre, 0.0)
 
     def about(vectors: FloatArray) -> FloatArray:
@@ -124,9 +130,19 @@ def turned(scan: CoarseScan, turn: FloatArray) -> ConeVec:
 
     views = scan.cone_vec
     source, panel = (
-        about(place - centre) + centre for place in (views.source, views.detector)
+        about(place - centre) + centre + up for place in (views.source, views.detector)
     )
     return ConeVec.from_vectors(source, panel, about(views.u), about(views.v))
+
+
+def _sense(scan: CoarseScan) -> float:
+    """Return -1 for a helix that rises clockwise, whose angles are counted upwards; else
+    1.
+    """
+    if not scan.circle.rise:
+        return 1.0
+    first, second = scan.cone_vec.source[:2, :2] - scan.circle.centre
+    return float(np.sign(first[0] * second[1] - first[1] * second[0]))
 
 
 def moved(
@@ -145,6 +161,23 @@ def moved(
     return ConeVec.from_vectors(cone_vec.source, panel, cone_vec.u, cone_vec.v)
 
 
+def shifts_of(scan: CoarseScan, suspect: Suspect) -> FloatArray:
+    """Compute the shifts of images to the right and below that a panel at another place
+    makes, (n, 2) [coarse pixels].
+
+    Args:
+        scan: coarse, n views.
+        suspect: the same images, and each panel moved in its plane.
+    """
+    stated = scan.cone_vec
+    step = suspect.cone_vec.detector - stated.detector
+    along, down = (
+        (step * axis).sum(axis=1) / np.square(axis).sum(axis=1)
+        for axis in (stated.u, stated.v)
+    )
+    return -np.column_stack([along, down])
+
+
 def _orders(scan: CoarseScan) -> Iterator[Suspect]:
     """Yield suspected scans whose images belong to other angles: in another order
     (`_permutations`), then over half and twice the span; each with the same images and
@@ -157,7 +190,8 @@ def _orders(scan: CoarseScan) -> Iterator[Suspect]:
     count = len(angle)
     for kind, order, figure in _permutations(angle):
         turn = angle[order][scan.numbers] - scan.angles
-        yield Suspect(kind, scan.images, turned(scan, turn), figure)
+        views = turned(scan, turn, rising=True)
+        yield Suspect(kind, scan.images, views, figure)
     run = np.unwrap(angle) - angle[0]
     span = float(np.ptp(run)) * count / max(count - 1, 1)
     for times in (0.5, 2.0):

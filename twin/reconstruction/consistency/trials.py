@@ -17,7 +17,11 @@ import numpy as np
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
-from flexdt.twin.reconstruction.acquisition.trajectory import narrow_overlap
+from flexdt.twin.reconstruction.acquisition.trajectory import (
+    circle_of,
+    distinct_angles,
+    narrow_overlap,
+)
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
 from flexdt.twin.reconstruction.consistency.movement import moving, wandering
 from flexdt.twin.reconstruction.consistency.reprojection import Reprojection, lowered
@@ -25,6 +29,7 @@ from flexdt.twin.reconstruction.consistency.suspects import (
     Suspect,
     moved,
     reversed_turn,
+    shifts_of,
     suspects,
 )
 from flexdt.twin.reconstruction.uniform_nodes import UniformNodes, smoothed
@@ -33,7 +38,8 @@ MAX_RELIABLE_RESIDUAL: Final = 0.3
 """Residual of the second reconstruction, over the images, below which it is reliable:
 one of few views or few columns beyond the axis has larger ones."""
 MIN_VIEWS_A_COLUMN: Final = 1.6
-"""Least views for a coarse column; with fewer, streaks hide contradictions."""
+"""Least views for a coarse column of the whole field of view, of which a panel aside sees
+half at a time; with fewer, streaks hide contradictions."""
 MAX_ARC_RATIO: Final = 2.0
 """Widest over usual angle of a view, above which views are random and weights are
 rough."""
@@ -58,6 +64,8 @@ TURNED: Final = frozenset({"direction", "columns", "turned"})
 """Explanations whose volume is turned about the axis."""
 MIRRORED: Final = frozenset({"columns", "rows", "turned"})
 """Explanations by mirrored images."""
+REORDERED: Final = frozenset({"listed", "interlaced", "reversed", "names", "span"})
+"""Explanations by other angles, which may leave arcs out that the stated ones do not."""
 TURN_STEPS: Final = 180
 """Angles of a turn in which a mirrored object is compared."""
 
@@ -103,9 +111,9 @@ class Trial:
         Sets `whole` (no row is cut off), `expected` (misfit (2,) of a second
         reconstruction), `telling` ((2,): for values and their changes, whether that is
         below `MAX_RELIABLE_RESIDUAL`), `excess` (misfit over the expected one), `wander`
-        (see `wandering`; 0 for a scan that is not whole) and `even`
-        (`MIN_VIEWS_A_COLUMN` views a column, and no step above `MAX_ARC_RATIO` times the
-        median).
+        (see `wandering`; 0 for a scan that is not whole) and `even` (views at
+        `MIN_VIEWS_A_COLUMN` angles a column of the field of view, and no step above
+        `MAX_ARC_RATIO` times the median).
 
         Args:
             scan: coarse; all of its views and rows are compared.
@@ -119,18 +127,22 @@ class Trial:
         if own is None:
             raise GeometryError("FDK cannot use the views of a coarse copy of the scan")
         self.own = own
-        self._seconds: dict[Tried, FloatArray] = {}
-        second = Reprojection.of(
-            scan, own.again, scan.cone_vec, None, noise=own.noise_again
-        )
+        self._seconds: dict[Tried, Reprojection | None] = {}
+        second = self._second(own, scan.cone_vec)
         self.expected = _misfit_of(second)
         self.wander = 0.0
         if self.whole and second is not None:
-            self.wander = wandering(scan, own, second)
+            self.wander = wandering(scan.angles, own, second)
         self.telling = self.expected < MAX_RELIABLE_RESIDUAL
         self.excess = self._excess(own, self.expected)
+        low, high = scan.ends
+        self._aside = abs(high - low) > (low + high) / scan.images.shape[2]
+        self._full = circle_of(scan.cone_vec).full
+        # A panel aside sees half of the field of view at a time.
+        columns = scan.images.shape[2] * 2.0 * max(low, high) / (low + high)
         step = scan.circle.step
-        enough = len(step) >= MIN_VIEWS_A_COLUMN * scan.images.shape[2]
+        views = len(distinct_angles(scan.circle)[0])
+        enough = views >= MIN_VIEWS_A_COLUMN * columns * scan.turns
         self.even = bool(enough and step.max() <= MAX_ARC_RATIO * np.median(step))
 
     @cached_property
@@ -147,7 +159,7 @@ class Trial:
         if self.whole:
             return self.own
         scan = self.scan
-        complete = Reprojection.of(scan, scan.images, scan.cone_vec, None)
+        complete = Reprojection.of(scan, scan.images, scan.cone_vec, scan.complete)
         if complete is None or complete.arcs.sum() >= self.own.arcs.sum():
             return self.own
         return complete
@@ -172,9 +184,17 @@ class Trial:
         steps = NARROW_STEPS if narrow else 1
         return [*self._beside(far, steps), *map(self._tried, chosen)]
 
-    def movement(self) -> Tried:
-        """Try shifts of single images: movement of object or scanner between views."""
-        return self._tried(moving(self.scan, self.own, self._shown))
+    def movement(self, beside: list[Tried]) -> Tried:
+        """Try shifts of single images: movement of object or scanner between views.
+
+        Args:
+            beside: tried panels at other places, where registration may begin.
+        """
+        starts = [(np.zeros((len(self.scan.angles), 2)), self.own)]
+        for one in beside:
+            if one.shown is not None:
+                starts.append((shifts_of(self.scan, one.suspect), one.shown))
+        return self._compared(*moving(self.scan, starts, self._shown))
 
     def only(self, kinds: frozenset[str]) -> list[Tried]:
         """Try the explanations of some kinds: of those that `suspects` lists, and the
@@ -189,7 +209,19 @@ class Trial:
         """
         if one.shown is None:
             return np.inf
-        return self._excess(one.shown, self._expected_of(one, one.shown))
+        return self._excess(one.shown, _misfit_of(self._second_of(one, one.shown)))
+
+    def wander_of(self, one: Tried) -> float:
+        """Compute how far images' centroids are from those of an explanation's volume
+        (`wandering`); infinite if FDK cannot use its geometry.
+        """
+        if one.shown is None:
+            return np.inf
+        second = self._second_of(one, one.shown)
+        if second is None:
+            return np.inf
+        angles = circle_of(one.suspect.cone_vec).angle
+        return wandering(angles, one.shown, second)
 
     def fits_as_well(self, one: Tried, ratio: float) -> bool:
         """Return whether an explanation leaves at most `ratio` times the residual of the
@@ -198,35 +230,33 @@ class Trial:
         """
         if one.shown is None:
             return False
-        expected = self._expected_of(one, one.shown) / self.expected
+        expected = _misfit_of(self._second_of(one, one.shown)) / self.expected
         usual = float(np.exp(np.log(expected[self.telling]).mean()))
         return one.residual <= ratio * usual
 
-    def _expected_of(self, one: Tried, shown: Reprojection) -> FloatArray:
-        """Compute `_expected` of an explanation once and cache it: it is a
-        reconstruction.
+    def _second_of(self, one: Tried, shown: Reprojection) -> Reprojection | None:
+        """Reproject an explanation's volume, reconstructed from its own projections; None
+        where FDK cannot use the geometry. It is made once and cached.
         """
         if one not in self._seconds:
             suspect = one.suspect
-            second = self._expected(shown, suspect.cone_vec, suspect.shifts)
-            self._seconds[one] = second
+            self._seconds[one] = self._second(shown, suspect.cone_vec, suspect.shifts)
         return self._seconds[one]
 
-    def _expected(
+    def _second(
         self, shown: Reprojection, cone_vec: ConeVec, shifts: FloatArray | None = None
-    ) -> FloatArray:
-        """Compute the misfit (2,) of a volume's second reconstruction: its projections,
-        reconstructed and projected again; infinite where FDK cannot use the geometry.
+    ) -> Reprojection | None:
+        """Reconstruct a volume's projections and project them again; None where FDK cannot
+        use the geometry.
 
         Args:
             shown: projections of the volume.
             cone_vec: n views.
             shifts: (n, 2) of the projections, or None.
         """
-        again = Reprojection.of(
-            self.scan, shown.again, cone_vec, None, shifts, shown.noise_again
-        )
-        return _misfit_of(again)
+        scan = self.scan
+        noise = shown.noise_again if scan.seen_rows is None else None
+        return Reprojection.of(scan, shown.again, cone_vec, scan.complete, shifts, noise)
 
     def _excess(self, shown: Reprojection, expected: FloatArray) -> float:
         """Compute the misfit relative to the expected one: of changes along rows if those
@@ -236,6 +266,10 @@ class Trial:
         return float(ratios[1 if self.telling[1] else 0])
 
     def _tried(self, suspect: Suspect) -> Tried:
+        """Reproject a suspected geometry and compare it with the scan's own."""
+        return self._compared(suspect, self._shown(suspect))
+
+    def _compared(self, suspect: Suspect, shown: Reprojection | None) -> Tried:
         """Compare a suspected geometry with the scan's own, by the reliable ("telling")
         measures.
 
@@ -246,12 +280,12 @@ class Trial:
         Args:
             suspect: reconstructed as complete: the explanation of a scan also explains
                 why it seemed cut off.
+            shown: its reprojection; None where FDK cannot use its geometry.
 
         Returns:
             With the suspect alone (scores infinite) if FDK cannot use it or no measure is
             reliable.
         """
-        shown = self._shown(suspect)
         if shown is None or not self.telling.any():
             return Tried(suspect, None)
         misfits = (shown.misfit() / self._stated.misfit())[self.telling]
@@ -268,14 +302,24 @@ class Trial:
         return Tried(suspect, shown, score, residual, evidence, find_change)
 
     def _shown(self, suspect: Suspect) -> Reprojection | None:
-        """Reproject a suspect; None where FDK cannot use its geometry.
+        """Reproject a suspect; None where FDK cannot use its geometry, or weighs the rays
+        of a panel aside otherwise because its angles have gaps and the scan's have not, or
+        the other way round: what it does better then may be FDK's.
 
         Shifted images are cut off as the scan's are. Any other explanation of a scan also
         explains why it seemed cut off.
         """
-        truncation = None if suspect.shifts is None else self.scan.truncation
+        scan = self.scan
+        if suspect.kind in REORDERED and self._aside:
+            try:
+                full = circle_of(suspect.cone_vec).full
+            except GeometryError:
+                return None
+            if full != self._full:
+                return None
+        truncation = scan.complete if suspect.shifts is None else scan.truncation
         return Reprojection.of(
-            self.scan, suspect.images, suspect.cone_vec, truncation, suspect.shifts
+            scan, suspect.images, suspect.cone_vec, truncation, suspect.shifts
         )
 
     def _change(self, suspect: Suspect, shown: Reprojection, *, better: bool) -> float:
