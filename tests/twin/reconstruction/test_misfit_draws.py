@@ -161,12 +161,13 @@ def test_movement_is_named_with_an_order_that_fits_as_well() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "number"), [(16161, 15), (18181, 71), (26002, 118), (26002, 144)]
+    ("seed", "number"),
+    [(16161, 15), (18181, 71), (26002, 118), (26002, 144), (26004, 84), (26004, 94)],
 )
 def test_what_is_easier_for_fdk_contradicts_nothing(seed: int, number: int) -> None:
     """Panels aside: random views of which every second one leaves an arc out; few views
-    that leave arcs out themselves; and a narrow overlap of half as many views as columns
-    of the field of view ask for."""
+    that leave arcs out themselves; a narrow overlap of half as many views as columns of the
+    field of view ask for. Twice the angles fill a gap, and wedges."""
     case = misfits.drawn(seed, number, right=True)
     assert case is not None
     found = misfits.looked_at(case)

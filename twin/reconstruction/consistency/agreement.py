@@ -255,19 +255,6 @@ def _covered(claimed: float) -> float:
     return min(max(SMOOTH_CHANGE_SHARE * claimed, least), MAX_UNTOLD_CHANGE)
 
 
-def _fits_better(one: Tried) -> bool:
-    """Return whether an explanation's residual is less than the stated geometry's, by
-    `MIN_FINE_EVIDENCE_SIGMAS` and by `EQUAL_MISFIT_RATIO`.
-
-    One with a figure that was found by trials (`FOUND_BY_TRIALS`) never fits better: the
-    best of many small movements always does a little, and a claim covers it.
-    """
-    if one.suspect.kind in FOUND_BY_TRIALS:
-        return False
-    less = one.residual * EQUAL_MISFIT_RATIO < 1.0
-    return less and one.evidence < -MIN_FINE_EVIDENCE_SIGMAS
-
-
 def still_misfits(scan: CoarseScan) -> bool:
     """Return whether images of a finer copy do not fit, either (`MAX_MISFIT`), or cannot
     tell: the misfit of objects finer than the coarse pixels falls, that of a wrong geometry
@@ -445,7 +432,7 @@ class Comparison:
             for one in self._tried
             if one.evidence < self._least_evidence_against(one)
             and not (sides_known and one.suspect.kind in SIDES)
-            and one.change > (MIN_CHANGE if _fits_better(one) else covered)
+            and one.change > (MIN_CHANGE if self._fits_better(one) else covered)
             and (
                 one.evidence < -MIN_EVIDENCE_SIGMAS
                 or trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
@@ -465,7 +452,7 @@ class Comparison:
         else:
             change = max(one.change for one in as_good)
         named = self._named(as_good, best.score, change)
-        return replace(named, fits_better=change is not None and _fits_better(best))
+        return replace(named, fits_better=change is not None and self._fits_better(best))
 
     @property
     def _clear_score(self) -> float:
@@ -477,6 +464,23 @@ class Comparison:
         if trial.whole and trial.even and trial.telling.all():
             return MAX_BETTER_MISFIT
         return MAX_MUCH_BETTER_MISFIT
+
+    def _fits_better(self, one: Tried) -> bool:
+        """Return whether an explanation's residual is less than the stated geometry's, by
+        `MIN_FINE_EVIDENCE_SIGMAS` and by `EQUAL_MISFIT_RATIO`, also of what each volume's
+        second reconstruction explains: angles that fill a gap are only easier for FDK.
+
+        One with a figure that was found by trials (`FOUND_BY_TRIALS`) never fits better:
+        the best of many small movements always does a little, and a claim covers it.
+        """
+        if (
+            one.suspect.kind in FOUND_BY_TRIALS
+            or one.residual * EQUAL_MISFIT_RATIO >= 1.0
+        ):
+            return False
+        if one.evidence >= -MIN_FINE_EVIDENCE_SIGMAS:
+            return False
+        return self._trial.excess_of(one) * EQUAL_MISFIT_RATIO < self._trial.excess
 
     def _clearly_better(self, one: Tried) -> bool:
         """Return whether an explanation leaves less of the residual than `_clear_score`,
