@@ -421,17 +421,20 @@ class Comparison:
 
         Returns:
             None if the scan is truncated or each such explanation is excluded
-            (`_least_evidence_against`). Else all that are as good as the best; `change` is
-            the largest of theirs, or None where the best is clearly better than the stated
-            geometry of a doubtful scan.
+            (`_least_evidence_against`), as movement is where another is best (`_best`).
+            Else all that are as good as the best; `change` is the largest of theirs, or
+            None where the best is clearly better than the stated geometry of a doubtful
+            scan.
         """
         trial = self._trial
         covered = _covered(claimed)
+        best_of_all = self._best()
         rivals = [
             one
             for one in self._tried
             if one.evidence < self._least_evidence_against(one)
             and not (sides_known and one.suspect.kind in SIDES)
+            and (one.suspect.shifts is None or one is best_of_all)
             and one.change > (MIN_CHANGE if self._fits_better(one) else covered)
             and (
                 one.evidence < -MIN_EVIDENCE_SIGMAS
