@@ -344,7 +344,7 @@ def explain_residuals(
         return fit, out
     # What else the residuals show has no meaning where no cause explains them.
     explained = moving(plain, lambda motion: refit(motion=motion))
-    explained = explained or wobble(plain, limit)
+    explained = explained or wobble(plain)
     explained = explained or error(
         "misfit",
         f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "

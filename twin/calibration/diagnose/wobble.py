@@ -10,6 +10,7 @@ or the two together: a wobble is named where its likelihood exceeds theirs.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,6 +25,10 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import UNITS, to_edge
 
 LEANS: Final = ("axis_tilt_x", "axis_tilt_z")
+MAX_REST_SHARE: Final = 0.5
+"""Part of the residuals that a wobble may leave: the fit is not repeated with it."""
+LEAST_SEEN: Final = 1e-3
+"""Part of a lean that the geometry must leave, for it to be told."""
 HARMONICS: Final = (1, 2, 3)
 TIMES: Final = {1: "once", 2: "twice", 3: "three times"}
 MIN_FRAMES: Final = 12
@@ -32,31 +37,28 @@ MOST_FRAMES: Final = 720
 
 
 class Wave(NamedTuple):
-    """A parameter that follows a harmonic of the turn.
+    """Parameters that follow a harmonic of the turn.
 
     Attributes:
-        name: of the parameter.
         harmonic: times a turn.
-        power: sum of squares of the residuals that it explains.
-        size: its amplitude, internal unit.
+        power: sum of squares of the residuals that they explain.
+        size: the largest amplitude of all directions, internal unit.
     """
 
-    name: str
     harmonic: int
     power: float
     size: float
 
 
-def wobble(fit: FitResult, limit_px: float) -> Finding | None:
-    """Name a wobble of the axis that explains the residuals of a fit.
+def wobble(fit: FitResult) -> Finding | None:
+    """Name a wobble of the axis that explains the residuals of a fit: halves them.
 
     Args:
         fit: of one scan, whose residuals nothing else explains.
-        limit_px: residual up to which they are explained.
 
     Returns:
         An error with the lean's amplitude and harmonic; None if no lean explains them, if
-        another parameter does so within odds of exp(NAMED_LOG_ODDS), for several scans, or
+        other parameters do so within odds of exp(NAMED_LOG_ODDS), for several scans, or
         for too few or too many frames.
     """
     problem = fit.problem
@@ -70,26 +72,29 @@ def wobble(fit: FitResult, limit_px: float) -> Finding | None:
     before = float(np.square(left).sum())
     basis = np.linalg.qr(problem.jacobian(x, use)[kept])[0]
     free = left.ravel() - basis @ (basis.T @ left.ravel())
-    waves = [
-        _wave(fit, use, basis, free, name, harmonic)
-        for name in (*LEANS, *MOVING)
-        for harmonic in HARMONICS
-    ]
-    lean = max((w for w in waves if w.name in LEANS), key=lambda w: w.power)
-    rival = max((w for w in waves if w.name not in LEANS), key=lambda w: w.power)
+
+    def best_of(names: Sequence[str]) -> Wave:
+        """Find the harmonic at which parameters explain most together."""
+        waves = [_wave(fit, use, basis, free, names, h) for h in HARMONICS]
+        return max(waves, key=lambda wave: wave.power)
+
+    lean = best_of(LEANS)
     rest = before - lean.power
-    after_px = fit.certificate.rms_px * math.sqrt(max(rest, 0.0) / before)
-    if not after_px < limit_px:
+    if not math.sqrt(max(rest, 0.0)) < MAX_REST_SHARE * math.sqrt(before):
         return None
+    rival = best_of(MOVING)
     odds = len(free) / 2 * math.log((before - rival.power) / max(rest, 1e-300))
     if odds < NAMED_LOG_ODDS:
         return None
-    size = abs(float(to_edge(lean.name, lean.size)))
+    after_px = fit.certificate.rms_px * math.sqrt(max(rest, 0.0) / before)
+    size = f"by {to_edge(LEANS[0], lean.size):.2g} {UNITS[LEANS[0]]} "
+    if lean.harmonic == 1:
+        # A part of it that turns with the stage is the phantom's own lean: it is not known.
+        size = ""
     return error(
         "wobble",
-        f"the rotation axis leans to and fro by {size:.2g} {UNITS[lean.name]} "
-        f"{TIMES[lean.harmonic]} a turn ({lean.name}): the stage wobbles; the residuals "
-        f"are {after_px:.2g} px without it",
+        f"the rotation axis leans to and fro {size}{TIMES[lean.harmonic]} a turn: the stage "
+        f"wobbles; the residuals are {after_px:.2g} px without it",
     )
 
 
@@ -98,28 +103,31 @@ def _wave(
     use: npt.NDArray[np.bool_],
     basis: FloatArray,
     free: FloatArray,
-    name: str,
+    names: Sequence[str],
     harmonic: int,
 ) -> Wave:
-    """Fit a parameter that follows a harmonic of the angle to what the geometry leaves.
+    """Fit parameters that follow a harmonic of the angle to what the geometry leaves.
 
     Args:
         fit: gives the geometry.
         use: positions that count, (n, k).
         basis: of the geometry's columns, orthonormal, (m, c).
         free: residuals without them, (m,).
-        name: of the parameter.
+        names: of the parameters.
         harmonic: times a turn.
     """
     problem = fit.problem
     count, beads = use.shape
-    slope = derivative(problem, fit, name, use).reshape(count, 2 * beads)
     turn = harmonic * np.asarray(problem.poses.angle)[:, None]
     kept = np.repeat(use.ravel(), 2)
-    columns = np.stack(
-        [(slope * shape(turn)).ravel()[kept] for shape in (np.cos, np.sin)], axis=1
-    )
-    columns = columns - basis @ (basis.T @ columns)
-    sizes, _, _, _ = np.linalg.lstsq(columns, free, rcond=1e-6)
-    explained = columns @ sizes
-    return Wave(name, harmonic, float(explained @ free), float(np.linalg.norm(sizes)))
+    columns = []
+    for name in names:
+        slope = derivative(problem, fit, name, use).reshape(count, 2 * beads)
+        columns += [(slope * shape(turn)).ravel()[kept] for shape in (np.cos, np.sin)]
+    table = np.stack(columns, axis=1)
+    lengths = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
+    table = (table - basis @ (basis.T @ table)) / lengths
+    shares = np.linalg.lstsq(table, free, rcond=LEAST_SEEN)[0]
+    ellipse = (shares / lengths).reshape(len(names), 2)
+    size = float(np.linalg.svd(ellipse, compute_uv=False)[0])
+    return Wave(harmonic, float((table @ shares) @ free), size)
