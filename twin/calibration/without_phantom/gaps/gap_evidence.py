@@ -21,7 +21,12 @@ from flexdt.twin.calibration.without_phantom.conjugate_rays import (
     Profile,
     Step,
 )
-from flexdt.twin.calibration.without_phantom.gaps.hidden_gap import HiddenGap, hidden_gap
+from flexdt.twin.calibration.without_phantom.gaps.hidden_gap import (
+    HiddenGap,
+    frames_show,
+    hidden_gap,
+    possible_gap,
+)
 from flexdt.twin.calibration.without_phantom.tile_gap import SIDE, Gap, local_gaps
 from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -60,7 +65,8 @@ def find_gap(
     """Find the gap between two tiles of the panel, if there is one.
 
     A gap counts if single frames show it and both ends of rays agree, if it is a likely
-    hidden one, or if both ends of rays show a significant step. Its width is that of both
+    hidden one, or if both ends of rays show a significant step that single frames favour
+    over none; one that they do not is left open. Its width is that of both
     ends of rays. The gap is marked as beside the axis if its place leaves the width to
     the prior. Hidden ones are judged only if none is closed; a likely one does not count
     if both ends of rays show another step behind it.
@@ -101,6 +107,9 @@ def find_gap(
     gap = _measured(rays, values, [*certified, likely], profile.best(), axis)
     if gap is None:
         return GapFound(None, hidden)
+    by_rays_alone = not certified and likely is None
+    if by_rays_alone and not frames_show(frames, gap, 2.0 * rays.smoothing):
+        return GapFound(None, possible_gap(gap))
     closed_rays, behind = _closed(rays, values, gap.column, gap.width)
     second, step = _left_behind(closed_rays, behind, gap, seen)
     _require_one(gap, second)

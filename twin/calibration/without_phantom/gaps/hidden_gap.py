@@ -221,6 +221,39 @@ def hidden_gap(
     )
 
 
+def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
+    """Check whether single frames favour a gap of any width near a column over none.
+
+    Where both ends of rays differ by what is smooth in the columns (hardening, an object
+    that is not symmetric), a step passes for a gap; frames do not show one.
+
+    Args:
+        frames: line integrals of `tile_gap.averaged_rows`, some of a turn.
+        gap: by both ends of rays.
+        about: distance from its column within which frames may show it [px].
+
+    Returns:
+        Also True where the images have too few columns about the gap to judge it.
+    """
+    stack = np.asarray(frames, dtype=np.float64)
+    half = LEAST_COLUMNS + SIDE
+    low = max(gap.column - half, 0)
+    end = min(gap.column + half, stack.shape[2])
+    if end - low < 2 * SIDE + LEAST_COLUMNS:
+        return True
+    columns = np.arange(low + SIDE, end - SIDE + 1)
+    near = np.abs(columns - gap.column) <= about
+    found = _evidence(stack[:, :, low:end]).found[:, near]
+    return not found.size or float(found.max()) > 0.0
+
+
+def possible_gap(gap: Gap) -> HiddenGap:
+    """Return a gap that both ends of rays show and single frames do not, as one that is not
+    excluded.
+    """
+    return HiddenGap(gap.column, gap.column, 0.5, gap.width, None, True)
+
+
 def _gap_at(column: int, share: FloatArray) -> Gap:
     """Make the gap at a column: mean width and standard deviation, at least that of
     `local_sigma`.
