@@ -522,7 +522,7 @@ def test_dask_workers_give_the_same_bytes(
 
     path = plan_file(("batch.items", 5))
     with LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=True, dashboard_address=None
+        n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0"
     ) as c:
         words = ["batch", str(path), "--out", str(tmp_path / "dask"), "--scheduler"]
         assert run([*words, c.scheduler_address]) == 0

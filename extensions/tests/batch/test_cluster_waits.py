@@ -153,7 +153,7 @@ def test_a_scheduler_without_workers_is_told(
     monkeypatch.setattr(cluster_watch, "EVERY_S", 0.2)
     with (
         LocalCluster(
-            n_workers=0, threads_per_worker=1, dashboard_address=None
+            n_workers=0, threads_per_worker=1, dashboard_address=":0"
         ) as cluster,
         dask_executor(cluster.scheduler_address) as pool,
     ):
@@ -179,7 +179,7 @@ def test_a_scheduler_that_is_slow_is_waited_for(
     monkeypatch.setattr(cluster_watch, "EVERY_S", 0.2)
     monkeypatch.setattr(cluster_watch, "LOOK_S", 0.3)
     with LocalCluster(
-        n_workers=0, threads_per_worker=1, dashboard_address=None
+        n_workers=0, threads_per_worker=1, dashboard_address=":0"
     ) as cluster:
         answers = cluster.scheduler.handlers
         at_once = {name: answers[name] for name in ("identity", "run_function")}

@@ -289,7 +289,7 @@ def test_dask_workers_write_the_same_bytes_however_many(
     reconstruct_dataset(load_dataset(scan), here, wanted, workers=nullcontext(Here()))
     for count in (1, 3):
         with distributed.LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None,
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0",
             local_directory=str(tmp_path),
         ) as cluster:  # fmt: skip
             out = tmp_path / f"by-{count}.zarr"

@@ -329,7 +329,7 @@ class Comparison:
 
         Not doubtful means that the scan fits. Unfit is only a whole scan of even steps
         whose misfit exceeds `MAX_MISFIT`. Panels far aside are tried only on an unfit
-        scan, mirrored images and movement only if doubtful.
+        scan, mirrored images only if doubtful, movement only of a whole one that is.
 
         Args:
             trial: of the scan's stated geometry.
@@ -351,7 +351,8 @@ class Comparison:
         elif trial.telling.any():
             others = trial.others(far=self._unfit, doubtful=doubtful)
             self._tried = [trial.opposite(), *others]
-            if doubtful:
+            # Of images that are cut off, shifts push out of view what does not fit.
+            if doubtful and trial.whole:
                 beside = [one for one in others if one.suspect.kind in PLACES]
                 self._movement = trial.movement(beside)
                 self._tried.append(self._movement)
