@@ -286,14 +286,20 @@ def test_the_histogram_counts_what_the_image_holds(
 
     wait(lambda: page.evaluate("flexdt.store.image?.code === 'deflate'"))
     wait(counts_it, "the image's histogram")
-    heights, ends, window = page.evaluate(BARS_DRAWN, BINS)
-    shares, edges = np.histogram(values, BINS, ends)
-    percent = 100.0 * shares / shares.sum()
-    middles = (edges[1:] + edges[:-1]) / 2
-    free = np.abs(np.subtract.outer(middles, window)).min(axis=1) > 2 * np.diff(edges)[0]
-    rising = np.log1p(percent[free] / 0.01)
-    assert np.corrcoef(rising, np.array(heights)[free])[0, 1] > 0.99
-    assert free.sum() > BINS / 2
+
+    def draws_it() -> bool:
+        # Bars are drawn after the image has come, with its ends.
+        heights, ends, window = page.evaluate(BARS_DRAWN, BINS)
+        shares, edges = np.histogram(values, BINS, ends)
+        percent = 100.0 * shares / shares.sum()
+        middles = (edges[1:] + edges[:-1]) / 2
+        apart = np.abs(np.subtract.outer(middles, window)).min(axis=1)
+        free = apart > 2 * np.diff(edges)[0]
+        rising = np.log1p(percent[free] / 0.01)
+        alike = np.corrcoef(rising, np.array(heights)[free])[0, 1] > 0.99
+        return bool(alike and free.sum() > BINS / 2)
+
+    wait(draws_it, "the histogram's bars")
     flags = twin.state().image
     assert flags is not None
     seen(page, twin)
