@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -281,11 +282,12 @@ class Candidates:
             first = layout.panel_column
             bent = len(panel.names) - 2 * len(panel.borders)
             columns = tuple(range(first, first + bent))
-            places = self._places()
             out.append(Cause("panel", columns, PANEL_WIDTHS_PX))
             for i, border in enumerate(panel.borders):
                 at = first + bent + 2 * i
-                chance = LOG_CHANCE + math.log(alike_places(border, places, panel.shape))
+                chance = LOG_CHANCE + math.log(
+                    alike_places(border, self._places, panel.shape)
+                )
                 out.append(
                     Cause(border_name(border), (at, at + 1), GAP_WIDTHS_PX, chance)
                 )
@@ -298,8 +300,9 @@ class Candidates:
         out.append(Cause("priors", (), PRIOR_FACTORS, PRIOR_LOG_CHANCE))
         return tuple(out)
 
+    @cached_property
     def _places(self) -> FloatArray:
-        """Return the predicted column and row of each position that counts, (m, 2) [px]."""
+        """Predicted column and row of each position that counts, (m, 2) [px]."""
         problem = self.fit.problem
         return problem.residuals(self.fit.solution.x)[0][problem.seen]
 
@@ -479,10 +482,7 @@ class Candidates:
         """Return the width of the named cause in a choice; 0 if it is not chosen or not a
         candidate.
         """
-        for cause, pick in zip(self.causes, choice, strict=True):
-            if cause.name == name:
-                return pick
-        return 0.0
+        return self.widths(choice).get(name, 0.0)
 
     def widths(self, choice: Choice) -> dict[str, float]:
         """Return the widths of a choice by the names of their causes, for other tables."""
@@ -543,7 +543,7 @@ class Candidates:
             self.values,
             widths,
             model.noise * math.sqrt(self.alike),
-            self._places(),
+            self._places,
             problem.whiten[problem.seen],
             shape,
             self.borders,

@@ -3,8 +3,8 @@
 A bearing leans the axis by the same angle each time the stage comes to the same angle:
 columns of a lean in each frame, times cosine and sine of whole multiples of the angle. A
 lean that turns with the stage once a turn is a phantom that leans, which the fit knows
-already. A rival is any other parameter that does the same at the same multiple (runout),
-or the two together: a wobble is named where its likelihood exceeds theirs.
+already. A rival is place and angle that do the same together (runout): a wobble is named
+where its likelihood exceeds theirs by far.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.diagnose import Finding, error
-from flexdt.twin.calibration.diagnose.causes import NAMED_LOG_ODDS
+from flexdt.twin.calibration.diagnose.causes import MIN_MOVING_FRAMES, NAMED_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.residual_structure import MOVING
@@ -31,9 +31,8 @@ LEAST_SEEN: Final = 1e-3
 """Part of a lean that the geometry must leave, for it to be told."""
 HARMONICS: Final = (1, 2, 3)
 TIMES: Final = {1: "once", 2: "twice", 3: "three times"}
-MIN_FRAMES: Final = 12
 MOST_FRAMES: Final = 720
-"""Frames from and up to which a wobble is looked for."""
+"""Largest number of frames of which a wobble is looked for."""
 
 
 class Wave(NamedTuple):
@@ -63,7 +62,7 @@ def wobble(fit: FitResult) -> Finding | None:
     """
     problem = fit.problem
     frames = len(problem.seen)
-    if problem.group.max() > 0 or not MIN_FRAMES <= frames <= MOST_FRAMES:
+    if problem.group.max() > 0 or not MIN_MOVING_FRAMES <= frames <= MOST_FRAMES:
         return None
     use = problem.seen & fit.certificate.used
     kept = np.repeat(use.ravel(), 2)

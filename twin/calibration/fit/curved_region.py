@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from flexdt.twin.calibration.fit.residual_structure import Residuals
 from flexdt.twin.geometry.conventions import FloatArray
@@ -59,6 +58,8 @@ class Bend:
             at: (m,) indices of the given columns.
             covariance: (m, m) of the given columns without the bend.
         """
+        from scipy.optimize import least_squares
+
         if not len(self.second):
             return float(off @ np.linalg.solve(covariance, off))
         size = np.sqrt(np.diag(covariance))

@@ -181,20 +181,18 @@ def hidden_gap(
     else:
         reach = math.inf
     stack = np.asarray(frames, dtype=np.float64)
-    half = max(float(LEAST_COLUMNS), reach) + SIDE
-    low = math.floor(max(axis - half, 0.0))
-    end = math.ceil(min(axis + half, stack.shape[2]))
-    if end - low < 2 * SIDE + LEAST_COLUMNS:
+    judged = _judged_about(stack, axis, reach)
+    if judged is None:
         return None
-    columns = np.arange(low + SIDE, end - SIDE + 1)
-    evidence = _evidence(stack[:, :, low:end])
-    evidence = evidence.beside(-_of_outlines(evidence.found, columns - 0.5 - axis))
+    columns, evidence = judged
+    beside = columns.astype(np.float64) - 0.5 - axis
+    evidence = evidence.beside(-_of_outlines(evidence.found, beside))
     steps = mode_steps(rays, axis, reach) if rays is not None else None
     if steps is not None:
         evidence = _with_modes(evidence, columns, steps)
     if profile is not None:
         evidence = evidence.beside(_evidence_of_rays(columns, axis, profile))
-    hidden = np.abs(columns - 0.5 - axis) <= reach
+    hidden = np.abs(beside) <= reach
     ratio = evidence.ratio * hidden
     odds = CHANCE / (1.0 - CHANCE) * ratio / hidden.sum()
     total = float(odds.sum())
@@ -221,6 +219,27 @@ def hidden_gap(
     )
 
 
+def _judged_about(
+    stack: FloatArray, middle: float, reach: float
+) -> tuple[npt.NDArray[np.intp], Evidence] | None:
+    """Judge the borders about a column by single frames.
+
+    Args:
+        stack: line integrals, (n, rows, cols).
+        middle: column.
+        reach: distance from it up to which borders are judged, LEAST_COLUMNS at least [px].
+
+    Returns:
+        First columns beyond the borders, (c,), and their evidence; None for too few columns.
+    """
+    half = max(float(LEAST_COLUMNS), reach) + SIDE
+    low = math.floor(max(middle - half, 0.0))
+    end = math.ceil(min(middle + half, stack.shape[2]))
+    if end - low < 2 * SIDE + LEAST_COLUMNS:
+        return None
+    return np.arange(low + SIDE, end - SIDE + 1), _evidence(stack[:, :, low:end])
+
+
 def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
     """Check whether single frames favour a gap of any width near a column over none.
 
@@ -236,14 +255,11 @@ def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
         Also True where the images have too few columns about the gap to judge it.
     """
     stack = np.asarray(frames, dtype=np.float64)
-    half = LEAST_COLUMNS + SIDE
-    low = max(gap.column - half, 0)
-    end = min(gap.column + half, stack.shape[2])
-    if end - low < 2 * SIDE + LEAST_COLUMNS:
+    judged = _judged_about(stack, gap.column, 0.0)
+    if judged is None:
         return True
-    columns = np.arange(low + SIDE, end - SIDE + 1)
-    near = np.abs(columns - gap.column) <= about
-    found = _evidence(stack[:, :, low:end]).found[:, near]
+    columns, evidence = judged
+    found = evidence.found[:, np.abs(columns - gap.column) <= about]
     return not found.size or float(found.max()) > 0.0
 
 

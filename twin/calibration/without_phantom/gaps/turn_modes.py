@@ -22,6 +22,10 @@ from scipy.sparse import csr_matrix
 
 from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays
+from flexdt.twin.calibration.without_phantom.gaps.gradient_step import (
+    THIRD_DIFFERENCE_POWER,
+    UNKNOWN_WIDTH_PX,
+)
 from flexdt.twin.calibration.without_phantom.turn import MEDIAN_OF_CHI_SQUARE
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -48,14 +52,10 @@ SCALES: Final = np.exp(np.arange(-24.0, 4.0, 0.5))
 NOISES: Final = 2.0 ** np.arange(-2.0, 6.0, 0.5)
 """Variances of the object [1/column^2], and of noise over that of differences, that are
 tried."""
-THIRD_DIFFERENCE_POWER: Final = 20.0
-"""Variance of third differences of white noise, over the noise's."""
 LEAST_NOISE: Final = 1e-6
 """Least variance of noise, as a share of that of the views: images without any noise."""
 NOISE_COLUMNS = 9
 """Columns over which the noise is averaged."""
-UNKNOWN_WIDTH_PX: Final = 1e6
-"""Standard deviation of a width that nothing determines [px]."""
 
 
 class ModeSteps(NamedTuple):
