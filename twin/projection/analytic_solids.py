@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import assert_never
 
 import numpy as np
@@ -30,6 +31,8 @@ Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 IntArray = npt.NDArray[np.int64]
+KEPT_SHAPES = 4096
+"""Shapes whose conversion is kept: a scene is often projected again."""
 UNIT_TOLERANCE = 1e-6
 """Largest deviation of directions from orthonormal ones."""
 
@@ -119,7 +122,8 @@ class Convex:
 
 
 def as_convex(shape: Shape) -> Convex:
-    """Convert one shape to its quadric and slabs, with its corners or semi-axes [mm].
+    """Convert one shape to its quadric and slabs, with its corners or semi-axes [mm];
+    equal shapes share one read-only result.
 
     Spheres and ellipsoids have semi-axes and no slabs; boxes, cylinders and polyhedra
     have corners, whose convex hull holds them. Boxes and polyhedra have no quadric
@@ -129,6 +133,14 @@ def as_convex(shape: Shape) -> Convex:
         GeometryError: a size is not positive, axes are not orthonormal, or a polyhedron
             is not bounded.
     """
+    try:
+        return _kept_convex(shape)
+    except TypeError:  # a list or an array among its values cannot be looked up
+        return _convex(shape)
+
+
+def _convex(shape: Shape) -> Convex:
+    """Convert one shape, see `as_convex`."""
     none = np.zeros((0, 5))
     match shape:
         case Sphere(center, radius):
@@ -177,6 +189,16 @@ def as_convex(shape: Shape) -> Convex:
             assert_never(shape)
 
 
+@lru_cache(maxsize=KEPT_SHAPES)
+def _kept_convex(shape: Shape) -> Convex:
+    """Convert one shape, or return the result of an equal one."""
+    one = _convex(shape)
+    for array in vars(one).values():
+        if array is not None:
+            array.setflags(write=False)
+    return one
+
+
 def hull_points(one: Convex) -> FloatArray:
     """Compute points whose convex hull holds a solid, (k, 3) [mm]: its corners, or those
     of a round solid's box.
@@ -206,26 +228,15 @@ def shadows(
     """
     result = np.empty((len(rays), len(shapes), 4), np.int64)
     inverse = _inverses(rays)
-    for i, one in enumerate(shapes):
-        if one.corners is not None:
-            result[:, i] = corner_shadows(one.corners, rays, shape)
-            continue
-        # With the ellipsoid's centre q and semi-axes F in pixels and depths, a plane through
-        # the
-        # source with normal m touches it when (m . q)^2 = |F' m|^2. For the normals of columns and
-        # rows, (1, 0, -x) and (0, 1, -x), that is a quadratic in x.
-        assert one.semi_axes is not None
-        q = np.einsum("nij,nj->ni", inverse, one.center - rays[:, :3])
-        f = inverse @ one.semi_axes.T
-        d = q[:, :, None] * q[:, None] - f @ f.transpose(0, 2, 1)
-        with np.errstate(all="ignore"):
-            middle = d[:, :2, 2]
-            end = np.stack([d[:, 0, 0], d[:, 1, 1]], axis=1)
-            half = np.sqrt(np.maximum(middle * middle - end * d[:, 2:, 2], 0.0))
-            low = (middle - half) / d[:, 2:, 2]
-            high = (middle + half) / d[:, 2:, 2]
-        ahead = q[:, 2] > np.linalg.norm(f[:, 2], axis=1) * (1 + 1e-9)
-        result[:, i] = _pixels(low, high, ahead, shape)
+    hulls = [(i, one.corners) for i, one in enumerate(shapes) if one.corners is not None]
+    if hulls:
+        which, corners = zip(*hulls, strict=True)
+        ranges = _hull_ranges(corners, rays, inverse)
+        result[:, list(which)] = _pixels(*ranges, shape)
+    balls = [i for i, one in enumerate(shapes) if one.corners is None]
+    if balls:
+        ranges = _ellipsoid_ranges([shapes[i] for i in balls], rays, inverse)
+        result[:, balls] = _pixels(*ranges, shape)
     return result
 
 
@@ -242,12 +253,65 @@ def corner_shadows(
     Returns:
         (n, 4) as in `shadows`; all pixels when a point is not in front of the source.
     """
-    at = np.einsum("nij,nkj->nki", _inverses(rays), corners - rays[:, None, :3])
-    depth = at[:, :, 2]
-    ahead = (depth > 1e-9 * np.abs(depth).max(axis=1, keepdims=True)).all(axis=1)
+    return _pixels(*_hull_ranges([corners], rays, _inverses(rays)), shape)[:, 0]
+
+
+Ranges = tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]
+"""Least and largest column and row of k shadows in n views, (n, k, 2) each, and (n, k) the
+solid is wholly in front of the source, so that they are known."""
+
+
+def _hull_ranges(
+    corners: Sequence[FloatArray], rays: FloatArray, inverse: FloatArray
+) -> Ranges:
+    """Compute the ranges of the shadows of convex hulls.
+
+    Args:
+        corners: (m, 3) points of each hull [mm].
+        rays: (n, 12) as of `ConeVec.rays`.
+        inverse: (n, 3, 3) of `_inverses`.
+    """
+    starts = np.cumsum([0, *(len(points) for points in corners[:-1])])
+    points = np.concatenate(corners).T
+    at = inverse @ (points - rays[:, :3, None])
+    depth = at[:, 2]
+    largest = np.maximum.reduceat(np.abs(depth), starts, axis=1)
+    ahead = np.minimum.reduceat(depth, starts, axis=1) > 1e-9 * largest
     with np.errstate(all="ignore"):
-        at = at[:, :, :2] / depth[:, :, None]
-    return _pixels(at.min(axis=1), at.max(axis=1), ahead, shape)
+        pixels = at[:, :2] / at[:, 2:]
+    low = np.minimum.reduceat(pixels, starts, axis=2)
+    high = np.maximum.reduceat(pixels, starts, axis=2)
+    return low.transpose(0, 2, 1), high.transpose(0, 2, 1), ahead
+
+
+def _ellipsoid_ranges(
+    shapes: Sequence[Convex], rays: FloatArray, inverse: FloatArray
+) -> Ranges:
+    """Compute the ranges of the shadows of balls and ellipsoids.
+
+    With the centre q and semi-axes F in pixels and depths, a plane through the source
+    with normal m touches an ellipsoid when (m . q)^2 = |F' m|^2. For the normals of columns
+    and rows, (1, 0, -x) and (0, 1, -x), that is a quadratic in x.
+
+    Args:
+        shapes: with semi-axes.
+        rays: (n, 12) as of `ConeVec.rays`.
+        inverse: (n, 3, 3) of `_inverses`.
+    """
+    centers = np.array([one.center for one in shapes])
+    semi_axes = np.array([one.semi_axes for one in shapes])
+    q = (centers - rays[:, None, :3]) @ inverse.transpose(0, 2, 1)
+    f = inverse[:, None] @ semi_axes.transpose(0, 2, 1)
+    d = q[..., None] * q[..., None, :] - f @ f.transpose(0, 1, 3, 2)
+    with np.errstate(all="ignore"):
+        middle = d[..., :2, 2]
+        square = d[..., 2:, 2]
+        end = np.stack([d[..., 0, 0], d[..., 1, 1]], axis=-1)
+        half = np.sqrt(np.maximum(middle * middle - end * square, 0.0))
+        low = (middle - half) / square
+        high = (middle + half) / square
+    ahead = q[..., 2] > np.linalg.norm(f[..., 2, :], axis=-1) * (1 + 1e-9)
+    return low, high, ahead
 
 
 def _inverses(rays: FloatArray) -> FloatArray:
@@ -272,20 +336,22 @@ def _pixels(
     """Convert ranges of columns and rows to whole pixels.
 
     Args:
-        low: (n, 2) least column and row.
-        high: (n, 2) largest.
-        ahead: (n,) the range is known; otherwise all pixels are taken.
+        low: (..., 2) least column and row.
+        high: (..., 2) largest.
+        ahead: (...) the range is known; otherwise all pixels are taken.
         shape: (rows, cols).
 
     Returns:
-        (n, 4) first row, row after the last, first column, column after the last.
+        (..., 4) first row, row after the last, first column, column after the last.
     """
-    first = np.where(ahead[:, None], np.ceil(low - 1e-6), 0).clip(0, shape[::-1])
-    last = np.where(ahead[:, None], np.floor(high + 1e-6) + 1, np.inf).clip(
-        0, shape[::-1]
-    )
-    ends = [first[:, 1], last[:, 1], first[:, 0], last[:, 0]]
-    return np.column_stack(ends).astype(np.int64)
+    known = ahead[..., None]
+    size = np.array(shape[::-1], dtype=np.float64)
+    first = np.where(known, np.ceil(low - 1e-6), 0.0)
+    last = np.where(known, np.floor(high + 1e-6) + 1.0, size)
+    out = np.empty((*ahead.shape, 4), dtype=np.int64)
+    out[..., 2::-2] = np.minimum(np.maximum(first, 0.0), size)
+    out[..., 3::-2] = np.minimum(np.maximum(last, 0.0), size)
+    return out
 
 
 def _corners(center: FloatArray, axes: FloatArray, half: FloatArray) -> FloatArray:

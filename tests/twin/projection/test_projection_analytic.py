@@ -133,6 +133,34 @@ def test_culling_loses_no_pixel(name, circle, monkeypatch) -> None:
     assert np.array_equal(culled, project_scene(one(shape), geometry, SHAPE))
 
 
+def test_culling_of_many_solids_at_once_loses_no_pixel_of_any(circle) -> None:
+    """Shadows are found for all solids of a scene together, those with corners and the
+    round ones apart: each must keep the place of its own."""
+    shapes = (
+        Box((-0.8, -0.6, 0.7), (0.4, 0.3, 0.5)),
+        Sphere((0.9, 0.2, -0.8), 0.2),
+        Cylinder((0.1, 0.8, 0.1), 0.2, 0.6),
+        Ellipsoid((-0.9, 0.5, -0.5), (0.1, 0.3, 0.2)),
+        Box((0.7, -0.8, 0.2), (0.2, 0.4, 0.3)),
+    )
+    solids = [one(shape).solids[0] for shape in shapes]
+    geometry = circle(7, 5.0, 16.0, 0.3, start=0.1, roll=0.3, pitch_tilt=-0.4)
+    alone = [project_scene(Scene((solid,)), geometry, SHAPE) for solid in solids]
+    together = project_scene(Scene(tuple(solids)), geometry, SHAPE)
+    assert np.abs(together - np.sum(alone, axis=0)).max() < 1e-6 * together.max()
+
+
+def test_a_shape_of_lists_and_arrays_is_projected_as_one_of_tuples(circle) -> None:
+    geometry = circle(3, 8.0, 16.0, 0.2)
+    center = np.array([0.1, 0.0, 0.2])
+    listed = project_scene(one(Box(center, [1.0, 0.8, 1.2])), geometry, SHAPE)  # type: ignore[arg-type]
+    tupled = one(Box((0.1, 0.0, 0.2), (1.0, 0.8, 1.2)))
+    assert np.array_equal(listed, project_scene(tupled, geometry, SHAPE))
+    center += 0.5
+    moved = project_scene(one(Box(center, [1.0, 0.8, 1.2])), geometry, SHAPE)  # type: ignore[arg-type]
+    assert not np.array_equal(listed, moved)
+
+
 @pytest.mark.parametrize("name", INSIDE)
 def test_a_solid_around_or_behind_the_source_is_handled(name) -> None:
     shape, inside = INSIDE[name]
