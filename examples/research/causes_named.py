@@ -135,8 +135,9 @@ def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
     """Find the parameter or image quantity with the largest error [sigma], and its name;
     (0, "") if all are exact.
 
-    A parameter that moves may have any of its values. Image quantities count only where
-    nothing moves and the spots were not changed.
+    A parameter that moves may have any of its values, and image quantities any of theirs;
+    where the motion was followed, they are those of its mean. They do not count where the
+    phantom grows, or the spots were changed.
     """
     assert result.fit is not None
     worst, where = 0.0, ""
@@ -149,10 +150,15 @@ def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
         off = max(low - value, value - high, 0.0) / max(e.sigma, 1e-12)
         if off > worst:
             worst, where = off, name
-    if any(low < high for low, high in scan.truth.values()) or scan.after is not None:
+    moves = any(low < high for low, high in scan.truth.values())
+    told = any(low < high for low, high in scan.image_ends.values())
+    if scan.after is not None or (moves and not told):
         return worst, where
     for name, e in image_quantities(result.fit)[0].items():
-        off = abs(e.value - scan.image.get(name, e.value)) / max(e.sigma, 1e-12)
+        low = high = scan.image.get(name, e.value)
+        if moves and not result.motions:
+            low, high = scan.image_ends.get(name, (e.value, e.value))
+        off = max(low - e.value, e.value - high) / max(e.sigma, 1e-12)
         if off > worst:
             worst, where = off, name
     return worst, where

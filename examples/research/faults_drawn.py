@@ -91,7 +91,8 @@ class Faulty:
         beside: patterns of what may be said, too.
         silent: to be offered and right without a word is right.
         after: what was done to the spots of the frames, if anything.
-        image: `in_images` of the world.
+        image: `in_images` of the world; where something moves, of its mean over the frames.
+        image_ends: their least and largest value in any frame, where something moves.
         pixel: its pixels [mm].
     """
 
@@ -105,14 +106,34 @@ class Faulty:
     shape: tuple[int, int] = SHAPE
     after: Callable[[list[Array | None]], list[Array | None]] | None = None
     image: Mapping[str, float] = field(default_factory=dict)
+    image_ends: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     pixel: float = PIXEL
+
+
+def frames_of(world: World) -> list[World]:
+    """Return the world as it is in each frame, or once if nothing but the stage moves."""
+    n = len(world.angles)
+    moves = np.ptp(world.spot, axis=0).any()
+    moves = moves or any(np.ptp(np.ravel(v)) > 0 for v in world.offsets.values())
+    if not moves:
+        return [world]
+    each = {name: np.broadcast_to(value, (n,)) for name, value in world.offsets.items()}
+    return [
+        replace(
+            world,
+            offsets={name: float(value[i]) for name, value in each.items()},
+            spot=world.spot[i : i + 1],
+        )
+        for i in range(n)
+    ]
 
 
 def in_images(world: World) -> dict[str, float]:
     """Compute "axis_column", of the axis in the middle row [px], and "magnification" of a
-    short line on the axis along the panel's rows, in the first frame.
+    short line on the axis along the panel's rows, of the mean place over the frames, at
+    the first angle.
     """
-    still = {n: float(np.ravel(v)[0]) for n, v in world.offsets.items()}
+    still = {n: float(np.mean(v)) for n, v in world.offsets.items()}
     tau = np.array([still.get("tau_x", 0.0), still.get("tau_z", 0.0), 0.0])
     reach = 0.5
     points = tau + np.array(
@@ -127,7 +148,8 @@ def in_images(world: World) -> dict[str, float]:
     )
     first = replace(
         world, beads=points, radii=np.full(6, 1e-4), offsets=still, angles=world.angles[:1],
-        spot=world.spot[:1], shown=np.ones((1, 6), dtype=bool), arc=0.0, size=None,
+        spot=world.spot.mean(axis=0, keepdims=True), shown=np.ones((1, 6), dtype=bool),
+        arc=0.0, size=None,
     )  # fmt: skip
     ((up, down, *ends),) = shadows(first)[0]
     middle = (SHAPE[0] - 1) / 2
@@ -296,6 +318,8 @@ def drawn(kind: str, seed: int) -> Faulty:
         spots.append(rng.permutation(rows[inside]))
     if draft.after is not None:
         spots = draft.after(spots)
+    each = [in_images(world) for world in frames_of(draft.world)]
+    ends = {n: [image[n] for image in each] for n in each[0]}
     scale = float(np.polyfit(draft.believed.angles, draft.world.angles, 1)[0])
     truth = {
         name: (float(np.min(value)), float(np.max(value)))
@@ -313,6 +337,7 @@ def drawn(kind: str, seed: int) -> Faulty:
         draft.noise_px,
         after=draft.after,
         image=in_images(draft.world),
+        image_ends={n: (min(values), max(values)) for n, values in ends.items()},
         pixel=draft.world.pixel,
     )
 
@@ -961,17 +986,43 @@ def _four_tiles(draft: Draft, rng: Rng) -> Draft:
     return _bent(draft, rng, after)
 
 
-def _source_jumps(draft: Draft, rng: Rng) -> Draft:
-    """Let the focal spot jump aside by 0.02 to 0.3 mm in the middle half of the scan,
-    which looks like an object that jumps: a finding of motion is expected.
+def _source_moves(axis: int, low: float, high: float, jumps: bool) -> Fault:
+    """Make a fault: the focal spot jumps by `low` to `high` [mm] in the middle half of the
+    scan, or drifts evenly; it looks like an object that moves, and a finding of motion is
+    expected.
+
+    Args:
+        axis: 0: aside, 1: along the beam, 2: up.
+        low, high: least and largest way.
+        jumps: else it drifts.
     """
-    draft = _usual(draft, rng)
-    n = len(draft.world.angles)
-    at = int(rng.integers(n // 4, 3 * n // 4))
-    way = np.array([_sign(rng) * rng.uniform(0.02, 0.3), 0.0, 0.0])
-    world = replace(draft.world, spot=(np.arange(n) >= at)[:, None] * way)
-    truth = {"dO_x": draft.world.offsets["dO_x"] + np.array([-1.0, 1.0]) * way[0]}
-    return replace(draft, world=world, names=(MOVES,), beside=OTHERS, truth=truth)
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the frame and the way."""
+        draft = _usual(draft, rng)
+        n = len(draft.world.angles)
+        at = int(rng.integers(n // 4, 3 * n // 4))
+        course = (np.arange(n) >= at) if jumps else np.linspace(0.0, 1.0, n)
+        way = np.zeros(3)
+        way[axis] = _sign(rng) * rng.uniform(low, high)
+        world = replace(draft.world, spot=course[:, None] * way)
+        # Seen from a spot that stands still, all else moves by so much.
+        name = ("dO_x", "dO_z", "dO_y")[axis]
+        ends = np.array([-1.0, 1.0]) * way[axis]
+        truth = {name: draft.world.offsets[name] + ends}
+        panel = "dD" + name[2:]
+        truth[panel] = draft.world.offsets[panel] + ends
+        return replace(draft, world=world, names=(MOVES,), beside=OTHERS, truth=truth)
+
+    return fault
+
+
+def _usual_jump(name: str, low: float, high: float) -> Fault:
+    """Make a fault: a parameter jumps by `low` to `high` [mm, deg] in a scan whose panel
+    and axis are not exactly where they are said to be.
+    """
+    jump = _jump(name, low, high)
+    return lambda draft, rng: jump(_usual(draft, rng), rng)
 
 
 def _grows(draft: Draft, rng: Rng) -> Draft:
@@ -1093,7 +1144,16 @@ KINDS: Final[Mapping[str, Fault]] = {
     "frame_lost": _renumbered(1),
     "exposed_again": _exposed_again,
     "four_tiles": _four_tiles,
-    "source_jumps": _source_jumps,
+    "source_jumps": _source_moves(0, 0.02, 0.3, jumps=True),
+    "source_jumps_up": _source_moves(2, 0.02, 0.3, jumps=True),
+    "source_jumps_along": _source_moves(1, 0.2, 3.0, jumps=True),
+    "source_drifts": _source_moves(0, 0.05, 0.3, jumps=False),
+    "source_drifts_up": _source_moves(2, 0.05, 0.3, jumps=False),
+    "object_jumps": _usual_jump("dO_x", 0.02, 0.3),
+    "object_jumps_up": _usual_jump("dO_y", 0.02, 0.3),
+    "object_jumps_along": _usual_jump("dO_z", 0.2, 3.0),
+    "panel_jumps": _usual_jump("dD_x", 0.02, 0.3),
+    "panel_jumps_up": _usual_jump("dD_y", 0.02, 0.3),
     "grows": _grows,
     "other_pitch": _other_pitch,
 }  # fmt: skip

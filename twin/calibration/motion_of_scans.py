@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose.causes import OPEN_LOG_ODDS
+from flexdt.twin.calibration.diagnose.fitted import MOTION_WORDS, open_motions
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import (
     MotionFit,
@@ -67,9 +70,10 @@ def settle_motion(
         fit: the last one.
 
     Returns:
-        The state with wider sigmas but the same motion, and up to two findings: a warning
-        if it changes by more than a sigma, and an error if the fit is identifiable but an
-        asked parameter with a unit is determined worse than `request.bound`.
+        The state with wider sigmas but the same motion, and findings: warnings if something
+        else moves than was asked for, if the tracks leave open what moves, and if it
+        changes by more than a sigma; an error if the fit is identifiable but an asked
+        parameter with a unit is determined worse than `request.bound`.
     """
     held = state.motion
     assert held is not None
@@ -83,7 +87,7 @@ def settle_motion(
         float(np.nan_to_num(np.abs(d) / np.maximum(b.sigma, 1e-300)).max(initial=0.0))
         for b, d in zip(again.motions, off, strict=True)
     )
-    out = []
+    out = _what_moves(held)
     if worst > 1.0:
         out.append(
             warning(
@@ -107,3 +111,33 @@ def settle_motion(
             )
         )
     return replace(state, motion=replace(held, motions=motions)), out
+
+
+def _what_moves(held: MotionFit) -> list[Finding]:
+    """Make warnings that something else moves than was asked for, and that it is open what
+    moves.
+
+    Args:
+        held: the motion.
+    """
+    out = []
+    others = [n for n in held.moving if n not in held.asked]
+    if others:
+        out.append(
+            warning(
+                "other_motion",
+                f"not {', '.join(held.asked)} alone: "
+                f"{', '.join(MOTION_WORDS[n] for n in others)} ({', '.join(others)}), which "
+                "explains the images far better; that was followed",
+            )
+        )
+    alike = open_motions(held, math.exp(OPEN_LOG_ODDS))
+    if alike:
+        out.append(
+            warning(
+                "motion_open",
+                f"the images do not tell for certain what moves, {', '.join(held.moving)} or "
+                f"otherwise: {' or '.join(alike)}; the intervals contain what they differ by",
+            )
+        )
+    return out

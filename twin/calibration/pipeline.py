@@ -228,7 +228,7 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
     """Explain the residuals, check the parameters that were not estimated, settle the
     motion if there is one, and add findings.
 
-    With motion, vibration is not reported.
+    With motion, vibration is reported only if it forbids the fit.
 
     Args:
         fitted: the last fit.
@@ -245,8 +245,8 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
         state, unsettled = settle_motion(state, fitted.request, fit)
         state = state.with_findings(*unsettled)
         # A deviation in every frame takes up part of what its beads share, and the rest looks
-        # shared, too: the sigmas stay wide, but nothing vibrates.
-        explained = [f for f in explained if f.code != "vibration"]
+        # shared, too: the sigmas stay wide, but nothing vibrates. What explains a misfit stays.
+        explained = [f for f in explained if f.code != "vibration" or f.forbids]
     fit = with_start(fit, asked.start, fitted.iterations)
     return replace(state, fit=fit).with_findings(*explained)
 

@@ -11,7 +11,7 @@ import pytest
 from calibration_scenarios import scenario
 from scipy import linalg
 
-from flexdt.twin.calibration.fit.fitted_motion import _Mixed
+from flexdt.twin.calibration.fit.motion_model import Course, MotionModel
 from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.motion import MOVABLE, Motion
@@ -52,7 +52,8 @@ def test_a_runout_is_found_in_radiographs() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
-    """Likelihood, deviations and sigmas beside full matrices of second differences."""
+    """Likelihood, deviations and sigmas beside full matrices of second differences, and of
+    jumps and ramps as columns."""
     rng = np.random.default_rng(seed)
     sizes, g, p, each = (7, 9), 3, 2, 6
     n = sum(sizes)
@@ -61,16 +62,28 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
     y = rng.normal(size=n * each) + 3 * slopes[:, 0] * np.linspace(-1, 1, n)[frame]
     weight, off = np.array([0.0, 0.5, 0.0]), np.array([0.0, 0.3, 0.0])
     column = np.stack([np.full(n, 2), np.repeat([0, -1], sizes)], axis=1)
-    model = _Mixed(rows, y, slopes, frame, sizes, column, weight, off)
+    model = MotionModel(rows, y, slopes, frame, sizes, column, weight, off)
     prior = np.array([[0.0, np.sqrt(0.5), 0.0]])
     x, y1 = np.vstack([rows, prior]), np.r_[y, np.sqrt(0.5) * 0.3]
 
     def dense(choice: Any) -> tuple[float, Any, Any, Any]:
-        parts, precision = [x], [np.zeros((g, g))]
+        parts, precision, into = [x], [np.zeros((g, g))], [np.eye(g)]
         variance = np.eye(len(y1))
         for i, pick in enumerate(choice):
             z = np.zeros((len(y1), n))
             z[np.arange(n * each), frame] = slopes[:, i]
+            if isinstance(pick, Course):
+                height = model.courses[:, pick.shape].copy()
+                for label in np.unique(column[:, i]):
+                    own = column[:, i] == label
+                    height[own] -= height[own].mean()
+                height /= np.sqrt(np.square(slopes[:, i]).sum() / n)
+                variance += pick.width**2 * np.outer(z @ height, z @ height)
+                parts.append((z @ height)[:, None])
+                precision.append(np.array([[1 / pick.width**2]]))
+                into.append(height[:, None])
+                continue
+            into.append(np.eye(n))
             blocks = []
             for size, amplitudes in zip(sizes, model.spectrum(i, pick), strict=True):
                 bends = np.diff(np.eye(size), 2, axis=0)
@@ -96,7 +109,9 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
         value = -0.5 * (np.linalg.slogdet(variance)[1] + np.linalg.slogdet(normal)[1])
         whole = np.hstack(parts)
         joint = np.linalg.inv(whole.T @ whole + linalg.block_diag(*precision))
-        found = joint @ whole.T @ y1
+        both = linalg.block_diag(*into)
+        found = both @ joint @ whole.T @ y1
+        joint = both @ joint @ both.T
         # From (x, d) to (x + mean of d, d - mean of d).
         change = np.eye(g + p * n)
         for i in range(p):
@@ -117,18 +132,26 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
         ((1.0, 1.0), (0.1, 4.0)),
         ((10.0, 4.0), (0.3, math.inf)),
         ((3.0, 16.0), (30.0, 4.0)),
+        (Course(0, 10.0), (3.0, 4.0)),
+        (Course(3, 100.0), Course(1, 3.0)),
     ]
     ours = [model.likelihood(choice) for choice in choices]
     theirs = [dense(choice)[0] for choice in choices]
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1e-6)
     for choice in choices:
-        values, spread, added, _ = model.solved(choice)
+        values, spread, added, _, moved = model.solved(choice)
         _, found, covariance, noise2 = dense(choice)
         np.testing.assert_allclose(values.T.ravel(), found[g:], atol=1e-8)
-        sigma = np.sqrt(np.diag(covariance)[g:])
-        np.testing.assert_allclose(spread.T.ravel(), sigma, rtol=1e-6)
+        sigma = np.sqrt(np.maximum(np.diag(covariance)[g:], 0.0))
+        np.testing.assert_allclose(spread.T.ravel(), sigma, rtol=1e-6, atol=1e-8)
         plain = noise2 * np.linalg.inv(x.T @ x)
         np.testing.assert_allclose(added + plain, covariance[:g, :g], atol=1e-8)
+        np.testing.assert_allclose(moved, found[:g], atol=1e-8)
+    for beside in (None, (3.0, 4.0), Course(4, 10.0)):
+        shapes = range(model.courses.shape[1])
+        tried = [(Course(s, w), beside) for s in shapes for w in (1.0, 30.0)]
+        found = model.best_course((None, beside), 0, (1.0, 30.0))
+        assert found == max(tried, key=model.likelihood)[0]
 
 
 def test_a_motion_goes_into_poses_and_documents() -> None:

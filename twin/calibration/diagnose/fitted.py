@@ -19,6 +19,7 @@ from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.diagnose.causes import (
     LEAST_BEADS,
+    NAMED_LOG_ODDS,
     Known,
     Refit,
     explained_by_causes,
@@ -75,10 +76,22 @@ PLAUSIBLE_SHARE = 0.12
 """Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
 scaled together with its beads looks like the right one at another distance, so that this offset
 is its only sign."""
+MOTION_WORDS: Final = {
+    "dO_x": "the object moves aside",
+    "dO_y": "the object moves up or down",
+    "dO_z": "the object moves along the beam",
+    "alpha": "the object turns",
+    "dS_x": "the source moves aside",
+    "dS_y": "the source moves up or down",
+    "dD_x": "the panel moves aside",
+    "dD_y": "the panel moves up or down",
+    "dD_z": "the panel moves along the beam",
+}
+"""Parameter -> words on its motion."""
 ALIKE_MOTION: Final = {
-    "dO_x": "the source moves aside, the other way",
-    "dO_y": "the source moves up or down, the other way",
-    "dO_z": "the phantom grows or shrinks",
+    "dO_x": ("the source moves aside, the other way",),
+    "dO_y": ("the source moves up or down, the other way",),
+    "dO_z": ("the phantom grows or shrinks",),
 }
 """Parameter -> other motions that look like this motion of the object."""
 OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
@@ -403,10 +416,30 @@ def _looks_alike(column: str) -> str:
     """Return words on another motion that looks like a change of a parameter (of one
     scan: NAME@NUMBER), in brackets after a blank; "" without one.
     """
-    name = column.split("@")[0]
-    if name in ALIKE_MOTION:
-        return f" (or {ALIKE_MOTION[name]}, which looks alike)"
-    return ""
+    return _alternatives(ALIKE_MOTION.get(column.split("@")[0], ()))
+
+
+def _alternatives(words: Sequence[str]) -> str:
+    """Return motions that look alike in brackets after a blank; "" without any."""
+    if not words:
+        return ""
+    return f" (or {' or '.join(words)}, which look{'s' * (len(words) == 1)} alike)"
+
+
+def open_motions(found: MotionFit, odds: float) -> list[str]:
+    """List words on motions that may take the place of one that was found.
+
+    Args:
+        found: what moves.
+        odds: of the found motion against another, up to which that is listed.
+    """
+    certain = set(found.moving)
+    sets: list[tuple[str, ...]] = []
+    for names in found.alike(1.0 / odds):
+        part_of_it = any(set(less) <= set(names) for less in sets)
+        if not certain <= set(names) and not part_of_it:
+            sets.append(names)
+    return [" and ".join(MOTION_WORDS[n] for n in names) for names in sets]
 
 
 def _lost_beads(fit: FitResult) -> list[Finding]:
@@ -529,8 +562,9 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     except TwinError:
         return None
     remaining = largest_residual(better, EXPLAINED_CHANCE)
-    if not better.certificate.rms_px < min(0.5 * before, remaining):
+    if not better.certificate.rms_px < min(0.5 * before, remaining) or not found.moving:
         return None
+    names = list(found.motions[0].names)
     use = problem.seen
     effects = []
     for i, name in enumerate(names):
@@ -562,10 +596,13 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         code = "vibration"
     else:
         code = "drift"
+    alike = open_motions(found, math.exp(NAMED_LOG_ODDS))
+    if name == "dO_z":
+        alike += ALIKE_MOTION[name]
     return error(
         code,
-        f"{', '.join(motions)} moves during the scan, {how}{_looks_alike(name)}: --per-frame "
-        f"{','.join(names)} follows it",
+        f"{', '.join(motions)} moves during the scan, {how}{_alternatives(alike)}: "
+        f"--per-frame {','.join(names)} follows it",
         per_frame=names,
     )
 

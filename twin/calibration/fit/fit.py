@@ -53,6 +53,7 @@ from flexdt.twin.calibration.fit.weak_directions import BOUND
 from flexdt.twin.errors import NotIdentifiableError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.panel import Panel, PanelModel
 from flexdt.twin.geometry.poses import Poses
@@ -389,6 +390,7 @@ class FitResult:
         bead_prior_mm: standard deviation of the prior on bead positions; 0 if they were fixed.
         strain_prior: that of the phantom's stretches and shears; 0 if it has its stated shape.
         rival_pitch: pixel pitch that is in the covariance; None: no such pitch.
+        motions: deviations of single frames in the poses, of each group; empty: none.
     """
 
     parameters: Offsets
@@ -405,6 +407,7 @@ class FitResult:
     bead_prior_mm: float = 0.0
     strain_prior: Strain = UNSTRAINED
     rival_pitch: RivalPitch | None = None
+    motions: tuple[Motion, ...] = ()
 
     @property
     def panel(self) -> Panel | None:
@@ -748,6 +751,8 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     """Compute the quantities of IN_IMAGES, in the first frame of each group of frames, to
     first order; a rival pixel pitch adds to the variance.
 
+    Where frames deviate, those of their mean are meant: the sigmas are of it.
+
     Args:
         fit: whose estimates are all determined.
 
@@ -756,9 +761,15 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
         interval and unit.
     """
     t = float(stdtrit(fit.certificate.dof, 0.975))
+    problem = fit.problem
+    if fit.motions:
+        deviations = replace(
+            fit.motions[0], values=np.concatenate([m.values for m in fit.motions])
+        )
+        problem = replace(problem, poses=deviations.applied(problem.poses, -1.0))
     out = []
     for group in range(len(fit.group_parameters)):
-        here, rows = image_slopes(fit.problem, fit.solution.x, group)
+        here, rows = image_slopes(problem, fit.solution.x, group)
         variance = np.einsum("qi,ij,qj->q", rows, fit.covariance, rows)
         if fit.rival_pitch is not None:
             variance += _pitch_variance(fit, fit.rival_pitch, group, here[0], rows)

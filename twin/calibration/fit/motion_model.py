@@ -1,0 +1,521 @@
+"""The linear mixed model of motion: a fit's columns, and parameters' deviations in frames.
+
+Deviations of a parameter have one of two priors. They are normal, smaller where they bend
+more (second differences; banded, so everything is solved frame by frame); or they follow a
+course of one number: a jump at a frame, or a ramp over a scan. What jumps is told from what
+wanders by its evidence, and so are two parameters that jump at the same frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg
+
+from flexdt.twin.calibration.fit.fit import LEAST_NOISE
+from flexdt.twin.calibration.fit.residual_structure import cross
+from flexdt.twin.geometry.conventions import FloatArray
+
+COLUMNS: Final = 512
+"""Number of covariance columns processed at a time."""
+MOST_COURSES: Final = 720
+"""Largest number of frames of a scan at which jumps are tried."""
+
+
+class Course(NamedTuple):
+    """A course of deviations.
+
+    Attributes:
+        shape: its number, of `MotionModel.courses`.
+        width: of its height, in sigmas from one frame.
+    """
+
+    shape: int
+    width: float
+
+
+class Waves(NamedTuple):
+    """Normal deviations.
+
+    Attributes:
+        width: in sigmas from one frame.
+        waves: half waves in a scan above which amplitudes fall; inf: no fall.
+    """
+
+    width: float
+    waves: float
+
+
+Pick = Waves | Course | None
+"""Prior of a parameter's deviations; None: it does not move."""
+MotionChoice = tuple[Pick, ...]
+"""Of each parameter."""
+
+
+class Answer(NamedTuple):
+    """The deviations of a choice.
+
+    Attributes:
+        values: (n, p) from their mean, internal units; 0 where a parameter does not move.
+        sigma: (n, p) of them; nan where a parameter does not move.
+        added: (g, g) covariance that they add to the fit's columns.
+        inflation: factor, 1 or more, by which they take up its degrees of freedom.
+        columns: (g,) change of the fit's columns.
+    """
+
+    values: FloatArray
+    sigma: FloatArray
+    added: FloatArray
+    inflation: float
+    columns: FloatArray
+
+
+class MotionModel:
+    """Linear mixed model: the fit's g columns, and p parameters' deviations in n frames.
+
+    The prior precision of a parameter's deviations is (1 + D'D / l^2) / v, with D the second
+    differences of frames: it has five diagonals, so everything is solved in bands. Its
+    directions are nearly cosines of the frame's number.
+
+    Attributes:
+        plain: (g, g) normal equations of the fit's columns, scaled, with their priors.
+        push: (g,) right-hand side of the same.
+        pairs, mixed, pull: (n, p, p), (n, g, p), (n, p): sums over each frame's rows of two
+            derivatives, of one and a column, of one and the residual.
+        scale: (g,) length of the fit's columns.
+        total: sum of squares of the residuals, priors included.
+        freedom: number of rows and priors less g.
+        sizes: frames of each scan.
+        column: (n, p) column of the fit to which a deviation belongs; -1: to no column.
+        courses: (n, c) ramps of each scan, then jumps: 0 before a frame, 1 from it to the
+            end of its scan.
+    """
+
+    def __init__(
+        self,
+        rows: FloatArray,
+        residual: FloatArray,
+        motion: FloatArray,
+        frame: npt.NDArray[np.intp],
+        sizes: Sequence[int],
+        column: npt.NDArray[np.int64],
+        weight: FloatArray,
+        off: FloatArray,
+    ) -> None:
+        """Sum up the normal equations, with columns scaled to unit length; the rows are
+        not kept.
+
+        Args:
+            rows: (m, g) derivatives by the fit's columns.
+            residual: (m,).
+            motion: (m, p) derivatives by the parameters of each row's frame.
+            frame: (m,) of each row.
+            sizes: frames of each scan.
+            column: (n, p), see the class.
+            weight: (g,) of the priors; 0 without.
+            off: (g,) distance of their means.
+        """
+        n = sum(sizes)
+        p = motion.shape[1]
+        g = rows.shape[1]
+        self.sizes = sizes
+        self.column = column
+        self.scale = np.sqrt(np.einsum("mg,mg->g", rows, rows) + weight)
+        self.scale[self.scale == 0.0] = 1.0
+        rows = rows / self.scale
+        weight = weight / self.scale**2
+        off = off * self.scale
+        self.pairs = np.zeros((n, p, p))
+        self.mixed = np.zeros((n, g, p))
+        self.pull = np.zeros((n, p))
+        np.add.at(self.pairs, frame, motion[:, :, None] * motion[:, None, :])
+        np.add.at(self.mixed, frame, rows[:, :, None] * motion[:, None, :])
+        np.add.at(self.pull, frame, motion * residual[:, None])
+        self.plain = cross(rows, rows) + np.diag(weight + 1e-10)
+        self.push = np.einsum("mg,m->g", rows, residual) + weight * off
+        self.total = float(np.sum(residual**2) + np.sum(weight * off**2))
+        self.freedom = max(len(residual) + int((weight > 0).sum()) - g, 1)
+        self.courses = _courses(sizes)
+
+    def one_frame(self, i: int) -> float:
+        """Compute the variance of a parameter's deviation from one frame."""
+        return 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)
+
+    def course(self, i: int, shape: npt.NDArray[np.intp] | int) -> FloatArray:
+        """Compute the deviations of a parameter that follow courses, from their mean, (n,)
+        or (n, courses), as high as the sigma from one frame.
+
+        Args:
+            i: number of the parameter.
+            shape: numbers of courses.
+        """
+        out = self.courses[:, shape].copy()
+        own = self.column[:, i]
+        for label in np.unique(own):
+            out[own == label] -= out[own == label].mean(axis=0)
+        return np.asarray(out * math.sqrt(self.one_frame(i)))
+
+    def spectrum(self, i: int, pick: Waves) -> list[FloatArray]:
+        """Compute the variance of the amplitude of each scan's cosines, for deviations
+        that are level at the ends.
+
+        Args:
+            i: number of the parameter.
+            pick: width, in sigmas from one frame, and smoothness of its motion.
+
+        Returns:
+            For each scan (frames,), by the number of half waves, falling; the mean from
+            one half wave on is the squared width.
+        """
+        width, waves = pick
+        one_frame = self.one_frame(i)
+        out = []
+        for size in self.sizes:
+            bends = (2.0 * np.sin(0.5 * math.pi * np.arange(size) / size)) ** 2
+            shares = 1.0 / (1.0 + (bends / _stiffness(size, waves)) ** 2)
+            out.append(width**2 * one_frame * shares * (size - 1) / shares[1:].sum())
+        return out
+
+    def _diagonals(self, i: int, pick: Waves) -> FloatArray:
+        """Compute the prior precision of a parameter's deviations, a banded matrix: (1 +
+        D'D / stiffness^2) / variance of each scan.
+
+        Args:
+            i: number of the parameter.
+            pick: width and smoothness of its motion.
+
+        Returns:
+            (3, n) the main diagonal and the two below it, for n frames; scans are not
+            connected.
+        """
+        parts = []
+        for size, variance in zip(self.sizes, self.spectrum(i, pick), strict=True):
+            inner = np.ones(size - 2)  # frames with a second difference [1, -2, 1]
+            diagonal = np.convolve(inner, [1.0, 4.0, 1.0])
+            beside = np.r_[np.convolve(inner, [-2.0, -2.0]), 0.0]
+            squared = np.stack([diagonal, beside, np.r_[inner, 0.0, 0.0]])
+            squared /= _stiffness(size, pick[1]) ** 2
+            squared[0] += 1.0
+            parts.append(squared / variance[0])
+        return np.concatenate(parts, axis=1)
+
+    def _factor(self, moving: Sequence[int], choice: MotionChoice) -> FloatArray:
+        """Factorise the deviations' normal equations, frame by frame (banded Cholesky);
+        raises LinAlgError if they are not positive definite.
+
+        Args:
+            moving: numbers of the p moving parameters.
+            choice: width and smoothness of each parameter; those of moving ones are not
+                None.
+
+        Returns:
+            (2 p + 1, n p) lower Cholesky factor as `scipy.linalg.cho_solve_banded` takes
+            it.
+        """
+        n = len(self.pull)
+        p = len(moving)
+        band = np.zeros((2 * p + 1, n, p))
+        for a, i in enumerate(moving):
+            for b in range(a + 1):
+                band[a - b, :, b] = self.pairs[:, i, moving[b]]
+            pick = choice[i]
+            assert pick is not None
+            assert not isinstance(pick, Course)
+            band[[0, p, 2 * p], :, a] += self._diagonals(i, pick)
+        return np.asarray(
+            linalg.cholesky_banded(
+                band.reshape(2 * p + 1, n * p), lower=True, check_finite=False
+            )
+        )
+
+    def _eliminated(self, choice: MotionChoice) -> _Eliminated:
+        """Eliminate the normal deviations of a choice from the normal equations (Schur
+        complement). The heights of its courses are further columns.
+
+        Args:
+            choice: of each parameter.
+
+        Returns:
+            The reduced equations, and the factors with which deviations follow from their
+            solution; with empty factors if there are no normal deviations.
+        """
+        moving = [
+            i
+            for i, pick in enumerate(choice)
+            if pick is not None and not isinstance(pick, Course)
+        ]
+        follow = [i for i, pick in enumerate(choice) if isinstance(pick, Course)]
+        plain, push, mixed = self._with_courses(choice, follow)
+        if not moving:
+            empty = np.zeros((0, len(push)))
+            return _Eliminated(
+                (), follow, mixed, np.zeros((1, 0)), empty, empty, plain, push, 0.0
+            )
+        band = self._factor(moving, choice)
+        across = mixed[:, :, moving].transpose(0, 2, 1).reshape(-1, len(push))
+        pull = self.pull[:, moving].ravel()
+        both = linalg.cho_solve_banded((band, True), np.column_stack([across, pull]))
+        inner = both[:, :-1]
+        alone = both[:, -1]
+        return _Eliminated(
+            tuple(moving),
+            follow,
+            mixed,
+            band,
+            across,
+            inner,
+            plain - cross(across, inner),
+            push - np.einsum("ng,n->g", across, alone),
+            float(np.sum(pull * alone)),
+        )
+
+    def _with_courses(
+        self, choice: MotionChoice, follow: Sequence[int]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Append the heights of courses to the fit's columns.
+
+        Args:
+            choice: of each parameter.
+            follow: numbers of the c parameters that follow a course.
+
+        Returns:
+            Normal equations (g + c, g + c) and (g + c,) with priors, and sums (n, g + c, p)
+            of each frame's products with the parameters.
+        """
+        g = len(self.push)
+        if not follow:
+            return self.plain, self.push, self.mixed
+        mixed = np.concatenate([self.mixed, np.zeros((len(self.pull), len(follow),
+                                self.pull.shape[1]))], axis=1)  # fmt: skip
+        size = g + len(follow)
+        plain = np.zeros((size, size))
+        plain[:g, :g] = self.plain
+        push = np.concatenate([self.push, np.zeros(len(follow))])
+        for at, i in enumerate(follow):
+            pick = choice[i]
+            assert isinstance(pick, Course)
+            shape = self.course(i, pick.shape)
+            mixed[:, g + at] = shape[:, None] * self.pairs[:, i]
+            push[g + at] = shape @ self.pull[:, i]
+        for at, i in enumerate(follow):
+            pick = choice[i]
+            assert isinstance(pick, Course)
+            own = self.course(i, pick.shape) @ mixed[:, :, i]
+            plain[g + at] = own
+            plain[:, g + at] = own
+            plain[g + at, g + at] += 1.0 / pick.width**2
+        return plain, push, mixed
+
+    def likelihood(self, choice: MotionChoice) -> float:
+        """Compute the logarithm of the restricted likelihood of a choice of motions, up
+        to a constant; the noise is eliminated.
+
+        Args:
+            choice: of each parameter.
+
+        Raises:
+            LinAlgError: the equations are singular.
+        """
+        part = self._eliminated(choice)
+        lower, rest = self._reduced(part)
+        return self._logarithm(choice, part, lower, rest)
+
+    def _reduced(self, part: _Eliminated) -> tuple[FloatArray, float]:
+        """Factorise reduced equations; returns the lower factor and the sum of squares that
+        is left.
+        """
+        lower = linalg.cholesky(part.left, lower=True, check_finite=False)
+        found = linalg.solve_triangular(lower, part.push, lower=True)
+        rest = self.total - part.explained - float(np.sum(found**2))
+        return lower, max(rest, LEAST_NOISE**2)
+
+    def _logarithm(
+        self, choice: MotionChoice, part: _Eliminated, lower: FloatArray, rest: float
+    ) -> float:
+        """Return the logarithm of the restricted likelihood of reduced equations."""
+        volume = 2.0 * (np.log(np.diag(lower)).sum() + np.log(part.band[0]).sum())
+        for i, pick in enumerate(choice):
+            if isinstance(pick, Course):
+                volume += 2.0 * math.log(pick.width)
+            elif pick is not None:
+                alone = linalg.cholesky_banded(self._diagonals(i, pick), lower=True)
+                volume -= 2.0 * float(np.log(alone[0]).sum())
+        return float(-0.5 * (volume + self.freedom * math.log(rest)))
+
+    def best_course(
+        self, choice: MotionChoice, i: int, widths: Sequence[float]
+    ) -> Course:
+        """Find the course of a parameter that is most likely beside the motions of a
+        choice.
+
+        Args:
+            choice: in which the parameter does not move.
+            i: number of the parameter.
+            widths: to try.
+
+        Raises:
+            LinAlgError: the equations are singular.
+        """
+        part = self._eliminated(choice)
+        lower, rest = self._reduced(part)
+        shapes = self.course(i, np.arange(self.courses.shape[1]))
+        power = np.einsum("nc,n->c", shapes**2, self.pairs[:, i, i])
+        across = part.mixed[:, :, i].T @ shapes
+        pull = self.pull[:, i] @ shapes
+        if part.moving:
+            beside = self.pairs[:, list(part.moving), i]
+            deviations = (beside[:, :, None] * shapes[:, None, :]).reshape(
+                -1, shapes.shape[1]
+            )
+            inner = linalg.cho_solve_banded((part.band, True), deviations)
+            power = power - np.einsum("nc,nc->c", deviations, inner)
+            across = across - part.across.T @ inner
+            pull = pull - self.pull[:, list(part.moving)].ravel() @ inner
+        over = linalg.solve_triangular(lower, across, lower=True)
+        power = np.maximum(power - np.einsum("gc,gc->c", over, over), 0.0)
+        pull = pull - linalg.solve_triangular(lower, part.push, lower=True) @ over
+        best = (-math.inf, Course(0, widths[0]))
+        for width in widths:
+            whole = power + 1.0 / width**2
+            left = np.maximum(rest - pull**2 / whole, LEAST_NOISE**2)
+            gain = -0.5 * (
+                np.log(whole) + 2.0 * math.log(width) + self.freedom * np.log(left)
+            )
+            at = int(np.argmax(gain))
+            best = max(best, (float(gain[at]), Course(at, width)))
+        return best[1]
+
+    def solved(self, choice: MotionChoice) -> Answer:
+        """Solve for the deviations of a choice."""
+        part = self._eliminated(choice)
+        inverse = linalg.inv(part.left)
+        fixed = inverse @ part.push
+        n = len(self.pull)
+        g = len(self.push)
+        p = len(part.moving)
+        rest = max(self.total - part.explained - float(fixed @ part.push), 0.0)
+        noise2 = rest / self.freedom
+        values = np.zeros((n, len(choice)))
+        sigma = np.full((n, len(choice)), np.nan)
+        taken = 0.0
+        covariance = inverse[:g, :g]
+        columns = fixed[:g].copy()
+        for at, i in enumerate(part.follow):
+            pick = choice[i]
+            assert isinstance(pick, Course)
+            shape = self.course(i, pick.shape)
+            values[:, i] = fixed[g + at] * shape
+            sigma[:, i] = math.sqrt(noise2 * inverse[g + at, g + at]) * np.abs(shape)
+            taken += 1.0
+        if p:
+            pull = self.pull[:, part.moving].ravel()
+            found = linalg.cho_solve_banded((part.band, True), pull) - part.inner @ fixed
+            square = np.einsum(
+                "ng,gh,nh->n", part.inner, inverse, part.inner, optimize=True
+            )
+            for begin in range(0, n * p, COLUMNS):
+                unit = np.eye(n * p, min(COLUMNS, n * p - begin), -begin)
+                solved = linalg.cho_solve_banded((part.band, True), unit)
+                across = np.arange(unit.shape[1])
+                square[begin + across] += solved[begin + across, across]
+            # Deviations are from their mean, which is the parameter's own value.
+            place = np.arange(n * p)
+            own = self.column[:, part.moving]
+            labels = (own - own.min() + 1) * p + np.arange(p)
+            kinds, first, mean_of = np.unique(
+                labels.ravel(), return_index=True, return_inverse=True
+            )
+            size = np.bincount(mean_of).astype(np.float64)
+            each = np.zeros((n * p, len(kinds)))
+            each[place, mean_of] = 1.0 / size[mean_of]
+            with_mean = linalg.cho_solve_banded((part.band, True), each)
+            with_fixed = -inverse @ (part.inner.T @ each)
+            with_mean -= part.inner @ with_fixed
+            of_means = np.einsum("nc,nd->cd", each, with_mean)
+            means = found @ each
+            values[:, part.moving] = (found - means[mean_of]).reshape(n, p)
+            centred = (
+                square - 2.0 * with_mean[place, mean_of] + np.diag(of_means)[mean_of]
+            )
+            # The fit's columns are then those values and the means together.
+            into = np.zeros((g, len(kinds)))
+            for kind, into_column in enumerate(own.ravel()[first].tolist()):
+                if into_column >= 0:
+                    into[into_column, kind] = self.scale[into_column]
+            both = with_fixed[:g] @ into.T
+            covariance = covariance + both + both.T + into @ of_means @ into.T
+            columns += into @ means
+            # What the data add to each deviation's prior is what they take of the freedom.
+            information = np.einsum("nii->ni", self.pairs)[:, part.moving].ravel()
+            taken += float(np.sum(np.minimum(information * square, 1.0)))
+            sigma[:, part.moving] = np.sqrt(noise2 * np.maximum(centred, 0.0)).reshape(
+                n, p
+            )
+        added = noise2 * (covariance - linalg.inv(self.plain))
+        added = added / np.outer(self.scale, self.scale)
+        inflation = self.freedom / max(self.freedom - taken, 1.0)
+        return Answer(values, sigma, added, inflation, columns / self.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class _Eliminated:
+    """Normal equations of the fit's g columns and of c courses' heights once the normal
+    deviations are eliminated.
+
+    Attributes:
+        moving: numbers of the eliminated parameters.
+        follow: numbers of those that follow a course.
+        mixed: (n, g + c, parameters) sums over each frame's products.
+        band, across, inner: factors of the eliminated deviations.
+        left, push: (g + c, g + c), (g + c,) the equations.
+        explained: sum of squares that the deviations alone explain.
+    """
+
+    moving: tuple[int, ...]
+    follow: Sequence[int]
+    mixed: FloatArray
+    band: FloatArray
+    across: FloatArray
+    inner: FloatArray
+    left: FloatArray
+    push: FloatArray
+    explained: float
+
+
+def _stiffness(size: int, waves: float) -> float:
+    """Compute the eigenvalue of the second differences at which amplitudes fall.
+
+    Args:
+        size: frames of the scan.
+        waves: half waves in the scan; inf for as many as frames or more.
+    """
+    if waves < size:
+        return (2.0 * math.sin(0.5 * math.pi * waves / size)) ** 2
+    return math.inf
+
+
+def _courses(sizes: Sequence[int]) -> FloatArray:
+    """Make ramps and jumps of scans; see `MotionModel.courses`.
+
+    A jump leaves two frames on either side: a single one that is elsewhere is no motion.
+    """
+    n = sum(sizes)
+    out = []
+    jumps = []
+    begin = 0
+    for size in sizes:
+        ramp = np.zeros(n)
+        ramp[begin : begin + size] = np.linspace(-0.5, 0.5, size)
+        out.append(ramp)
+        step = max(1, size // MOST_COURSES)
+        for frame in range(begin + 2, begin + size - 1, step):
+            jump = np.zeros(n)
+            jump[frame : begin + size] = 1.0
+            jumps.append(jump)
+        begin += size
+    return np.stack([*out, *jumps], axis=1)
