@@ -8,9 +8,9 @@ come out smooth, jitter comes out frame by frame, and motion that the tracks do 
 stays zero. The slope at either end is free: deviations assumed level there make a drift,
 which is not, look like a motion that turns once with the table.
 
-Object, source and panel that move the same way look alike (`RIVALS`): whichever is asked
-for, all of them are candidates. The most likely moves; what the others would make of the
-fit is averaged into its sigmas.
+Object, source and panel that move the same way look alike, and what moves is taken up in
+part by anything else that may: whichever is asked for, all are candidates. The most likely
+moves; what the others would make of the fit is averaged into its sigmas.
 
 The estimate is linear in small deviations. The caller puts them into the poses, fits
 again, and estimates the remainder, until they stay.
@@ -37,7 +37,7 @@ from flexdt.twin.calibration.fit.motion_search import Likely, most_likely, moves
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor, layout
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.motion import Motion, require_movable
+from flexdt.twin.geometry.motion import MOVABLE, Motion, require_movable
 from flexdt.twin.geometry.offsets import NAMES
 
 MOST_PASSES: Final = 6
@@ -46,12 +46,6 @@ SEARCHES: Final = 2
 BESIDE_BEAM: Final = 0.01
 """Standard deviation of the slope of a motion along the beam against it: 6 mm in 600;
 assumed."""
-RIVALS: Final = (
-    ("dO_x", "dS_x", "dD_x", "alpha"),
-    ("dO_y", "dS_y", "dD_y"),
-    ("dO_z", "dD_z"),
-)
-"""Parameters whose motions look alike: object, source and panel aside, up, along the beam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +54,8 @@ class MotionFit:
 
     Attributes:
         asked: parameters that were asked for; others move where the tracks show it.
-        motions: of each scan (group of frames): the asked parameters, and their rivals
-            that move.
+        motions: of each scan (group of frames): the asked parameters, and others that
+            move.
         covariance: (p, p) covariance that the unknown motion adds to the fit's
             parameters, edge units.
         likely: the priors of the deviations of all candidates, and their rivals.
@@ -106,9 +100,8 @@ class MotionFit:
 
 
 def candidates(asked: Sequence[str]) -> tuple[str, ...]:
-    """Return the asked parameters, then those whose motion looks like theirs."""
-    alike = [name for some in RIVALS if not set(some).isdisjoint(asked) for name in some]
-    return tuple(dict.fromkeys((*asked, *alike)))
+    """Return the asked parameters, then all others that may move."""
+    return tuple(dict.fromkeys((*asked, *MOVABLE)))
 
 
 def estimate_motion(
@@ -125,7 +118,7 @@ def estimate_motion(
     Args:
         fit: parameters that are the same in all frames, with poses that hold the motion
             `known`.
-        names: parameters that may move, of `geometry.motion.MOVABLE`; so may their rivals.
+        names: parameters that may move, of `geometry.motion.MOVABLE`; so may the others.
         known: motion that the fit's poses hold, found with the same names; None: no motion.
         search: for what moves, and how; else that of `known` is taken.
 
