@@ -123,12 +123,14 @@ def _what_moves(held: MotionFit) -> list[Finding]:
     out = []
     others = [n for n in held.moving if n not in held.asked]
     if others:
+        words = " and ".join(MOTION_WORDS[n] for n in others)
+        asked = ", ".join(held.asked)
+        how = "instead of" if set(held.moving).isdisjoint(held.asked) else "beside"
         out.append(
             warning(
                 "other_motion",
-                f"not {', '.join(held.asked)} alone: "
-                f"{', '.join(MOTION_WORDS[n] for n in others)} ({', '.join(others)}), which "
-                "explains the images far better; that was followed",
+                f"{words} ({', '.join(others)}) {how} {asked}: that explains the images far "
+                "better, and was followed",
             )
         )
     alike = open_motions(held, math.exp(OPEN_LOG_ODDS))
