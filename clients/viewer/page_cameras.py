@@ -20,7 +20,7 @@ from flexdt.clients.viewer.scenes.lamps import SKY, light_finely
 from flexdt.clients.viewer.scenes.layers import Nodes
 from flexdt.clients.viewer.scenes.views import Fitted, Standpoint
 from flexdt.clients.viewer.scenes.world import MM
-from flexdt.clients.viewer.viser_gate import Scenes, set_nodes
+from flexdt.clients.viewer.viser_gate import Scenes, set_camera, set_nodes
 from flexdt.twin.geometry.conventions import FloatArray
 
 FAR_RATIO = 1.3
@@ -193,7 +193,7 @@ class SceneClients:
             way = np.subtract(preset.position, preset.look_at)
             middle = at * MM
             x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
-            aim(
+            set_camera(
                 client,
                 replace(preset, position=(x, y, z), look_at=tuple(middle.tolist())),
             )
@@ -227,7 +227,7 @@ class SceneClients:
         if self._sent.get(client.client_id) == camera and self._untouched(client):
             return
         self._sent[client.client_id] = camera
-        aim(client, camera)
+        set_camera(client, camera)
 
     def _untouched(self, client: viser.ClientHandle) -> bool:
         """Check that a client's camera is still where it was put, within a share of its
@@ -292,19 +292,6 @@ def _now(client: viser.ClientHandle) -> Standpoint:
         for v in (c.position, c.look_at, c.up_direction)
     )
     return Standpoint(position, look_at, up, float(c.fov))
-
-
-def aim(client: viser.ClientHandle, camera: Standpoint) -> None:
-    """Set up direction, place, target and field of view [rad] of a client's camera in one
-    message.
-
-    It does not wait for the browser.
-    """
-    with client.atomic():
-        client.camera.up_direction = camera.up
-        client.camera.position = camera.position
-        client.camera.look_at = camera.look_at
-        client.camera.fov = camera.fov
 
 
 def _theme(client: viser.ClientHandle, dark: bool, fine: bool) -> None:

@@ -28,8 +28,10 @@ import websockets.asyncio.server as library
 from viser._messages import (
     Message,
     SceneNodeUpdateMessage,
+    SetCameraFovMessage,
     SetCameraLookAtMessage,
     SetCameraPositionMessage,
+    SetCameraUpDirectionMessage,
     SetSceneNodeVisibilityMessage,
     ShareUrlDisconnect,
     ShareUrlRequest,
@@ -207,6 +209,34 @@ def _changes(nodes: Nodes) -> Iterator[Message]:
             yield SetSceneNodeVisibilityMessage(name, properties["visible"])
         if rest:
             yield SceneNodeUpdateMessage(name, rest)
+
+
+def set_camera(client: viser.ClientHandle, camera: Standpoint) -> None:
+    """Set up direction, place, target and field of view [rad] of a client's camera in one
+    message.
+
+    It does not wait for the browser.
+
+    viser's own setters leave out what its record of the camera has already. A frame that
+    reports an older camera replaces that record, also between two of them: the target was
+    then left out after its place had moved it. So all four are queued, last, in any case.
+
+    Args:
+        client: of viser, whose first report has come.
+        camera: its new one.
+    """
+    with client.atomic():
+        client.camera.up_direction = camera.up
+        client.camera.position = camera.position
+        client.camera.look_at = camera.look_at
+        client.camera.fov = camera.fov
+        for message in (
+            SetCameraUpDirectionMessage(camera.up),
+            SetCameraPositionMessage(camera.position),
+            SetCameraLookAtMessage(camera.look_at),
+            SetCameraFovMessage(camera.fov),
+        ):
+            client._websock_connection.queue_message(message)
 
 
 def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:

@@ -16,15 +16,17 @@ import tempfile
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import msgpack
+import numpy as np
 import pytest
 import viser
 import websockets.asyncio.server as library
 from hypothesis import given
 from hypothesis import strategies as st
 from viser import _messages
+from viser._viser import CameraHandle
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 from websockets.typing import Origin, Subprotocol
@@ -33,6 +35,7 @@ from flexdt.clients.viewer import page_messages
 from flexdt.clients.viewer import viser_gate as gate
 from flexdt.clients.viewer.front import COOKIE, Front
 from flexdt.clients.viewer.page_messages import ALLOWED, Unwanted, admitted
+from flexdt.clients.viewer.scenes.views import Standpoint
 from flexdt.clients.viewer.viser_gate import GateError, Scenes
 
 TOKEN = "a-token-of-sixteen-or-more"
@@ -326,6 +329,71 @@ def test_a_page_opens_no_tunnel(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with_scenes(work)
     assert told == ["'ShareUrlRequest'", "no message", "text", "'ShareUrlDisconnect'"]
+
+
+class Reporting:
+    """A frame whose report of its first camera reaches viser after some of its orders.
+
+    Args:
+        after: orders, before which viser has a record of another camera.
+    """
+
+    FIRST: ClassVar = {
+        "up": (0.0, 0.0, 1.0),
+        "position": (-5.0, 0.0, 0.0),
+        "look_at": (-0.2, 0.3, -0.1),
+        "fov": 0.5,
+    }
+
+    def __init__(self, after: int) -> None:
+        self.after, self.orders, self.pose = after, 0, dict(self.FIRST)
+        self.camera, self._websock_connection = CameraHandle(self), self  # type: ignore[arg-type]
+        self.report()
+
+    atomic = contextlib.nullcontext
+
+    def report(self) -> None:
+        """As `handle_camera_message` of viser: its record becomes what the frame had."""
+        self.camera._state = dataclasses.replace(
+            self.camera._state,
+            position=np.array(self.FIRST["position"]),
+            look_at=np.array(self.FIRST["look_at"]),
+            up_direction=np.array(self.FIRST["up"]),
+            fov=self.FIRST["fov"],
+            update_timestamp=1.0,
+        )
+
+    def queue_message(self, message: _messages.Message) -> None:
+        match message:
+            case _messages.SetCameraUpDirectionMessage():
+                self.pose["up"] = message.position
+            case _messages.SetCameraPositionMessage():
+                self.pose["position"] = message.position
+            case _messages.SetCameraLookAtMessage():
+                self.pose["look_at"] = message.look_at
+            case _messages.SetCameraFovMessage():
+                self.pose["fov"] = message.fov
+        self.orders += 1
+        if self.orders == self.after:
+            self.report()
+
+
+@pytest.mark.parametrize("after", range(9))
+@pytest.mark.parametrize("keeps", ["", "look_at", "fov", "position", "look_at fov"])
+def test_a_camera_is_as_it_was_set_whatever_the_frame_reports_meanwhile(
+    after: int, keeps: str
+) -> None:
+    """And however much of it is as it was: a frame opens with the right target, from afar."""
+    wanted = {
+        "up": (0.0, 0.6, 0.8),
+        "position": (0.5, -0.2, 0.2),
+        "look_at": (-0.1, 0.4, 0.0),
+        "fov": 0.7,
+    }
+    wanted |= {name: Reporting.FIRST[name] for name in keeps.split()}
+    frame = Reporting(after)
+    gate.set_camera(frame, Standpoint(**wanted))  # type: ignore[arg-type]
+    assert frame.pose == wanted
 
 
 def test_folders_of_killed_viewers_are_removed_and_those_of_others_stay() -> None:
