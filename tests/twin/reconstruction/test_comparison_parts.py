@@ -88,13 +88,18 @@ def test_geometries_of_the_same_sources_share_a_circle() -> None:
     assert circle_of(wider).radius == pytest.approx(250.0)
 
 
-@pytest.mark.parametrize("rows", [6, 8])
+@pytest.mark.filterwarnings("ignore:.* layers of the grid lie")
+@pytest.mark.parametrize("side", [50, 51])
+@pytest.mark.parametrize("more", [0, 4])
+@pytest.mark.parametrize("rows", [6, 7, 8])
 def test_voxels_side_by_side_are_those_of_columns(
-    rows: int, monkeypatch: pytest.MonkeyPatch
+    rows: int, more: int, side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also above and below the panel, and on the axis, where voxels are just before its
+    outermost rows."""
     images = np.random.default_rng(rows).random((40, rows, 60)).astype(np.float32)
     scan = ConeVec.circular(sod=200.0, sdd=400.0, angles=40, shape=(rows, 60), pixel=0.5)
-    grid = Grid((rows, 50, 50), 0.25)
+    grid = Grid((rows + more, side, side), 0.25)
     beside = fdk(images, scan, grid, errors=False).data
     monkeypatch.setattr(fdk_plan, "FEW_ROWS", 0)
     columns = fdk(images, scan, grid, errors=False).data

@@ -52,6 +52,7 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
     reach,
     redundancy,
 )
+from flexdt.twin.reconstruction.feldkamp import fdk_plan
 from flexdt.twin.reconstruction.feldkamp.filtering import filtered, ramp
 from tests.twin.reconstruction.scans import CENTRE, MU, RADIUS, ball, circle, measure
 
@@ -229,6 +230,29 @@ def test_what_some_views_see_above_or_below_the_panel_is_right_or_nan(span, many
             values = found[inside & (seen >= lowest) & ~lost] / 0.02
             assert values.size > 40
             assert values.mean() == pytest.approx(1.0, abs=within)
+
+
+@pytest.mark.parametrize("rows", [5, 8, 9, 16, 33])
+@pytest.mark.parametrize("more", [0, 2])
+@pytest.mark.parametrize("few", [0, 8])
+def test_voxels_before_a_panels_edge_are_as_those_before_its_middle(
+    rows: int, more: int, few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cylinder cut off at top and bottom by panels of few rows and of many; voxels on the
+    axis are exactly before rows, the outermost ones or those that repeat them. And some views
+    at a time are all of them."""
+    monkeypatch.setattr(fdk_plan, "FEW_ROWS", few)
+    scan = circle(60, pixel=1.6, sod=400.0, sdd=800.0)
+    images = ellipses([(0.0, 0.0, 12.0, 12.0, 0.0, 0.02)], scan, (rows, 41))
+    grid = Grid((rows + more, 21, 21), 0.8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        whole = plain_fdk(images, scan, grid.blank()).data
+        chunks = lambda: (images[i : i + 7] for i in range(0, 60, 7))  # noqa: E731
+        parts = fdk_parts(chunks, scan, (rows, 41), grid.blank(), errors=False).data
+    on_axis = whole[:, 10, 10]
+    np.testing.assert_allclose(on_axis, np.median(on_axis), rtol=1e-3)
+    np.testing.assert_allclose(parts, whole, atol=1e-6 * np.nanmax(whole))
 
 
 def test_a_narrow_overlap_leaves_no_mark_on_the_axis():

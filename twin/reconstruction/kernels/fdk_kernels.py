@@ -55,6 +55,9 @@ MARGIN = 32
 """Samples after the end of a line that may be read or written, but do not count."""
 POINT = 44
 """Bits behind the point of a position on a line."""
+EDGE_ROWS = 1e-3
+"""Distance beyond the outermost rows within which a voxel is seen [rows]: voxels on the axis are
+often exactly before these rows, where rounding must not decide."""
 
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _INTS = ir.VectorType(ir.IntType(32), LANES)
@@ -287,13 +290,33 @@ def _column(g, cols, x, y):
     return depth, c
 
 
+@inline
+def _layers(start, step, rows, count):
+    """Find which of the voxels above one another a view sees: those whose rows are on the
+    panel, or beside it by `EDGE_ROWS`.
+
+    Args:
+        start: row of the lowest voxel, a fraction.
+        step: change of the row a voxel, negative.
+        rows: of the image.
+        count: number of voxels.
+
+    Returns:
+        The lowest and the highest one; the highest is below the lowest if there is none.
+    """
+    every = 1.0 / step
+    lowest = max(0, math.ceil((rows - 1 + EDGE_ROWS - start) * every))
+    highest = min(count - 1, math.floor((-EDGE_ROWS - start) * every))
+    return lowest, highest
+
+
 @kernel
 def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
     """Add one view to the voxels above one another at (x, y), weighted by 1 / depth^2;
     see `backproject`.
 
     Nothing is added where the column is beyond the image or behind the source, and only
-    to voxels whose rows are on the panel. Values are interpolated linearly between
+    to voxels whose rows are on the panel (`_layers`). Values are interpolated linearly between
     columns and rows.
 
     Args:
@@ -316,11 +339,9 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
     # The row of voxel k is start + k step.
     step = -dz * g[9] * inverse
     start = g[10] - (z0 - g[2]) * g[9] * inverse
-    # Rows fall with z (step < 0): voxels lowest to highest have 0 <= start + k step <= rows -
-    # 1, with a margin for rounding.
-    every = 1.0 / step
-    lowest = max(0, math.ceil((rows - 1 - start) * every + 1e-3))
-    highest = min(acc.size - 1, math.floor(-start * every - 1e-3))
+    # Rows fall with z (step < 0). A place just before the first row is read along the line
+    # through the first two, one just behind the last is the last, which is there twice.
+    lowest, highest = _layers(start, step, rows, acc.size)
     if highest < lowest:
         return
     # The column between image columns i and i + 1, only over the rows that are needed, from a
@@ -356,14 +377,15 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
         at: (n,) int32, filled: index of the sample before each place, column * rows +
             row.
         across, down: (n,) filled: fractions of a column and a row behind it.
-        weight: (n,) filled: 1 / depth^2; 0 for voxels behind the source or off the image.
+        weight: (n,) filled: 1 / depth^2; 0 for voxels behind the source or off the image
+            (above and below it by more than `EDGE_ROWS`).
         size: columns and rows of the image.
         base: the column to which `c` is relative.
         zero: the voxel of which `depth`, `c` and `row` are.
         slope: change a voxel of the depth.
         turn, rise: change a voxel of column and row times the depth.
     """
-    none = np.float32(0.0)
+    none, edge = np.float32(0.0), np.float32(EDGE_ROWS)
     first, last, lowest = (
         np.float32(-base),
         np.float32(size[0] - 1 - base),
@@ -378,8 +400,8 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
         part = inverse * inverse if far > none else none
         part = part if column >= first else none
         part = part if column <= last else none
-        part = part if line >= none else none
-        weight[k] = part if line <= lowest else none
+        part = part if line >= -edge else none
+        weight[k] = part if line <= lowest + edge else none
         column, line = min(max(column, first), last), min(max(line, none), lowest)
         i = np.int32(column)
         i = min(i - np.int32(column < np.float32(i)), np.int32(size[0] - 2 - base))
@@ -612,10 +634,8 @@ def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
     if depth == 0.0:
         return 0.0, 0.0
     inverse = 1.0 / depth
-    every = -1.0 / (dz * g[9] * inverse)
     start = g[10] - (z0 - g[2]) * g[9] * inverse
-    lowest = max(0, math.ceil((rows - 1 - start) * every))
-    highest = min(seen.size - 2, math.floor(-start * every))
+    lowest, highest = _layers(start, -dz * g[9] * inverse, rows, seen.size - 1)
     weight = weights[int(c)]
     # A source that moves on by an angle turns the line to a voxel by radius cos(fan) /
     # distance.

@@ -18,6 +18,8 @@ import math
 import numpy as np
 from numba import config, cuda
 
+from flexdt.twin.reconstruction.kernels.fdk_kernels import EDGE_ROWS
+
 BLOCK = (32, 4)
 """Threads a block: along z, and voxel columns along x; each is one warp."""
 RUN = 8
@@ -403,11 +405,12 @@ def backproject(images, cols, rows, views, first, size, volume):
                         views[view, 10]
                         - (first[2] - views[view, 2]) * views[view, 9] * inverse
                     )
-                    # Rows fall with z. The margin at the edges is that of the processor's
-                    # kernel.
+                    # Rows fall with z. What is seen at the edges is as in the processor's
+                    # kernels.
                     every = 1.0 / step
-                    low = max(0, int(math.ceil((rows - 1 - start) * every + 1e-3)))  # noqa: RUF046
-                    high = min(nz - 1, int(math.floor(-start * every - 1e-3)))  # noqa: RUF046
+                    end = rows - 1 + EDGE_ROWS
+                    low = max(0, int(math.ceil((end - start) * every)))  # noqa: RUF046
+                    high = min(nz - 1, int(math.floor((-EDGE_ROWS - start) * every)))  # noqa: RUF046
                     lowest[warp, lane] = low
                     highest[warp, lane] = high
                     columns[warp, lane] = i
@@ -430,9 +433,10 @@ def backproject(images, cols, rows, views, first, size, volume):
             for m in range(RUN):
                 k = begin + m * BLOCK[0]
                 if low <= k <= high:
-                    j = min(max(narrow(at >> BITS), 0), rows - 1)
+                    held = max(at, 0)
+                    j = min(narrow(held >> BITS), rows - 1)
                     after = place(min(j + 1, rows - 1))
-                    down = np.float32(place(at)) * UNIT
+                    down = np.float32(place(held)) * UNIT
                     up = images[left + place(j)]
                     up += across * (images[right + place(j)] - up)
                     under = images[left + after]
