@@ -1,11 +1,13 @@
 """Does a spoilt scan get the right name, and is none offered that is wrong?
 
-`python examples/research/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--json]` spoils
-scans of drawn bead phantoms in the ways of `faults_drawn.KINDS`, calibrates each and says
-whether the cause was named right, vaguely or not at all, and how many sigmas the worst of an
-answer that was offered is off. More than four is a confident wrong answer, and the command
-fails. `--json` prints a line as soon as a scan is judged, one scan of every kind before the
-second of any, and the sums last.
+`python examples/research/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--pairs 0]
+[--json]` spoils scans of drawn bead phantoms in the ways of `faults_drawn.KINDS`, calibrates
+each and says whether the cause was named right, vaguely or not at all, and how many sigmas the
+worst of an answer that was offered is off. More than four is a confident wrong answer, and the
+command fails. `--pairs N` draws N scans with two causes or of unusual setups instead
+(`faults_paired`; a name of one, `strain_z+frame_lost@helix`, is a kind, too). `--json` prints
+a line as soon as a scan is judged, one scan of every kind before the second of any, and the
+sums last.
 
 Geometry and shadows come from `faults_drawn`; nothing of the fit or of its diagnoses is in
 them.
@@ -23,6 +25,7 @@ from typing import Final
 
 import numpy as np
 from faults_drawn import KINDS, Faulty, drawn
+from faults_paired import ALONE, PAIRS, SETUPS, drawn_together
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
@@ -54,7 +57,8 @@ class Scored:
 
     Attributes:
         kind, seed: which.
-        verdict: right, vague or none; right without a name where nothing had to be said.
+        verdict: right, part, vague or none; right without a name where nothing had to be
+            said, part where one cause of two was named.
         offered: numbers were offered.
         worst: largest error of them in sigmas; 0 if none were offered.
         where: the parameter that is so far off.
@@ -103,9 +107,9 @@ def calibrated(
         outlines = replace(spots, bias=np.ones(len(frame)))
         looks.append(FrameSpots(outlines, FrameState.USABLE))
     b = scan.believed
-    poses = Poses.upright(
-        [0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, np.radians(b.angles)
-    )
+    rise = b.pitch / 360.0 * b.angles
+    stage = np.stack([0 * rise, 0 * rise + b.sod, rise], axis=1)
+    poses = Poses.upright([0, 0, 0], stage, [0, b.sdd, 0], b.pixel, np.radians(b.angles))
     request = CalibrationRequest(
         free=tuple(dict.fromkeys((*b.free, *free))), start=Offsets.from_edge(b.held),
         priors=b.priors, second_look=False, per_frame=per_frame,
@@ -116,18 +120,24 @@ def calibrated(
 
 
 def scored(kind: str, seed: int) -> Scored:
-    """Draw a scan of a kind, calibrate it, and judge findings and values; a refusal is
-    scored, too.
+    """Draw a scan of a kind, or of a pair or setup (`faults_paired`), calibrate it, and
+    judge findings and values; a refusal is scored, too.
     """
-    scan = drawn(kind, seed)
+    if kind in KINDS:
+        scan = drawn(kind, seed)
+        causes: tuple[tuple[str, ...], ...] = (scan.names,)
+    else:
+        scan, causes = drawn_together(kind, seed)
     try:
         result = calibrated(scan)
     except TwinError as error:
         said: tuple[str, ...] = (f"refused: {error}",)
-        return Scored(kind, seed, _verdict(scan, said, False), False, 0.0, "", said)
+        return Scored(
+            kind, seed, _verdict(scan, causes, said, False), False, 0.0, "", said
+        )
     said = tuple(f"{f.code}: {f.text}" for f in result.findings)
     worst, where = worst_error(result, scan) if result.identifiable else (0.0, "")
-    verdict = _verdict(scan, said, result.identifiable)
+    verdict = _verdict(scan, causes, said, result.identifiable)
     return Scored(kind, seed, verdict, result.identifiable, worst, where, said)
 
 
@@ -164,11 +174,14 @@ def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
     return worst, where
 
 
-def _verdict(scan: Faulty, said: Sequence[str], offered: bool) -> str:
-    """Judge what was said of a scan: "right", "vague" or "none".
+def _verdict(
+    scan: Faulty, causes: Sequence[Sequence[str]], said: Sequence[str], offered: bool
+) -> str:
+    """Judge what was said of a scan: "right", "part", "vague" or "none".
 
     Right is every expected finding without a false one, or nothing where the scan may be
-    silent and was offered. Vague is something else, none nothing.
+    silent and was offered. Part is one cause's findings of several. Vague is something
+    else, none nothing.
     """
     named = all(any(re.search(one, s) for s in said) for one in scan.names)
     others = [
@@ -181,7 +194,31 @@ def _verdict(scan: Faulty, said: Sequence[str], offered: bool) -> str:
         return "right"
     if scan.names and named:
         return "vague" if false else "right"
+    if len(causes) > 1 and not false:
+        for names in causes:
+            if names and all(any(re.search(one, s) for s in said) for one in names):
+                return "part"
     return "vague" if said else "none"
+
+
+def _drawn_names(args: argparse.Namespace) -> list[tuple[str, int]]:
+    """List the scans to be judged: every kind in turn, or pairs and setups drawn from the
+    seed: half of them pairs, a quarter each single causes and pairs of an unusual setup.
+    """
+    if not args.pairs:
+        seeds = range(args.seed, args.seed + args.each)
+        return [(kind, seed) for seed in seeds for kind in args.kinds.split(",")]
+    wanted = set(args.kinds.split(",")) | {"as_assumed"}
+    pairs = [p for p in PAIRS if wanted.issuperset(p.split("+"))]
+    alone = sorted({k for p in pairs for k in p.split("+")} - ALONE)
+    out = []
+    for i in range(args.pairs):
+        rng = np.random.default_rng([args.seed, i])
+        name = str(rng.choice(pairs if i % 4 else alone))
+        if i % 4 < 2:
+            name += f"@{rng.choice(list(SETUPS))}"
+        out.append((name, args.seed + i))
+    return out
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -195,15 +232,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--each", type=int, default=2, help="scans of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument(
+        "--pairs", type=int, default=0, help="scans of drawn pairs and setups"
+    )
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
-    kinds = args.kinds.split(",")
     all_of_them = []
-    for seed in range(args.seed, args.seed + args.each):
-        for kind in kinds:
-            all_of_them.append(scored(kind, seed))
-            if args.json:
-                print(json.dumps(asdict(all_of_them[-1])), flush=True)
+    for kind, seed in _drawn_names(args):
+        all_of_them.append(scored(kind, seed))
+        if args.json:
+            print(json.dumps(asdict(all_of_them[-1])), flush=True)
     wrong = [s for s in all_of_them if s.wrong]
     right = sum(s.verdict == "right" for s in all_of_them)
     offered = [s for s in all_of_them if s.offered]

@@ -48,6 +48,7 @@ class World:
         sod, sdd, pixel: [mm].
         arc: the object turns by so much while a frame is exposed [deg].
         size: (n,) of the phantom in each frame, as a factor; None: it stays.
+        pitch: the stage rises by so much a turn [mm].
     """
 
     beads: Array
@@ -61,12 +62,13 @@ class World:
     pixel: float = PIXEL
     arc: float = 0.0
     size: Array | None = None
+    pitch: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Believed:
     """What calibration is told; `arc` is the part of a step that an exposure lasts, if anybody
-    says it."""
+    says it, `pitch` the stage's rise a turn [mm]."""
 
     beads: Array
     radii: Array
@@ -78,6 +80,12 @@ class Believed:
     held: Mapping[str, float] = field(default_factory=dict)
     priors: Mapping[str, float] = field(default_factory=dict)
     arc: float | None = None
+    pitch: float = 0.0
+
+    @property
+    def step(self) -> float:
+        """Angle between frames [deg]."""
+        return float(self.angles[1] - self.angles[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +200,8 @@ def shadows(world: World) -> tuple[Array, Array]:
 
     zero = np.zeros(n)
     tau = np.stack([of("tau_x"), of("tau_z"), zero], axis=1)
-    foot = np.stack([of("dO_x"), world.sod + of("dO_z"), of("dO_y")], axis=1) + tau
+    rise = world.pitch / 360.0 * world.angles
+    foot = np.stack([of("dO_x"), world.sod + of("dO_z"), of("dO_y") + rise], axis=1) + tau
     spin = Rotation.from_rotvec(
         np.outer(-np.radians(world.angles + of("alpha")), [0, 0, 1])
     )
@@ -270,8 +279,6 @@ def drawn(kind: str, seed: int) -> Faulty:
     """Draw a scanner, a phantom and a scan with the fault `kind`, of KINDS, and compute
     its noisy spots.
 
-    Spots beyond the panel are left out, those of a frame are in random order.
-
     Args:
         kind: of the fault.
         seed: of all draws, together with the kind.
@@ -281,6 +288,11 @@ def drawn(kind: str, seed: int) -> Faulty:
         parameter, and the expected findings.
     """
     rng = np.random.default_rng([seed, *kind.encode()])
+    return taken(KINDS[kind](right_draft(rng), rng), rng)
+
+
+def right_draft(rng: Rng) -> Draft:
+    """Draw a scanner, a phantom and a full turn without a fault."""
     n, k = int(rng.choice([24, 36, 60])), int(rng.integers(5, 8))
     beads = phantom(rng, k)
     radii = np.full(k, float(rng.uniform(0.8, 1.5)))
@@ -297,14 +309,18 @@ def drawn(kind: str, seed: int) -> Faulty:
         sod,
         sdd,
     )
-    draft = KINDS[kind](
-        Draft(
-            world,
-            Believed(beads, radii, angles, sod, sdd),
-            float(rng.uniform(0.005, 0.04)),
-        ),
-        rng,
+    return Draft(
+        world,
+        Believed(beads, radii, angles, sod, sdd),
+        float(rng.uniform(0.005, 0.04)),
     )
+
+
+def taken(draft: Draft, rng: Rng) -> Faulty:
+    """Compute the noisy spots of a draft.
+
+    Spots beyond the panel are left out, those of a frame are in random order.
+    """
     centres, sizes = shadows(draft.world)
     if draft.slow_px > 0:
         centres += draft.slow_px * _slow(rng, centres.shape, draft.slow_part)
@@ -547,7 +563,7 @@ def _gap(angles: Array, rng: Rng) -> Array:
     """Frames are missing in the middle, and the others were numbered on."""
     n = len(angles)
     at, gap = int(rng.integers(n // 4, 3 * n // 4)), int(rng.integers(1, 4))
-    return angles + 360.0 / n * gap * (np.arange(n) >= at)
+    return angles + (angles[1] - angles[0]) * gap * (np.arange(n) >= at)
 
 
 def _stuttered(draft: Draft, rng: Rng) -> Draft:
@@ -918,7 +934,7 @@ def _exposed_long(draft: Draft, rng: Rng) -> Draft:
     below 3 deg silence is right, too.
     """
     draft = _usual(draft, rng)
-    step = 360.0 / len(draft.world.angles)
+    step = draft.believed.step
     share = float(rng.uniform(0.1, 1.0))
     world = replace(draft.world, arc=share * step)
     return replace(draft, world=world, names=("exposure_arc|turns while a frame is exposed",),
@@ -929,7 +945,7 @@ def _exposed_long(draft: Draft, rng: Rng) -> Draft:
 def _exposed_as_said(draft: Draft, rng: Rng) -> Draft:
     """Expose while the stage turns, with the exposure's length in the script."""
     draft = _exposed_long(draft, rng)
-    share = draft.world.arc * len(draft.world.angles) / 360.0
+    share = draft.world.arc / draft.believed.step
     return replace(draft, believed=replace(draft.believed, arc=share))
 
 
@@ -943,7 +959,7 @@ def _renumbered(shift: int) -> Fault:
         draft = _usual(draft, rng)
         n = len(draft.world.angles)
         at = int(rng.integers(1, n))
-        step = 360.0 / n
+        step = draft.believed.step
         angles = draft.world.angles + step * shift * (np.arange(n) >= at)
         world = replace(draft.world, angles=angles)
         code = "frame_numbers" if at < n - 1 else "frames_inconsistent|frame_numbers"

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from flexdt.twin.calibration.diagnose import Finding, listed
 from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.fitted import (
@@ -31,6 +33,7 @@ from flexdt.twin.calibration.fit.problem import (
     from_printed_reading,
     to_printed_reading,
 )
+from flexdt.twin.calibration.fit.residual_structure import larger
 from flexdt.twin.calibration.fits_of_scans import (
     MEASURED,
     fit_with_loose_priors,
@@ -143,8 +146,11 @@ def check_fixed(
         found.append(narrow_priors(verdict))
         given = {**asked.priors, **priors_of(state.scans, asked)}
         asked = replace(asked, priors=loosened(given, verdict.factor))
+    before = fit
     if found or fit is not free_fit:
         fit, explained = explain(state, asked, _fit_with_fixed(state, asked, fit))
+    if found:
+        fit = _with_stated_priors(fit, before)
     fit = _doubted(fit, free_fit, fixed)
     if exact:
         found += listed(judge_exact(fit, refit_scans(state, usual, fit), exact))
@@ -273,6 +279,22 @@ def _doubted(
         return fit
     doubt = {n: free_fit.values.get(n, v) - v for n, v in fit.values.items()}
     return replace(fit, certificate=widened(fit.certificate, doubt))
+
+
+def _with_stated_priors(fit: FitResult, stated: FitResult) -> FitResult:
+    """Widen the intervals of a fit to widened priors so that they hold where the stated
+    ones are right, too: another cause may move the images as a scanner elsewhere does.
+
+    Args:
+        fit: with the widened priors.
+        stated: with the stated ones, of the same parameters; else nothing changes.
+    """
+    if list(fit.values) != list(stated.values):
+        return fit
+    own = fit.certificate.covariance
+    off = np.array([stated.values[n] - v for n, v in fit.values.items()])
+    both = larger(own, stated.certificate.covariance + np.outer(off, off))
+    return replace(fit, certificate=widened(fit.certificate, both - own))
 
 
 def _fit_with_fixed(

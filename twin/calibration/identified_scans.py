@@ -24,6 +24,7 @@ from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, n
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.geometry.offsets import Offsets
 
 MAX_BEAD_SHARE: Final = 0.6
 """Largest part of a frame's spots that are beads for it to be tried at another frame's
@@ -62,7 +63,7 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             continue
         seek = partial(attempt, detections, state.model, scan.poses, start=request.start)
         found = seek()
-        numbers = _numbers(found, detections, state.model, scan)
+        numbers = _numbers(found, detections, state.model, scan, request.start)
         if numbers is not None and (odd := numbers.judged(scan.name)) is not None:
             findings.append(odd)
             if odd.forbids:
@@ -74,7 +75,7 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             )
             found = seek()
         finding = explain_identification(
-            found, detections, state.model, scan.poses, scan.name
+            found, detections, state.model, scan.poses, scan.name, request.start
         )
         if request.per_frame and finding is not None and finding.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
@@ -114,6 +115,7 @@ def _numbers(
     detections: Sequence[Detections],
     model: BeadModel,
     scan: Scan,
+    start: Offsets,
 ) -> FrameNumbers | None:
     """Find the angle that each frame shows, if some frames do not agree with the others.
 
@@ -129,6 +131,7 @@ def _numbers(
         detections: spots of each frame.
         model: the beads.
         scan: its poses and name.
+        start: offsets that are known before.
 
     Returns:
         None if all agree, or no angles fit.
@@ -140,7 +143,9 @@ def _numbers(
             return None
     n = len(counts)
     parts = [slice(0, n // 2), slice(n // 2, n), slice(n // 4, n - n // 4)]
-    halves = (attempt(detections[part], model, scan.poses[part]) for part in parts)
+    halves = (
+        attempt(detections[part], model, scan.poses[part], start=start) for part in parts
+    )
     if found is None or found.typical_px > CLEAR_PX:
         first = []
     else:
@@ -154,15 +159,19 @@ def _numbers(
         )
         if numbers is None:
             continue
-        if not numbers.renumbered or _fits_anew(numbers, detections, model, scan):
+        if not numbers.renumbered or _fits_anew(numbers, detections, model, scan, start):
             return numbers
     return None
 
 
 def _fits_anew(
-    numbers: FrameNumbers, detections: Sequence[Detections], model: BeadModel, scan: Scan
+    numbers: FrameNumbers,
+    detections: Sequence[Detections],
+    model: BeadModel,
+    scan: Scan,
+    start: Offsets,
 ) -> bool:
     """Check whether the spots of a scan fit the phantom at the angles that its frames show."""
     shown = replace(scan.poses, angle=numbers.angles(scan.poses.angle))
-    found = attempt(detections, model, shown)
+    found = attempt(detections, model, shown, start=start)
     return found is not None and convincing(found)

@@ -198,6 +198,7 @@ def identify(
         poses[chosen],
         free=SIX,
         shape=shapes[chosen],
+        start=start,
     )
     base = np.array([getattr(start, n) for n in SIX])
     turn = np.eye(len(SIX))[SIX.index("alpha")] * 2.0 * math.pi / how.starts
@@ -207,7 +208,12 @@ def identify(
     hypotheses = hypotheses[: max(MAX_FINALISTS, how.starts // 2)]
     hypotheses = _best_first(_rounds(problem, some, h, NARROW_PX) for h in hypotheses)
     whole = build_problem(
-        np.full((len(poses), len(model), 2), np.nan), model, poses, free=SIX, shape=shapes
+        np.full((len(poses), len(model), 2), np.nan),
+        model,
+        poses,
+        free=SIX,
+        shape=shapes,
+        start=start,
     )
     finals = _best_first(
         _finish(whole, scene, h, how) for h in _different(hypotheses)[:MAX_FINALISTS]

@@ -37,7 +37,7 @@ from flexdt.twin.calibration.fit.problem import (
     curvature,
     edge_factor,
 )
-from flexdt.twin.calibration.fit.residual_structure import MOVING
+from flexdt.twin.calibration.fit.residual_structure import MOVING, larger
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.panel import Border, PanelModel
 
@@ -118,15 +118,12 @@ class Found:
         applied: names of causes that are columns of the fit.
         open: names of causes that the data neither show nor exclude.
         strain: of the phantom, (10,) and its covariance (10, 10); None: it is not judged.
-        elsewhere: whether some beads alone that the first fit left out, three at least being
-            left, are more likely to be elsewhere than all beads to be off.
     """
 
     odds: dict[str, float] = field(default_factory=dict)
     applied: tuple[str, ...] = ()
     open: tuple[str, ...] = ()
     strain: tuple[FloatArray, FloatArray] | None = None
-    elsewhere: bool = False
 
     def named(self, name: str) -> bool:
         """Check whether a cause of the fit is beyond doubt."""
@@ -165,6 +162,7 @@ class Candidates:
         known: Known,
         borders: Sequence[Border],
         alike: float = 1.0,
+        left_out: Sequence[int] = (),
     ) -> None:
         """Tabulate the residuals' derivatives with respect to all causes, residuals of
         bad spots (beyond `OUTLIER_SIGMAS`) weighted less.
@@ -177,19 +175,20 @@ class Candidates:
             known: statements on the phantom and the positions.
             borders: panel borders that are causes, too.
             alike: number of neighbouring frames whose residuals count as one.
+            left_out: beads that are elsewhere: their positions are evidence of nothing.
         """
         problem = fit.problem
         x = fit.solution.x
         self.fit = fit
+        self.use = problem.seen.copy()
+        self.use[:, list(left_out)] = False
         self.known = known
         self.alike = alike
         self.borders = tuple(borders)
         self.count = problem.layout.parameter_count
         everything, there = _with_every_column(problem, x, panel_of(fit, borders))
-        rows = everything.jacobian(there, problem.seen)[
-            np.repeat(problem.seen.ravel(), 2)
-        ]
-        left = problem.whitened(x)[problem.seen]
+        rows = everything.jacobian(there, self.use)[np.repeat(self.use.ravel(), 2)]
+        left = problem.whitened(x)[self.use]
         lengths = np.linalg.norm(left, axis=1)
         self.noise = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, known.floor)
         bounded = np.minimum(
@@ -230,10 +229,10 @@ class Candidates:
             `WAVES` columns (2 x seen positions, 1), of unit length.
         """
         problem = self.fit.problem
-        n, k = problem.seen.shape
-        slope = derivative(problem, self.fit, name, problem.seen).reshape(n, 2 * k)
+        n, k = self.use.shape
+        slope = derivative(problem, self.fit, name, self.use).reshape(n, 2 * k)
         place = (np.arange(n) + 0.5) / n
-        seen = np.repeat(problem.seen.ravel(), 2)
+        seen = np.repeat(self.use.ravel(), 2)
         shapes = [
             place - 0.5,
             *(np.cos(math.pi * wave * place) for wave in range(1, WAVES)),
@@ -304,7 +303,7 @@ class Candidates:
     def _places(self) -> FloatArray:
         """Predicted column and row of each position that counts, (m, 2) [px]."""
         problem = self.fit.problem
-        return problem.residuals(self.fit.solution.x)[0][problem.seen]
+        return problem.residuals(self.fit.solution.x)[0][self.use]
 
     def judged(self, choice: Choice) -> Judged | None:
         """Judge a choice, once (cached).
@@ -440,9 +439,12 @@ class Candidates:
         return out
 
     def left_open(self, choice: Choice) -> tuple[FloatArray, FloatArray]:
-        """Compute the covariance of the geometry's columns averaged over all judged
-        choices whose evidence is at most `MAX_EVIDENCE_LOSS` below one's, and for that
-        choice alone.
+        """Compute the covariance of the geometry's columns that holds for every cause
+        that the data leave open, and for one choice alone.
+
+        All judged choices whose evidence is at most `MAX_EVIDENCE_LOSS` below that of the
+        one are averaged; and so are those with a cause, and those without it, wherever
+        that is open: before the scan is seen its probability is assumed, and may be any.
 
         Choices with other widths of the priors are left out: statements on the scanner
         are believed where the images do not contradict them.
@@ -451,20 +453,29 @@ class Candidates:
             choice: must be separable.
 
         Returns:
-            Both (columns, columns), the averaged one first; it includes the differences
+            Both (columns, columns), the one for all first; it includes the differences
             of their means.
         """
         at = self.judged(choice)
         assert at is not None
-        some = [
-            m
+        some = {
+            c: m
             for c, m in self._judged.items()
             if m is not None
             and c[-1] == choice[-1]
             and m.evidence > at.evidence - MAX_EVIDENCE_LOSS
-        ]
-        weights = np.exp(np.array([m.evidence for m in some]) - at.evidence)
-        _, spread = averaged(some, weights / weights.sum(), self.count, at)
+        }
+        models = list(some.values())
+        weights = np.exp(np.array([m.evidence for m in models]) - at.evidence)
+        weights /= weights.sum()
+        there = np.array(list(some))[:, :-1] > 0
+        _, spread = averaged(models, weights, self.count, at)
+        for part in (*there.T, *~there.T):
+            share = float(weights[part].sum())
+            if math.exp(-OPEN_LOG_ODDS) < share < 1.0:
+                those = [m for m, chosen in zip(models, part, strict=True) if chosen]
+                given = averaged(those, weights[part] / share, self.count, at)[1]
+                spread = larger(spread, given)
         return spread, at.covariance(self.count)
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
@@ -544,7 +555,7 @@ class Candidates:
             widths,
             model.noise * math.sqrt(self.alike),
             self._places,
-            problem.whiten[problem.seen],
+            problem.whiten[self.use],
             shape,
             self.borders,
         )
@@ -569,7 +580,7 @@ def _arc(column: int, share: float | None) -> list[Cause]:
 
 
 def explained_by_causes(
-    fit: FitResult, known: Known, refit: Refit
+    fit: FitResult, known: Known, refit: Refit, left_out: Sequence[int] = ()
 ) -> tuple[FitResult, Found]:
     """Fit with the most likely causes as columns, and average sigmas over those left
     open.
@@ -583,6 +594,8 @@ def explained_by_causes(
         fit: of the geometry, the phantom's strain with its prior.
         known: statements on the phantom and the positions.
         refit: fits again with `strain`, `arc`, `bead_tolerance_mm` and `panel`.
+        left_out: beads that are elsewhere; where some turn out to be, the causes of the
+            other beads' residuals are searched anew.
 
     Returns:
         The new fit and the causes that were found. `fit` itself without causes if a fit
@@ -596,7 +609,7 @@ def explained_by_causes(
     # Before a cause is fitted, it correlates the residuals itself.
     alike = 1.0
     for _ in range(MOST_ROUNDS):
-        candidates, choice = _searched(fit, known, borders, alike, before)
+        candidates, choice = _searched(fit, known, borders, alike, before, left_out)
         before = candidates.widths(choice)
         borders = candidates.chosen_borders(choice)
         options = _options(candidates, choice, borders)
@@ -631,10 +644,13 @@ def explained_by_causes(
     lost = lost_beads(first)
     elsewhere = (
         "beads" in names
+        and not left_out
         and 0 < len(lost) <= len(first.problem.model) - LEAST_BEADS
         and candidates.elsewhere(choice, lost)
     )
-    found = Found(odds, names, doubtful, candidates.strain(choice), elsewhere)
+    if elsewhere:
+        return explained_by_causes(first, known, refit, lost)
+    found = Found(odds, names, doubtful, candidates.strain(choice))
     return _widened(fit, candidates, choice), found
 
 
@@ -644,6 +660,7 @@ def _searched(
     borders: tuple[Border, ...],
     alike: float,
     before: Mapping[str, float],
+    left_out: Sequence[int],
 ) -> tuple[Candidates, Choice]:
     """Find the most likely causes, borders of the panel's tiles among them.
 
@@ -659,11 +676,12 @@ def _searched(
         borders: found before.
         alike: number of neighbouring frames whose residuals count as one.
         before: width of each cause of the fit, from which the search starts, too.
+        left_out: beads that are elsewhere.
 
     Returns:
         The table, with at most `MOST_BORDERS` borders, and its most likely choice.
     """
-    candidates = Candidates(fit, known, borders, alike)
+    candidates = Candidates(fit, known, borders, alike, left_out)
     choice = candidates.best([candidates.choice(before)])
     while len(candidates.borders) < MOST_BORDERS:
         found: dict[Border, list[Choice]] = {}
@@ -673,7 +691,8 @@ def _searched(
                 found.setdefault(border, []).append(part)
         some = []
         for border, parts in found.items():
-            table = Candidates(fit, known, (*candidates.borders, border), alike)
+            every = (*candidates.borders, border)
+            table = Candidates(fit, known, every, alike, left_out)
             more = [
                 other
                 for part in parts

@@ -184,6 +184,7 @@ def explain_identification(
     model: BeadModel,
     poses: Poses,
     name: str,
+    start: Offsets = NOMINAL,
 ) -> Finding | None:
     """Judge an assignment; if it is poor, find the mistake that explains the spots.
 
@@ -198,6 +199,7 @@ def explain_identification(
         model: the beads.
         poses: nominal geometry.
         name: of the scan, the text's beginning.
+        start: offsets that are known before.
 
     Returns:
         None for a good assignment.
@@ -247,7 +249,7 @@ def explain_identification(
                 f"{name}: in each frame {rest:.1f} of the spots are none of the beads of "
                 f"{model.name!r}: other balls, or something round; not used",
             )
-    explanation = _alternative(found, detections, model, poses)
+    explanation = _alternative(found, detections, model, poses, start)
     if explanation is not None:
         return replace(explanation, text=f"{name}: {explanation.text}")
     if found is not None and _plausible(found):
@@ -363,6 +365,7 @@ def _alternative(
     detections: Sequence[Detections],
     model: BeadModel,
     poses: Poses,
+    start: Offsets,
 ) -> Finding | None:
     """Find the mistake that makes phantom and spots agree best.
 
@@ -376,6 +379,7 @@ def _alternative(
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+        start: offsets that are known before.
 
     Returns:
         Its finding, an error; None if no mistake explains the spots.
@@ -438,7 +442,9 @@ def _alternative(
             f"without bead {j} the others fit: it is not where the phantom's model has it"
         )
         trials.append(("bead_displaced", text, {"model": others}))
-    given: dict[str, Any] = {"detections": detections, "model": model, "poses": poses}
+    given: dict[str, Any] = {
+        "detections": detections, "model": model, "poses": poses, "start": start,
+    }  # fmt: skip
     best: tuple[float, float, str, str] | None = None
     for code, text, change in trials:
         other = attempt(**(given | change))
@@ -460,15 +466,15 @@ def _alternative(
     if found is not None and _plausible(found) and found.typical_px > 0.3 * found.rms_px:
         return None  # The right beads in about the right places: the residuals will tell.
     return (
-        _in_motion(detections, model, poses)
-        or _in_parts(detections, model, poses)
-        or _other_turn(detections, model, poses)
-        or _one_by_one(detections, model, poses)
+        _in_motion(detections, model, poses, start)
+        or _in_parts(detections, model, poses, start)
+        or _other_turn(detections, model, poses, start)
+        or _one_by_one(detections, model, poses, start)
     )
 
 
 def _in_motion(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, start: Offsets
 ) -> Finding | None:
     """Check whether the spots are those of the phantom, up to a motion.
 
@@ -476,13 +482,15 @@ def _in_motion(
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+        start: offsets that are known before.
 
     Returns:
         The finding that names the motion; None if there is none, if the spots do not fit
         the beads even with a gate of `WIDE_GATE_PX`, or for fewer than `LEAST_FRAMES`
         frames.
     """
-    found = attempt(detections, model, poses, search=Search(gate_px=WIDE_GATE_PX))
+    wide = Search(gate_px=WIDE_GATE_PX)
+    found = attempt(detections, model, poses, search=wide, start=start)
     if found is None or min(found.explained, found.found) < GOOD_SHARE:
         return None
     if len(poses) < LEAST_FRAMES:
@@ -490,7 +498,7 @@ def _in_motion(
     shape = np.array([d.shape for d in detections], dtype=np.float64)
     here = poses
     # Of a large motion panel and axis have taken up a part: they begin where they should be.
-    still = replace(NOMINAL, **{name: getattr(found.parameters, name) for name in SIX})
+    still = replace(start, **{name: getattr(found.parameters, name) for name in SIX})
 
     def fitted(motion: MotionFit | None = None) -> FitResult:
         """Fit all six parameters to the tracks, with the frames displaced by the first of
@@ -510,6 +518,7 @@ def _in_motion(
             start=still,
             centre=found.bias,
             priors=ASSUMED,
+            prior_centre=start,
             bound=math.inf,
         )
 
@@ -517,7 +526,7 @@ def _in_motion(
 
 
 def _in_parts(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, start: Offsets
 ) -> Finding | None:
     """Check whether the first or the last frames alone fit the phantom.
 
@@ -527,6 +536,7 @@ def _in_parts(
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+        start: offsets that are known before.
 
     Returns:
         An error: on frame numbers if one end fits, on a turn above `LEAST_TURN_DEG` or
@@ -539,7 +549,7 @@ def _in_parts(
             ("first", slice(0, n // share)),
             ("last", slice(n - n // share, n)),
         ):
-            own = attempt(detections[part], model, poses[part])
+            own = attempt(detections[part], model, poses[part], start=start)
             if own is not None and convincing(own):
                 ends.setdefault(end, (part, own.parameters))
         if len(ends) > 1:
@@ -567,7 +577,7 @@ def _in_parts(
 
 
 def _other_turn(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, start: Offsets
 ) -> Finding | None:
     """Check whether the stage turns by another angle than stated, from the frames within
     75 deg of the first.
@@ -576,6 +586,7 @@ def _other_turn(
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+        start: offsets that are known before.
 
     Returns:
         An error with the factor on the angles; None if no other one fits, it is within
@@ -588,7 +599,7 @@ def _other_turn(
     best = (GOOD_RMS_PX, 1.0)
     for factor in TURN_FACTORS:
         some = replace(poses, angle=poses.angle[0] + factor * turned)[:n]
-        own = attempt(detections[:n], model, some, loose=TURN_WIDTH)
+        own = attempt(detections[:n], model, some, loose=TURN_WIDTH, start=start)
         if own is not None and convincing(own) and own.rms_px < best[0]:
             best = own.rms_px, factor * own.parameters.angle_scale
     if abs(best[1] - 1.0) < LEAST_TURN:
@@ -604,7 +615,7 @@ def _other_turn(
 
 
 def _one_by_one(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses
+    detections: Sequence[Detections], model: BeadModel, poses: Poses, start: Offsets
 ) -> Finding | None:
     """Check whether frames fit the phantom one by one, though not together:
     `SAMPLED_FRAMES` are tried, each with 5 spots or more.
@@ -613,6 +624,7 @@ def _one_by_one(
         detections: spots of each frame.
         model: the beads.
         poses: nominal geometry.
+        start: offsets that are known before.
 
     Returns:
         An error on the frames' order or angles; None if fewer than 70 % fit.
@@ -621,7 +633,9 @@ def _one_by_one(
     good = 0
     for i in chosen:
         alone = slice(i, i + 1)
-        own = attempt(detections[alone], model, poses[alone], search=Search(starts=36))
+        own = attempt(
+            detections[alone], model, poses[alone], search=Search(starts=36), start=start
+        )
         if own is not None and len(detections[i]) >= 5:
             good += convincing(own) and own.explained > SOME_SPOTS
     if good < 0.7 * len(chosen):

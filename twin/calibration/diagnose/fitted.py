@@ -321,7 +321,7 @@ def explain_residuals(
 ) -> tuple[FitResult, list[Finding]]:
     """Judge the residuals of the final fit; name the causes that would explain them.
 
-    A single displaced bead is left out rather than all beads fitted. If the residuals
+    If the residuals
     exceed the limit, or too many positions were left out, a factor on the angles is
     tried; then, beyond the limit, a motion, a wobble of the axis, else the error "misfit"
     is given, beside which only lost beads are reported.
@@ -342,9 +342,6 @@ def explain_residuals(
     plain = fit
     fit, causes = explained_by_causes(fit, known, refit)
     named = named_causes(fit, causes)
-    if causes.elsewhere:
-        fit = plain
-        named = []
     certificate = fit.certificate
     out = [*_lost_beads(fit), *_drifts(fit), *named]
     limit = max(misfit_px, largest_residual(fit, MISFIT_CHANCE, sigmas_known))
