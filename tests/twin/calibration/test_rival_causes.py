@@ -13,7 +13,7 @@ from faults_drawn import drawn
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.tiles import alike_places, likely_border
-from flexdt.twin.calibration.fit.evidence import Table, averaged
+from flexdt.twin.calibration.fit.evidence import Table, squares
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.problem import STRAINS, build_problem
 from flexdt.twin.geometry.panel import Border
@@ -108,11 +108,10 @@ def test_evidence_differs_as_densities_do(seed: int) -> None:
         models.append((judged, density))
     (one, first), (two, second) = models
     assert one.evidence - two.evidence == pytest.approx(first - second, abs=1e-6)
-    middle, spread = averaged([one, two], np.array([0.75, 0.25]), 2, one)
+    first, second = squares([one, two], 2, one)
     off = two.mean[:2] - one.mean[:2]
-    assert middle == pytest.approx(0.25 * off)
-    both = 0.75 * one.covariance(2) + 0.25 * (two.covariance(2) + np.outer(off, off))
-    assert spread == pytest.approx(both)
+    assert first == pytest.approx(one.covariance(2))
+    assert second == pytest.approx(two.covariance(2) + np.outer(off, off))
 
 
 @pytest.mark.parametrize("axis", [0, 1])

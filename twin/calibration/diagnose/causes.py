@@ -24,7 +24,7 @@ from flexdt.twin.calibration.diagnose.tiles import (
     likely_border,
 )
 from flexdt.twin.calibration.fit.certificate import widened
-from flexdt.twin.calibration.fit.evidence import Judged, Table, averaged
+from flexdt.twin.calibration.fit.evidence import Judged, Table, squares
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.problem import (
@@ -469,13 +469,14 @@ class Candidates:
         weights = np.exp(np.array([m.evidence for m in models]) - at.evidence)
         weights /= weights.sum()
         there = np.array(list(some))[:, :-1] > 0
-        _, spread = averaged(models, weights, self.count, at)
+        about = squares(models, self.count, at).reshape(len(models), -1)
+        shape = (self.count, self.count)
+        spread = (weights @ about).reshape(shape)
         for part in (*there.T, *~there.T):
             share = float(weights[part].sum())
             if math.exp(-OPEN_LOG_ODDS) < share < 1.0:
-                those = [m for m, chosen in zip(models, part, strict=True) if chosen]
-                given = averaged(those, weights[part] / share, self.count, at)[1]
-                spread = larger(spread, given)
+                given = (weights * part / share) @ about
+                spread = larger(spread, given.reshape(shape))
         return spread, at.covariance(self.count)
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:

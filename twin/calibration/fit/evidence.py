@@ -138,25 +138,20 @@ def freedom_log(count: float, variance: float) -> float:
     return count * math.log(variance)
 
 
-def averaged(
-    models: Sequence[Judged], weights: FloatArray, count: int, at: Judged
-) -> tuple[FloatArray, FloatArray]:
-    """Average the first columns over models, about the mean of one.
+def squares(models: Sequence[Judged], count: int, at: Judged) -> FloatArray:
+    """Compute the mean squares of the first columns about the mean of one model, for each:
+    its covariance and the difference of the means.
 
     Args:
         models: judged on one table, of the same first columns.
-        weights: of the models, of sum 1.
         count: first columns.
-        at: the model about which is averaged.
+        at: the model about which they are.
 
     Returns:
-        Mean (count,) less that of `at`, and mean square (count, count) about `at`: the
-        models' covariances and the differences of their means.
+        (models, count, count); their averages are those of the mixture.
     """
-    middle = np.zeros(count)
-    spread = np.zeros((count, count))
-    for model, weight in zip(models, weights.tolist(), strict=True):
+    out = np.empty((len(models), count, count))
+    for square, model in zip(out, models, strict=True):
         off = model.mean[:count] - at.mean[:count]
-        middle += weight * off
-        spread += weight * (model.covariance(count) + np.outer(off, off))
-    return middle, spread
+        square[:] = model.covariance(count) + np.outer(off, off)
+    return out
