@@ -59,7 +59,9 @@ BEAD_SHARES: Final = tuple(2e-4 * 2.0**k for k in range(8))
 """Widths of the beads' places as parts of the phantom's size."""
 PANEL_WIDTHS_PX: Final = tuple(0.004 * 2.5**k for k in range(9))
 MOTION_WIDTHS: Final = (1.0, 4.0, 16.0, 64.0)
-"""Widths of a motion, in standard deviations of its estimate from an entire scan."""
+"""Widths of a motion, in standard deviations of its estimate."""
+LEAST_VISIBLE: Final = 1e-3
+"""Part of a motion that the geometry must leave, for it to be told."""
 WAVES: Final = 8
 """Number of shapes of a motion here: a ramp, and half waves in a scan."""
 PRIOR_FACTORS: Final = (3.0, 10.0)
@@ -196,10 +198,13 @@ class Candidates:
         )
         share = np.repeat(bounded, 2)[:, None]
         motion = [rows_of for name in self._moving() for rows_of in self._motion(name)]
-        table = np.concatenate([rows, *motion], axis=1) * share
+        if motion:
+            moving = np.concatenate(motion, axis=1)
+            rows = np.concatenate([rows, moving / self._visible(rows, moving)], axis=1)
+        table = rows * share
         causes = there - everything.start
         causes[: self.count] = 0.0
-        values = left.ravel() + rows @ causes
+        values = left.ravel() + rows[:, : len(causes)] @ causes
         self.rows = table
         self.values = values * share[:, 0]
         self.table = Table(self.rows, self.values, known.floor, alike)
@@ -240,6 +245,28 @@ class Candidates:
         for shape in shapes:
             column = (slope * shape[:, None]).ravel()[seen]
             yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
+
+    def _visible(self, rows: FloatArray, moving: FloatArray) -> FloatArray:
+        """Compute which part of each motion the geometry does not take up, `LEAST_VISIBLE`
+        at least.
+
+        Over a part of a turn, or in a helix, an even drift is almost an object that
+        stands elsewhere, or a panel and an axis that roll: what is seen of it is little
+        beside what it is.
+
+        Args:
+            rows: (m, q) of the geometry and causes.
+            moving: (m, p) columns of unit length.
+
+        Returns:
+            (p,) lengths.
+        """
+        prior = self.noise / self.fit.problem.prior_sigma[: self.count]
+        table = np.concatenate([rows[:, : self.count], np.diag(prior)])
+        scale = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
+        basis = np.linalg.qr(table / scale)[0][: len(rows)]
+        taken = np.square(basis.T @ moving).sum(axis=0)
+        return np.asarray(np.sqrt(np.maximum(1.0 - taken, LEAST_VISIBLE**2)))
 
     def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
         """List the causes of the table: shape, beads, arc, panel, borders, motion and
@@ -439,12 +466,14 @@ class Candidates:
         return out
 
     def left_open(self, choice: Choice) -> tuple[FloatArray, FloatArray]:
-        """Compute the covariance of the geometry's columns that holds for every cause
-        that the data leave open, and for one choice alone.
+        """Compute the mean square of the geometry's columns about a fit, over all that
+        the data leave open, and the covariance of that fit.
+
+        The fit has the causes of a choice but its motions, which are no columns of it.
 
         All judged choices whose evidence is at most `MAX_EVIDENCE_LOSS` below that of the
-        one are averaged; and so are those with a cause, and those without it, wherever
-        that is open: before the scan is seen its probability is assumed, and may be any.
+        one are averaged. Where the images speak for a cause, the mean square is no less
+        than that with it: how probable it is without them is assumed, and may be wrong.
 
         Choices with other widths of the priors are left out: statements on the scanner
         are believed where the images do not contradict them.
@@ -453,28 +482,32 @@ class Candidates:
             choice: must be separable.
 
         Returns:
-            Both (columns, columns), the one for all first; it includes the differences
-            of their means.
+            Both (columns, columns), the mean square first.
         """
-        at = self.judged(choice)
-        assert at is not None
+        moves = [c.name in MOTIONS for c in self.causes]
+        fitted = tuple(0.0 if m else w for m, w in zip(moves, choice, strict=True))
+        best = self.judged(choice)
+        at = self.judged(fitted)
+        assert best is not None
+        if at is None:
+            at = best
         some = {
             c: m
             for c, m in self._judged.items()
             if m is not None
             and c[-1] == choice[-1]
-            and m.evidence > at.evidence - MAX_EVIDENCE_LOSS
+            and m.evidence > best.evidence - MAX_EVIDENCE_LOSS
         }
         models = list(some.values())
-        weights = np.exp(np.array([m.evidence for m in models]) - at.evidence)
+        weights = np.exp(np.array([m.evidence for m in models]) - best.evidence)
         weights /= weights.sum()
-        there = np.array(list(some))[:, :-1] > 0
+        there = np.array(list(some)) > 0
         about = squares(models, self.count, at).reshape(len(models), -1)
         shape = (self.count, self.count)
         spread = (weights @ about).reshape(shape)
-        for part in (*there.T, *~there.T):
+        for cause, part in zip(self.causes, there.T, strict=True):
             share = float(weights[part].sum())
-            if math.exp(-OPEN_LOG_ODDS) < share < 1.0:
+            if 0.0 < share < 1.0 and math.log(share / (1.0 - share)) > cause.chance:
                 given = (weights * part / share) @ about
                 spread = larger(spread, given.reshape(shape))
         return spread, at.covariance(self.count)
@@ -631,7 +664,11 @@ def explained_by_causes(
     )
     # What moves looks like other causes in part, and most of it stays in the residuals.
     if moves and fit.certificate.rms_px > MAX_REST_SHARE * first.certificate.rms_px:
-        return first, Found(odds)
+        nothing: Choice = tuple(
+            pick if c.name in MOTIONS else 0.0
+            for c, pick in zip(candidates.causes, choice, strict=True)
+        )
+        return _widened(first, candidates, nothing), Found(odds)
     names = tuple(
         c.name
         for c, pick in zip(candidates.causes, choice, strict=True)
