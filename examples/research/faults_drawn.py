@@ -276,7 +276,7 @@ class Draft:
 
 
 def drawn(kind: str, seed: int) -> Faulty:
-    """Draw a scanner, a phantom and a scan with the fault `kind`, of KINDS, and compute
+    """Draw a scanner, a phantom and a scan with the fault `kind`, of KINDS or RIGHT, and compute
     its noisy spots.
 
     Args:
@@ -288,7 +288,7 @@ def drawn(kind: str, seed: int) -> Faulty:
         parameter, and the expected findings.
     """
     rng = np.random.default_rng([seed, *kind.encode()])
-    return taken(KINDS[kind](right_draft(rng), rng), rng)
+    return taken({**KINDS, **RIGHT}[kind](right_draft(rng), rng), rng)
 
 
 def right_draft(rng: Rng) -> Draft:
@@ -903,6 +903,110 @@ def _right(draft: Draft, rng: Rng) -> Draft:
                    names=("phantom_strained|priors_narrow",))  # fmt: skip
 
 
+CAUSE_ODDS: Final = 0.1
+"""Of each cause, present to absent, as the calibration assumes them; so are the widths here."""
+STRAIN: Final = 1e-3
+STRAIN_WIDTHS: Final = (2.5e-3, 6e-3, 1.5e-2, 4e-2)
+"""Of what every phantom is strained by, and of phantoms of another shape."""
+BEAD_SHARES: Final = tuple(2e-4 * 2.0**k for k in range(8))
+PANEL_WIDTHS_PX: Final = tuple(0.004 * 2.5**k for k in range(9))
+GAP_WIDTHS_PX: Final = (0.1, 0.5, 2.0, 8.0)
+LEAST_TILE: Final = 1 / 8
+MAY_MOVE: Final = ("dO_x", "dO_y", "dO_z", "alpha")
+MOTION_SIGMAS: Final = (1.0, 4.0, 16.0, 64.0)
+MOTION_SHAPES: Final = 8
+ARC_WIDTH: Final = 0.5
+"""Of the squared share of a step that an exposure lasts, which is never negative."""
+
+
+def _with_causes(moving: bool) -> Fault:
+    """Make a draw of a phantom and a scanner as `as_assumed`, in which each cause that a
+    calibration looks for occurs as often and as large as it assumes.
+
+    Args:
+        moving: whether the causes include motion. A moving parameter's true value is its mean.
+    """
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the causes; no finding is right, and so is any."""
+
+        def width(*some: float) -> float:
+            """Draw whether a cause is there, and its width; 0 without it."""
+            there = rng.uniform() < CAUSE_ODDS / (1.0 + CAUSE_ODDS)
+            pick = float(rng.choice(some))
+            return pick if there else 0.0
+
+        draft = _usual(draft, rng)
+        world = draft.world
+        beads = world.beads
+        stretch = width(*STRAIN_WIDTHS) or STRAIN
+        shear = width(*STRAIN_WIDTHS) or STRAIN
+        change = shear * rng.normal(size=(3, 3))
+        np.fill_diagonal(change, stretch * rng.normal(size=3))
+        change += (1.0 + stretch * rng.normal()) * np.eye(3)
+        place = width(*BEAD_SHARES) * float(np.ptp(beads, axis=0).max())
+        beads = beads @ change.T + place * rng.normal(size=beads.shape)
+        arc = math.sqrt(min(width(ARC_WIDTH) * abs(rng.normal()), 1.0))
+        bent = width(*PANEL_WIDTHS_PX) * rng.normal(size=16)
+        gap = width(*GAP_WIDTHS_PX) * rng.normal(size=2)
+        axis = int(rng.integers(2))
+        border = SHAPE[1 - axis] * rng.uniform(LEAST_TILE, 1.0 - LEAST_TILE)
+        world = replace(world, beads=beads, arc=arc * 360.0 / len(world.angles))
+        truth = {n: float(np.ravel(v)[0]) for n, v in world.offsets.items()}
+        moved = dict(world.offsets)
+        for name in MAY_MOVE if moving else ():
+            sizes = (
+                width(*MOTION_SIGMAS) * draft.noise_px * rng.normal(size=MOTION_SHAPES)
+            )
+            if sizes.any():
+                moved[name] = truth[name] + _motion(world, name, sizes)
+
+        def after(spots: list[Array | None]) -> list[Array | None]:
+            """Shift the spots of all frames by the panel's bend and its gap, in place."""
+            middle = [(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2]
+            for s in spots:
+                assert s is not None
+                x, y = ((s[:, :2] - middle) / (max(SHAPE) / 2)).T
+                powers = np.array([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
+                affine = np.array([bent[0] * x + bent[1] * y, bent[1] * x - bent[0] * y])
+                smooth = affine + bent[2:].reshape(2, 7) @ powers
+                s[:, :2] += smooth.T + np.outer(s[:, axis] >= border, gap)
+            return spots
+
+        world = replace(world, offsets=moved)
+        return replace(draft, world=world, silent=True, after=after, truth=truth)
+
+    return fault
+
+
+def _motion(world: World, name: str, sizes: Array) -> Array:
+    """Compute the change of a parameter in each frame, (n,) [mm, deg]: a ramp and half
+    waves, each of a size that it moves all shadows by together.
+
+    Args:
+        world: at rest.
+        name: of the parameter.
+        sizes: (MOTION_SHAPES,) root sum of squares of the shadows' shifts [px].
+    """
+    n = len(world.angles)
+    place = (np.arange(n) + 0.5) / n
+    shapes = [place - 0.5]
+    shapes += [np.cos(math.pi * wave * place) for wave in range(1, MOTION_SHAPES)]
+    step = 1e-3
+    value = world.offsets[name]
+    ends = [
+        shadows(replace(world, offsets={**world.offsets, name: value + d}))[0]
+        for d in (step, -step)
+    ]
+    slope = np.linalg.norm((ends[0] - ends[1]) / (2.0 * step), axis=2)
+    slope = np.sqrt(np.sum(slope**2, axis=1))
+    parts = [
+        size * shape / float(np.linalg.norm(slope * shape))
+        for size, shape in zip(sizes, shapes, strict=True)
+    ]
+    return np.asarray(sum(parts))
+
+
 def _strained(kind: str) -> Fault:
     """Make a fault that strains the phantom against its file by 0.05 to 1 %.
 
@@ -1174,3 +1278,10 @@ KINDS: Final[Mapping[str, Fault]] = {
     "other_pitch": _other_pitch,
 }  # fmt: skip
 """Every fault."""
+RIGHT: Final[Mapping[str, Fault]] = {
+    "as_assumed": _right,
+    "with_causes": _with_causes(moving=False),
+    "with_motion": _with_causes(moving=True),
+}
+"""Scans as a calibration assumes them to be: without further causes, with those of the
+phantom, the exposure and the panel, and with motion as well."""

@@ -632,9 +632,9 @@ def explained_by_causes(
             other beads' residuals are searched anew.
 
     Returns:
-        The new fit and the causes that were found. `fit` itself without causes if a fit
-        with them is not identifiable; `fit` with the odds alone if the object moves and
-        more than `MAX_REST_SHARE` of the residuals is left.
+        The new fit and the causes that were found; as `_undetermined` says if a fit with
+        them is not identifiable; `fit` with the odds alone if the object moves and more
+        than `MAX_REST_SHARE` of the residuals is left.
     """
     first = fit
     borders: tuple[Border, ...] = ()
@@ -655,7 +655,7 @@ def explained_by_causes(
             applied = chosen
             better = refit(**options)
             if not better.identifiable:
-                return first, Found()
+                return _undetermined(first, better, candidates, choice)
             fit = better
         alike = fit.certificate.enlargement
     odds = candidates.odds()
@@ -669,11 +669,7 @@ def explained_by_causes(
             for c, pick in zip(candidates.causes, choice, strict=True)
         )
         return _widened(first, candidates, nothing), Found(odds)
-    names = tuple(
-        c.name
-        for c, pick in zip(candidates.causes, choice, strict=True)
-        if pick and not c.name.startswith(RIVALS)
-    )
+    names = _applied(candidates, choice)
     doubtful = tuple(
         n
         for n, o in odds.items()
@@ -690,6 +686,40 @@ def explained_by_causes(
         return explained_by_causes(first, known, refit, lost)
     found = Found(odds, names, doubtful, candidates.strain(choice))
     return _widened(fit, candidates, choice), found
+
+
+def _applied(candidates: Candidates, choice: Choice) -> tuple[str, ...]:
+    """Name the causes of a choice that are columns of its fit."""
+    return tuple(
+        c.name
+        for c, pick in zip(candidates.causes, choice, strict=True)
+        if pick and not c.name.startswith(RIVALS)
+    )
+
+
+def _undetermined(
+    first: FitResult, better: FitResult, candidates: Candidates, choice: Choice
+) -> tuple[FitResult, Found]:
+    """Choose what is stated where the images do not determine the geometry beside the most
+    likely causes.
+
+    Args:
+        first: fit without causes.
+        better: fit with those of `choice`, not identifiable.
+        candidates: all causes, judged.
+        choice: the most likely one.
+
+    Returns:
+        `better` with its causes if they are beyond doubt: no geometry can be offered then.
+        Else `first`, wider by what the causes leave open, and the odds.
+    """
+    nothing = (0.0,) * len(choice)
+    odds = candidates.odds()
+    if candidates.evidence(choice) - candidates.evidence(nothing) > NAMED_LOG_ODDS:
+        return better, Found(
+            odds, _applied(candidates, choice), (), candidates.strain(choice)
+        )
+    return _widened(first, candidates, nothing), Found(odds)
 
 
 def _searched(
