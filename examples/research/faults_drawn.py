@@ -276,8 +276,8 @@ class Draft:
 
 
 def drawn(kind: str, seed: int) -> Faulty:
-    """Draw a scanner, a phantom and a scan with the fault `kind`, of KINDS or RIGHT, and compute
-    its noisy spots.
+    """Draw a scanner, a phantom and a scan with the fault `kind`, of DRAWS, and compute its
+    noisy spots.
 
     Args:
         kind: of the fault.
@@ -288,7 +288,7 @@ def drawn(kind: str, seed: int) -> Faulty:
         parameter, and the expected findings.
     """
     rng = np.random.default_rng([seed, *kind.encode()])
-    return taken({**KINDS, **RIGHT}[kind](right_draft(rng), rng), rng)
+    return taken(DRAWS[kind](right_draft(rng), rng), rng)
 
 
 def right_draft(rng: Rng) -> Draft:
@@ -912,6 +912,7 @@ BEAD_SHARES: Final = tuple(2e-4 * 2.0**k for k in range(8))
 PANEL_WIDTHS_PX: Final = tuple(0.004 * 2.5**k for k in range(9))
 GAP_WIDTHS_PX: Final = (0.1, 0.5, 2.0, 8.0)
 LEAST_TILE: Final = 1 / 8
+LEAST_SIDE: Final = 4
 MAY_MOVE: Final = ("dO_x", "dO_y", "dO_z", "alpha")
 MOTION_SIGMAS: Final = (1.0, 4.0, 16.0, 64.0)
 MOTION_SHAPES: Final = 8
@@ -964,13 +965,19 @@ def _with_causes(moving: bool) -> Fault:
         def after(spots: list[Array | None]) -> list[Array | None]:
             """Shift the spots of all frames by the panel's bend and its gap, in place."""
             middle = [(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2]
+            beyond = np.concatenate(
+                [s[:, axis] >= border for s in spots if s is not None]
+            )
+            # Where every spot is on one tile, the panel is where that tile is.
+            parted = min(beyond.sum(), (~beyond).sum()) >= LEAST_SIDE
+            shift = gap if parted else np.zeros(2)
             for s in spots:
                 assert s is not None
                 x, y = ((s[:, :2] - middle) / (max(SHAPE) / 2)).T
                 powers = np.array([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
                 affine = np.array([bent[0] * x + bent[1] * y, bent[1] * x - bent[0] * y])
                 smooth = affine + bent[2:].reshape(2, 7) @ powers
-                s[:, :2] += smooth.T + np.outer(s[:, axis] >= border, gap)
+                s[:, :2] += smooth.T + np.outer(s[:, axis] >= border, shift)
             return spots
 
         world = replace(world, offsets=moved)
@@ -1285,3 +1292,5 @@ RIGHT: Final[Mapping[str, Fault]] = {
 }
 """Scans as a calibration assumes them to be: without further causes, with those of the
 phantom, the exposure and the panel, and with motion as well."""
+DRAWS: Final = {**KINDS, **RIGHT}
+"""Every kind of scan."""

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 from faults_drawn import (
+    DRAWS,
     KINDS,
     Array,
     Draft,
@@ -194,7 +195,7 @@ def _and_then(draft: Draft, name: str, rng: Rng) -> Draft:
     names that are expected, and whether it may be silent, are the new fault's alone."""
     before = draft.after
     bare = replace(draft, after=None, names=(), beside=(), silent=False)
-    new = KINDS[name](bare, rng)
+    new = DRAWS[name](bare, rng)
     after = new.after
     if before is not None and after is not None:
         first, second = before, after

@@ -25,7 +25,6 @@ from typing import Final
 import numpy as np
 from causes_named import WRONG_SIGMAS, calibrated
 from faults_drawn import RIGHT, drawn
-from scipy.special import fdtr
 
 from flexdt.twin.errors import TwinError
 
@@ -73,8 +72,7 @@ def covered(kind: str, seed: int) -> Covered | None:
     some = {n: e for n, e in certificate.estimates.items() if e.sigma > 0}
     pulls = {n: (e.value - known[n]) / e.sigma for n, e in some.items()}
     inside = {n: e.low <= known[n] <= e.high for n, e in some.items()}
-    distance2 = certificate.mahalanobis2({n: known[n] for n in some})
-    level = float(fdtr(len(some), certificate.dof, distance2 / len(some)))
+    level = certificate.level({n: known[n] for n in some})
     return Covered(seed, pulls, inside, level)
 
 

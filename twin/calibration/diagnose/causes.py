@@ -23,8 +23,8 @@ from flexdt.twin.calibration.diagnose.tiles import (
     alike_places,
     likely_border,
 )
-from flexdt.twin.calibration.fit.certificate import widened
-from flexdt.twin.calibration.fit.evidence import Judged, Table, squares
+from flexdt.twin.calibration.fit.certificate import Rival, widened
+from flexdt.twin.calibration.fit.evidence import Judged, Table
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.problem import (
@@ -76,6 +76,10 @@ MOST_ROUNDS: Final = 4
 MOST_BORDERS: Final = 2
 MAX_EVIDENCE_LOSS: Final = 12.0
 """Logarithm of the evidence ratio beyond which models have no weight."""
+LEAST_REST: Final = 1e-3
+"""Part of a variance that is left where a rival explanation knows more."""
+LEAST_RANK: Final = 1e-12
+"""Part of a variance that is added against rounding."""
 NO_PANEL_PX: Final = 1e-4
 """Width of the polynomials at a tile's border without other distortion [px]."""
 SHAPES: Final = ("stretch", "shear")
@@ -465,52 +469,75 @@ class Candidates:
             out[cause.name] = _total(sides[1]) - _total(sides[0])
         return out
 
-    def left_open(self, choice: Choice) -> tuple[FloatArray, FloatArray]:
-        """Compute the mean square of the geometry's columns about a fit, over all that
-        the data leave open, and the covariance of that fit.
-
-        The fit has the causes of a choice but its motions, which are no columns of it.
-
-        All judged choices whose evidence is at most `MAX_EVIDENCE_LOSS` below that of the
-        one are averaged. Where the images speak for a cause, the mean square is no less
-        than that with it: how probable it is without them is assumed, and may be wrong.
-
-        Choices with other widths of the priors are left out: statements on the scanner
-        are believed where the images do not contradict them.
+    def fitted(self, choice: Choice) -> Judged:
+        """Return the model of the fit with the causes of a choice but its motions, which
+        are no columns of it; that of the choice itself if the other was not judged.
 
         Args:
             choice: must be separable.
-
-        Returns:
-            Both (columns, columns), the mean square first.
         """
         moves = [c.name in MOTIONS for c in self.causes]
-        fitted = tuple(0.0 if m else w for m, w in zip(moves, choice, strict=True))
-        best = self.judged(choice)
-        at = self.judged(fitted)
-        assert best is not None
-        if at is None:
-            at = best
-        some = {
-            c: m
-            for c, m in self._judged.items()
-            if m is not None
-            and c[-1] == choice[-1]
-            and m.evidence > best.evidence - MAX_EVIDENCE_LOSS
+        still = tuple(0.0 if m else w for m, w in zip(moves, choice, strict=True))
+        model = self.judged(still) or self.judged(choice)
+        assert model is not None
+        return model
+
+    def likely(self, choice: Choice) -> dict[Choice, float]:
+        """List all judged choices whose evidence is at most `MAX_EVIDENCE_LOSS` below the
+        largest, and their probabilities, of sum 1.
+
+        Choices with other widths of the priors than one are left out: statements on the
+        scanner are believed where the images do not contradict them.
+
+        Args:
+            choice: the one.
+        """
+        evidence = {
+            other: model.evidence
+            for other, model in self._judged.items()
+            if model is not None and other[-1] == choice[-1]
         }
-        models = list(some.values())
-        weights = np.exp(np.array([m.evidence for m in models]) - best.evidence)
-        weights /= weights.sum()
-        there = np.array(list(some)) > 0
-        about = squares(models, self.count, at).reshape(len(models), -1)
-        shape = (self.count, self.count)
-        spread = (weights @ about).reshape(shape)
+        best = max(evidence.values())
+        some = {
+            other: math.exp(one - best)
+            for other, one in evidence.items()
+            if one > best - MAX_EVIDENCE_LOSS
+        }
+        total = sum(some.values())
+        return {other: weight / total for other, weight in some.items()}
+
+    def rivals(self, likely: Mapping[Choice, float], at: Judged) -> list[Rival]:
+        """List what the geometry's columns are in likely choices, about the values of one
+        model, internal units.
+
+        Args:
+            likely: choices and their probabilities.
+            at: the model.
+        """
+        own = at.mean[: self.count]
+        out = []
+        for choice, weight in likely.items():
+            model = self._judged[choice]
+            assert model is not None
+            off = model.mean[: self.count] - own
+            out.append(Rival(weight, off, model.covariance(self.count)))
+        return out
+
+    def spoken_for(self, likely: Mapping[Choice, float]) -> list[FloatArray]:
+        """List, for each cause that the images speak for and leave open, the probabilities
+        of likely choices given that it is there, (choices,) of sum 1.
+
+        Args:
+            likely: choices and their probabilities.
+        """
+        weights = np.array(list(likely.values()))
+        there = np.array(list(likely)) > 0
+        out = []
         for cause, part in zip(self.causes, there.T, strict=True):
             share = float(weights[part].sum())
             if 0.0 < share < 1.0 and math.log(share / (1.0 - share)) > cause.chance:
-                given = (weights * part / share) @ about
-                spread = larger(spread, given.reshape(shape))
-        return spread, at.covariance(self.count)
+                out.append(weights * part / share)
+        return out
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
         """Return the phantom's strain (10,) in a choice, in the order of STRAINS, and its
@@ -783,6 +810,9 @@ def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResul
     """Add the differences between likely choices to the covariance of a fit; never
     narrows it.
 
+    Where the images speak for a cause, the mean square is no less than that with it: how
+    probable it is without them is assumed, and may be wrong.
+
     Args:
         fit: with the causes of `choice`.
         candidates: all causes, judged.
@@ -791,14 +821,49 @@ def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResul
     Returns:
         The fit with a wider certificate; itself if the choices agree.
     """
-    spread, own = candidates.left_open(choice)
-    factor = [edge_factor(n) for n in fit.problem.layout.names[: candidates.count]]
-    more = (spread - own) * np.outer(factor, factor)
-    values, vectors = np.linalg.eigh(more)
-    if not (values > 0).any():
+    likely = candidates.likely(choice)
+    own = candidates.fitted(choice)
+    if len(likely) == 1 and own is candidates.judged(next(iter(likely))):
         return fit
+    at = own.covariance(candidates.count)
+    factor = np.array(
+        [edge_factor(n) for n in fit.problem.layout.names[: candidates.count]]
+    )
+    unit = np.outer(factor, factor)
+    rivals = candidates.rivals(likely, own)
+    square = np.array([r.covariance + np.outer(r.off, r.off) for r in rivals])
+    mean = np.tensordot(list(likely.values()), square, 1)
+    wide = mean
+    for given in candidates.spoken_for(likely):
+        wide = larger(wide, np.tensordot(given, square, 1))
+    values, vectors = np.linalg.eigh((wide - at) * unit)
     more = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return replace(fit, certificate=widened(fit.certificate, more))
+    certificate = fit.certificate
+    apart = tuple(
+        Rival(
+            rival.weight,
+            rival.off * factor,
+            _changed(
+                certificate.covariance, (rival.covariance + wide - mean - at) * unit
+            ),
+        )
+        for rival in rivals
+    )
+    return replace(fit, certificate=replace(widened(certificate, more), rivals=apart))
+
+
+def _changed(covariance: FloatArray, change: FloatArray) -> FloatArray:
+    """Add a change, (p, p), to a covariance (p, p), of which at least `LEAST_REST` is left
+    in every direction.
+    """
+    size = np.sqrt(np.diag(covariance))
+    # Of exact positions it is the priors' alone and of lower rank.
+    scaled = covariance / np.outer(size, size) + LEAST_RANK * np.eye(len(size))
+    root = np.linalg.cholesky(scaled) * size[:, None]
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ change @ inverse.T)
+    whole = root @ vectors
+    return np.asarray((whole * np.maximum(1.0 + values, LEAST_REST)) @ whole.T)
 
 
 def _options(

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import fdtri, stdtrit
+from scipy.special import fdtr, stdtrit
 
 from flexdt.twin.calibration.fit.curved_region import Bend, bend_of
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor
@@ -252,6 +252,21 @@ class Outlier:
 
 
 @dataclass(frozen=True, eq=False)
+class Rival:
+    """What the estimates are if one of several explanations of the images holds.
+
+    Attributes:
+        weight: probability of the explanation.
+        off: (p,) its values less the estimates, edge units.
+        covariance: (p, p) of them, edge units.
+    """
+
+    weight: float
+    off: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Certificate:
     """The quality of one fit.
 
@@ -275,6 +290,8 @@ class Certificate:
         used: (n, k) positions in the fit.
         outliers: positions left out.
         held: parameters held by the gauge, with the reason.
+        rivals: explanations that the images leave open, of which `covariance` is the mean
+            square about the estimates; empty for one alone.
     """
 
     estimates: dict[str, Estimate]
@@ -293,6 +310,7 @@ class Certificate:
     used: npt.NDArray[np.bool_]
     outliers: tuple[Outlier, ...]
     held: tuple[tuple[str, str], ...]
+    rivals: tuple[Rival, ...] = ()
 
     @property
     def identifiable(self) -> bool:
@@ -359,17 +377,47 @@ class Certificate:
         Raises:
             ValueError: a name of `truth` that is not reported.
         """
-        names = list(self.estimates)
-        at = [names.index(n) for n in truth]
-        d = np.array([v - self.estimates[n].value for n, v in truth.items()])
-        return self.bend().distance2(d, at, self.covariance[np.ix_(at, at)])
+        at, off = self._places(truth)
+        return self.bend().distance2(off, at, self.covariance[np.ix_(at, at)])
+
+    def level(self, truth: Mapping[str, float]) -> float:
+        """Compute the level of the smallest joint region that contains some values: 0 at
+        the estimates, above 0.95 outside of the 95 % region; arguments as `mahalanobis2`.
+
+        That of one explanation is Hotelling's (F distribution). Of rivals it is the mean
+        of theirs, each as likely as the values make it: a mean of numbers that are evenly
+        distributed over the values that the explanations expect.
+        """
+        at, off = self._places(truth)
+        p = len(at)
+        if not self.rivals:
+            return float(fdtr(p, self.dof, self.mahalanobis2(truth) / p))
+        bend = self.bend()
+        levels = []
+        likely = []
+        for rival in self.rivals:
+            covariance = rival.covariance[np.ix_(at, at)]
+            distance2 = bend.distance2(off - rival.off[at], at, covariance)
+            size = np.sqrt(np.diag(covariance))
+            volume = 2.0 * np.log(size).sum()
+            volume += np.linalg.slogdet(covariance / np.outer(size, size))[1]
+            levels.append(float(fdtr(p, self.dof, distance2 / p)))
+            likely.append(math.log(rival.weight) - 0.5 * (distance2 + float(volume)))
+        weights = np.exp(np.array(likely) - max(likely))
+        return float(weights @ np.array(levels) / weights.sum())
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
-        """Check whether values are in the joint 95 % region of their columns
-        (Hotelling: F distribution); arguments as `mahalanobis2`.
+        """Check whether values are in the joint 95 % region of their columns; arguments as
+        `mahalanobis2`.
         """
-        p = len(truth)
-        return self.mahalanobis2(truth) <= p * float(fdtri(p, self.dof, 0.95))
+        return self.level(truth) <= 0.95
+
+    def _places(self, truth: Mapping[str, float]) -> tuple[list[int], FloatArray]:
+        """Find the columns of some values, and compute the values less the estimates."""
+        names = list(self.estimates)
+        at = [names.index(n) for n in truth]
+        off = [v - self.estimates[n].value for n, v in truth.items()]
+        return at, np.array(off, dtype=np.float64)
 
 
 def widened(
@@ -408,6 +456,9 @@ def widened(
         estimates=estimates,
         covariance=covariance,
         correlation=covariance / np.outer(sigma, sigma),
+        rivals=tuple(
+            replace(r, covariance=r.covariance + more) for r in certificate.rivals
+        ),
     )
 
 

@@ -3,8 +3,7 @@
 A model gives each column of a table a normal prior; columns of no prior are flat. Its
 evidence is the likelihood of the residuals with all columns integrated out, at the
 standard deviation of the residuals that makes them most likely (MacKay, Neural
-Computation 4 (1992) 415). Estimates averaged with those weights have the covariance of
-the mixture: those of the models, and that of their differences.
+Computation 4 (1992) 415).
 """
 
 from __future__ import annotations
@@ -136,22 +135,3 @@ class Table:
 def freedom_log(count: float, variance: float) -> float:
     """Return the part of the evidence from the spread of `count` values."""
     return count * math.log(variance)
-
-
-def squares(models: Sequence[Judged], count: int, at: Judged) -> FloatArray:
-    """Compute the mean squares of the first columns about the mean of one model, for each:
-    its covariance and the difference of the means.
-
-    Args:
-        models: judged on one table, of the same first columns.
-        count: first columns.
-        at: the model about which they are.
-
-    Returns:
-        (models, count, count); their averages are those of the mixture.
-    """
-    out = np.empty((len(models), count, count))
-    for square, model in zip(out, models, strict=True):
-        off = model.mean[:count] - at.mean[:count]
-        square[:] = model.covariance(count) + np.outer(off, off)
-    return out
