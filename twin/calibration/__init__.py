@@ -7,6 +7,7 @@ from flexdt.twin.calibration.bead_model import (
     spot_radii,
 )
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder, detect_beads
+from flexdt.twin.calibration.diagnose.identifiability import Prediction, identifiability
 from flexdt.twin.calibration.fit.certificate import Certificate, Estimate
 from flexdt.twin.calibration.fit.fit import (
     IN_IMAGES,
@@ -19,11 +20,7 @@ from flexdt.twin.calibration.fit.fit import (
     image_slopes,
     require_identifiable,
 )
-from flexdt.twin.calibration.fit.identifiability import (
-    Prediction,
-    identifiability,
-    visible_beads,
-)
+from flexdt.twin.calibration.fit.forecast import visible_beads
 from flexdt.twin.calibration.fit.problem import (
     EIGHT,
     SIX,

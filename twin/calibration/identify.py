@@ -25,7 +25,7 @@ from flexdt.twin.calibration.bead_model import (
 )
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, Solver, solve
-from flexdt.twin.calibration.fit.identifiability import visible_beads
+from flexdt.twin.calibration.fit.forecast import visible_beads
 from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX, FitProblem, as_poses, build_problem
 from flexdt.twin.errors import TwinError

@@ -14,7 +14,7 @@ import pytest
         ("flexdt.twin.calibration.detect.detection", 4),
         ("flexdt.twin.calibration.identify", 13),
         ("flexdt.twin.calibration.fit.fit", 10),
-        ("flexdt.twin.calibration.fit.identifiability", 8),
+        ("flexdt.twin.calibration.diagnose.identifiability", 8),
         ("flexdt.phantoms.beads", 5),
         ("flexdt.phantoms.samples", 5),
         ("flexdt.phantoms.bricks", 1),

@@ -164,7 +164,8 @@ class Candidates:
 
     def __init__(
         self,
-        fit: FitResult,
+        problem: FitProblem,
+        x: FloatArray,
         known: Known,
         borders: Sequence[Border],
         alike: float = 1.0,
@@ -177,22 +178,22 @@ class Candidates:
         the last columns are of motions.
 
         Args:
-            fit: of the geometry.
+            problem: of the geometry's fit.
+            x: its column values.
             known: statements on the phantom and the positions.
             borders: panel borders that are causes, too.
             alike: number of neighbouring frames whose residuals count as one.
             left_out: beads that are elsewhere: their positions are evidence of nothing.
         """
-        problem = fit.problem
-        x = fit.solution.x
-        self.fit = fit
+        self.problem = problem
+        self.x = x
         self.use = problem.seen.copy()
         self.use[:, list(left_out)] = False
         self.known = known
         self.alike = alike
         self.borders = tuple(borders)
         self.count = problem.layout.parameter_count
-        everything, there = _with_every_column(problem, x, panel_of(fit, borders))
+        everything, there = _with_every_column(problem, x, panel_of(problem, borders))
         rows = everything.jacobian(there, self.use)[np.repeat(self.use.ravel(), 2)]
         left = problem.whitened(x)[self.use]
         lengths = np.linalg.norm(left, axis=1)
@@ -222,10 +223,10 @@ class Candidates:
         """List the free parameters whose motion can be a cause: those of MOVING that the
         fit estimates; empty for several scans or fewer than `MIN_MOVING_FRAMES` frames.
         """
-        sizes = np.bincount(self.fit.problem.group)
+        sizes = np.bincount(self.problem.group)
         if len(sizes) != 1 or sizes[0] < MIN_MOVING_FRAMES:
             return []
-        return [n for n in MOVING if n in self.fit.values]
+        return [n for n in MOVING if n in self.problem.layout.names[: self.count]]
 
     def _motion(self, name: str) -> Iterator[FloatArray]:
         """Yield the image shifts of a parameter that changes over the scan as a ramp or
@@ -237,9 +238,9 @@ class Candidates:
         Yields:
             `WAVES` columns (2 x seen positions, 1), of unit length.
         """
-        problem = self.fit.problem
+        problem = self.problem
         n, k = self.use.shape
-        slope = derivative(problem, self.fit, name, self.use).reshape(n, 2 * k)
+        slope = derivative(problem, self.x, name, self.use).reshape(n, 2 * k)
         place = (np.arange(n) + 0.5) / n
         seen = np.repeat(self.use.ravel(), 2)
         shapes = [
@@ -333,8 +334,7 @@ class Candidates:
     @cached_property
     def _places(self) -> FloatArray:
         """Predicted column and row of each position that counts, (m, 2) [px]."""
-        problem = self.fit.problem
-        return problem.residuals(self.fit.solution.x)[0][self.use]
+        return self.problem.residuals(self.x)[0][self.use]
 
     def judged(self, choice: Choice) -> Judged | None:
         """Judge a choice, once (cached).
@@ -360,7 +360,7 @@ class Candidates:
         """
         factor = choice[-1] or 1.0
         columns = list(range(self.count))
-        widths = [self.fit.problem.prior_sigma[: self.count] * factor]
+        widths = [self.problem.prior_sigma[: self.count] * factor]
         chance = 0.0
         for cause, pick in zip(self.causes, choice, strict=True):
             width = pick or cause.always
@@ -391,7 +391,7 @@ class Candidates:
             beads: indices.
         """
         at = next(i for i, cause in enumerate(self.causes) if cause.name == "beads")
-        size = float(np.ptp(self.fit.problem.model.beads, axis=0).max())
+        size = float(np.ptp(self.problem.model.beads, axis=0).max())
         every = self.causes[at].columns
         own = [every[3 * bead + axis] for bead in beads for axis in range(3)]
         columns, widths, chance = self._model(with_pick(choice, at, 0.0))
@@ -539,6 +539,26 @@ class Candidates:
                 out.append(weights * part / share)
         return out
 
+    def expected(self) -> tuple[FloatArray, FloatArray]:
+        """Compute the covariance of the geometry's columns averaged over no cause and every
+        single one, as it is expected of data without any, and that of no cause; internal
+        units, both (columns, columns).
+
+        The residuals' spread is `noise`; what always holds is as large as its widths.
+        """
+        drawn = np.zeros(len(self.means))
+        for cause in self.causes:
+            drawn[list(cause.columns)] = cause.always**2
+        nothing: Choice = (0.0,) * len(self.causes)
+        choices = [nothing] + [
+            with_pick(nothing, i, width)
+            for i, cause in enumerate(self.causes)
+            if cause.columns
+            for width in cause.widths
+        ]
+        models = [self._model(choice) for choice in choices]
+        return self.table.expected(models, drawn, self.noise, self.count)
+
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
         """Return the phantom's strain (10,) in a choice, in the order of STRAINS, and its
         covariance (10, 10); None if a stated strain is 0 or the choice cannot be judged.
@@ -597,10 +617,10 @@ class Candidates:
             several shapes.
         """
         model = self.judged(choice)
-        shape = image_shape(self.fit)
+        shape = image_shape(self.problem)
         if model is None or shape is None:
             return None
-        problem = self.fit.problem
+        problem = self.problem
         widths = np.concatenate(
             [np.full(self.count, np.inf)]
             + [
@@ -749,6 +769,24 @@ def _undetermined(
     return _widened(first, candidates, nothing), Found(odds)
 
 
+def expected_open(problem: FitProblem, known: Known) -> FloatArray:
+    """Compute the covariance that the causes of a scan are expected to leave open, beyond
+    that of its fit.
+
+    Args:
+        problem: planned, with its positions as predicted at the start.
+        known: statements on the phantom and the positions; the floor is the spread of the
+            whitened residuals.
+
+    Returns:
+        (p, p) of the columns that are parameters, edge units.
+    """
+    spread, own = Candidates(problem, problem.start, known, ()).expected()
+    names = problem.layout.names[: len(own)]
+    factor = np.array([edge_factor(n) for n in names])
+    return np.asarray((spread - own) * np.outer(factor, factor))
+
+
 def _searched(
     fit: FitResult,
     known: Known,
@@ -776,7 +814,7 @@ def _searched(
     Returns:
         The table, with at most `MOST_BORDERS` borders, and its most likely choice.
     """
-    candidates = Candidates(fit, known, borders, alike, left_out)
+    candidates = Candidates(fit.problem, fit.solution.x, known, borders, alike, left_out)
     choice = candidates.best([candidates.choice(before)])
     while len(candidates.borders) < MOST_BORDERS:
         found: dict[Border, list[Choice]] = {}
@@ -787,7 +825,7 @@ def _searched(
         some = []
         for border, parts in found.items():
             every = (*candidates.borders, border)
-            table = Candidates(fit, known, every, alike, left_out)
+            table = Candidates(fit.problem, fit.solution.x, known, every, alike, left_out)
             more = [
                 other
                 for part in parts
@@ -887,7 +925,7 @@ def _options(
     )
     beads = candidates.width(choice, "beads")
     bent = candidates.width(choice, "panel")
-    shape = image_shape(candidates.fit)
+    shape = image_shape(candidates.problem)
     panel = None
     if shape is not None and (bent or borders):
         panel = PanelModel(bent or NO_PANEL_PX, shape, tuple(borders))
@@ -908,19 +946,19 @@ def lost_beads(fit: FitResult) -> list[int]:
     return np.flatnonzero((seen >= 3) & (used < 0.5 * seen)).tolist()
 
 
-def image_shape(fit: FitResult) -> tuple[int, int] | None:
+def image_shape(problem: FitProblem) -> tuple[int, int] | None:
     """Return (rows, cols) of the images; None where frames differ."""
-    sizes = np.unique(2 * fit.problem.origin + 1, axis=0)
+    sizes = np.unique(2 * problem.origin + 1, axis=0)
     if len(sizes) == 1:
         return (int(sizes[0, 1]), int(sizes[0, 0]))
     return None
 
 
-def panel_of(fit: FitResult, borders: Sequence[Border]) -> PanelModel | None:
+def panel_of(problem: FitProblem, borders: Sequence[Border]) -> PanelModel | None:
     """Make a panel model with every term that a distortion may have, of width 1 px, and
     the given borders; None for images of several shapes.
     """
-    shape = image_shape(fit)
+    shape = image_shape(problem)
     if shape is None:
         return None
     return PanelModel(1.0, shape, tuple(borders))

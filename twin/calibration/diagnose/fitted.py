@@ -565,7 +565,9 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     use = problem.seen
     effects = []
     for i, name in enumerate(names):
-        reach = float(np.sqrt(np.mean(derivative(problem, fit, name, use) ** 2)))
+        reach = float(
+            np.sqrt(np.mean(derivative(problem, fit.solution.x, name, use) ** 2))
+        )
         effects.append(reach * max(float(np.ptp(m.values[:, i])) for m in found.motions))
     first = int(np.argmax(effects))
     motion = max(found.motions, key=lambda m: float(np.ptp(m.values[:, first])))

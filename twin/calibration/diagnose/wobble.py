@@ -121,7 +121,7 @@ def _wave(
     kept = np.repeat(use.ravel(), 2)
     columns = []
     for name in names:
-        slope = derivative(problem, fit, name, use).reshape(count, 2 * beads)
+        slope = derivative(problem, fit.solution.x, name, use).reshape(count, 2 * beads)
         columns += [(slope * shape(turn)).ravel()[kept] for shape in (np.cos, np.sin)]
     table = np.stack(columns, axis=1)
     lengths = np.maximum(np.linalg.norm(table, axis=0), 1e-300)

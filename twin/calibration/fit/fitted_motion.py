@@ -195,7 +195,7 @@ def _model(fit: FitResult, names: Sequence[str], known: MotionFit | None) -> Mot
     )  # in this order also where that is nan
     residual = problem.whitened(x).ravel()[keep]
     motion = np.stack(
-        [derivative(problem, fit, name, use)[keep] for name in names], axis=1
+        [derivative(problem, fit.solution.x, name, use)[keep] for name in names], axis=1
     )
     if known is not None:
         moved = known.motions[0].names
@@ -315,7 +315,8 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
     keep = np.repeat(use.ravel(), 2)
     frame = np.repeat(np.arange(len(along)), 2 * problem.seen.shape[1])
     aside = [
-        along[frame] * derivative(problem, fit, name, use) for name in ("dO_x", "dO_y")
+        along[frame] * derivative(problem, fit.solution.x, name, use)
+        for name in ("dO_x", "dO_y")
     ]
     rows = np.column_stack([problem.jacobian(x, use), *aside])[keep]
     size = len(x)
@@ -350,21 +351,21 @@ def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
 
 
 def derivative(
-    problem: FitProblem, fit: FitResult, name: str, use: npt.NDArray[np.bool_]
+    problem: FitProblem, x: FloatArray, name: str, use: npt.NDArray[np.bool_]
 ) -> FloatArray:
     """Compute the whitened change of the positions with one frame's parameter, free or
     not; beads and other parameters stay.
 
     Args:
         problem: of the fit.
-        fit: gives the column values.
+        x: column values.
         name: of the parameter.
         use: (n, k) positions that count; others have 0.
 
     Returns:
         (2 n k,), an internal unit.
     """
-    params, beads = problem.spread(fit.solution.x)
+    params, beads = problem.spread(x)
     groups = len(params)
     alone = layout((name,), groups, (name,), len(beads), False)
     still = replace(problem, base=params, layout=alone, panel=None, curvature=None)

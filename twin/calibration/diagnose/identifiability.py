@@ -1,30 +1,24 @@
 """Forecast of the parameters that a planned scan determines, and changes to improve it.
 
-The prediction is the Cramer-Rao bound of the reprojection residuals at the planned
-geometry. The suggestions are planned scans too and are evaluated in the same way.
+The prediction is that of the fit (`fit.forecast`), and what the causes that a calibration
+looks for are expected to leave open. The suggestions are planned scans too and are evaluated
+in the same way.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.bead_model import (
-    BeadModel,
-    BeadPhantom,
-    bead_model,
-    spot_radii,
-)
-from flexdt.twin.calibration.fit.certificate import Conditioning, spectrum
-from flexdt.twin.calibration.fit.fit import IN_IMAGES, image_slopes
+from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
+from flexdt.twin.calibration.diagnose.causes import Known, expected_open
+from flexdt.twin.calibration.fit.forecast import Forecast, forecast, visible_beads
 from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known, known_strain
 from flexdt.twin.calibration.fit.problem import (
     SIX,
-    FitProblem,
     Shape,
     as_poses,
     build_problem,
@@ -104,6 +98,7 @@ def identifiability(
     bead_tolerance_mm: float | None = None,
     priors: Given | None = None,
     bound: float = BOUND,
+    causes: bool = True,
 ) -> Prediction:
     """Predict the uncertainty of a calibration, and that of changed plans.
 
@@ -121,6 +116,8 @@ def identifiability(
             `flexdt calibrate` assumes for a scanner without its own; 0 is exactly, "none"
             is all exactly.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
+        causes: count what the causes that `calibrate` looks for leave open; False: the fit
+            alone, as `estimate_geometry` states it.
 
     Returns:
         Predicted sigmas, rank, directions not determined, and suggestions, best first:
@@ -151,7 +148,7 @@ def identifiability(
     widths = known(free, priors)
 
     def predict(
-        beads: BeadModel, plan: Poses, sizes: FloatArray
+        beads: BeadModel, plan: Poses, sizes: FloatArray, rivals: bool = False
     ) -> tuple[Forecast, npt.NDArray[np.bool_]]:
         """Predict the certificate of a fit to a planned scan.
 
@@ -161,6 +158,7 @@ def identifiability(
             beads: the phantom's k beads.
             plan: poses of n frames.
             sizes: (n, 2) rows and columns of the frames.
+            rivals: count what other causes leave open.
 
         Returns:
             The forecast, and the visible beads (n, k).
@@ -169,6 +167,7 @@ def identifiability(
         pixels = plan.cone_vec(at).project_points(beads.beads, (1, 1))
         origin = (sizes[:, ::-1] - 1) / 2
         tracks = np.where(visible[..., None], pixels + origin[:, None], np.nan)
+        strain = known_strain(beads, free, priors, bead_tolerance_mm)
         problem = build_problem(
             tracks,
             beads,
@@ -180,12 +179,16 @@ def identifiability(
             start=at,
             bead_tolerance_mm=tolerance,
             priors=widths,
-            strain=known_strain(beads, free, priors, bead_tolerance_mm),
+            strain=strain,
         )
-        return forecast(problem, bound), visible
+        fitted = forecast(problem, bound)
+        if rivals and not fitted.spectrum.null and visible.any():
+            open_ = expected_open(problem, Known(strain, bead_tolerance_mm, 1.0))
+            return forecast(problem, bound, open_), visible
+        return fitted, visible
 
     sizes = frame_shapes(shape, len(poses))
-    expected, visible = predict(model, poses, sizes)
+    expected, visible = predict(model, poses, sizes, causes)
     spec = expected.spectrum
     sigmas = expected.sigmas
     suggestions: list[Suggestion] = []
@@ -208,90 +211,6 @@ def identifiability(
         visible=visible,
         suggestions=tuple(suggestions),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Forecast:
-    """The forecast of a problem's data, with its priors.
-
-    Attributes:
-        sigmas: requested column -> standard deviation, edge units; inf: not determined.
-        image_sigmas: of IN_IMAGES.
-        covariance: (p, p) of the requested columns, edge units.
-        spectrum: rank, condition, null and weak directions of the requested columns.
-    """
-
-    sigmas: dict[str, float]
-    image_sigmas: dict[str, float]
-    covariance: FloatArray
-    spectrum: Conditioning
-
-
-def forecast(problem: FitProblem, bound: float = BOUND) -> Forecast:
-    """Predict the certificate of a fit to the data of a problem, at its start, for
-    whitened residuals of spread 1.
-
-    With nuisance parameters (priors, strain), rank and condition are of the asked ones,
-    all else given.
-
-    Args:
-        problem: the planned data, with priors.
-        bound: as of `identifiability`.
-
-    Returns:
-        Sigmas of the asked parameters and those in images (infinite where not determined,
-        the latter together), covariance and spectrum.
-    """
-    names = problem.layout.names
-    count = problem.layout.asked
-    reported = problem.layout.parameter_count
-    seen = int(problem.seen.any(axis=0).sum())
-    rows = np.concatenate(
-        [problem.jacobian(problem.start), np.diag(1.0 / problem.prior_sigma)]
-    )
-    spec = spectrum(rows, names, seen, reported=count, bound=bound)
-    strained = problem.layout.strain_columns
-    if count < reported or strained.start < strained.stop:
-        # Rank and condition say what the images tell of what was asked for, all else given.
-        nuisance = {*range(count, reported), *range(strained.start, strained.stop)}
-        given = [i for i in range(len(names)) if i not in nuisance]
-        alone = spectrum(rows[:, given], [names[i] for i in given], seen, reported=count)
-        rank = min(alone.rank, len(given) - len(spec.null))
-        unit = spec.unit_covariance
-        spec = replace(alone, unit_covariance=unit, rank=rank, null=spec.null)
-    covariance = spec.unit_covariance[:count, :count]
-    sigmas = dict(zip(names[:count], np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    images = dict.fromkeys(IN_IMAGES, math.inf)
-    whole = spec.unit_covariance[:reported, :reported]
-    if np.isfinite(whole).all():
-        slopes = image_slopes(problem, problem.start, 0)[1]
-        variance = np.einsum("qi,ij,qj->q", slopes, whole, slopes)
-        images = dict(
-            zip(IN_IMAGES, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True)
-        )
-    return Forecast(sigmas, images, covariance, spec)
-
-
-def visible_beads(
-    model: BeadModel, poses: Poses, shape: FloatArray, at: Offsets = NOMINAL
-) -> npt.NDArray[np.bool_]:
-    """Mark beads whose spots are entirely on the detector.
-
-    Args:
-        model: the beads.
-        poses: n frames.
-        shape: (n, 2) detector (rows, cols) of each frame.
-        at: geometry offsets.
-
-    Returns:
-        (n, k) bool; False too for beads behind the source.
-    """
-    cone = poses.cone_vec(at)
-    pixels = cone.project_points(model.beads, (1, 1))
-    radius = spot_radii(model, cone)
-    half = shape[:, None, ::-1] / 2
-    inside = (np.abs(pixels) + radius[..., None] <= half).all(axis=2)
-    return np.asarray(inside & (radius > 0))
 
 
 def _worst(sigmas: dict[str, float]) -> float:
