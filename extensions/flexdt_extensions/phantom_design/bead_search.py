@@ -24,6 +24,7 @@ from flexdt.twin.calibration import (
     BeadModel,
     axis_in_image,
     estimate_geometry,
+    identifiability,
     spot_radii,
     tolerance_of,
     visible_beads,
@@ -109,7 +110,7 @@ def measured_spread(
     """
     rng = np.random.default_rng([seed, 11])
     errors: list[dict[str, float]] = []
-    tolerance = planned.bead_tolerance_mm
+    tolerance = planned.spread_mm
     free_beads = tolerance > 0
     widths = {name: width for name, width in planned.widths.items() if width > 0}
     for _ in range(trials):
@@ -273,6 +274,26 @@ def forecast(
         float(score_of(felt[None], criterion)[0]),
         float(masks.mean()),
     )
+
+
+def stated(model: BeadModel, planned: PlannedScans) -> dict[str, float] | None:
+    """Predict the sigmas that `flexdt calibrate` states, with the phantom's strain and what
+    other causes leave open; touching spots count.
+
+    Returns:
+        Parameters and IN_IMAGES -> standard deviation, edge units; None if the scans do not
+        determine all of them.
+    """
+    found = identifiability(
+        model,
+        planned.poses,
+        planned.noise_px,
+        planned.free,
+        shape=planned.shape,
+        bead_tolerance_mm=planned.bead_tolerance_mm,
+        priors=planned.widths,
+    )
+    return found.sigmas | found.image_sigmas if found.identifiable else None
 
 
 def design(

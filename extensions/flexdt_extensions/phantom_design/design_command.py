@@ -42,8 +42,11 @@ def design(
     ),
     free: Free = None,
     noise: float = option(0.1, "Measure positions with this noise.", metavar="PX"),
-    tolerance: float = option(
-        0.0, "How well beads will sit.", "--bead-tolerance", metavar="MM"
+    tolerance: float | None = option(
+        None,
+        "How well beads will sit; left out: as calibrate assumes.",
+        "--bead-tolerance",
+        metavar="MM",
     ),
     criterion: Literal["a", "d", "worst"] = option("a", "What is minimised."),
     trials: int = option(60, "Fits that check it.", min=0),
@@ -80,7 +83,7 @@ def design(
         else:
             places = [(600.0, 0.0)]
         poses, shape = work.circle_poses(scanner, places, sdd, frames)
-    if not (noise > 0 and tolerance >= 0 and radius > 0):
+    if not (noise > 0 and (tolerance or 0.0) >= 0 and radius > 0):
         raise typer.BadParameter(
             "--noise and --radius must be positive, --bead-tolerance >= 0"
         )

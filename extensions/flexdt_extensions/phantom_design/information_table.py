@@ -59,7 +59,8 @@ class PlannedScans:
         noise_px: standard deviation of a detected coordinate.
         free: parameters to be estimated, shared by all placements.
         bead_tolerance_mm: > 0: standard deviation of the beads' places; they are
-            estimated, too.
+            estimated, too. 0 and None: a search takes them as exact; None: a calibration
+            is not told so.
         priors: standard deviations of the other parameters [mm, deg, 1], 0 exactly known;
             None: as `known` of `fit.priors` has it.
     """
@@ -68,7 +69,7 @@ class PlannedScans:
     shape: tuple[int, int]
     noise_px: float = NOISE_PX
     free: tuple[str, ...] = SIX
-    bead_tolerance_mm: float = 0.0
+    bead_tolerance_mm: float | None = 0.0
     priors: Mapping[str, float] | None = None
 
     @property
@@ -77,6 +78,11 @@ class PlannedScans:
         if self.priors is None:
             return known(self.free)
         return self.priors
+
+    @property
+    def spread_mm(self) -> float:
+        """Standard deviation of the beads' places that a search counts; 0: exact."""
+        return self.bead_tolerance_mm or 0.0
 
     def sizes(self) -> FloatArray:
         """Return (n, 2) detector (rows, cols) of each frame."""
@@ -167,7 +173,7 @@ class SeatTable:
             planned.poses.cone_vec().project_points(places, (1, 1)).transpose(1, 0, 2),
             spot_radii(model, planned.poses.cone_vec()).T,
             visible_beads(model, planned.poses, planned.sizes()).T,
-            planned.bead_tolerance_mm,
+            planned.spread_mm,
         )
 
     def touching(
@@ -244,7 +250,7 @@ def _problem(model: BeadModel, planned: PlannedScans) -> FitProblem:
         free=planned.free,
         shape=planned.sizes(),
         noise_px=planned.noise_px,
-        free_beads=planned.bead_tolerance_mm > 0,
+        free_beads=planned.spread_mm > 0,
         priors=planned.widths,
     )
 

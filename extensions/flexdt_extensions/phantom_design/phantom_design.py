@@ -36,6 +36,7 @@ from flexdt_extensions.phantom_design.bead_search import (
     forecast,
     measured_spread,
     share_identified,
+    stated,
 )
 from flexdt_extensions.phantom_design.information_table import (
     CRITERIA,
@@ -217,6 +218,7 @@ def run_design(
                 "sigmas": guess.sigmas,
                 "image_sigmas": guess.image_sigmas,
                 "measured": measured,
+                "stated": stated(model, scans),
                 "shadows_used": guess.used,
                 "determined": guess.worst <= BOUND / TOLERANCE["mm"],
                 "identified": share_identified(model, scans, seed=request.seed),
@@ -265,9 +267,9 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
         document: of `run_design`.
 
     Returns:
-        Name, unit, predicted and measured of the design, then of the spiral, and the
-        gain, the spiral's prediction divided by the design's ("-" where the document has
-        no gain), as text.
+        Name, unit, predicted and measured of the design and what `flexdt calibrate` states
+        of it, predicted and measured of the spiral, and the gain: the spiral's prediction
+        divided by the design's ("-" where the document has no gain), as text.
     """
     ours = document["design"]
     theirs = document["spiral"]
@@ -277,6 +279,7 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
             IN_IMAGES[name] if kind == "image_sigmas" else unit_of(name),
             f"{sigma:.3g}",
             _of(ours["measured"], name),
+            _of(ours["stated"], name),
             f"{theirs[kind][name]:.3g}",
             _of(theirs["measured"], name),
             "-" if document["gain"] is None else f"{theirs[kind][name] / sigma:.2f}",
@@ -286,7 +289,9 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
     ]
 
 
-HEADER = ("parameter", "unit", "design", "measured", "spiral", "measured", "gain")
+HEADER = (
+    "parameter", "unit", "design", "measured", "calibrate states", "spiral", "measured", "gain",
+)  # fmt: skip
 
 
 def write(

@@ -47,7 +47,7 @@ def test_forecast_is_the_public_prediction_where_no_shadows_touch(
     planned = PlannedScans(circle(36), SHAPE, bead_tolerance_mm=tolerance)
     ours = forecast(LEGO, planned)
     theirs = identifiability(
-        LEGO, planned.poses, 0.1, shape=SHAPE, bead_tolerance_mm=tolerance
+        LEGO, planned.poses, 0.1, shape=SHAPE, bead_tolerance_mm=tolerance, causes=False
     )
     assert ours.used == 1.0
     for name, sigma in (theirs.sigmas | theirs.image_sigmas).items():
@@ -57,7 +57,9 @@ def test_forecast_is_the_public_prediction_where_no_shadows_touch(
 def test_touching_shadows_count_for_nothing() -> None:
     near = BeadModel(np.array([[-6.0, 0, 0], [6.0, 0, 0], [0, 5.0, 15.0]]), np.array(1.0))
     found = forecast(near, PlannedScans(circle(72), SHAPE))
-    free = identifiability(near, circle(72), 0.1, shape=SHAPE, bead_tolerance_mm=0.0)
+    free = identifiability(
+        near, circle(72), 0.1, shape=SHAPE, bead_tolerance_mm=0.0, causes=False
+    )
     assert 0.8 < found.used < 1.0
     for name, sigma in free.image_sigmas.items():
         assert found.image_sigmas[name] > sigma * 1.003, name

@@ -32,6 +32,9 @@ def test_lego_design_is_written_whole(
     felt = {"axis_column", "axis_angle", "magnification"}
     assert set(ours["image_sigmas"]) == felt
     assert set(ours["measured"]) == set(document["free"]) | felt
+    assert set(ours["stated"]) == set(document["free"]) | felt
+    # Nobody said that the phantom is exact, so that its millimetre is known to 0.1 %.
+    assert ours["stated"]["magnification"] > 10 * ours["image_sigmas"]["magnification"]
     assert document["priors"]["dD_x"] > 0
     found = as_phantom(str(out / "phantom.json"))
     np.testing.assert_allclose(found.beads, ours["beads"])
@@ -107,6 +110,7 @@ def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
         "sigmas": {"dO_x": 0.1},
         "image_sigmas": {"axis_column": 0.01},
         "measured": None,
+        "stated": None,
     }
     document: dict[str, object] = {
         "design": entry,
