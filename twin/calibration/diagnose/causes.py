@@ -266,7 +266,7 @@ class Candidates:
         Returns:
             (p,) lengths.
         """
-        prior = self.noise / self.fit.problem.prior_sigma[: self.count]
+        prior = self.noise / self.problem.prior_sigma[: self.count]
         table = np.concatenate([rows[:, : self.count], np.diag(prior)])
         scale = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
         basis = np.linalg.qr(table / scale)[0][: len(rows)]
