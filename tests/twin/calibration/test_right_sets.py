@@ -8,16 +8,17 @@ import faults_drawn
 import numpy as np
 import prior_coverage as own
 import pytest
-from causes_named import scored
+from causes_named import calibrated, scored
+from faults_drawn import drawn
 from right_sets import FAR_SIGMAS, LEVELS, covered
 from right_sets import off as off_of
 from scipy.stats import f
 
-from flexdt.twin.calibration.diagnose import causes, tiles
+from flexdt.twin.calibration.diagnose import causes, fitted, tiles
 from flexdt.twin.calibration.fit import priors, problem
 from flexdt.twin.calibration.fit.certificate import Certificate, Rival, widened
 from flexdt.twin.calibration.fit.curved_region import Bend
-from flexdt.twin.calibration.fit.fit import estimate_geometry
+from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.geometry.poses import Poses
 
 DEGREES = 300.0
@@ -134,3 +135,33 @@ def test_a_cause_beside_which_nothing_is_determined_is_not_left_out() -> None:
     found = scored("with_causes", 70003)
     assert not found.offered, found
     assert any(s.startswith("phantom_strained") for s in found.said), found
+
+
+def test_a_doubtful_cause_beside_which_nothing_is_determined_widens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The likeliest choice, but not beyond doubt: the fit without it is offered, with what
+    they differ by."""
+    search = fitted.explained_by_causes
+    found: list[tuple[FitResult, FitResult, causes.Found]] = []
+
+    def opened(fit: FitResult) -> FitResult:
+        certificate = fit.certificate
+        spectrum = replace(certificate.spectrum, rank=0)
+        return replace(fit, certificate=replace(certificate, spectrum=spectrum))
+
+    def explained(
+        fit: FitResult, known: causes.Known, refit: causes.Refit
+    ) -> tuple[FitResult, causes.Found]:
+        better, odds = search(fit, known, lambda **changes: opened(refit(**changes)))
+        found.append((fit, better, odds))
+        return better, odds
+
+    monkeypatch.setattr(fitted, "explained_by_causes", explained)
+    calibrated(drawn("as_assumed", 50018))
+    first, better, odds = found[0]
+    assert better.identifiable
+    assert better.values == first.values
+    assert not odds.applied
+    assert max(better.sigmas[n] / s for n, s in first.sigmas.items()) > 1.2
+    assert len(better.certificate.rivals) > 10
