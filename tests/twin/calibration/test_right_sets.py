@@ -10,7 +10,7 @@ import prior_coverage as own
 import pytest
 from causes_named import calibrated, scored
 from faults_drawn import drawn
-from right_sets import FAR_SIGMAS, LEVELS, covered
+from right_sets import FAR_SIGMAS, LEVELS, contains_what_is_asked, covered
 from right_sets import off as off_of
 from scipy.stats import f
 
@@ -34,6 +34,9 @@ def levels(scale: float, scans: int = 400) -> list[float]:
 
 def test_regions_of_another_size_are_told() -> None:
     """The judgement itself: 400 scans tell a region that is scaled by 1.3, or by .8."""
+    assert contains_what_is_asked(levels(1.0))
+    assert not contains_what_is_asked(levels(1.3))
+    assert not contains_what_is_asked(levels(0.8))
     right = off_of(levels(1.0))
     assert all(abs(v) < FAR_SIGMAS for v in right.values()), right
     assert off_of(levels(1.3))[0.5] > FAR_SIGMAS
@@ -120,12 +123,10 @@ def test_what_widens_the_estimates_widens_every_rival(plain: Certificate) -> Non
 @pytest.mark.campaign(4)
 @pytest.mark.parametrize("kind", ["as_assumed", "with_causes"])
 def test_regions_contain_as_many_truths_as_they_say(kind: str) -> None:
-    """A region of 1.3 times its size fails: 50 of 80 truths are in the 50 % region then."""
+    """A region of 1.3 times its size fails: 74 of 80 truths are in the 50 % region then."""
     found = [one for seed in range(300, 380) if (one := covered(kind, seed)) is not None]
     far = off_of([one.level for one in found])
-    assert min(far.values()) > -FAR_SIGMAS, far
-    if kind == "with_causes":
-        assert max(far.values()) < FAR_SIGMAS, far
+    assert all(abs(v) < FAR_SIGMAS for v in far.values()), far
     assert far.keys() == set(LEVELS)
 
 
