@@ -123,8 +123,8 @@ def test_what_widens_the_estimates_widens_every_rival(plain: Certificate) -> Non
 @pytest.mark.campaign(4)
 @pytest.mark.parametrize("kind", ["as_assumed", "with_causes"])
 def test_regions_contain_as_many_truths_as_they_say(kind: str) -> None:
-    """A region of 1.3 times its size fails: 74 of 80 truths are in the 50 % region then."""
-    found = [one for seed in range(300, 380) if (one := covered(kind, seed)) is not None]
+    """A region of 1.3 times its size fails: 37 of 40 truths are in the 50 % region then."""
+    found = [one for seed in range(300, 340) if (one := covered(kind, seed)) is not None]
     far = off_of([one.level for one in found])
     assert all(abs(v) < FAR_SIGMAS for v in far.values()), far
     assert far.keys() == set(LEVELS)
