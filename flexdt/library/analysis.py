@@ -7,16 +7,18 @@ the command line calls too.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Unpack
 
 from flexdt.library.calibration.align_dataset import Aligned
-from flexdt.library.calibration.calibrate import Outcome, calibrate_with
+from flexdt.library.calibration.calibrate import Outcome, calibrate_with, typed_words
 from flexdt.library.calibration.calibration_options import CalibrationOptions
+from flexdt.library.calibration.proposed_commands import IN_MEMORY
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.exchange import with_geometry
-from flexdt.library.reading.folders import load_dataset, read_tiffs
+from flexdt.library.reading.folders import load_dataset
 from flexdt.library.reading.listed_images import markers_alone
 from flexdt.phantoms import Phantom
 from flexdt.twin import long_work
@@ -91,7 +93,11 @@ def _calibrate(
     Raises:
         TwinError: neither data, nor geometry and markers.
     """
+    files: tuple[str, ...] = ()
+    if geometry is not None:
+        files = ("GEOMETRY",)
     if isinstance(geometry, str | PathLike):
+        files = (str(geometry),)
         geometry = ConeVec.load(geometry)
     markers = options.get("markers")
     if data is None:
@@ -102,6 +108,7 @@ def _calibrate(
         else:
             name = "marks"
         sets = [markers_alone(geometry, name)]
+        folders: list[str] = []
     else:
         if isinstance(data, DataSet | str | PathLike):
             several = [data]
@@ -110,7 +117,13 @@ def _calibrate(
         sets = [
             _open(d) if geometry is None else _with_geometry(d, geometry) for d in several
         ]
-    return calibrate_with(sets, phantom, options)
+        folders = [_typed(d) for d in several]
+    typed = replace(
+        typed_words(sets, phantom, options),
+        data=tuple(folders),
+        geometry=files * max(len(folders), 1),
+    )
+    return calibrate_with(sets, phantom, options, typed)
 
 
 @public
@@ -226,12 +239,19 @@ def align(
 
 
 def _with_geometry(data: Data, geometry: ConeVec) -> DataSet:
-    """Return a data set with another nominal geometry, or read a folder of TIFF images
-    with it.
-    """
+    """Return a data set with another nominal geometry, or open a folder with it."""
     if isinstance(data, DataSet):
         return with_geometry(data, geometry)
-    return read_tiffs(data, geometry)
+    return load_dataset(data, geometry=geometry)
+
+
+def _typed(data: Data) -> str:
+    """Return the folder of a scan as it was given, or what stands for one in memory."""
+    if not isinstance(data, DataSet):
+        return str(data)
+    if data.folder is None:
+        return IN_MEMORY
+    return data.where
 
 
 def _open(data: Data) -> DataSet:

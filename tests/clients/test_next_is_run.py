@@ -20,7 +20,7 @@ import pytest
 import flexdt as fx
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.command_tree import run
-from flexdt.library.calibration.calibrate import NEXT, settling_commands
+from flexdt.library.calibration.proposed_commands import NEXT, Typed, settling_commands
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.twin.calibration.diagnose import error
 from flexdt.twin.geometry.offsets import Offsets
@@ -57,6 +57,12 @@ def elsewhere(poses: Poses) -> Poses:
     return replace(poses, detector=poses.detector + [0.0, 25.0, 0.0])
 
 
+def jumping(poses: Poses) -> Poses:
+    """The source steps aside in the middle of the turn."""
+    aside = np.where(np.arange(len(poses)) < 9, 0.0, 0.2)
+    return replace(poses, source=poses.source + aside[:, None] * [1.0, 0.0, 0.0])
+
+
 @dataclass(frozen=True)
 class Case:
     """A scan whose report proposes commands.
@@ -67,6 +73,7 @@ class Case:
         phantom: that is named; the one that was scanned is "lego".
         moving: parameters with another value in each frame.
         advises: option that is in one of the proposed commands.
+        anybody: the scan is a folder of TIFFs, with its geometry in a file.
     """
 
     code: str
@@ -74,6 +81,7 @@ class Case:
     phantom: str = "lego"
     moving: tuple[str, ...] = ()
     advises: str = ""
+    anybody: bool = False
 
 
 CASES = {
@@ -92,14 +100,30 @@ CASES = {
     "held_parameter": Case(
         "held_parameter", lambda: elsewhere(turned()), advises=",dD_z"
     ),
+    "anybodys": Case("", turned, advises="--geometry GEOMETRY ", anybody=True),
+    "anybodys_held": Case(
+        "held_parameter", lambda: elsewhere(turned()), advises=",dD_z", anybody=True
+    ),
+    "jumps": Case("", lambda: jumping(turned()), advises="--per-frame dO_x,"),
 }
 
 
-def scanned(true: Poses, said: Poses, folder: Path) -> Path:
-    """Save a scan of the LEGO phantom at one geometry under another."""
+def scanned(true: Poses, said: Poses, folder: Path, anybody: bool = False) -> Path:
+    """Save a scan of the LEGO phantom at one geometry under another.
+
+    Anybody's is a folder of TIFFs under other names, with a geometry file beside it.
+    """
     geometry = true.cone_vec(Offsets.from_edge(TRUTH)).with_shape(SHAPE)
     data = fx.simulate("lego", geometry, noise=1)
     with_geometry(data, said.cone_vec(Offsets()).with_shape(SHAPE)).save(folder)
+    if anybody:
+        for file in list(folder.iterdir()):
+            if file.name == "geometry.json":
+                file.rename(folder.with_suffix(".json"))
+            elif file.name.startswith("scan_"):
+                file.rename(folder / file.name.replace("scan_", "view"))
+            elif file.suffix != ".tif":
+                file.unlink()
     return folder
 
 
@@ -122,8 +146,11 @@ def require_right_or_careful(document: Any, moving: tuple[str, ...] = ()) -> Non
 
 def proposed(case: Case, folder: Path) -> tuple[Path, list[str], Any]:
     """Calibrate the scan of a case: its folder, what is proposed, and the document."""
-    scan = scanned(case.true(), turned(), folder / "scan")
-    document = calibrated([str(scan), "--phantom", case.phantom], folder / "first.json")
+    scan = scanned(case.true(), turned(), folder / "scan", case.anybody)
+    words = [str(scan)]
+    if case.anybody:
+        words = ["--frames", str(scan), "--geometry", str(scan.with_suffix(".json"))]
+    document = calibrated([*words, "--phantom", case.phantom], folder / "first.json")
     errors = [p["code"] for p in document["problems"] if p["severity"] == "error"]
     assert errors[:1] == [case.code] * bool(case.code), document["problems"]
     return scan, document["next"], document
@@ -134,6 +161,9 @@ def filled_in(line: str, scan: Path, folder: Path) -> list[str]:
     places = {
         "SAMPLE": str(scan), "REPORT.json": str(folder / "first.json"), "NAME": "lego",
         "PLACE-1": str(scan), "PLACE-2": str(folder / "nearer"),
+        "GEOMETRY": str(scan.with_suffix(".json")),
+        "GEOMETRY-1": str(scan.with_suffix(".json")),
+        "GEOMETRY-2": str(folder / "nearer.json"),
     }  # fmt: skip
     words = shlex.split(line, comments=True)
     assert words.pop(0) == "flexdt"
@@ -148,8 +178,8 @@ def run_what_is_proposed(case: Case, folder: Path) -> None:
         words = filled_in(line, scan, folder)
         if str(folder / "nearer") in words:
             near = turned(0.75 * SOD_MM)
-            scanned(near, near, folder / "nearer")
-        if words[0] == "calibrate" and "--report" not in words:
+            scanned(near, near, folder / "nearer", case.anybody)
+        if words[0] == "calibrate" and "report.html" not in words:
             document = calibrated(words[1:], folder / "next.json")
             require_right_or_careful(document, case.moving)
         elif words[0] == "calibrate":
@@ -190,15 +220,21 @@ def test_advice_of_a_finding_becomes_a_command() -> None:
         "dD_z is held at 0 mm: free dD_z, det_roll too, or hold it",
         free=("dD_z", "det_roll"),
     )
-    (line,) = settling_commands(said)
-    assert line.endswith(" --free {free},dD_z,det_roll")
+    typed = Typed(("scan",), "lego", options={"prior": "dD_z=0,det_yaw=0.1"})
+    (line,) = settling_commands(said, typed, ("dO_x",))
+    assert line == (
+        "flexdt calibrate scan --phantom lego --prior det_yaw=0.1 "
+        "--free dO_x,dD_z,det_roll"
+    )
     (line,) = settling_commands(
         error(
             "drift",
             "dO_x moves: --per-frame dO_x,dO_y follows it",
             per_frame=("dO_x", "dO_y"),
-        )
+        ),
+        typed,
+        (),
     )
     assert line.endswith(" --per-frame dO_x,dO_y")
-    (line,) = settling_commands(error("one_bead", "a single shadow"))
+    (line,) = settling_commands(error("one_bead", "a single shadow"), typed, ())
     assert line.endswith(" --report report.html")

@@ -403,11 +403,14 @@ def test_the_command(
     )
     assert "folder" in capsys.readouterr().err
     base = ["reconstruct", str(folders["plain"]), "--out", str(tmp_path / "d.mha")]
+    of_motors = tmp_path / "of-motors.json"
+    of_motors.write_text('{"correction": {"dO_x": 0.1}}')
     for extra, about in (
         (["--kv", "60"], "--kv"),
         (["--iterations", "5"], "--iterations"),
         (["--algorithm", "sirt", "--weight", "0.01"], "--weight"),
         (["--correction", "none", "--geometry", str(out)], "--correction"),
+        (["--correction", str(of_motors), "--geometry", str(out)], "own geometry"),
     ):
         assert run([*base, *extra]) == 2
         assert about in capsys.readouterr().err

@@ -18,6 +18,7 @@ from flexdt.clients.cli.command_tree import run
 from flexdt.library.datasets import exchange
 from flexdt.library.datasets.exchange import (
     ExchangeError,
+    Given,
     export_dataset,
     geometry_of,
     load_geometry,
@@ -379,8 +380,8 @@ def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> No
     data = load_dataset(folder)
     save_geometry(geometry_of(data, NOMINAL), file)
     (own,), (imported,) = (
-        _load_data_sets([folder], None),
-        _load_data_sets([folder], [file]),
+        _load_data_sets([folder], [], Given()),
+        _load_data_sets([folder], [file], Given()),
     )
     assert np.abs(own.cone_vec.rows - imported.cone_vec.rows).max() < 1e-9
     # A correction means the same on top of either, but for alpha: a panel that the profile rolls
@@ -391,4 +392,4 @@ def test_calibrate_takes_imported_geometries(folder: Path, tmp_path: Path) -> No
     difference = own.corrected(moved).rows - imported.corrected(moved).rows
     assert np.abs(difference).max() < 1e-9
     with pytest.raises(BadParameter, match="1 geometries for 2"):
-        _load_data_sets([folder, folder], [file])
+        _load_data_sets([folder, folder], [file], Given())

@@ -84,7 +84,7 @@ def test_transmissions_taken_for_line_integrals_are_named() -> None:
     light = np.exp(-seen(data))
     wrong = fx.DataSet.from_arrays(light.astype(np.float32), scan).calibrate(phantom)
     (told,) = [p["text"] for p in wrong.document["problems"] if p["code"] == "no_beads"]
-    assert "Taken as transmissions, 6 of 6 frames show such spots" in told
+    assert "but 6 of 6 show such spots taken as transmissions" in told
     right = fx.DataSet.from_arrays(light, scan, flat=np.ones(shape)).calibrate(phantom)
     assert right.calibration.identifiable, right.document["problems"]
     empty = fx.DataSet.from_arrays(np.ones_like(light), scan).calibrate(phantom)

@@ -16,7 +16,11 @@ import typer
 from flexdt.clients.cli import option_values, options, value_completion
 from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.command_settings import CalibrateSettings
-from flexdt.clients.cli.commands.data_commands import geometry_options
+from flexdt.clients.cli.commands.data_commands import (
+    geometry_options,
+    read_geometry,
+    scan_of,
+)
 from flexdt.clients.cli.console import as_json, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import chosen
@@ -93,6 +97,7 @@ def calibrate(
     from flexdt.library.calibration.calibrate import calibrate_with
     from flexdt.library.calibration.calibration_report import write_report
     from flexdt.library.calibration.calibration_request import request_of
+    from flexdt.library.calibration.proposed_commands import Typed, option_words
     from flexdt.library.figures import require_plots
 
     options: CalibrationOptions = {
@@ -125,7 +130,14 @@ def calibrate(
         geometry or [],
         geometry_options(None, shape, pixel),
     )
-    outcome = calibrate_with(given, target, options)
+    typed = Typed(
+        tuple(map(str, datasets or ())),
+        target,
+        tuple(map(str, geometry or ())),
+        option_words(options) | _words(frames=frames, shape=shape, pixel=pixel),
+        None if report is None or report.suffix.lower() != ".json" else str(report),
+    )
+    outcome = calibrate_with(given, target, options, typed)
     document: dict[str, Any] = outcome.document
     if report is not None:
         write_report(outcome, report)
@@ -144,6 +156,11 @@ def calibrate(
         raise CommandError(f"not to be used{codes and ': '}{codes}", NOT_IDENTIFIABLE)
     if push:
         _push(twin, outcome.correction, outcome.sources, document)
+
+
+def _words(**options: object) -> dict[str, str]:
+    """Return those of the command's options that were given, as they were typed."""
+    return {name: str(value) for name, value in options.items() if value is not None}
 
 
 def _read_assignments(given: list[str] | None) -> dict[str, float]:
@@ -196,15 +213,13 @@ def _load_inputs(
     if folders:
         if frames is not None:
             raise typer.BadParameter("--frames and a data set; give one")
-        return _load_data_sets(folders, geometries)
+        return _load_data_sets(folders, geometries, known)
     if len(geometries) != 1 or (frames is None and markers is None):
         raise typer.BadParameter(
             "no data set; allowed: --frames DIR or --markers FILE, and one "
             "--geometry FILE"
         )
-    from flexdt.twin.geometry.cone_vec import ConeVec
-
-    cone = ConeVec.load(geometries[0], shape=known.shape, pixel=known.pitch_mm)
+    cone = read_geometry(geometries[0], known)
     if frames is not None:
         from flexdt.library.reading.folders import read_tiffs
 
@@ -215,31 +230,33 @@ def _load_inputs(
     return [markers_alone(cone, markers.stem)]
 
 
-def _load_data_sets(folders: list[Path], geometries: list[Path] | None) -> list[DataSet]:
+def _load_data_sets(
+    folders: list[Path], geometries: list[Path], known: Given
+) -> list[DataSet]:
     """Load the data sets, each with its own geometry or the one of a file.
 
-    No geometries (None or an empty list): each data set keeps its own. Order is that of
-    the folders.
+    Without geometries each data set keeps its own; with them folders of anybody's TIFFs
+    are data sets, too. Order is that of the folders.
 
     Args:
         folders: of the data sets.
-        geometries: one file for each, or None.
+        geometries: one file for each, or none.
+        known: detector shape and pitch that the files lack.
 
     Raises:
         typer.BadParameter: another number of geometries.
     """
-    from flexdt.library.datasets.exchange import load_geometry, with_geometry
     from flexdt.library.reading.folders import load_dataset
 
-    data = [load_dataset(folder) for folder in folders]
     if not geometries:
-        return data
+        return [load_dataset(folder) for folder in folders]
     if len(geometries) != len(folders):
         raise typer.BadParameter(
             f"{len(geometries)} geometries for {len(folders)} data sets"
         )
     return [
-        with_geometry(d, load_geometry(f)) for d, f in zip(data, geometries, strict=True)
+        load_dataset(folder, geometry=read_geometry(file, known))
+        for folder, file in zip(folders, geometries, strict=True)
     ]
 
 
@@ -272,9 +289,11 @@ def align(
 
     if push:
         _require_answer(twin)
-    data = _load_data_sets([dataset], None if geometry is None else [geometry])[0]
+    data = scan_of(dataset, False, None, geometry)
     found = align_dataset(data, per_frame)
     document: dict[str, Any] = found.document
+    if geometry is not None:
+        document["geometry"] = [str(geometry)]
     if out is not None:
         write_json(out, document)
     warn(found.warnings)

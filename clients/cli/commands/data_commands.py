@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from flexdt.library.data_set import DataSet
     from flexdt.library.datasets.exchange import Given
+    from flexdt.twin.geometry.cone_vec import ConeVec
     from flexdt.twin.geometry.offsets import Offsets
 
 
@@ -144,6 +145,11 @@ def reconstruct(
     )
     option_values.require_folder(out)
     parameters, report = _correction(correction, twin)
+    if None not in (correction, geometry) and not (report and report.of_geometry):
+        raise typer.BadParameter(
+            f"--correction: {correction} corrects the scanner's own geometry, not one from a "
+            "file; allowed: a report of a calibration or alignment with --geometry"
+        )
     # Workers have working directories of their own.
     shared = scheduler is not None or slurm is not None
     data = scan_of(dataset.resolve() if shared else dataset, texts, report, geometry)
@@ -193,7 +199,7 @@ def _check_together(
 
     Checked in this order, the first wrong one is raised: preview, the ending of `out`,
     kV, options that the algorithm lacks, SLURM with a scheduler, workers for an algorithm
-    that has none, and correction with a geometry.
+    that has none, and a correction that is no report with a geometry.
 
     Args:
         given: options by name.
@@ -240,9 +246,9 @@ def _check_together(
             if name in given
         ),
         (
-            {"correction", "geometry"} <= given.keys(),
+            "geometry" in given and given.get("correction") in ("twin", "none"),
             "correction",
-            "no correction is added to a geometry from a file",
+            f"{given.get('correction')} is not for a geometry from a file",
         ),
     ):
         if wrong:
@@ -283,25 +289,22 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
 def scan_of(
     folder: Path, texts: bool, report: Report | None, geometry: Path | None = None
 ) -> DataSet:
-    """Load the data set, with the motion and the panel of a report, or the geometry of a
-    file.
+    """Load the data set, with the geometry of a file, and the motion and the panel of a
+    report.
 
     A report's panel becomes the data set's correction, its motion is applied if it is of
     this data set. A geometry replaces the data set's own first.
 
     Args:
-        folder: of the data set.
+        folder: of the data set, or of anybody's TIFFs if there is a geometry.
         texts: use the two settings texts only, not `flexdt.json`.
         report: of a calibration; None for none.
         geometry: file; None for the data set's own.
     """
     from flexdt.library.reading.folders import load_dataset
 
-    data = load_dataset(folder, ignore_document=texts)
-    if geometry is not None:
-        from flexdt.library.datasets.exchange import load_geometry, with_geometry
-
-        data = with_geometry(data, load_geometry(geometry))
+    given = None if geometry is None else read_geometry(geometry)
+    data = load_dataset(folder, ignore_document=texts, geometry=given)
     if report is None:
         return data
     from flexdt.twin.geometry.panel import Panel
@@ -360,6 +363,11 @@ class Report:
     path: Path
     parameters: Offsets
     document: dict[str, Any]
+
+    @property
+    def of_geometry(self) -> bool:
+        """True for a report of a scan whose geometry came from a file."""
+        return bool(self.document.get("geometry"))
 
     @property
     def of_beads(self) -> bool:
@@ -576,6 +584,20 @@ def import_(
         size = f"{width} x {height} pixels"
     u, v = geometry.pitch_mm
     yield f"{out}: {len(geometry)} views of {size}, pixel {u:.6g} x {v:.6g} mm"
+
+
+def read_geometry(file: Path, known: Given | None = None) -> ConeVec:
+    """Load a scan's geometry from a file of any format that `ConeVec.load` knows.
+
+    Args:
+        file: the geometry.
+        known: detector shape and pitch that it lacks; None for none.
+    """
+    from flexdt.twin.geometry.cone_vec import ConeVec
+
+    if known is None:
+        return ConeVec.load(file)
+    return ConeVec.load(file, shape=known.shape, pixel=known.pitch_mm)
 
 
 def geometry_options(

@@ -10,7 +10,6 @@ determine more.
 from __future__ import annotations
 
 import math
-import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,6 +33,12 @@ from flexdt.library.calibration.markers import (
     calibrate_unknown,
     read_markers,
     seen_alone,
+)
+from flexdt.library.calibration.proposed_commands import (
+    IN_MEMORY,
+    Typed,
+    option_words,
+    settling_commands,
 )
 from flexdt.library.calibration.square_pixels import squared
 from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
@@ -174,11 +179,29 @@ def _digits(value: object, sigma: object) -> tuple[str, str]:
 
 
 def calibrate_with(
-    datasets: Sequence[Images], phantom: str | Phantom, options: CalibrationOptions
+    datasets: Sequence[Images],
+    phantom: str | Phantom,
+    options: CalibrationOptions,
+    typed: Typed | None = None,
 ) -> Outcome[Images]:
     """Calibrate from data sets with a user's options; see `calibrate_datasets`."""
     request = request_of(phantom, options)
-    return calibrate_datasets(datasets, phantom, request, **detection_of(options))
+    if typed is None:
+        typed = typed_words(datasets, phantom, options)
+    return calibrate_datasets(
+        datasets, phantom, request, typed=typed, **detection_of(options)
+    )
+
+
+def typed_words(
+    datasets: Sequence[ImageSet], phantom: str | Phantom, options: CalibrationOptions
+) -> Typed:
+    """Return the words of the command that calibrates data sets so."""
+    return Typed(
+        tuple(IN_MEMORY if d.folder is None else str(d.folder) for d in datasets),
+        phantom if isinstance(phantom, str) else phantom.name,
+        options=option_words(options),
+    )
 
 
 def calibrate_datasets(
@@ -189,6 +212,7 @@ def calibrate_datasets(
     markers: str | PathLike[str] | Sequence[Mark] | None = None,
     scale: Scale | str | None = None,
     radius_px: float | None = None,
+    typed: Typed | None = None,
 ) -> Outcome[Images]:
     """Calibrate from data sets; TIFFs and the two settings texts are enough for one.
 
@@ -207,6 +231,8 @@ def calibrate_datasets(
         scale: a known distance of two unknown markers, or its text (see `Scale.of`).
         radius_px: of their spots; spots of 0.65 to 1.5 times of it are taken; None: any
             that `SpotFinder` accepts.
+        typed: the words of the command, for those that are proposed; default: those of
+            the data sets' folders.
 
     Returns:
         Calibration, the document of `flexdt calibrate` with the commands to run next, the
@@ -289,11 +315,10 @@ def calibrate_datasets(
     result = with_undetermined(result)
     seconds = time.perf_counter() - start
     document = calibration_document(result, seconds) | marker_document
-    if isinstance(phantom, str):
-        given = phantom
-    else:
-        given = target.name
-    document["next"] = next_commands(result, [d.where for d in datasets], given)
+    if typed is None:
+        typed = typed_words(datasets, phantom, {"free": want.free} if request else {})
+    document["next"] = next_commands(result, typed)
+    document["geometry"] = list(typed.geometry)
     if result.identifiable and result.motions:
         document["motion"] = [m.to_dict() for m in result.motions]
         datasets = [
@@ -538,29 +563,6 @@ SECOND_SOD_RATIO: Final = 0.7
 """Source-object distance of a second placement over the first's: nearer, where offsets
 act differently."""
 
-_CALIBRATE: Final = "flexdt calibrate {data} --phantom {phantom}"
-_REPORT: Final = f"{_CALIBRATE} --report report.html"
-NEXT: Final[Mapping[str, Sequence[str]]] = {
-    "wrong_phantom": ("flexdt phantom list", "flexdt calibrate {data} --phantom NAME"),
-    "bead_size": ("flexdt phantom list", "flexdt calibrate {data} --phantom NAME"),
-}
-"""Code of a finding that forbids a result -> commands that would settle it; other findings
-advise options, or have a report that shows the shadows."""
-
-
-def settling_commands(finding: Finding) -> Sequence[str]:
-    """Return the commands that would settle a finding, with places for the data set's
-    words: those of its code, else those that it advises, else one for a report.
-    """
-    if finding.code in NEXT:
-        return NEXT[finding.code]
-    commands = []
-    if finding.per_frame:
-        commands.append(f"{_CALIBRATE} --per-frame {','.join(finding.per_frame)}")
-    if finding.free:
-        commands.append(f"{_CALIBRATE} --free {{free}},{','.join(finding.free)}")
-    return commands or [_REPORT]
-
 
 def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> str:
     """Return one sentence on use, and one on the limit of the calibration.
@@ -578,7 +580,8 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
     if not result.identifiable or result.fit is None:
         weak = () if result.fit is None else result.fit.certificate.weak
         why = [f.text for f in result.errors] or list(weak) or ["there is no fit"]
-        return f"Not to be used: {why[0]}."
+        stop = "" if why[0].endswith("?") else "."
+        return f"Not to be used: {why[0]}{stop}"
     column = _column(seen)
     if column.sigma <= SHARP_PX:
         use = "Safe to reconstruct"
@@ -613,54 +616,54 @@ def _is_sharp(fit: FitResult) -> bool:
     return _column(image_quantities(fit)).sigma <= SHARP_PX
 
 
-def next_commands(result: Calibration, data: Sequence[str], phantom: str) -> list[str]:
+def next_commands(result: Calibration, typed: Typed) -> list[str]:
     """List commands that would determine more, or settle an error; most useful first.
 
     With an error other than UNDETERMINED, those that settle the first one. Else
     "reconstruct" if the geometry is sharp, and two scans at different SOD unless it is
-    sharp and not limited by priors.
+    sharp and not limited by priors; if it is not sharp and something moves, those that
+    follow the motion alone.
 
     Args:
         result: of the calibration.
-        data: folders of its data sets.
-        phantom: its name or file.
+        typed: the calibration as words of its command.
     """
-    names = " ".join(shlex.quote(one) for one in data)
     if result.fit is None:
         estimates = {}
     else:
         estimates = result.fit.certificate.estimates
-    requested = [e for e in estimates.values() if e.asked]
+    # Names of several scans end in @SCAN.
+    asked = [name for name, e in estimates.items() if e.asked]
+    free = list(dict.fromkeys(name.split("@")[0] for name in asked))
     if result.errors and result.errors[0].code != UNDETERMINED:
-        free = ",".join(name for name, e in estimates.items() if e.asked)
-        lines = settling_commands(result.errors[0])
-        return [
-            line.format(data=names, phantom=shlex.quote(phantom), free=free)
-            for line in lines
-        ]
-    # Whatever options the calibration had: its own report is used, not another calibration.
-    use = [
-        "flexdt reconstruct SAMPLE --correction REPORT.json --out volume.tif"
-        "  # REPORT.json: of this command with --report"
-    ]
-    limited = any(_by_priors(e) for e in requested)
+        return list(settling_commands(result.errors[0], typed, free))
+    limited = any(_by_priors(estimates[name]) for name in asked)
     sharp = result.fit is not None and result.identifiable and _is_sharp(result.fit)
     if sharp and not limited:
-        return use
+        return [typed.use()]
+    if not sharp:
+        for moving in result.findings:
+            if moving.per_frame:
+                return list(settling_commands(moving, typed, free))
     sod = float(result.scans[0].poses.sod.mean())
-    places = f"--position {sod:.0f} --position {SECOND_SOD_RATIO * sod:.0f}"
-    closer = [
-        f"flexdt script new --kind calibration {places} --out two-places.txt",
-        f"flexdt calibrate PLACE-1 PLACE-2 --phantom {shlex.quote(phantom)}",
-    ]
+    both = typed.command(data=("PLACE-1", "PLACE-2"))
+    if typed.geometry:
+        # Scripts are for the machine that a data set names.
+        closer = [
+            f"{both}  # scan the phantom at SOD {SECOND_SOD_RATIO * sod:.0f} mm, too"
+        ]
+    else:
+        places = f"--position {sod:.0f} --position {SECOND_SOD_RATIO * sod:.0f}"
+        closer = [
+            f"flexdt script new --kind calibration {places} --out two-places.txt",
+            both,
+        ]
     if not sharp:
         return closer
+    why = "for the absolute position, which volumes do not need"
     return [
-        *use,
-        *(
-            f"{line}  # for the absolute position, which volumes do not need"
-            for line in closer
-        ),
+        typed.use(),
+        *(f"{line}{'; ' if '  # ' in line else '  # '}{why}" for line in closer),
     ]
 
 

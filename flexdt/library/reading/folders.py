@@ -93,7 +93,7 @@ def load_dataset(
     A folder is read by the first of these that it has: the only file of a supported
     format of another program (in a folder without a document, geometry or projections of
     flexdt's names), flexdt.json, the geometry that `DataSet.save` wrote, a scanner's
-    settings texts.
+    settings texts; with a `geometry` anybody's TIFFs, as `read_tiffs` does.
 
     Args:
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts;
@@ -137,6 +137,8 @@ def load_dataset(
         data = _from_document(content, machine, profile)
     elif content.geometry is not None and not ignore_document:
         data = _from_geometry(content)
+    elif geometry is not None and not (content.scan_settings or content.xre_settings):
+        return read_tiffs(folder, geometry)
     else:
         data = _from_texts(content, machine, profile)
     if geometry is None:
@@ -398,7 +400,10 @@ def _other_scan(content: Folder) -> str:
             return f"; it holds a scan of {form.name}: fx.open({str(content.path / named[0])!r})"
     images = sorted(n for n in content.names if n.lower().endswith((".tif", ".tiff")))
     if images:
-        return f", but {len(images)} other TIFFs, which fx.read_tiffs(FOLDER, geometry) reads"
+        return (
+            f", but {len(images)} other TIFFs, which fx.read_tiffs(FOLDER, geometry) reads, "
+            "and commands read with --geometry FILE"
+        )
     return ""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers
 from flexdt.twin.calibration.repeated_frames import find_repeated
 
 ROWS, COLUMNS = 24, 48
@@ -75,3 +76,18 @@ def test_a_missing_frame_before_a_repeated_one_is_found() -> None:
     views = np.delete(views, 30, axis=0)
     views[70] = views[69] + rng.normal(0, 0.003, (ROWS, COLUMNS))
     assert find_repeated(views.astype(np.float32), even(120)) == ([70], [30])
+
+
+def test_a_doubled_frame_is_named_as_far_as_frames_tell() -> None:
+    """Frame 11 repeats frame 10 and is not used, as an exact copy, or shows the phantom."""
+    shift = np.where(np.arange(36) < 12, 0, -1)
+    fits = np.arange(36) != 11
+    copied = FrameNumbers(shift, fits).judged("scan")
+    assert copied is not None
+    assert "one of frames 11 to 12 shows the angle of the one before again" in copied.text
+    seen = FrameNumbers(np.where(np.arange(36) < 11, 0, -1), fits | True).judged("scan")
+    assert seen is not None
+    assert "frame 11 shows the angle of frame 10 again" in seen.text
+    lost = FrameNumbers(-shift, fits).judged("scan")
+    assert lost is not None
+    assert "a frame is lost between frames 10 and 12" in lost.text

@@ -108,11 +108,8 @@ def judge_frames(
         out.append(
             error(
                 "no_beads",
-                f"{name}: no bead was found in any of {n} frames; looked for were round spots, "
-                f"darker than what is round them, of {sought.radius_px[0]:.1f} to "
-                f"{sought.radius_px[1]:.1f} px radius: is this a bead phantom, is it in "
-                "the beam, "
-                f"and are geometry and pixel size right?{_of_intensities(scan, sought)}",
+                f"{name}: no bead was found in any of {n} frames"
+                f"{_of_intensities(scan, sought) or _looked_for(sought)}",
             )
         )
     elif empty:
@@ -125,19 +122,27 @@ def _of_intensities(scan: Scan, sought: SpotFinder) -> str:
     all images again.
 
     Returns:
-        A sentence for the finding, with a leading blank; empty if fewer than
-        `SHOWN_AT_LEAST` of the frames show spots then.
+        The end of the finding's sentence; empty if fewer than `SHOWN_AT_LEAST` of the
+        frames show spots then.
     """
     looks = scan.frames.look(replace(sought, intensities=True))
     shown = sum(len(look.detections) > 0 for look in looks)
     if shown < SHOWN_AT_LEAST * len(looks):
         return ""
     return (
-        f" Taken as transmissions, {shown} of {len(looks)} frames show such spots: the "
-        "images hold "
-        "transmissions or counts instead of line integrals; give a flat image, which "
-        "transmissions "
-        "have as ones, or -ln of the images"
+        f", but {shown} of {len(looks)} show such spots taken as transmissions: the images "
+        "hold transmissions or counts, not line integrals; give a flat image (of ones, for "
+        "transmissions), or -ln of the images"
+    )
+
+
+def _looked_for(sought: SpotFinder) -> str:
+    """Write what was looked for, and what may be wrong, as the end of a sentence."""
+    low, high = sought.radius_px
+    return (
+        "; looked for were round spots, darker than what is round them, of "
+        f"{low:.1f} to {high:.1f} px radius: is this a bead phantom, is it in the beam, and "
+        "are geometry and pixel size right?"
     )
 
 

@@ -83,6 +83,10 @@ class FrameNumbers:
                 out[i] = out[i - 1]
         return out
 
+    def _last_before(self, frame: int) -> int:
+        """Return the last frame before one that shows the phantom; the first if none does."""
+        return int(np.flatnonzero(self.fits[:frame]).max(initial=0))
+
     def judged(self, name: str) -> Finding | None:
         """Make the finding on wrong numbers of frames; at most `MAX_SHOWN` are listed.
 
@@ -111,7 +115,7 @@ class FrameNumbers:
         settled = self._settled
         changes = np.flatnonzero(np.diff(settled)) + 1
         described = "; ".join(
-            _change(int(i), int(settled[i] - settled[i - 1]))
+            _change(self._last_before(i), i, int(settled[i] - settled[i - 1]))
             for i in changes[:MAX_SHOWN].tolist()
         )
         if len(changes) <= MAX_SHOWN:
@@ -125,28 +129,25 @@ class FrameNumbers:
         )
 
 
-def _change(frame: int, steps: int) -> str:
+def _change(last: int, frame: int, steps: int) -> str:
     """Describe in words lost or repeated frames before a frame, for the finding.
 
     Args:
+        last: number of the last frame with the shift before.
         frame: number of the first frame with the new shift.
-        steps: above 0: so many frames are lost; below 0: the frame before is repeated so
-            many times.
+        steps: above 0: so many frames are lost; below 0: so many are repeated.
     """
-    if steps < 0:
-        if steps == -1:
-            times = ""
-        else:
-            times = f" {-steps} times"
-        return (
-            f"frame {frame} shows the angle of frame {frame - 1} again, and all after it come "
-            f"late: doubled{times}"
-        )
-    if steps == 1:
-        lost = "a frame is"
+    if steps >= 0:
+        lost = "a frame is" if steps == 1 else f"{steps} frames are"
+        return f"{lost} lost between frames {last} and {frame}"
+    times = "" if steps == -1 else f" {-steps} times"
+    if last == frame - 1:
+        shown = f"frame {frame} shows the angle of frame {last} again"
     else:
-        lost = f"{steps} frames are"
-    return f"{lost} lost between frames {frame - 1} and {frame}"
+        shown = (
+            f"one of frames {last + 1} to {frame} shows the angle of the one before again"
+        )
+    return f"{shown}, and all after it come late: doubled{times}"
 
 
 def frame_numbers(

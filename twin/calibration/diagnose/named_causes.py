@@ -120,15 +120,14 @@ def _strained(found: Found) -> Finding | None:
         CAUSE_WORDS[n] for n in SHAPE_LIKE_CAUSES if n in found.open or n in found.applied
     ]
     if alike:
-        rival = f" (or there is {' or '.join(alike)}, which looks alike)"
+        rival = f" ({' or '.join(alike)} would look alike)"
     else:
         rival = ""
     return warning(
         "phantom_strained",
-        f"the phantom is not as its file says: {strains}{rival}. Its shape was fitted along; how "
-        "large it is as a whole images do not tell, so lengths, dO_z and the "
-        "magnification hold "
-        "as far as its millimetre: measure it, or give --bead-tolerance",
+        f"the phantom is not as its file says: {strains}{rival}. Its shape was fitted, its "
+        "size is not in the images: lengths, dO_z and the magnification hold as far as its "
+        "millimetre; measure it, or give --bead-tolerance MM",
     )
 
 

@@ -1,0 +1,156 @@
+"""Commands that a calibration's report proposes: the command that was typed, with what a
+finding advises, so that they run on the same scan as they stand.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from flexdt.library.calibration.calibration_options import CalibrationOptions
+from flexdt.twin.calibration.diagnose import Finding
+
+IN_MEMORY: Final = "DATASET"
+"""Stands for a scan in memory, which has no folder to type."""
+OPTION_OF: Final[Mapping[str, str]] = {"priors": "prior"}
+"""Option of the library -> option of the command, where the names differ."""
+NEXT: Final[Mapping[str, tuple[str, str]]] = {
+    "wrong_phantom": ("flexdt phantom list", "NAME"),
+    "bead_size": ("flexdt phantom list", "NAME"),
+}
+"""Code of a finding that forbids a result -> command to run first, and the word that stands
+for another phantom; other findings advise options, or have a report that shows the shadows."""
+
+
+@dataclass(frozen=True)
+class Typed:
+    """A calibration as words of the command line.
+
+    Attributes:
+        data: folders of its scans.
+        phantom: its name or file.
+        geometry: files, one for each scan; empty where the scans have their own.
+        options: name of the command's option -> its value.
+        report: JSON file of the report; None where none was asked for.
+    """
+
+    data: tuple[str, ...]
+    phantom: str
+    geometry: tuple[str, ...] = ()
+    options: Mapping[str, str] | None = None
+    report: str | None = None
+
+    def command(self, *, phantom: str = "", data: Sequence[str] = (), **more: str) -> str:
+        """Return the command, with other options.
+
+        Args:
+            phantom: in place of the one that was typed.
+            data: in place of those that were typed; each geometry is a place then, too.
+            more: option (_ for -) -> value, added or in place of what was typed.
+        """
+        geometry: Sequence[str] = self.geometry
+        options = dict(self.options or {})
+        if data:
+            options.pop("frames", None)
+        if data and geometry:
+            geometry = [f"GEOMETRY-{n}" for n in range(1, len(data) + 1)]
+        replaced = {name.replace("_", "-"): value for name, value in more.items()}
+        pairs = [
+            *((name, options.pop(name)) for name in ("frames",) if name in options),
+            *(("geometry", file) for file in geometry),
+            ("phantom", phantom or self.phantom),
+            *(options | replaced).items(),
+        ]
+        words = [
+            *(data or self.data),
+            *(word for name, value in pairs for word in (f"--{name}", value)),
+        ]
+        line = f"flexdt calibrate {shlex.join(words)}"
+        if IN_MEMORY in words:
+            line += f"  # {IN_MEMORY}: the folder of data.save(FOLDER)"
+        return line
+
+    def use(self) -> str:
+        """Return the command that reconstructs a sample with the report."""
+        words = ["SAMPLE"]
+        if self.geometry:
+            words += ["--geometry", "GEOMETRY"]
+        words += ["--correction", self.report or "REPORT.json", "--out", "volume.tif"]
+        notes = []
+        if self.geometry:
+            notes.append("GEOMETRY: nominal, of the sample's scan")
+        if self.report is None:
+            notes.append("REPORT.json: of this command with --report")
+        note = f"  # {'; '.join(notes)}" if notes else ""
+        return f"flexdt reconstruct {shlex.join(words)}{note}"
+
+
+def option_words(options: CalibrationOptions) -> dict[str, str]:
+    """Write options as those of the command: name -> value; defaults are left out.
+
+    `bound` is a key of the settings file, and marks in memory have no file to type.
+    """
+    words = {}
+    given: Mapping[str, Any] = {**options}
+    for name, value in given.items():
+        if (
+            value is None
+            or name == "bound"
+            or (name == "markers" and isinstance(value, list | tuple))
+        ):
+            continue
+        if isinstance(value, Mapping):
+            text = ",".join(f"{key}={number:g}" for key, number in value.items())
+        elif isinstance(value, list | tuple):
+            text = ",".join(value)
+        elif isinstance(value, float):
+            text = f"{value:g}"
+        else:
+            text = str(value)
+        if text and (name, text) != ("reading", "axis"):
+            words[OPTION_OF.get(name, name).replace("_", "-")] = text
+    return words
+
+
+def settling_commands(
+    finding: Finding, typed: Typed, free: Sequence[str]
+) -> Iterator[str]:
+    """Yield the commands that would settle a finding: those of its code, else those that
+    it advises, else one for a report.
+
+    Args:
+        finding: that decides.
+        typed: the calibration that made it.
+        free: parameters that it estimated.
+    """
+    if finding.code in NEXT:
+        first, other = NEXT[finding.code]
+        yield first
+        yield typed.command(phantom=other)
+        return
+    options = typed.options or {}
+    if finding.per_frame:
+        moving = [name for name in options.get("per-frame", "").split(",") if name]
+        yield typed.command(
+            per_frame=",".join(dict.fromkeys((*moving, *finding.per_frame)))
+        )
+    if finding.free:
+        more = {"free": ",".join(dict.fromkeys((*free, *finding.free)))}
+        held = options.get("prior", "")
+        if held not in ("", "none"):
+            # A parameter has a prior or is free.
+            kept = [w for w in held.split(",") if w.split("=")[0] not in finding.free]
+            if kept:
+                more["prior"] = ",".join(kept)
+            else:
+                typed = Typed(
+                    typed.data,
+                    typed.phantom,
+                    typed.geometry,
+                    {name: value for name, value in options.items() if name != "prior"},
+                )
+        yield typed.command(**more)
+    if not (finding.per_frame or finding.free):
+        yield typed.command(report="report.html")
