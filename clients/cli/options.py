@@ -77,7 +77,7 @@ Geometry = Annotated[
     typer.Option(
         "--geometry",
         metavar="FILE",
-        help="Use this geometry (flexdt import) instead of the data set's.",
+        help="Use this geometry instead of the data set's, or for anybody's TIFFs.",
     ),
 ]
 Jobs = Annotated[

@@ -574,3 +574,19 @@ def test_the_command_writes_a_correction_that_reconstruct_takes(
     out, err = capsys.readouterr()
     assert not json.loads(out)["identifiable"]
     assert "full turn" in err
+    assert run(["align", str(tmp_path / "half")]) == 5
+    assert capsys.readouterr().out.count("of a full turn without a view") == 1
+    # The same images as anybody's TIFFs.
+    geometry = tmp_path / "scan.json"
+    (tmp_path / "scan" / "geometry.json").rename(geometry)
+    for file in (tmp_path / "scan").glob("*[!f]"):
+        file.unlink()
+    assert run(["align", folder]) == 1
+    assert "--geometry FILE" in capsys.readouterr().err
+    there = ["--geometry", str(geometry)]
+    assert run(["align", folder, *there, "--out", str(report)]) == 0
+    again = json.loads(report.read_text())["parameters"]["axis_column_px"]
+    assert again["value"] == pytest.approx(column, abs=1e-3)
+    volume = str(tmp_path / "tiffs.mha")
+    assert run(["reconstruct", folder, *there, "--out", volume, *words]) == 0
+    np.testing.assert_allclose(fx.Volume.load(volume).data, given, atol=1e-3)

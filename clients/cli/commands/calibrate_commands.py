@@ -78,7 +78,7 @@ def calibrate(
         tracks: Write the beads of every frame, seen, before and after.
         geometry: Start from this geometry; once for each data set, in order.
         bead_tolerance: Estimate the beads' places, too, known to this tolerance.
-        prior: Know offsets so well, not as the machine says; none: all exactly.
+        prior: State how well other offsets are known, 0 exactly; none: all exactly.
         frames: Read any scanner's TIFFs, with --geometry.
         shape: Take this detector shape where FILE does not say it.
         pixel: Take this pixel pitch where FILE does not say it (RTK).
@@ -305,8 +305,11 @@ def align(
     yield table(rows, ("parameter", "value", "sigma", "unit"))
     yield f"{document['frames']} frames, {_number(document['seconds'], 2)} s"
     yield from motions(document)
+    reasons: dict[str, list[str]] = {}
     for name, why in found.alignment.refused.items():
-        yield f"not told: {name}: {why}"
+        reasons.setdefault(why, []).append(name)
+    for why, names in reasons.items():
+        yield f"not told: {', '.join(names)}: {why}"
     if not found.identifiable:
         why = found.alignment.refused["axis_column_px"]
         raise CommandError(f"not identifiable: {why}", NOT_IDENTIFIABLE)

@@ -36,6 +36,7 @@ from flexdt.library.calibration.markers import (
 )
 from flexdt.library.calibration.proposed_commands import (
     IN_MEMORY,
+    VALUE,
     Typed,
     option_words,
     settling_commands,
@@ -43,7 +44,7 @@ from flexdt.library.calibration.proposed_commands import (
 from flexdt.library.calibration.square_pixels import squared
 from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
 from flexdt.library.datasets.notebook_html import emphasised, values_table
-from flexdt.phantoms import Phantom, load_phantom
+from flexdt.phantoms import Phantom, load_phantom, phantom_names
 from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin import long_work
 from flexdt.twin.calibration.detect.detection import SpotFinder
@@ -197,9 +198,15 @@ def typed_words(
     datasets: Sequence[ImageSet], phantom: str | Phantom, options: CalibrationOptions
 ) -> Typed:
     """Return the words of the command that calibrates data sets so."""
+    if isinstance(phantom, str):
+        named = phantom
+    elif phantom.name in phantom_names():
+        named = phantom.name
+    else:
+        named = VALUE
     return Typed(
         tuple(IN_MEMORY if d.folder is None else str(d.folder) for d in datasets),
-        phantom if isinstance(phantom, str) else phantom.name,
+        named,
         options=option_words(options),
     )
 

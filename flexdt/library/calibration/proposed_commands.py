@@ -14,6 +14,13 @@ from flexdt.twin.calibration.diagnose import Finding
 
 IN_MEMORY: Final = "DATASET"
 """Stands for a scan in memory, which has no folder to type."""
+VALUE: Final = "PHANTOM"
+"""Stands for a phantom in memory, which has no file to type."""
+STANDS_FOR: Final = {
+    IN_MEMORY: "the folder of data.save(FOLDER)",
+    VALUE: "the phantom's file",
+}
+"""Word of a command -> what its reader replaces it by."""
 OPTION_OF: Final[Mapping[str, str]] = {"priors": "prior"}
 """Option of the library -> option of the command, where the names differ."""
 NEXT: Final[Mapping[str, tuple[str, str]]] = {
@@ -67,10 +74,8 @@ class Typed:
             *(data or self.data),
             *(word for name, value in pairs for word in (f"--{name}", value)),
         ]
-        line = f"flexdt calibrate {shlex.join(words)}"
-        if IN_MEMORY in words:
-            line += f"  # {IN_MEMORY}: the folder of data.save(FOLDER)"
-        return line
+        notes = "; ".join(f"{w}: {STANDS_FOR[w]}" for w in STANDS_FOR if w in words)
+        return f"flexdt calibrate {shlex.join(words)}{notes and f'  # {notes}'}"
 
     def use(self) -> str:
         """Return the command that reconstructs a sample with the report."""

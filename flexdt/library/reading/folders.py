@@ -479,8 +479,8 @@ def _from_texts(
     if settings is None:
         raise DatasetMissingError(
             f"{content.path}: none of {DOCUMENT}, {SCAN_SETTINGS!r} and {XRE_SETTINGS!r} "
-            "is there, "
-            "so the geometry is unknown",
+            "is there, so the geometry is unknown; fx.read_tiffs(FOLDER, geometry) and "
+            "--geometry FILE of the commands state it",
             {
                 "path": str(content.path),
                 "missing": [DOCUMENT, SCAN_SETTINGS, XRE_SETTINGS],

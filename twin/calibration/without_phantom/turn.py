@@ -222,8 +222,7 @@ def _require_turn(angle: FloatArray) -> tuple[FloatArray, float]:
     if widest > WIDEST_GAP * usual:
         raise NotIdentifiableError(
             f"the frames leave {math.degrees(widest):.4g} deg of a full turn without a "
-            "view (usual "
-            f"step {math.degrees(usual):.4g} deg): only the mean over a full turn is symmetric",
+            f"view (usual step {math.degrees(usual):.4g} deg), so only opposite rays can tell",
         )
     return gaps, usual
 
