@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flexdt.twin.calibration.diagnose.fitted import named_turn
 from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers
 from flexdt.twin.calibration.repeated_frames import find_repeated
 
@@ -91,3 +92,13 @@ def test_a_doubled_frame_is_named_as_far_as_frames_tell() -> None:
     lost = FrameNumbers(-shift, fits).judged("scan")
     assert lost is not None
     assert "a frame is lost between frames 10 and 12" in lost.text
+
+
+def test_a_whole_step_too_many_or_too_few_is_a_lost_or_a_doubled_frame() -> None:
+    for sense in (1.0, -1.0):
+        angles = sense * np.radians(10.0 * np.arange(36))
+        for steps, words in ((1, "1 frame is lost"), (-2, "2 frames are doubled")):
+            code, text = named_turn(sense * 10.0 * steps, angles)
+            assert code == "frame_numbers"
+            assert words in text
+        assert named_turn(sense * 4.0, angles)[0] == "angle_step"

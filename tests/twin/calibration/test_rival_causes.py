@@ -12,6 +12,7 @@ from causes_named import calibrated, scored, worst_error
 from faults_drawn import drawn
 
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.diagnose.named_causes import strain_words
 from flexdt.twin.calibration.diagnose.tiles import alike_places, likely_border
 from flexdt.twin.calibration.fit.evidence import Table
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
@@ -270,3 +271,20 @@ def test_pixels_of_another_pitch_are_named_beside_the_distance() -> None:
     pitch = re.search(r"the pixels are ([0-9.]+) mm wide instead of 0.1496 mm", said)
     assert pitch is not None
     assert float(pitch[1]) == pytest.approx(scan.pixel, rel=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("strain", "words"),
+    [
+        ({"zz": 0.003}, "0.3 % taller"),
+        ({"zz": -0.003}, "0.3 % less tall"),
+        ({"xx": 0.009}, "0.9 % longer along x"),
+        ({"xx": 0.004, "yy": 0.004}, "0.4 % less tall"),
+        ({"xz": -0.002}, "-0.2 % aslant along x"),
+    ],
+)
+def test_a_phantom_that_is_off_in_one_length_is_told_so(
+    strain: dict[str, float], words: str
+) -> None:
+    mean = np.array([strain.get(name, 0.0) for name in STRAINS])
+    assert strain_words(mean, 1e-12 * np.eye(len(mean))) == words

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 import numpy as np
@@ -23,20 +24,48 @@ CAUSE_WORDS: Final = {
 """Cause that may be left open -> its words."""
 SHAPE_LIKE_CAUSES: Final = ("arc", "beads", "panel")
 """Causes that may look like a phantom of another shape."""
-TERMS: Final[dict[str, dict[str, float]]] = {
-    "taller": {"zz": 1.0, "xx": -0.5, "yy": -0.5},
-    "longer along x than along y": {"xx": 1.0, "yy": -1.0},
+LENGTHS: Final = {
+    "xx": ("longer along x", "shorter along x"),
+    "yy": ("longer along y", "shorter along y"),
+    "zz": ("taller", "less tall"),
+}
+"""Stretch -> words on it where it is above, and below 0."""
+SHEARS: Final[dict[str, dict[str, float]]] = {
     "sheared across": {"xy": 1.0, "yx": 1.0},
     "aslant along x": {"xz": 1.0},
     "tilted along x": {"zx": 1.0},
     "aslant along y": {"yz": 1.0},
     "tilted along y": {"zy": 1.0},
 }
-"""Words on a strain -> its weights of STRAINS."""
-PARTS: Final[dict[str, FloatArray]] = {
-    name: np.array([terms.get(term, 0.0) for term in STRAINS])
-    for name, terms in TERMS.items()
-}
+"""Words on a shear -> its weights of STRAINS."""
+
+
+def _row(terms: Mapping[str, float]) -> FloatArray:
+    """Return weights of STRAINS, (len(STRAINS),)."""
+    return np.array([terms.get(term, 0.0) for term in STRAINS])
+
+
+def _parts(mean: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    """Yield the parts of a strain that images determine: words, and weights of STRAINS.
+
+    Images do not tell the scale, so the two stretches are told beside the middle one: a
+    phantom of one wrong length differs in that one.
+
+    Args:
+        mean: of the strain, (len(STRAINS),).
+    """
+    stretch = {name: float(_row({name: 1.0}) @ mean) for name in LENGTHS}
+    middle = sorted(stretch, key=stretch.__getitem__)[1]
+    for name, (above, below) in LENGTHS.items():
+        if name == middle:
+            continue
+        beside = _row({name: 1.0, middle: -1.0})
+        if beside @ mean < 0.0:
+            yield below, -beside
+        else:
+            yield above, beside
+    for words, terms in SHEARS.items():
+        yield words, _row(terms)
 
 
 def named_causes(fit: FitResult, found: Found) -> list[Finding]:
@@ -81,12 +110,30 @@ def named_causes(fit: FitResult, found: Found) -> list[Finding]:
     return out
 
 
+def strain_words(mean: FloatArray, covariance: FloatArray) -> str:
+    """Write the parts of a strain beyond `SIGNIFICANT` sigmas that are above 0.3 of the
+    largest, such as "0.3 % taller"; "" if there is none.
+
+    Args:
+        mean, covariance: (len(STRAINS),) and its square.
+    """
+    certain = {}
+    for words, row in _parts(mean):
+        value = float(row @ mean)
+        sigma = max(float(np.sqrt(row @ covariance @ row)), 1e-12)
+        if abs(value) > SIGNIFICANT * sigma:
+            certain[words] = value
+    most = max(map(abs, certain.values()), default=0.0)
+    return ", ".join(
+        f"{100 * value:{'+' if words in SHEARS else ''}.2g} % {words}"
+        for words, value in certain.items()
+        if abs(value) > 0.3 * most
+    )
+
+
 def _strained(found: Found) -> Finding | None:
     """Make the warning on the phantom's shape, apart from its scale, which images do not
     determine.
-
-    Only parts (`TERMS`) beyond `SIGNIFICANT` sigmas are named, those above 0.3 of the
-    largest.
 
     Args:
         found: the causes, with mean and covariance of the strain.
@@ -97,25 +144,9 @@ def _strained(found: Found) -> Finding | None:
     """
     if found.strain is None:
         return None
-    mean, covariance = found.strain
-    parts = [
-        (
-            float(row @ mean),
-            float(row @ mean) / max(float(np.sqrt(row @ covariance @ row)), 1e-12),
-        )
-        for row in PARTS.values()
-    ]
-    certain = {
-        n: value
-        for n, (value, score) in zip(PARTS, parts, strict=True)
-        if abs(score) > SIGNIFICANT
-    }
-    if not certain:
+    strains = strain_words(*found.strain)
+    if not strains:
         return None
-    most = max(map(abs, certain.values()))
-    strains = ", ".join(
-        f"{100 * v:+.2g} % {n}" for n, v in certain.items() if abs(v) > 0.3 * most
-    )
     alike = [
         CAUSE_WORDS[n] for n in SHAPE_LIKE_CAUSES if n in found.open or n in found.applied
     ]
