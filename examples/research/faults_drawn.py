@@ -1152,6 +1152,19 @@ def _usual_jump(name: str, low: float, high: float) -> Fault:
     return lambda draft, rng: jump(_usual(draft, rng), rng)
 
 
+def _jumps_twice(draft: Draft, rng: Rng) -> Draft:
+    """Let the object jump aside twice by 0.05 to 0.3 mm, there and partly back, in the
+    middle three fifths of the scan, and expect a finding of motion.
+    """
+    draft = _usual(draft, rng)
+    n = len(draft.world.angles)
+    first, second = np.sort(rng.choice(np.arange(n // 5, 4 * n // 5), 2, replace=False))
+    course = rng.uniform(0.05, 0.3) * (np.arange(n) >= first)
+    course -= rng.uniform(0.05, 0.3) * (np.arange(n) >= second)
+    draft = _varying(draft, "dO_x", course)
+    return replace(draft, names=(MOVES,), beside=OTHERS)
+
+
 def _grows(draft: Draft, rng: Rng) -> Draft:
     """Let the phantom grow by 0.05 to 0.7 % during the scan, as one that warms up, and
     expect a finding of growth or motion; dO_z may be that of any frame.
@@ -1279,6 +1292,7 @@ KINDS: Final[Mapping[str, Fault]] = {
     "object_jumps": _usual_jump("dO_x", 0.02, 0.3),
     "object_jumps_up": _usual_jump("dO_y", 0.02, 0.3),
     "object_jumps_along": _usual_jump("dO_z", 0.2, 3.0),
+    "object_jumps_twice": _jumps_twice,
     "panel_jumps": _usual_jump("dD_x", 0.02, 0.3),
     "panel_jumps_up": _usual_jump("dD_y", 0.02, 0.3),
     "grows": _grows,

@@ -42,7 +42,7 @@ ADVISED: Final = (
     "axis_far_aslant", "tau_held", "height_held", "across_held", "strain_x", "strain_z", "grows",
     "source_jumps", "source_jumps_up", "source_jumps_along", "source_drifts",
     "source_drifts_up", "object_jumps", "object_jumps_up", "object_jumps_along",
-    "panel_jumps", "panel_jumps_up", "other_pitch",
+    "object_jumps_twice", "panel_jumps", "panel_jumps_up", "other_pitch",
 )  # fmt: skip
 """Kinds of faults whose findings advise arguments. Not among them: `four_tiles`, whose tiles
 may have no name."""

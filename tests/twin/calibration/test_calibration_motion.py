@@ -73,15 +73,15 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
             z = np.zeros((len(y1), n))
             z[np.arange(n * each), frame] = slopes[:, i]
             if isinstance(pick, Course):
-                height = model.courses[:, pick.shape].copy()
+                height = model.courses[:, list(pick.shapes)].copy()
                 for label in np.unique(column[:, i]):
                     own = column[:, i] == label
-                    height[own] -= height[own].mean()
+                    height[own] -= height[own].mean(axis=0)
                 height /= np.sqrt(np.square(slopes[:, i]).sum() / n)
-                variance += pick.width**2 * np.outer(z @ height, z @ height)
-                parts.append((z @ height)[:, None])
-                precision.append(np.array([[1 / pick.width**2]]))
-                into.append(height[:, None])
+                variance += pick.width**2 * (z @ height) @ (z @ height).T
+                parts.append(z @ height)
+                precision.append(np.eye(len(pick.shapes)) / pick.width**2)
+                into.append(height)
                 continue
             into.append(np.eye(n))
             blocks = []
@@ -132,8 +132,8 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
         ((1.0, 1.0), (0.1, 4.0)),
         ((10.0, 4.0), (0.3, math.inf)),
         ((3.0, 16.0), (30.0, 4.0)),
-        (Course(0, 10.0), (3.0, 4.0)),
-        (Course(3, 100.0), Course(1, 3.0)),
+        (Course((0,), 10.0), (3.0, 4.0)),
+        (Course((1, 3), 100.0), Course((1,), 3.0)),
     ]
     ours = [model.likelihood(choice) for choice in choices]
     theirs = [dense(choice)[0] for choice in choices]
@@ -147,11 +147,14 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
         plain = noise2 * np.linalg.inv(x.T @ x)
         np.testing.assert_allclose(added + plain, covariance[:g, :g], atol=1e-8)
         np.testing.assert_allclose(moved, found[:g], atol=1e-8)
-    for beside in (None, (3.0, 4.0), Course(4, 10.0)):
-        shapes = range(model.courses.shape[1])
-        tried = [(Course(s, w), beside) for s in shapes for w in (1.0, 30.0)]
+    shapes = range(model.courses.shape[1])
+    for beside in (None, (3.0, 4.0), Course((4,), 10.0)):
+        tried = [(Course((s,), w), beside) for s in shapes for w in (1.0, 30.0)]
         found = model.best_course((None, beside), 0, (1.0, 30.0))
         assert found == max(tried, key=model.likelihood)[0]
+        tried = [(found.beside(s), beside) for s in shapes if s not in found.shapes]
+        second = model.best_course((found, beside), 0, (1.0, 30.0))
+        assert second == max(tried, key=model.likelihood)[0]
 
 
 def test_a_motion_goes_into_poses_and_documents() -> None:

@@ -65,6 +65,18 @@ def test_what_jumps_is_followed_and_not_what_was_asked_for(
     assert worst_error(result, scan)[0] < 4.0
 
 
+@pytest.mark.parametrize("asked", [OBJECT, ("dS_x",)])
+def test_an_object_that_jumps_twice_is_no_object_and_panel_that_jump(
+    asked: tuple[str, ...],
+) -> None:
+    """While a parameter jumped once at most, the panel had the second jump."""
+    scan = drawn("object_jumps_twice", 2)
+    result = calibrated(scan, asked)
+    assert result.identifiable, result.findings
+    assert moving(result) == {"dO_x"}
+    assert worst_error(result, scan)[0] < 4.0
+
+
 def test_what_is_open_is_in_the_sigmas_of_every_frame() -> None:
     """The object jumped by .3 mm; source and panel, which were asked for, stood still."""
     scan = drawn("jump_across", 50002)

@@ -1,8 +1,8 @@
 """The linear mixed model of motion: a fit's columns, and parameters' deviations in frames.
 
 Deviations of a parameter have one of two priors. They are normal, smaller where they bend
-more (second differences; banded, so everything is solved frame by frame); or they follow a
-course of one number: a jump at a frame, or a ramp over a scan. What jumps is told from what
+more (second differences; banded, so everything is solved frame by frame); or they follow
+courses of one number each: a jump at a frame, or a ramp over a scan. What jumps is told from what
 wanders by its evidence, and so are two parameters that jump at the same frame.
 """
 
@@ -28,15 +28,19 @@ MOST_COURSES: Final = 720
 
 
 class Course(NamedTuple):
-    """A course of deviations.
+    """Deviations that are a sum of courses.
 
     Attributes:
-        shape: its number, of `MotionModel.courses`.
-        width: of its height, in sigmas from one frame.
+        shapes: their numbers, of `MotionModel.courses`, rising.
+        width: of each height, in sigmas from one frame.
     """
 
-    shape: int
+    shapes: tuple[int, ...]
     width: float
+
+    def beside(self, shape: int) -> Course:
+        """Return the same with a further course."""
+        return Course(tuple(sorted((*self.shapes, shape))), self.width)
 
 
 class Waves(NamedTuple):
@@ -55,6 +59,20 @@ Pick = Waves | Course | None
 """Prior of a parameter's deviations; None: it does not move."""
 MotionChoice = tuple[Pick, ...]
 """Of each parameter."""
+
+
+class Height(NamedTuple):
+    """A further column: the height of a course.
+
+    Attributes:
+        parameter: number of the one that follows it.
+        shape: (n,) deviations, see `MotionModel.course`.
+        width: see `Course`.
+    """
+
+    parameter: int
+    shape: FloatArray
+    width: float
 
 
 class Answer(NamedTuple):
@@ -146,15 +164,15 @@ class MotionModel:
         """Compute the variance of a parameter's deviation from one frame."""
         return 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)
 
-    def course(self, i: int, shape: npt.NDArray[np.intp] | int) -> FloatArray:
-        """Compute the deviations of a parameter that follow courses, from their mean, (n,)
-        or (n, courses), as high as the sigma from one frame.
+    def course(self, i: int, shapes: Sequence[int]) -> FloatArray:
+        """Compute the deviations of a parameter that follow courses, from their mean, (n,
+        courses), as high as the sigma from one frame.
 
         Args:
             i: number of the parameter.
-            shape: numbers of courses.
+            shapes: numbers of courses.
         """
-        out = self.courses[:, shape].copy()
+        out = self.courses[:, list(shapes)]
         own = self.column[:, i]
         for label in np.unique(own):
             out[own == label] -= out[own == label].mean(axis=0)
@@ -249,12 +267,17 @@ class MotionModel:
             for i, pick in enumerate(choice)
             if pick is not None and not isinstance(pick, Course)
         ]
-        follow = [i for i, pick in enumerate(choice) if isinstance(pick, Course)]
-        plain, push, mixed = self._with_courses(choice, follow)
+        heights = [
+            Height(i, self.course(i, pick.shapes)[:, at], pick.width)
+            for i, pick in enumerate(choice)
+            if isinstance(pick, Course)
+            for at in range(len(pick.shapes))
+        ]
+        plain, push, mixed = self._with_courses(heights)
         if not moving:
             empty = np.zeros((0, len(push)))
             return _Eliminated(
-                (), follow, mixed, np.zeros((1, 0)), empty, empty, plain, push, 0.0
+                (), heights, mixed, np.zeros((1, 0)), empty, empty, plain, push, 0.0
             )
         band = self._factor(moving, choice)
         across = mixed[:, :, moving].transpose(0, 2, 1).reshape(-1, len(push))
@@ -264,7 +287,7 @@ class MotionModel:
         alone = both[:, -1]
         return _Eliminated(
             tuple(moving),
-            follow,
+            heights,
             mixed,
             band,
             across,
@@ -275,40 +298,31 @@ class MotionModel:
         )
 
     def _with_courses(
-        self, choice: MotionChoice, follow: Sequence[int]
+        self, heights: Sequence[Height]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Append the heights of courses to the fit's columns.
-
-        Args:
-            choice: of each parameter.
-            follow: numbers of the c parameters that follow a course.
+        """Append c heights of courses to the fit's columns.
 
         Returns:
             Normal equations (g + c, g + c) and (g + c,) with priors, and sums (n, g + c, p)
             of each frame's products with the parameters.
         """
-        g = len(self.push)
-        if not follow:
+        if not heights:
             return self.plain, self.push, self.mixed
-        mixed = np.concatenate([self.mixed, np.zeros((len(self.pull), len(follow),
-                                self.pull.shape[1]))], axis=1)  # fmt: skip
-        size = g + len(follow)
+        g = len(self.push)
+        size = g + len(heights)
+        n, p = self.pull.shape
+        mixed = np.concatenate([self.mixed, np.zeros((n, len(heights), p))], axis=1)
         plain = np.zeros((size, size))
         plain[:g, :g] = self.plain
-        push = np.concatenate([self.push, np.zeros(len(follow))])
-        for at, i in enumerate(follow):
-            pick = choice[i]
-            assert isinstance(pick, Course)
-            shape = self.course(i, pick.shape)
-            mixed[:, g + at] = shape[:, None] * self.pairs[:, i]
-            push[g + at] = shape @ self.pull[:, i]
-        for at, i in enumerate(follow):
-            pick = choice[i]
-            assert isinstance(pick, Course)
-            own = self.course(i, pick.shape) @ mixed[:, :, i]
-            plain[g + at] = own
-            plain[:, g + at] = own
-            plain[g + at, g + at] += 1.0 / pick.width**2
+        push = np.concatenate([self.push, np.zeros(len(heights))])
+        for at, one in enumerate(heights, g):
+            mixed[:, at] = one.shape[:, None] * self.pairs[:, one.parameter]
+            push[at] = one.shape @ self.pull[:, one.parameter]
+        for at, one in enumerate(heights, g):
+            own = one.shape @ mixed[:, :, one.parameter]
+            plain[at] = own
+            plain[:, at] = own
+            plain[at, at] += 1.0 / one.width**2
         return plain, push, mixed
 
     def likelihood(self, choice: MotionChoice) -> float:
@@ -341,7 +355,7 @@ class MotionModel:
         volume = 2.0 * (np.log(np.diag(lower)).sum() + np.log(part.band[0]).sum())
         for i, pick in enumerate(choice):
             if isinstance(pick, Course):
-                volume += 2.0 * math.log(pick.width)
+                volume += 2.0 * len(pick.shapes) * math.log(pick.width)
             elif pick is not None:
                 alone = linalg.cholesky_banded(self._diagonals(i, pick), lower=True)
                 volume -= 2.0 * float(np.log(alone[0]).sum())
@@ -354,16 +368,22 @@ class MotionModel:
         choice.
 
         Args:
-            choice: in which the parameter does not move.
+            choice: in which the parameter does not move, or follows courses, to which one
+                is added.
             i: number of the parameter.
-            widths: to try.
+            widths: to try; that of the other courses is kept.
 
         Raises:
             LinAlgError: the equations are singular.
         """
         part = self._eliminated(choice)
         lower, rest = self._reduced(part)
-        shapes = self.course(i, np.arange(self.courses.shape[1]))
+        before = choice[i]
+        if isinstance(before, Course):
+            widths = (before.width,)
+        else:
+            before = Course((), widths[0])
+        shapes = self.course(i, range(self.courses.shape[1]))
         power = np.einsum("nc,n->c", shapes**2, self.pairs[:, i, i])
         across = part.mixed[:, :, i].T @ shapes
         pull = self.pull[:, i] @ shapes
@@ -379,16 +399,17 @@ class MotionModel:
         over = linalg.solve_triangular(lower, across, lower=True)
         power = np.maximum(power - np.einsum("gc,gc->c", over, over), 0.0)
         pull = pull - linalg.solve_triangular(lower, part.push, lower=True) @ over
-        best = (-math.inf, Course(0, widths[0]))
+        best = (-math.inf, 0, widths[0])
         for width in widths:
             whole = power + 1.0 / width**2
             left = np.maximum(rest - pull**2 / whole, LEAST_NOISE**2)
             gain = -0.5 * (
                 np.log(whole) + 2.0 * math.log(width) + self.freedom * np.log(left)
             )
+            gain[list(before.shapes)] = -math.inf
             at = int(np.argmax(gain))
-            best = max(best, (float(gain[at]), Course(at, width)))
-        return best[1]
+            best = max(best, (float(gain[at]), at, width))
+        return Course(before.shapes, best[2]).beside(best[1])
 
     def solved(self, choice: MotionChoice) -> Answer:
         """Solve for the deviations of a choice."""
@@ -405,13 +426,17 @@ class MotionModel:
         taken = 0.0
         covariance = inverse[:g, :g]
         columns = fixed[:g].copy()
-        for at, i in enumerate(part.follow):
-            pick = choice[i]
-            assert isinstance(pick, Course)
-            shape = self.course(i, pick.shape)
-            values[:, i] = fixed[g + at] * shape
-            sigma[:, i] = math.sqrt(noise2 * inverse[g + at, g + at]) * np.abs(shape)
-            taken += 1.0
+        for i in dict.fromkeys(one.parameter for one in part.heights):
+            own_heights = [
+                at for at, one in enumerate(part.heights, g) if one.parameter == i
+            ]
+            shapes = np.stack([part.heights[at - g].shape for at in own_heights], axis=1)
+            values[:, i] = shapes @ fixed[own_heights]
+            square = np.einsum(
+                "nc,cd,nd->n", shapes, inverse[np.ix_(own_heights, own_heights)], shapes
+            )
+            sigma[:, i] = np.sqrt(noise2 * np.maximum(square, 0.0))
+            taken += len(own_heights)
         if p:
             pull = self.pull[:, part.moving].ravel()
             found = linalg.cho_solve_banded((part.band, True), pull) - part.inner @ fixed
@@ -469,7 +494,7 @@ class _Eliminated:
 
     Attributes:
         moving: numbers of the eliminated parameters.
-        follow: numbers of those that follow a course.
+        heights: of the c courses.
         mixed: (n, g + c, parameters) sums over each frame's products.
         band, across, inner: factors of the eliminated deviations.
         left, push: (g + c, g + c), (g + c,) the equations.
@@ -477,7 +502,7 @@ class _Eliminated:
     """
 
     moving: tuple[int, ...]
-    follow: Sequence[int]
+    heights: Sequence[Height]
     mixed: FloatArray
     band: FloatArray
     across: FloatArray

@@ -1,6 +1,6 @@
 """Which parameters move, and how: a search among rivals, by their evidence.
 
-Every parameter may stand still, wander (`Waves`) or follow a jump or ramp (`Course`). From
+Every parameter may stand still, wander (`Waves`) or follow jumps and a ramp (`Course`). From
 one choice the search goes to the best that differs in one parameter, or has one parameter
 in exchange for another, until none is better. What comes near the best is returned with
 its probability, so that the sigmas contain what the tracks leave open.
@@ -40,6 +40,8 @@ ONE_PERIOD: Final = 2
 MIN_EVIDENCE: Final = 6.0
 """Gain in log likelihood from which a parameter counts as moving: white noise has it in less
 than one of a thousand fits (55 pairs of width and smoothness are tried)."""
+MOST_COURSES_OF_ONE: Final = 3
+"""Largest number of courses that a parameter follows; a busier one wanders."""
 COURSE_CHANCE: Final = 0.1
 """Probability that a parameter jumps or drifts, before the scan is seen; assumed."""
 MOST_RIVALS: Final = 24
@@ -120,7 +122,7 @@ class _Search:
         out = self.likelihood(choice)
         for pick in choice:
             if isinstance(pick, Course):
-                out += self._course
+                out += self._course * len(pick.shapes)
             elif pick is not None:
                 out -= MIN_EVIDENCE
         return out
@@ -159,12 +161,15 @@ class _Search:
                 continue
             without = _with(choice, i, None)
             yield without
-            if not isinstance(pick, Course):
-                yield from self._follows(without, i)
-            else:
+            if isinstance(pick, Course):
                 yield from self._wanders(without, i)
+                yield from self._courses_beside(choice, i, pick)
+                yield from _taken_over(without, pick)
+            else:
+                yield from self._follows(without, i)
             for j in still:
                 if isinstance(pick, Course):
+                    yield _with(without, j, pick)
                     yield from self._follows(without, j)
                 else:
                     yield self._uphill(_with(without, j, pick), j)
@@ -175,13 +180,32 @@ class _Search:
         yield from self._wanders(choice, i)
 
     def _follows(self, choice: MotionChoice, i: int) -> Iterator[MotionChoice]:
-        """Yield the choice in which a still parameter follows its best course, if the
-        equations are not singular.
+        """Yield choices in which a parameter follows its best course, then one more, as
+        long as that is more likely; none where the equations are singular.
         """
-        try:
-            yield _with(choice, i, self._model.best_course(choice, i, HEIGHTS))
-        except np.linalg.LinAlgError:
-            return
+        for _ in range(MOST_COURSES_OF_ONE):
+            before = choice
+            pick = choice[i]
+            if isinstance(pick, Course) and len(pick.shapes) >= MOST_COURSES_OF_ONE:
+                return
+            try:
+                course = self._model.best_course(choice, i, HEIGHTS)
+            except np.linalg.LinAlgError:
+                return
+            choice = _with(choice, i, course)
+            yield choice
+            if len(course.shapes) > 1 and self.score(choice) < self.score(before):
+                return
+
+    def _courses_beside(
+        self, choice: MotionChoice, i: int, pick: Course
+    ) -> Iterator[MotionChoice]:
+        """Yield choices in which a parameter follows a course more, or less."""
+        yield from self._follows(choice, i)
+        if len(pick.shapes) > 1:
+            for shape in pick.shapes:
+                rest = tuple(s for s in pick.shapes if s != shape)
+                yield _with(choice, i, Course(rest, pick.width))
 
     def _wanders(self, choice: MotionChoice, i: int) -> Iterator[MotionChoice]:
         """Yield choices in which a still parameter wanders by one of ROUGH."""
@@ -215,13 +239,15 @@ class _Search:
 
     def other_frames(self, choice: MotionChoice) -> Iterator[MotionChoice]:
         """Yield a choice with each of its jumps up to two frames earlier or later."""
-        scans = len(self._model.sizes)
+        jumps = range(len(self._model.sizes), self._model.courses.shape[1])
         for i, pick in enumerate(choice):
-            if isinstance(pick, Course) and pick.shape >= scans:
-                for shift in (-2, -1, 1, 2):
-                    shape = pick.shape + shift
-                    if scans <= shape < self._model.courses.shape[1]:
-                        yield _with(choice, i, Course(shape, pick.width))
+            if not isinstance(pick, Course):
+                continue
+            for shape, shift in product(pick.shapes, (-2, -1, 1, 2)):
+                rest = tuple(s for s in pick.shapes if s != shape)
+                moved = shape + shift
+                if shape in jumps and moved in jumps and moved not in rest:
+                    yield _with(choice, i, Course(rest, pick.width).beside(moved))
 
     def gains(self, choice: MotionChoice) -> tuple[float, ...]:
         """Compute the logarithm of the likelihood that each parameter gains by moving, or
@@ -287,6 +313,15 @@ class _Search:
         return choice
 
 
+def _taken_over(choice: MotionChoice, pick: Course) -> Iterator[MotionChoice]:
+    """Yield choices in which a parameter that follows courses takes over those of another."""
+    for j, other in enumerate(choice):
+        if isinstance(other, Course):
+            shapes = tuple(sorted({*other.shapes, *pick.shapes}))
+            if len(shapes) <= MOST_COURSES_OF_ONE:
+                yield _with(choice, j, Course(shapes, other.width))
+
+
 def moves(choice: Sequence[Pick]) -> frozenset[int]:
     """Return the numbers of the parameters that a choice moves."""
     return frozenset(i for i, pick in enumerate(choice) if pick is not None)
@@ -295,7 +330,7 @@ def moves(choice: Sequence[Pick]) -> frozenset[int]:
 def _kind(pick: Pick) -> object:
     """Return what tells priors of deviations apart, but for their widths."""
     if isinstance(pick, Course):
-        return pick.shape
+        return pick.shapes
     return None if pick is None else -1
 
 
