@@ -18,7 +18,7 @@ from flexdt.twin.calibration.fit.fitted_motion import (
 )
 from flexdt.twin.calibration.fits_of_scans import refit_scans
 from flexdt.twin.calibration.outcome import Calibration
-from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
 
 
 def fit_with_motion(
@@ -50,11 +50,13 @@ def fit_with_motion(
         )
         return replace(state, scans=scans, motion=motion)
 
+    stated = stated_priors(state.scans, request)
     fit, found = follow_motion(
         fit,
         request.per_frame,
         lambda motion: refit_scans(moved(motion), request, fit),
         state.motion,
+        [name for name, width in stated.items() if width == 0],
     )
     return moved(found), fit
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from causes_named import calibrated, worst_error
@@ -138,3 +140,17 @@ def test_a_misfit_named_a_vibration_is_not_dropped_with_a_motion(
     assert "vibration" in [f.code for f in calibrated(scan).errors]
     result = calibrated(scan, ("alpha",))
     assert not result.identifiable, result.findings
+
+
+def test_what_is_stated_exactly_is_doubted_by_evidence_alone() -> None:
+    """The source is a rival of an object that jumped a little, unless it is stated exactly;
+    where it jumped far it is followed all the same."""
+    scan = drawn("jump_across", 50002)
+    exact = replace(scan.believed, priors={"dS_x": 0.0})
+    (said,) = calibrated(scan, ("dO_x",)).findings
+    assert "the source moves aside" in said.text
+    stated = calibrated(replace(scan, believed=exact), ("dO_x",)).findings
+    assert not any("the source moves aside" in f.text for f in stated)
+    far = drawn("source_jumps", 9304)
+    exact = replace(far.believed, priors={"dS_x": 0.0})
+    assert moving(calibrated(replace(far, believed=exact), ("dO_x",))) == {"dS_x"}

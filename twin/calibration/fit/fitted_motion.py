@@ -18,7 +18,7 @@ again, and estimates the remainder, until they stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -110,6 +110,7 @@ def estimate_motion(
     known: MotionFit | None = None,
     *,
     search: bool = True,
+    exact: Collection[str] = (),
 ) -> MotionFit:
     """Estimate the motion in the tracks of a fit, by a linear mixed model about it.
 
@@ -121,6 +122,8 @@ def estimate_motion(
         names: parameters that may move, of `geometry.motion.MOVABLE`; so may the others.
         known: motion that the fit's poses hold, found with the same names; None: no motion.
         search: for what moves, and how; else that of `known` is taken.
+        exact: parameters that are stated to be exactly known: they move only where the
+            tracks contradict that.
 
     Returns:
         The total motion of each scan, `known` included. A parameter that the scans share
@@ -145,7 +148,8 @@ def estimate_motion(
     try:
         if search or known is None:
             start = None if known is None else known.likely.choice
-            likely = most_likely(model, len(names), start)
+            held = [i for i, n in enumerate(everything) if n in exact and n not in names]
+            likely = most_likely(model, len(names), start, held)
         else:
             likely = known.likely
         best = model.solved(likely.choice)
@@ -245,6 +249,7 @@ def follow_motion(
     names: Sequence[str],
     refit: Callable[[MotionFit], FitResult],
     known: MotionFit | None = None,
+    exact: Collection[str] = (),
 ) -> tuple[FitResult, MotionFit]:
     """Estimate motion and the other parameters by turns until the motion stays
     (`MotionFit.near`), `MOST_PASSES` at most, of which `SEARCHES` search for what moves.
@@ -254,6 +259,7 @@ def follow_motion(
         names: parameters that may move.
         refit: the fit to poses that hold another motion.
         known: None: no motion.
+        exact: see `estimate_motion`.
 
     Returns:
         The last fit, and the motion its poses hold. `aware` gives the fit's sigmas with
@@ -263,7 +269,7 @@ def follow_motion(
         TwinError: as `estimate_motion`.
     """
     for turn in range(MOST_PASSES):
-        found = estimate_motion(fit, names, known, search=turn < SEARCHES)
+        found = estimate_motion(fit, names, known, search=turn < SEARCHES, exact=exact)
         fit = refit(found)
         if known is not None and found.near(known):
             break

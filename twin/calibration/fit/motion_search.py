@@ -9,7 +9,7 @@ its probability, so that the sigmas contain what the tracks leave open.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -42,6 +42,8 @@ MIN_EVIDENCE: Final = 6.0
 than one of a thousand fits (55 pairs of width and smoothness are tried)."""
 MOST_COURSES_OF_ONE: Final = 3
 """Largest number of courses that a parameter follows; a busier one wanders."""
+EXACT_LOG_CHANCE: Final = math.log(1e-3)
+"""Logarithm of the probability that what is stated to be exactly known moves; assumed."""
 COURSE_CHANCE: Final = 0.1
 """Probability that a parameter jumps or drifts, before the scan is seen; assumed."""
 MOST_RIVALS: Final = 24
@@ -68,7 +70,10 @@ class Likely(NamedTuple):
 
 
 def most_likely(
-    model: MotionModel, asked: int, start: MotionChoice | None = None
+    model: MotionModel,
+    asked: int,
+    start: MotionChoice | None = None,
+    exact: Collection[int] = (),
 ) -> Likely:
     """Search for the most likely motion.
 
@@ -78,11 +83,12 @@ def most_likely(
         model: of all parameters that may move.
         asked: number of parameters that were asked for, the first ones.
         start: a choice from which the search begins, besides that of no motion.
+        exact: numbers of parameters that are stated to be exactly known.
 
     Raises:
         LinAlgError: the equations are singular without motion.
     """
-    search = _Search(model)
+    search = _Search(model, exact)
     every = range(model.pull.shape[1])
     nothing: MotionChoice = (None,) * len(every)
     model.likelihood(nothing)
@@ -100,9 +106,15 @@ def most_likely(
 class _Search:
     """Choices of a model that were judged, each once."""
 
-    def __init__(self, model: MotionModel) -> None:
-        """Begin without any."""
+    def __init__(self, model: MotionModel, exact: Collection[int] = ()) -> None:
+        """Begin without any.
+
+        Args:
+            model: of all parameters.
+            exact: numbers of those that are stated to be exactly known.
+        """
         self._model = model
+        self._exact = frozenset(exact)
         self._known: dict[MotionChoice, float] = {}
         self._course = math.log(COURSE_CHANCE) - math.log(
             model.courses.shape[1] * len(HEIGHTS)
@@ -120,7 +132,9 @@ class _Search:
     def score(self, choice: MotionChoice) -> float:
         """Compute the logarithm of the probability of a choice, up to a constant."""
         out = self.likelihood(choice)
-        for pick in choice:
+        for i, pick in enumerate(choice):
+            if pick is not None and i in self._exact:
+                out += EXACT_LOG_CHANCE
             if isinstance(pick, Course):
                 out += self._course * len(pick.shapes)
             elif pick is not None:
