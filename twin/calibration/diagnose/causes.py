@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+from scipy.linalg import lapack
 
 from flexdt.twin.calibration.diagnose.tiles import (
     GAP_WIDTHS_PX,
@@ -203,16 +204,14 @@ class Candidates:
         )
         share = np.repeat(bounded, 2)[:, None]
         motion = [rows_of for name in self._moving() for rows_of in self._motion(name)]
-        if motion:
-            moving = np.concatenate(motion, axis=1)
-            rows = np.concatenate([rows, moving / self._visible(rows, moving)], axis=1)
-        table = rows * share
+        table = np.concatenate([rows, *motion], axis=1) * share
         causes = there - everything.start
         causes[: self.count] = 0.0
-        values = left.ravel() + rows[:, : len(causes)] @ causes
+        values = left.ravel() + rows @ causes
         self.rows = table
         self.values = values * share[:, 0]
         self.table = Table(self.rows, self.values, known.floor, alike)
+        self.visible = self._visible(rows.shape[1])
         self.causes = self._causes(everything)
         self._judged: dict[Choice, Judged | None] = {}
         self.means = np.zeros(table.shape[1])
@@ -251,27 +250,35 @@ class Candidates:
             column = (slope * shape[:, None]).ravel()[seen]
             yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
 
-    def _visible(self, rows: FloatArray, moving: FloatArray) -> FloatArray:
-        """Compute which part of each motion the geometry does not take up, `LEAST_VISIBLE`
-        at least.
+    def _visible(self, first: int) -> FloatArray:
+        """Compute which part of each column's length widths are meant for: of a motion,
+        what the geometry leaves of it, `LEAST_VISIBLE` at least.
 
         Over a part of a turn, or in a helix, an even drift is almost an object that
         stands elsewhere, or a panel and an axis that roll: what is seen of it is little
         beside what it is.
 
         Args:
-            rows: (m, q) of the geometry and causes.
-            moving: (m, p) columns of unit length.
+            first: column of a motion.
 
         Returns:
-            (p,) lengths.
+            (q,), 1 for other columns than motions.
         """
-        prior = self.noise / self.problem.prior_sigma[: self.count]
-        table = np.concatenate([rows[:, : self.count], np.diag(prior)])
-        scale = np.maximum(np.linalg.norm(table, axis=0), 1e-300)
-        basis = np.linalg.qr(table / scale)[0][: len(rows)]
-        taken = np.square(basis.T @ moving).sum(axis=0)
-        return np.asarray(np.sqrt(np.maximum(1.0 - taken, LEAST_VISIBLE**2)))
+        own = slice(0, self.count)
+        gram = self.table.gram
+        out = np.ones(len(gram))
+        inside = gram[own, own].copy()
+        prior = self.noise / self.problem.prior_sigma[own]
+        inside.flat[:: self.count + 1] += prior**2 / self.alike
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(inside), 1e-300))
+        factor, failed = lapack.dpotrf(inside * np.outer(scale, scale), lower=1)
+        if failed or first == len(gram):  # Columns that nothing tells apart hide no more.
+            return out
+        push = scale[:, None] * gram[own, first:]
+        taken = np.square(lapack.dtrtrs(factor, push, lower=1)[0]).sum(axis=0)
+        power = np.maximum(np.diag(gram)[first:], 1e-300)
+        out[first:] = np.sqrt(np.maximum(1.0 - taken / power, LEAST_VISIBLE**2))
+        return out
 
     def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
         """List the causes of the table: shape, beads, arc, panel, borders, motion and
@@ -366,7 +373,7 @@ class Candidates:
             width = pick or cause.always
             if cause.columns and width > 0:
                 columns += cause.columns
-                widths.append(np.full(len(cause.columns), width))
+                widths.append(width / self.visible[list(cause.columns)])
             if pick:
                 chance += cause.chance - math.log(len(cause.widths))
         return columns, np.concatenate(widths), chance
@@ -624,7 +631,7 @@ class Candidates:
         widths = np.concatenate(
             [np.full(self.count, np.inf)]
             + [
-                np.full(len(c.columns), w)
+                w / self.visible[list(c.columns)]
                 for c, p in zip(self.causes, choice, strict=True)
                 if c.columns and (w := p or c.always) > 0
             ]

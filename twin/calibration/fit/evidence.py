@@ -53,7 +53,11 @@ class Judged:
 
 
 class Table:
-    """Rows of residuals and of all columns that a model may have."""
+    """Rows of residuals and of all columns that a model may have.
+
+    Attributes:
+        gram: (q, q) products of the columns.
+    """
 
     def __init__(
         self, rows: FloatArray, values: FloatArray, floor: float, alike: float = 1.0
@@ -67,7 +71,7 @@ class Table:
             alike: number of correlated rows that count as one, 1 or more.
         """
         self._count = len(values) / alike
-        self._gram = cross(rows, rows) / alike
+        self.gram = cross(rows, rows) / alike
         self._push = np.einsum("mq,m->q", rows, values) / alike
         self._total = float(values @ values) / alike
         self._floor = floor
@@ -90,7 +94,7 @@ class Table:
             The model; None if its columns are not separable.
         """
         at = np.asarray(columns, dtype=np.intp)
-        gram = self._gram[np.ix_(at, at)]
+        gram = self.gram[np.ix_(at, at)]
         flat = np.isinf(widths)
         precision = np.where(flat, 0.0, 1.0 / widths**2)
         # Deviations from the means have priors about zero.
