@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 from faults_drawn import KINDS, Faulty, drawn
-from faults_paired import ALONE, PAIRS, SETUPS, drawn_together
+from faults_paired import drawn_names, drawn_together
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
@@ -201,24 +201,15 @@ def _verdict(
     return "vague" if said else "none"
 
 
-def _drawn_names(args: argparse.Namespace) -> list[tuple[str, int]]:
-    """List the scans to be judged: every kind in turn, or pairs and setups drawn from the
-    seed: half of them pairs, a quarter each single causes and pairs of an unusual setup.
+def _to_judge(args: argparse.Namespace) -> list[tuple[str, int]]:
+    """List the kinds and seeds of the scans to be judged: every kind in turn, or drawn
+    pairs and setups.
     """
-    if not args.pairs:
-        seeds = range(args.seed, args.seed + args.each)
-        return [(kind, seed) for seed in seeds for kind in args.kinds.split(",")]
-    wanted = set(args.kinds.split(",")) | {"as_assumed"}
-    pairs = [p for p in PAIRS if wanted.issuperset(p.split("+"))]
-    alone = sorted({k for p in pairs for k in p.split("+")} - ALONE)
-    out = []
-    for i in range(args.pairs):
-        rng = np.random.default_rng([args.seed, i])
-        name = str(rng.choice(pairs if i % 4 else alone))
-        if i % 4 < 2:
-            name += f"@{rng.choice(list(SETUPS))}"
-        out.append((name, args.seed + i))
-    return out
+    kinds = args.kinds.split(",")
+    if args.pairs:
+        return drawn_names(args.pairs, args.seed, kinds)
+    seeds = range(args.seed, args.seed + args.each)
+    return [(kind, seed) for seed in seeds for kind in kinds]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -238,7 +229,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
     all_of_them = []
-    for kind, seed in _drawn_names(args):
+    for kind, seed in _to_judge(args):
         all_of_them.append(scored(kind, seed))
         if args.json:
             print(json.dumps(asdict(all_of_them[-1])), flush=True)

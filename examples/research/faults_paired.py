@@ -7,7 +7,7 @@ and the setup is one of SETUPS, which changes the scan before anything is wrong 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -245,3 +245,26 @@ def drawn_together(name: str, seed: int) -> tuple[Faulty, tuple[tuple[str, ...],
     beside = (*draft.beside, *itertools.chain.from_iterable(may if must else ()))
     every = tuple(itertools.chain.from_iterable(some))
     return taken(replace(draft, names=every, beside=beside, silent=not must), rng), some
+
+
+def drawn_names(
+    count: int, seed: int, kinds: Collection[str] = MILD
+) -> list[tuple[str, int]]:
+    """Draw names of scans, and the seed of each: three of four are pairs of mild faults, the
+    fourth is one alone, and every second has an unusual setup.
+
+    Args:
+        count: of the scans.
+        seed: of the draws; the scans' seeds count on from it.
+        kinds: faults that may be drawn.
+    """
+    pairs = [p for p in PAIRS if set(p.split("+")) <= set(kinds)]
+    alone = [k for k in MILD if k in kinds]
+    out = []
+    for i in range(count):
+        rng = np.random.default_rng([seed, i])
+        name = str(rng.choice(pairs if i % 4 else alone))
+        if i % 4 < 2:
+            name += f"@{rng.choice(list(SETUPS))}"
+        out.append((name, seed + i))
+    return out
