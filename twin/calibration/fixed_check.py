@@ -153,7 +153,11 @@ def check_fixed(
         fit = _with_stated_priors(fit, before)
     fit = _doubted(fit, free_fit, fixed)
     if exact:
-        found += listed(judge_exact(fit, refit_scans(state, usual, fit), exact))
+        freed = refit_scans(state, usual, fit)
+        judged = judge_exact(fit, freed, exact)
+        if judged is not None and judged.forbids:  # With the sigmas of causes left open.
+            judged = judge_exact(fit, explain(state, usual, freed)[0], exact)
+        found += listed(judged)
 
     def without(name: str) -> FitResult:
         """Fit with one parameter's prior so wide that the images alone determine it,
