@@ -159,7 +159,7 @@ class Table:
             That mean square about the first model's estimates, and that model's covariance,
             both (count, count).
         """
-        gram = self._gram / noise**2
+        gram = self.gram / noise**2
         # Of the products of rows and values, noise and what is drawn.
         square = gram + (gram * drawn) @ gram
         inverses = []
