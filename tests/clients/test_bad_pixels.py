@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 
 import bias_bound
+import clean_pixel_table
 import numpy as np
 import pytest
 
@@ -139,6 +140,20 @@ def test_a_thin_ring_about_the_axis_is_no_pair_of_bad_pixels(
     found = bad_pixels(lambda _: views, axis)
     assert found is not None
     assert np.argwhere(found.mask).tolist() == [[20, 44]]
+
+
+@pytest.mark.parametrize("seed", [60, 67, 83, 85, 91, 105])
+def test_the_only_pair_that_no_other_pixel_is_like_is_of_the_ring_beside(
+    seed: int,
+) -> None:
+    """The limbs of one thin ring of five see more than anything else; a dead pixel elsewhere,
+    which is beside nothing, is found."""
+    images, _, axis = clean_pixel_table.drawn("rings", seed)
+    assert bad_pixels(lambda _: images, axis) is None
+    images[:, 24, 8] = 10.0
+    found = bad_pixels(lambda _: images, axis)
+    assert found is not None
+    assert np.argwhere(found.mask).tolist() == [[24, 8]]
 
 
 @pytest.mark.parametrize(

@@ -461,21 +461,50 @@ class _Judged:
         suspect whose counterpart is alike (`MIN_ALIKE_RATIO`) is of the object where
         there are more such pairs than bad pixels scattered over the panel would make. At
         the axis, a suspect is bad in a bad column, or if it is unexplained.
+
+        Unexplained pixels are counted apart (`_standing`).
         """
         lasting = self.suspects & (self.often >= MIN_LASTING_SHARE * self.views)
         at_axis = self._at_axis()
-        defect = _bad_columns(self.suspects) | (self.unexplained > 0.0)
-        alike = np.zeros_like(lasting)
         strange = self.unexplained > 0.0
-        for kind, most in (
-            (~strange, MAX_PAIRS_CHANCE),
-            (strange, MAX_UNEXPLAINED_PAIRS_CHANCE),
-        ):
-            row, col = np.nonzero(lasting & kind & ~at_axis)
-            paired = self._has_counterpart(row, col)
-            if self._chance_of_pairs(len(row), int(paired.sum())) < most:
-                alike[row, col] = paired
+        defect = _bad_columns(self.suspects) | strange
+        alike = self._standing(lasting & strange & ~at_axis, self.suspects & ~strange)
+        row, col = np.nonzero(lasting & ~strange & ~at_axis)
+        paired = self._has_counterpart(row, col)
+        if self._chance_of_pairs(len(row), int(paired.sum())) < MAX_PAIRS_CHANCE:
+            alike[row, col] = paired
         return np.asarray(lasting & np.where(at_axis, defect, ~alike))
+
+    def _standing(
+        self, strange: npt.NDArray[np.bool_], others: npt.NDArray[np.bool_]
+    ) -> npt.NDArray[np.bool_]:
+        """Find pixels with unexplained values that are of an object which stands still,
+        (rows, cols).
+
+        What no other pixel has, as the limb of a thin ring, goes on beside it, and hardly
+        any bad pixels are beside those of an object by chance: pairs there are counted
+        first. Where all pairs together are of an object, the rest are as well, if they
+        are more than so many bad pixels would make (`MAX_PAIRS_CHANCE`).
+
+        Args:
+            strange: these pixels.
+            others: suspects that are not.
+        """
+        alike = np.zeros_like(strange)
+        row, col = np.nonzero(strange)
+        paired = self._has_counterpart(row, col)
+        place = _about(others)
+        near = paired & place[row, col]
+        share = float(place.mean())
+        chance = self._chance_of_pairs(len(row), int(near.sum()), share)
+        found = near & (chance < MAX_UNEXPLAINED_PAIRS_CHANCE)
+        rest = paired & ~found
+        together = self._chance_of_pairs(len(row), int(paired.sum()))
+        alone = self._chance_of_pairs(int((~found).sum()), int(rest.sum()))
+        if together < MAX_UNEXPLAINED_PAIRS_CHANCE and alone < MAX_PAIRS_CHANCE:
+            found = paired
+        alike[row, col] = found
+        return alike
 
     def _has_counterpart(
         self, row: npt.NDArray[np.intp], col: npt.NDArray[np.intp]
@@ -498,18 +527,19 @@ class _Judged:
             alike |= inside & (peak > least)
         return alike
 
-    def _chance_of_pairs(self, many: int, paired: int) -> float:
+    def _chance_of_pairs(self, many: int, paired: int, share: float = 1.0) -> float:
         """Compute the probability that of pixels scattered over the panel so many have
         counterparts (Poisson).
 
         Args:
             many: number of pixels.
-            paired: number of those with a counterpart, or more.
+            paired: number of those with a counterpart, or more, in a part of the panel.
+            share: of the panel's pixels in that part.
         """
         from scipy.stats import poisson
 
         reached = 2 * AXIS_REACH_PX + 1
-        expected = 0.5 * many * many * reached / self.suspects.size
+        expected = 0.5 * share * many * many * reached / self.suspects.size
         return float(poisson.sf((paired + 1) // 2 - 1, expected))
 
     def _flickering(self, bad: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
@@ -614,6 +644,13 @@ def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
 def _bad_columns(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """Find columns that are bad over more than half of their rows, (cols,)."""
     return np.asarray(mask.mean(axis=0) > 0.5)
+
+
+def _about(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Find the pixels that touch marked ones, also at a corner, and these, (rows, cols)."""
+    from scipy.ndimage import binary_dilation
+
+    return np.asarray(binary_dilation(mask, np.ones((3, 3), np.bool_)))
 
 
 def _largest_about(response: Float32Array) -> Float32Array:
