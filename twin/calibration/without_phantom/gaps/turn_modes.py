@@ -18,7 +18,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
 
 from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays
@@ -288,13 +287,17 @@ def _integrals(
     weight = np.tile(np.gradient(along), len(at)) * (far <= radius[-1])
     weights = np.concatenate([(1.0 - part) * weight, part * weight])
     ray = np.repeat(np.arange(len(at)), len(along))
-    places = np.tile(ray, 2), np.concatenate([inner, inner + 1])
-    wave = np.ones_like(turn)
+    # In the order of the table's places, all shares of one are beside each other.
+    place = np.tile(ray, 2) * len(radius) + np.concatenate([inner, inner + 1])
+    order = np.argsort(place, kind="stable")
+    first = np.flatnonzero(np.diff(place[order], prepend=-1))
+    filled = place[order][first]
+    turn = np.tile(turn, 2)[order]
+    wave = weights[order].astype(np.complex128)
+    table = np.zeros(len(at) * len(radius), dtype=np.complex128)
     for _ in range(most + 1):
-        table = csr_matrix(
-            (weights * np.tile(wave, 2), places), shape=(len(at), len(radius))
-        )
-        yield table.toarray()
+        table[filled] = np.add.reduceat(wave, first)
+        yield table.reshape(len(at), -1).copy()
         wave = wave * turn
 
 
