@@ -84,6 +84,19 @@ def test_gaps_behind_natural_objects_are_named(kind: str, seed: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("bone", 5002), ("bottle", 5001), ("bottle", 6106)]
+)
+@pytest.mark.campaign(1)
+def test_gaps_that_the_mean_shows_are_named(kind: str, seed: int) -> None:
+    """At the rim of what turns; behind a wall that turns back there, refused as two gaps; and
+    where nothing is seen to turn."""
+    told = natural_objects.tried(kind, seed, gap=True)
+    assert told["named"], told
+    assert abs(told["pull"]) < 4, told
+
+
+@pytest.mark.slow
 def test_both_ends_of_rays_find_the_column_from_two_pixels_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

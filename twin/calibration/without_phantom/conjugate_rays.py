@@ -110,12 +110,15 @@ class Profile:
         basis: shares in bins of a common shift, of a yaw and of a step at radii, (r, m, 3).
         shift: distance between the ends, of each bin, (m,) [px].
         sigma: standard deviation of the shift by sectors of the turn, (m,) [px].
+        certain: number of radii, the first ones, at which a step is told from a wall that
+            turns back.
     """
 
     radii: FloatArray
     basis: FloatArray
     shift: FloatArray
     sigma: FloatArray
+    certain: int
 
     @classmethod
     def of(
@@ -127,8 +130,9 @@ class Profile:
         sigma: FloatArray,
         soft: float,
     ) -> Profile:
-        """Make a profile that looks for steps at all columns but those of the last
-        `BEYOND` bins: with one bin beyond, a wall that turns back there looks the same.
+        """Make a profile that looks for steps at all columns but those of the last bin, and
+        is certain of them but for the last `BEYOND` bins: with one bin beyond, a wall that
+        turns back there looks the same.
 
         Args:
             radius: of columns from the axis, (k,) [px].
@@ -137,8 +141,9 @@ class Profile:
             shift, sigma: of the bins, (m,) [px].
             soft: sigma of the smoothing [px].
         """
-        at = radius[place <= place.max() - BEYOND]
-        return cls(at, _basis(radius, weight, place, at, soft), shift, sigma)
+        at = radius[place < place.max()]
+        certain = int((place <= place.max() - BEYOND).sum())
+        return cls(at, _basis(radius, weight, place, at, soft), shift, sigma, certain)
 
     def best(self) -> Step:
         """Find the most significant step, by its width over `least`; it need not be
@@ -156,12 +161,13 @@ class Profile:
         found = [NO_STEP]
         border = np.abs(self.basis[:, :, 2] - 0.5).argmin(axis=1)
         for _ in range(1 + len(self.shift) // LEAST_BINS):
-            chi_square = np.square(self._fit(sigma)[2]).sum(axis=1)
+            chi_square = np.square(self._fit(sigma)[2]).sum(axis=1)[: self.certain]
             widened = self._widened(sigma, int(chi_square.argmin()))
             steps, rest = self._steps(widened)
             left_out = np.flatnonzero(np.isinf(sigma))
             clear = (np.abs(border[:, None] - left_out) > BESIDE).all(axis=1)
             narrow = clear & self._has_inside
+            narrow[self.certain :] = False
             narrow &= np.array([abs(one.width) < MAX_WIDTH_PX for one in steps])
             if not narrow.any():
                 break
@@ -180,7 +186,7 @@ class Profile:
         Args:
             radius: distance from the axis [px].
         """
-        place = int(np.abs(self.radii - radius).argmin())
+        place = self._place(radius, self.certain)
         step = self.beside_axis(radius)
         if self._has_inside[place]:
             return step
@@ -194,7 +200,28 @@ class Profile:
         Args:
             radius: distance from the axis [px].
         """
-        place = int(np.abs(self.radii - radius).argmin())
+        return self._at(self._place(radius, self.certain))
+
+    def at_rim(self, radius: float) -> Step:
+        """Estimate the step at the radius next to one, also with one bin beyond; a wall that
+        turns back there looks the same.
+
+        Args:
+            radius: distance from the axis [px].
+        """
+        return self._at(self._place(radius, len(self.radii)))
+
+    @property
+    def last(self) -> float:
+        """Largest radius at which a step is certain [px]."""
+        return float(self.radii[self.certain - 1])
+
+    def _place(self, radius: float, count: int) -> int:
+        """Find the radius next to one among the first `count`."""
+        return int(np.abs(self.radii[:count] - radius).argmin())
+
+    def _at(self, place: int) -> Step:
+        """Estimate the step at one of the radii."""
         return self._steps(self._widened(self.sigma, place))[0][place]
 
     @property
@@ -253,7 +280,7 @@ class Profile:
         Returns:
             (m,); `sigma` itself if the residuals are usual already.
         """
-        only = Profile(self.radii[[place]], self.basis[[place]], self.shift, sigma)
+        only = Profile(self.radii[[place]], self.basis[[place]], self.shift, sigma, 1)
         free = int(np.isfinite(sigma).sum()) - 2
 
         def explained(more: float) -> bool:

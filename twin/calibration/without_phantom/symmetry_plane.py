@@ -333,7 +333,7 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
     borders = panel.model.borders if panel else ()
     closed = [b.at for b in borders if b.axis == 0]
     rays = ConjugateRays.of(scan, first.turn)
-    return find_gap(rays, first.values, first.turn.samples, closed)
+    return find_gap(rays, first.values, first.turn, closed)
 
 
 def _closes(found: Symmetry, gap: Gap) -> bool:

@@ -118,8 +118,7 @@ def local_gaps(
     if stack.shape[2] < 8 * SIDE:
         return []
     table = (stack - stack.mean(axis=0)).reshape(-1, stack.shape[2])
-    spread = table.std(axis=0)
-    dead = spread < 0.1 * median_filter(spread, 4 * SIDE + 1)
+    dead = dead_columns(table)
     for at in closed:
         dead |= np.abs(np.arange(len(dead)) - at) < SIDE
     steps = np.diff(table, axis=1)
@@ -155,6 +154,16 @@ def local_gaps(
         width = float(WIDTHS[gains[:, one].argmax()])
         found.append(Gap(one + SIDE, width, float(local_sigma(width))))
     return found
+
+
+def dead_columns(table: FloatArray) -> npt.NDArray[np.bool_]:
+    """Mark columns that hardly change from frame to frame, as those about them do, (c,).
+
+    Args:
+        table: rows of frames without the mean of the frames, (m, c).
+    """
+    spread = table.std(axis=0)
+    return np.asarray(spread < 0.1 * median_filter(spread, 4 * SIDE + 1))
 
 
 def local_sigma(width: FloatArray | float) -> FloatArray:

@@ -4,13 +4,15 @@ of rays.
 A wall that turns back at a column looks like a gap to single frames (`tile_gap.py`); to
 both ends of the same rays (`conjugate_rays.py`) it does not. A gap is reported if a step
 between their distances exceeds the scan's differences at all other distances from the
-axis, or if the frames see a gap and the step there has its sign. Near the axis, where no
-distance is inside a step, the frames count alone (`hidden_gap.py`), and gaps that they
-neither show nor exclude are given too.
+axis, or if the frames see a gap and the step there has its sign. Where no distance is
+inside a step, near the axis, or only few are beyond it, the frames, the modes of the turn
+and the symmetry of its mean count (`hidden_gap.py`), and gaps that they neither show nor
+exclude are given too.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -27,9 +29,19 @@ from flexdt.twin.calibration.without_phantom.gaps.hidden_gap import (
     hidden_gap,
     possible_gap,
 )
-from flexdt.twin.calibration.without_phantom.tile_gap import SIDE, Gap, local_gaps
+from flexdt.twin.calibration.without_phantom.gaps.mirror_steps import (
+    MirrorSteps,
+    mirror_steps,
+)
+from flexdt.twin.calibration.without_phantom.tile_gap import (
+    SIDE,
+    Gap,
+    dead_columns,
+    local_gaps,
+)
+from flexdt.twin.calibration.without_phantom.turn import Turn
 from flexdt.twin.errors import NotIdentifiableError
-from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.geometry.conventions import FloatArray
 
 SIGMAS: Final = 3.0
 """Least width of a gap, in sigmas."""
@@ -59,23 +71,24 @@ class GapFound(NamedTuple):
 def find_gap(
     rays: ConjugateRays,
     values: FloatArray,
-    frames: Sequence[Float32Array],
+    turn: Turn,
     closed: Sequence[float] = (),
 ) -> GapFound:
     """Find the gap between two tiles of the panel, if there is one.
 
     A gap counts if single frames show it and both ends of rays agree, if it is a likely
-    hidden one, or if both ends of rays show a significant step that single frames favour
-    over none; one that they do not is left open. Its width is that of both
+    hidden one, or if both ends of rays show a significant step that the mean shows or
+    single frames favour over none; others are left open. Its width is that of both
     ends of rays. The gap is marked as beside the axis if its place leaves the width to
     the prior. Hidden ones are judged only if none is closed; a likely one does not count
-    if both ends of rays show another step behind it.
+    if both ends of rays show another step behind it. A second gap does not count where the
+    mean favours none.
 
     Args:
         rays: both ends of rays of a turn.
         values: parameters of the plane of symmetry in the order of `circular_scan.FREE`,
             (k,).
-        frames: line integrals of `tile_gap.averaged_rows`, some of the turn.
+        turn: its frames.
         closed: columns of borders next to which the images are filled in.
 
     Returns:
@@ -91,12 +104,16 @@ def find_gap(
     else:
         profile = None
     axis = rays.scan.column(values, rays.row)
+    frames = turn.samples
+    stack = np.asarray(frames, dtype=np.float64)
+    dead = dead_columns((stack - stack.mean(axis=0)).reshape(-1, rays.cols))
+    of_mean = mirror_steps(turn.mean, turn.noise, rays.scan, values, dead)
     if closed:
         hidden = None
     else:
-        hidden = hidden_gap(frames, axis, profile, rays.smoothing, rays)
+        hidden = hidden_gap(frames, axis, profile, rays.smoothing, rays, of_mean)
     if profile is None:
-        return GapFound(None, hidden)
+        return GapFound(_by_mean(hidden, of_mean), hidden)
     seen = [
         gap
         for gap in local_gaps(frames, axis, closed)
@@ -108,17 +125,32 @@ def find_gap(
     if gap is None:
         return GapFound(None, hidden)
     by_rays_alone = not certified and likely is None
-    if by_rays_alone and not frames_show(frames, gap, 2.0 * rays.smoothing):
+    about = 2.0 * rays.smoothing
+    told = of_mean.told(gap.column, about)
+    if by_rays_alone and not (told or frames_show(frames, gap, about)):
         return GapFound(None, possible_gap(gap))
     closed_rays, behind = _closed(rays, values, gap.column, gap.width)
     second, step = _left_behind(closed_rays, behind, gap, seen)
+    second, step = (
+        None if one is None or of_mean.denied(one.column, about) else one
+        for one in (second, step)
+    )
     _require_one(gap, second)
     if likely is not None and step is not None:
         return GapFound(None, hidden)
     _require_one(gap, step)
     inside = profile.at(abs(gap.column - 0.5 - axis))
-    gap = gap._replace(beside_axis=not np.isfinite(inside.sigma))
+    gap = gap._replace(beside_axis=not (told or np.isfinite(inside.sigma)))
     return GapFound(gap, None if likely is None else hidden, behind)
+
+
+def _by_mean(hidden: HiddenGap | None, of_mean: MirrorSteps) -> Gap | None:
+    """Give a likely gap where nothing that turns is seen from both ends, if the mean shows it;
+    the mean tells its width, too.
+    """
+    if hidden is None or hidden.likely is None:
+        return None
+    return hidden.likely if of_mean.told(hidden.likely.column, 0.0) else None
 
 
 def _measured(
@@ -148,7 +180,10 @@ def _measured(
         gap = _refined(rays, values, first)
     elif step.significant:
         at_step = _from_step(step, axis)
-        gap = _refined(rays, values, at_step)
+        # A wall that turns back there makes the first estimate surer than it is.
+        gap = _refined(rays, values, at_step._replace(sigma=math.inf))
+        if not math.isfinite(gap.sigma):
+            gap = at_step
         # The column is not known to the pixel.
         gap = gap._replace(sigma=max(gap.sigma, at_step.sigma))
     else:
@@ -175,7 +210,13 @@ def _left_behind(
     if profile is None:
         return None, None
     axis = closed.scan.column(values, closed.row)
-    far = [one for one in seen if abs(one.column - gap.column) > 2.0 * closed.smoothing]
+    # Rays see the difference of two gaps as far from the axis: what is left of this one.
+    own = abs(gap.column - 0.5 - axis)
+    far = [
+        one
+        for one in seen
+        if abs(abs(one.column - 0.5 - axis) - own) > 2.0 * closed.smoothing
+    ]
     second = next((one for one in far if _certified(one, profile, axis)), None)
     step = profile.best()
     return second, _from_step(step, axis) if step.significant else None

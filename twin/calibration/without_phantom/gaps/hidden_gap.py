@@ -4,21 +4,23 @@ Within some columns of the axis, and where no structure that turns is seen neare
 axis, a gap moves both ends of all rays alike: it looks like another axis, half of its
 width aside. Only single frames across the border itself reveal it. The same edges pass
 all borders there, a few frames later, so the other borders give the evidence of a border
-without a gap, its scatter, and the visibility of a gap. A gap that would be visible and
-is not is excluded; the width of the others stays in the column's sigma.
+without a gap, its scatter, and the visibility of a gap. The mean over the turn tells such
+gaps too, where a wall or a round body is nearer to the axis than all that turns
+(`mirror_steps.py`). A gap that would be visible and is not is excluded; the width of the
+others stays in the column's sigma.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d
-from scipy.special import log_softmax, logsumexp, softmax
+from scipy.special import softmax
 
 from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.calibration.without_phantom.conjugate_rays import (
@@ -28,6 +30,13 @@ from flexdt.twin.calibration.without_phantom.conjugate_rays import (
 from flexdt.twin.calibration.without_phantom.gaps.gradient_step import (
     gradient_steps,
     scatter_of_sums,
+)
+from flexdt.twin.calibration.without_phantom.gaps.mirror_steps import (
+    LOG_PRIOR,
+    REPORTED_ODDS,
+    WIDTHS_PX,
+    MirrorSteps,
+    over_widths,
 )
 from flexdt.twin.calibration.without_phantom.gaps.turn_modes import (
     ModeSteps,
@@ -45,15 +54,9 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 CHANCE: Final = 0.05
 """Probability that a panel has a gap at one of the columns where it is hidden; assumed: most
 panels are one piece, or their gaps are closed by the camera."""
-REPORTED_ODDS: Final = 100.0
-"""Odds of a gap from which it is reported, and odds against one from which it is excluded."""
 OPEN_SHARE: Final = 0.5
 """Part of the width of gaps that a gap that is not excluded leaves open at least: the width
 times the root of its probability covers no gap."""
-WIDTHS_PX: Final = np.arange(0.25, 3.01, 0.25)
-"""Widths of gaps that are tried [px]."""
-WIDTH_SPREAD_PX: Final = 1.0
-"""Standard deviation of the widths of gaps before the images [px]; assumed."""
 BLURS_PX: Final = (0.0, 1.0)
 """Standard deviations over which a gap is smeared that are tried [px]."""
 EVIDENCE_SHARES: Final = np.array([0.3, 0.65, 1.0])
@@ -90,8 +93,9 @@ SIGMAS: Final = 3.0
 """Standard deviations from which a step is significant."""
 
 
-_LOG_PRIOR: Final = log_softmax(-0.5 * np.square(WIDTHS_PX / WIDTH_SPREAD_PX))[:, None]
-"""Logarithm of the probabilities of the widths of gaps before the images, (w, 1)."""
+def _trusted(found: FloatArray) -> FloatArray:
+    """Return log likelihood ratios as far as `FOOLED_CHANCE` lets them count."""
+    return found - np.logaddexp(0.0, found + math.log(FOOLED_CHANCE))
 
 
 class HiddenGap(NamedTuple):
@@ -127,26 +131,45 @@ class Evidence:
     Attributes:
         found: logarithm of the likelihood of a gap over none by width and column, (w, c).
         width: logarithm of the likelihood of the widths of a gap that is there, (w, c).
+        free: `found` without what else may look like a gap, (w, c): at which column a gap is,
+            if there is one.
     """
 
     found: FloatArray
     width: FloatArray
+    free: FloatArray
 
-    def beside(self, more: FloatArray) -> Evidence:
-        """Add log likelihoods (w, c) of other data, which do not determine widths."""
-        return Evidence(self.found + more, self.width)
+    def beside(
+        self,
+        more: FloatArray,
+        width: FloatArray | float = 0.0,
+        free: FloatArray | None = None,
+    ) -> Evidence:
+        """Add log likelihoods (w, c) of other data.
+
+        Args:
+            more: of a gap over none.
+            width: of the widths of a gap; 0: the data do not determine them.
+            free: of a gap over none, without what else looks like one; None: `more`.
+        """
+        both = more if free is None else free
+        return Evidence(self.found + more, self.width + width, self.free + both)
+
+    def trusted(self) -> Evidence:
+        """Return the evidence as far as `FOOLED_CHANCE` lets single frames count: a wall
+        passes for a gap to them.
+        """
+        return replace(self, found=_trusted(self.found))
 
     @property
     def ratio(self) -> FloatArray:
         """Likelihood of a gap over none at each column, for any width, (c,)."""
-        return np.asarray(
-            np.exp(np.minimum(logsumexp(self.found + _LOG_PRIOR, axis=0), 600.0))
-        )
+        return np.asarray(np.exp(np.minimum(over_widths(self.found), 600.0)))
 
     @property
     def widths(self) -> FloatArray:
         """Probabilities of the widths of a gap at each column, (w, c)."""
-        return np.asarray(softmax(self.width + _LOG_PRIOR, axis=0))
+        return np.asarray(softmax(self.width + LOG_PRIOR, axis=0))
 
 
 def hidden_gap(
@@ -155,12 +178,14 @@ def hidden_gap(
     profile: Profile | None,
     smoothing: float,
     rays: ConjugateRays | None = None,
+    of_mean: MirrorSteps | None = None,
 ) -> HiddenGap | None:
-    """Judge the gaps between panel tiles that both ends of rays do not reveal, near the
-    axis.
+    """Judge the gaps between panel tiles that both ends of rays do not reveal: near the
+    axis, and beyond what turns.
 
-    Compared are the likelihoods by single frames and by both ends of rays, without those
-    that outlines explain, with a prior of `CHANCE`.
+    Compared are the likelihoods by single frames, by both ends of rays and by the mean's
+    symmetry, without those that outlines explain, with a prior of `CHANCE`. The modes of
+    the turn are looked at where these leave a gap open.
 
     Args:
         frames: line integrals of `tile_gap.averaged_rows`, some of a turn.
@@ -169,6 +194,7 @@ def hidden_gap(
             turns.
         smoothing: sigma of the columns' smoothing in the profile [px].
         rays: of the turn, whose angular modes are compared; None: frames alone.
+        of_mean: evidence of the mean, of WIDTHS_PX; None: none.
 
     Returns:
         The range of columns in which one may be hidden, its probability, its root mean
@@ -181,18 +207,39 @@ def hidden_gap(
     else:
         reach = math.inf
     stack = np.asarray(frames, dtype=np.float64)
-    judged = _judged_about(stack, axis, reach)
+    rim = np.empty(0, dtype=np.intp)
+    if of_mean is not None and profile is not None:
+        rim = _shown_at_rim(of_mean, axis, profile)
+    far = float(np.abs(rim - 0.5 - axis).max(initial=reach))
+    judged = _judged_about(stack, axis, far)
     if judged is None:
         return None
     columns, evidence = judged
     beside = columns.astype(np.float64) - 0.5 - axis
-    evidence = evidence.beside(-_of_outlines(evidence.found, beside))
-    steps = mode_steps(rays, axis, reach) if rays is not None else None
-    if steps is not None:
-        evidence = _with_modes(evidence, columns, steps)
+    # An outline explains evidence of a gap; it is none against one.
+    outlines = np.minimum(
+        _of_outlines(evidence.found, beside), np.maximum(evidence.found, 0.0)
+    )
+    evidence = evidence.beside(-outlines)
+    if of_mean is not None:
+        evidence = evidence.trusted().beside(
+            of_mean.found[:, columns], of_mean.free[:, columns], of_mean.free[:, columns]
+        )
+    hidden = (np.abs(beside) <= reach) | np.isin(columns, rim)
+    if rays is not None and not _is_excluded(evidence.ratio[hidden]):
+        steps = mode_steps(rays, axis, far)
+        if steps is not None:
+            of_modes = _of_modes(columns, steps)
+            if of_mean is None:
+                evidence = evidence.trusted()
+            evidence = evidence.beside(of_modes, of_modes)
     if profile is not None:
-        evidence = evidence.beside(_evidence_of_rays(columns, axis, profile))
-    hidden = np.abs(beside) <= reach
+        of_rays = _evidence_of_rays(columns, axis, profile)
+        at_rim = np.abs(beside) > profile.last
+        certain = np.where(at_rim, _trusted(of_rays), of_rays)
+        evidence = evidence.beside(certain, free=of_rays)
+    if of_mean is not None and profile is not None:
+        evidence = _beside_told(columns, evidence, hidden, axis, profile, of_mean)
     ratio = evidence.ratio * hidden
     odds = CHANCE / (1.0 - CHANCE) * ratio / hidden.sum()
     total = float(odds.sum())
@@ -200,13 +247,15 @@ def hidden_gap(
     open_gap = total * REPORTED_ODDS > 1.0 or float(ratio.max()) > 1.0
     wide = np.square(WIDTHS_PX) + np.square(local_sigma(WIDTHS_PX))
     # Blurred and noisy edges tell that there is a gap better than how wide it is.
-    doubted = 0.5 * (evidence.widths + np.exp(_LOG_PRIOR))
+    doubted = 0.5 * (evidence.widths + np.exp(LOG_PRIOR))
     mean_square = float(odds @ (wide @ doubted)) / (1.0 + total)
     if open_gap:
-        usual = float(wide @ np.exp(_LOG_PRIOR[:, 0]))
+        usual = float(wide @ np.exp(LOG_PRIOR[:, 0]))
         mean_square = max(mean_square, OPEN_SHARE**2 * usual)
     shown = columns[hidden]
     best = int(odds.argmax())
+    near = hidden & (odds > odds[best] / REPORTED_ODDS)
+    best = int(np.where(near, over_widths(evidence.free), -math.inf).argmax())
     return HiddenGap(
         int(shown[0]),
         int(shown[-1]),
@@ -295,11 +344,14 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
         At least twice the smoothing; the largest radius if no step is determined.
     """
     determined = np.array(
-        [SIGMAS * profile.at(r).sigma < MIN_HIDDEN_PX for r in profile.radii.tolist()]
+        [
+            SIGMAS * profile.at(r).sigma < MIN_HIDDEN_PX
+            for r in profile.radii[: profile.certain].tolist()
+        ]
     )
     inner = 2.0 * smoothing
     if not determined.any():
-        return max(inner, float(profile.radii[-1]))
+        return max(inner, float(profile.last))
     return max(inner, float(profile.radii[int(determined.argmax())]))
 
 
@@ -336,36 +388,98 @@ def _evidence_of_rays(
         (w, c).
     """
     beside = columns - 0.5 - axis
-    steps = [profile.beside_axis(abs(b)) for b in beside.tolist()]
+    certain = np.abs(beside) <= profile.last
+    steps = [
+        profile.beside_axis(abs(b)) if sure else profile.at_rim(abs(b))
+        for b, sure in zip(beside.tolist(), certain.tolist(), strict=True)
+    ]
     width = np.array([step.width for step in steps]) * np.sign(beside)
     sigma = np.array([step.sigma for step in steps])
     return _evidence_of_widths(width, sigma)
 
 
-def _with_modes(
-    of_frames: Evidence, columns: npt.NDArray[np.intp], steps: ModeSteps
-) -> Evidence:
-    """Add the evidence of the turn's modes to that of single frames, which count as far as
-    `FOOLED_CHANCE` lets them: a wall passes for a gap to frames.
+def _of_modes(columns: npt.NDArray[np.intp], steps: ModeSteps) -> FloatArray:
+    """Compute the log likelihood ratios of gaps by the turn's modes.
 
     Args:
-        of_frames: evidence by width and column, (w, c).
         columns: (c,) first columns beyond a gap.
-        steps: widths by the modes; columns that they do not judge add nothing.
+        steps: widths by the modes.
 
     Returns:
-        Evidence of both.
+        (w, c); 0 for columns that the modes do not judge.
     """
     judged = np.isin(columns, steps.columns)
     place = np.searchsorted(steps.columns, columns[judged])
-    of_modes = np.zeros_like(of_frames.found)
-    of_modes[:, judged] = _evidence_of_widths(
+    out = np.zeros((len(WIDTHS_PX), len(columns)))
+    out[:, judged] = _evidence_of_widths(
         steps.width[place], steps.sigma[place], MODES_SHARE
     )
-    trusted = of_frames.found - np.logaddexp(
-        0.0, of_frames.found + math.log(FOOLED_CHANCE)
-    )
-    return Evidence(trusted + of_modes, of_frames.width + of_modes)
+    return out
+
+
+def _is_excluded(ratio: FloatArray) -> bool:
+    """Check whether a gap at one of some columns has odds of `REPORTED_ODDS` against it.
+
+    Args:
+        ratio: likelihood of a gap over none at each, (c,); one at least.
+    """
+    odds = CHANCE / (1.0 - CHANCE) * float(ratio.mean())
+    return odds * REPORTED_ODDS < 1.0 and float(ratio.max()) < 1.0
+
+
+def _beside_told(
+    columns: npt.NDArray[np.intp],
+    evidence: Evidence,
+    hidden: npt.NDArray[np.bool_],
+    axis: float,
+    profile: Profile,
+    of_mean: MirrorSteps,
+) -> Evidence:
+    """Compare gaps with those where both ends of rays tell steps: the mean shows one that rays
+    show, too, some columns further as well.
+
+    Args:
+        columns: first columns that are judged, (c,).
+        evidence: of gaps there.
+        hidden: whether rays do not reveal a gap there, (c,).
+        axis: its column [px].
+        profile: steps that rays show.
+        of_mean: evidence of the mean.
+
+    Returns:
+        Evidence of gaps over none and over the likeliest one that is not hidden.
+    """
+    every = np.arange(of_mean.free.shape[1])
+    told = np.abs(every - 0.5 - axis) <= profile.last
+    told[columns] = False
+    by_both = of_mean.free[:, told] + _evidence_of_rays(every[told], axis, profile)
+    beside = ~hidden & (np.abs(columns - 0.5 - axis) <= profile.last)
+    rivals = np.append(over_widths(by_both), over_widths(evidence.free[:, beside]))
+    rival = max(float(rivals.max(initial=0.0)), 0.0)
+    return replace(evidence, found=np.minimum(evidence.found, evidence.free - rival))
+
+
+def _shown_at_rim(
+    of_mean: MirrorSteps, axis: float, profile: Profile
+) -> npt.NDArray[np.intp]:
+    """Find the columns beyond the last distance at which both ends of rays are certain of a
+    step, where they and the mean show one by `REPORTED_ODDS`.
+
+    Others there are nobody's: hardly anything turns beyond them.
+
+    Args:
+        of_mean: evidence of the mean.
+        axis: its column [px].
+        profile: steps that rays show.
+
+    Returns:
+        (c,) first columns beyond a gap, perhaps none.
+    """
+    columns = np.arange(of_mean.found.shape[1])
+    columns = columns[np.abs(columns - 0.5 - axis) > profile.last]
+    of_rays = _trusted(_evidence_of_rays(columns, axis, profile))
+    shown = over_widths(of_mean.found[:, columns] + of_rays) > math.log(REPORTED_ODDS)
+    return np.asarray(columns[shown])
 
 
 def _evidence_of_widths(
@@ -416,10 +530,8 @@ def _evidence(images: FloatArray) -> Evidence:
     of_edges = _evidence_of(around, power, edges, len(images), evenly=False)
     smooth = gradient_steps(around, _is_smooth(around, share), len(images))
     of_smooth = _evidence_of_widths(smooth.width, smooth.sigma, CURVED_SHARE)
-    return Evidence(
-        np.maximum(of_places.found, of_edges.found) + of_smooth,
-        of_places.width + of_smooth,
-    )
+    found = np.maximum(of_places.found, of_edges.found) + of_smooth
+    return Evidence(found, of_places.width + of_smooth, found)
 
 
 def _is_smooth(around: FloatArray, share: float) -> npt.NDArray[np.bool_]:
@@ -467,7 +579,7 @@ def _evidence_of(
     of_frame = row * frames // len(power)
     shape = len(BLURS_PX), len(WIDTHS_PX), places
     if not len(row):
-        return Evidence(np.zeros(shape[1:]), np.zeros(shape[1:]))
+        return Evidence(*np.zeros((3, *shape[1:])))
     edges = around[row, border] / np.sqrt(power[row, border])[:, None]
     count = np.bincount(border, minlength=places).astype(np.float64)
     if evenly:
@@ -486,10 +598,9 @@ def _evidence_of(
     found = np.array([one.found for one in judged]).reshape(shape)
     gain = np.array([one.gain for one in judged]).reshape(shape)
     trust = np.array([one.trust for one in judged]).reshape(shape[:2]).min(axis=1)
-    return Evidence(
-        np.logaddexp.reduce(found, axis=0) - math.log(len(BLURS_PX)),
-        np.logaddexp.reduce(gain * trust[:, None, None], axis=0),
-    )
+    of_gap = np.logaddexp.reduce(found, axis=0) - math.log(len(BLURS_PX))
+    of_width = np.logaddexp.reduce(gain * trust[:, None, None], axis=0)
+    return Evidence(of_gap, of_width, of_gap)
 
 
 class Judged(NamedTuple):
