@@ -81,8 +81,8 @@ def find_gap(
     single frames favour over none; others are left open. Its width is that of both
     ends of rays. The gap is marked as beside the axis if its place leaves the width to
     the prior. Hidden ones are judged only if none is closed; a likely one does not count
-    if both ends of rays show another step behind it. A second gap does not count where the
-    mean favours none.
+    if both ends of rays show another step behind it. A second gap is one that single frames
+    show and the mean, or rays; not where the mean favours none.
 
     Args:
         rays: both ends of rays of a turn.
@@ -130,11 +130,14 @@ def find_gap(
     if by_rays_alone and not (told or frames_show(frames, gap, about)):
         return GapFound(None, possible_gap(gap))
     closed_rays, behind = _closed(rays, values, gap.column, gap.width)
-    second, step = _left_behind(closed_rays, behind, gap, seen)
+    far = _far_from(gap, seen, about, axis)
+    second, step = _left_behind(closed_rays, behind, far)
     second, step = (
         None if one is None or of_mean.denied(one.column, about) else one
         for one in (second, step)
     )
+    if second is None:
+        second = next((one for one in far if of_mean.told(one.column, about)), None)
     _require_one(gap, second)
     if likely is not None and step is not None:
         return GapFound(None, hidden)
@@ -191,16 +194,29 @@ def _measured(
     return gap if gap == first or gap.width >= SIGMAS * gap.sigma else None
 
 
+def _far_from(gap: Gap, seen: Sequence[Gap], about: float, axis: float) -> list[Gap]:
+    """Select the gaps that are as far from the axis as another one on neither side: rays see
+    the difference of two such, what is left of the other's width.
+
+    Args:
+        gap: that other one.
+        seen: gaps that single frames show.
+        about: least difference of the distances [px].
+        axis: its column [px].
+    """
+    own = abs(gap.column - 0.5 - axis)
+    return [one for one in seen if abs(abs(one.column - 0.5 - axis) - own) > about]
+
+
 def _left_behind(
-    closed: ConjugateRays, values: FloatArray, gap: Gap, seen: Sequence[Gap]
+    closed: ConjugateRays, values: FloatArray, far: Sequence[Gap]
 ) -> tuple[Gap | None, Gap | None]:
     """Find what looks like another gap once one is closed.
 
     Args:
         closed: both ends of rays, the gap closed.
         values: parameters of the plane.
-        gap: the one that is closed.
-        seen: gaps that single frames show.
+        far: gaps that single frames show, away from the closed one.
 
     Returns:
         One that single frames show and both ends of rays certify, and one by a
@@ -210,13 +226,6 @@ def _left_behind(
     if profile is None:
         return None, None
     axis = closed.scan.column(values, closed.row)
-    # Rays see the difference of two gaps as far from the axis: what is left of this one.
-    own = abs(gap.column - 0.5 - axis)
-    far = [
-        one
-        for one in seen
-        if abs(abs(one.column - 0.5 - axis) - own) > 2.0 * closed.smoothing
-    ]
     second = next((one for one in far if _certified(one, profile, axis)), None)
     step = profile.best()
     return second, _from_step(step, axis) if step.significant else None
