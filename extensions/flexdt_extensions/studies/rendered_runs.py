@@ -289,8 +289,8 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
     def solve(n: int) -> Run:
         """Calibrate from `n` of the images; without a result the note gives the reason.
 
-        They are spread evenly; offsets have no prior. A run with errors has no problem to
-        judge.
+        They are spread evenly; offsets have no prior, and the phantom is as exact as the
+        thesis takes it to be. A run with errors has no problem to judge.
         """
         everything, truth = geometry_of(task, most)
         chosen = list(range(0, most, most // n))
@@ -303,7 +303,9 @@ def image_runs(task: WorkUnit, model: BeadModel, scene: Scene) -> list[Run]:
         result = calibrate(
             scans,
             model,
-            CalibrationRequest(free=task.free, priors=exact(task.free)),
+            CalibrationRequest(
+                free=task.free, priors=exact(task.free), bead_tolerance_mm=0.0
+            ),
             scene=scene,
         )
         note = "; ".join(f.text for f in result.errors)
