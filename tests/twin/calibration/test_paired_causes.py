@@ -106,7 +106,9 @@ def test_a_motion_counts_by_what_the_geometry_leaves_of_it() -> None:
     tracks = poses.cone_vec().project_points(b.beads, scan.shape)
     tracks = tracks + 0.02 * np.random.default_rng(0).normal(size=tracks.shape)
     fit = estimate_geometry(tracks, BeadModel(b.beads, b.radii), poses, shape=scan.shape)
-    candidates = Candidates(fit, Known((1e-3, 1e-3), None, 1e-3), ())
+    candidates = Candidates(
+        fit.problem, fit.solution.x, Known((1e-3, 1e-3), None, 1e-3), ()
+    )
     cause = next(c for c in candidates.causes if c.name == "motion of dO_x")
     for column in cause.columns:
         geometry = candidates.rows[:, : candidates.count]
