@@ -113,7 +113,14 @@ def test_predicted_sigma_is_the_scatter_of_the_estimates() -> None:
         for seed in range(400)
     ]  # fmt: skip
     predicted = identifiability(
-        model, poses, 0.2, shape=SHAPE, at=truth, priors="none", bead_tolerance_mm=0.0
+        model,
+        poses,
+        0.2,
+        shape=SHAPE,
+        at=truth,
+        priors="none",
+        bead_tolerance_mm=0.0,
+        causes=False,
     )
     assert_allclose(np.std(values, axis=0), list(predicted.sigmas.values()), rtol=0.15)
 
