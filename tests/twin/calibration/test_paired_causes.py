@@ -46,6 +46,11 @@ def test_pairs_share_no_quantity() -> None:
         ("drift_across@helix", 8064),
         # Widened priors took the place of a distortion that was open: 4.8 sigmas.
         ("detector_aside+radial@few_frames", 1017),
+        # Nothing was to move in fewer than 12 frames: 4.7, 7.9, 10 and 11 sigmas.
+        ("source_jumps@few_frames", 93002),
+        ("source_jumps@few_frames", 93007),
+        ("jump_across@few_frames", 93000),
+        ("frames_repeated+source_jumps@few_frames", 92097),
     ],
 )
 def test_what_a_cause_hides_behind_the_geometry_is_in_the_sigmas(

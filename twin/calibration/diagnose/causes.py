@@ -69,8 +69,9 @@ PRIOR_FACTORS: Final = (3.0, 10.0)
 PRIOR_LOG_CHANCE: Final = math.log(1e-3)
 """Logarithm of the probability that the scanner is so many times further off than stated;
 assumed."""
-MIN_MOVING_FRAMES: Final = 12
-"""Least number of frames in which motion is separable from noise."""
+MIN_MOVING_FRAMES: Final = 2
+"""Least number of frames between which something may move. In few of them motion is not told
+from noise, and stays in the sigmas."""
 LEAST_BEADS: Final = 3
 """Number of beads that a calibration needs."""
 MOST_ROUNDS: Final = 4

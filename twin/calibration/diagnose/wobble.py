@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.diagnose import Finding, error
-from flexdt.twin.calibration.diagnose.causes import MIN_MOVING_FRAMES, NAMED_LOG_ODDS
+from flexdt.twin.calibration.diagnose.causes import NAMED_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.residual_structure import MOVING
@@ -31,8 +31,9 @@ LEAST_SEEN: Final = 1e-3
 """Part of a lean that the geometry must leave, for it to be told."""
 HARMONICS: Final = (1, 2, 3)
 TIMES: Final = {1: "once", 2: "twice", 3: "three times"}
+LEAST_FRAMES: Final = 12
 MOST_FRAMES: Final = 720
-"""Largest number of frames of which a wobble is looked for."""
+"""Least and largest number of frames of which a wobble is looked for."""
 
 
 class Wave(NamedTuple):
@@ -62,7 +63,7 @@ def wobble(fit: FitResult) -> Finding | None:
     """
     problem = fit.problem
     frames = len(problem.seen)
-    if problem.group.max() > 0 or not MIN_MOVING_FRAMES <= frames <= MOST_FRAMES:
+    if problem.group.max() > 0 or not LEAST_FRAMES <= frames <= MOST_FRAMES:
         return None
     use = problem.seen & fit.certificate.used
     kept = np.repeat(use.ravel(), 2)
