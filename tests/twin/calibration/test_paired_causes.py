@@ -85,6 +85,15 @@ def test_a_stated_offset_holds_where_spots_are_identified(kind: str, seed: int) 
     assert not found.wrong, found
 
 
+@pytest.mark.parametrize("seed", [94001, 94012])
+def test_a_lost_frame_is_named_in_few_frames_too(seed: int) -> None:
+    """Of seven and eleven frames the first was left out, and all others are a step on: alpha
+    was 300 and 450 sigmas off."""
+    found = scored("frame_lost@few_frames", seed)
+    assert not found.offered
+    assert any(said.startswith("frame_numbers") for said in found.said), found
+
+
 @pytest.mark.slow
 @pytest.mark.campaign(4)
 @pytest.mark.parametrize("setup", SETUPS)

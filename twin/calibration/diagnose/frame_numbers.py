@@ -157,8 +157,8 @@ def frame_numbers(
     offsets: Offsets,
     spread_px: float,
 ) -> FrameNumbers | None:
-    """Find the angle that each frame shows, up to `MOST_SHIFT` numbers from its own, by
-    the cheapest path: a change of shift costs `CHANGE_COST`, a spot without a bead
+    """Find the angle that each frame shows, up to `MOST_SHIFT` numbers or half of the scan
+    from its own, by the cheapest path: a change of shift costs `CHANGE_COST`, a spot without a bead
     `ASTRAY_COST`.
 
     A frame that fits no angle has the shift of the one before; shifts are relative to the
@@ -172,13 +172,14 @@ def frame_numbers(
         spread_px: distance of spots from the beads' projections.
 
     Returns:
-        Shift of each frame's number, and the frames that fit; None for fewer than 12
+        Shift of each frame's number, and the frames that fit; None for fewer than three
         frames, or if less than `GOOD_SHARE` of those with two spots fit.
     """
     n = len(poses)
-    shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
-    if n < 2 * MOST_SHIFT:
+    most = min(MOST_SHIFT, (n - 1) // 2)
+    if most < 1:
         return None
+    shifts = np.arange(-most, most + 1)
     spread = max(spread_px, LEAST_SPREAD_PX)
     there = np.array([len(d) >= 2 for d in detections])
     costs = np.zeros((n, len(shifts)))
