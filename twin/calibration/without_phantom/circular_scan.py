@@ -88,8 +88,11 @@ class CircularScan:
             row: None: the panel's middle one.
         """
         rows, cols = self.shape
-        middle = np.array([(cols - 1) / 2, (rows - 1) / 2 if row is None else row])
-        return float(axis_in_image(self.pose, self.offsets(values), middle)[0])
+        middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
+        column, angle, _ = axis_in_image(self.pose, self.offsets(values), middle)
+        if row is None:
+            return float(column)
+        return float(column - math.tan(math.radians(angle)) * (row - middle[1]))
 
     def azimuth(self, frames: Sequence[int]) -> FloatArray:
         """Return the angle of the source about the axis in frames, (n,) [rad]."""
