@@ -23,7 +23,7 @@ from flexdt.twin.calibration import (
     FitResult,
     bead_model,
     build_problem,
-    edge_factor,
+    edge_factors,
     estimate_geometry,
     visible_beads,
 )
@@ -264,7 +264,7 @@ def _rows(state: Online, poses: Poses) -> FloatArray:
         start=state.fit.parameters,
         priors=state.priors,
     )
-    factor = np.array([edge_factor(name) for name in problem.layout.names])
+    factor = edge_factors(problem.layout.names)
     return np.asarray(problem.jacobian(problem.start) / factor)
 
 

@@ -28,6 +28,7 @@ from flexdt.twin.calibration.fit.problem import (
     Reading,
     build_problem,
     edge_factor,
+    edge_factors,
 )
 from flexdt.twin.calibration.fit.weak_directions import Direction, tolerance_of
 from flexdt.twin.calibration.identify import (
@@ -61,6 +62,7 @@ __all__ = [
     "build_problem",
     "detect_beads",
     "edge_factor",
+    "edge_factors",
     "estimate_geometry",
     "fit_geometry",
     "identifiability",

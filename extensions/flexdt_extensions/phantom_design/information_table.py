@@ -25,7 +25,7 @@ from flexdt.twin.calibration import (
     SIX,
     BeadModel,
     build_problem,
-    edge_factor,
+    edge_factors,
     image_slopes,
     spot_radii,
     tolerance_of,
@@ -158,9 +158,7 @@ class SeatTable:
         blocks = weight * np.einsum("mnip,mniq->mnpq", rows, rows)
         model = BeadModel(places, np.array(radius))
         seen, slopes = image_slopes(problems[0], problems[0].start, 0)
-        widths = problems[0].prior_sigma[:p] * np.array(
-            [edge_factor(name) for name in names]
-        )
+        widths = problems[0].prior_sigma[:p] * edge_factors(names)
         return cls(
             places,
             names,
@@ -262,7 +260,7 @@ def _rows(problem: FitProblem) -> FloatArray:
     coordinates.
     """
     n, k = problem.seen.shape
-    factor = np.array([edge_factor(name) for name in problem.layout.names])
+    factor = edge_factors(problem.layout.names)
     rows = (
         (problem.jacobian(problem.start) / factor)
         .reshape(n, k, 2, -1)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration import edge_factor
+from flexdt.twin.calibration import edge_factors
 from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -95,7 +95,7 @@ def algorithm_2(problem: FitProblem, lam: float = 1e-2) -> Algorithm2:
         The outcome of `iterate` in mm and deg, and the geometry at the end.
     """
     pairs = bead_pairs(problem.seen)
-    unit = np.array([edge_factor(n) for n in problem.layout.names])
+    unit = edge_factors(problem.layout.names)
     small = [
         unit[i] != 1.0 or n.startswith("tau") for i, n in enumerate(problem.layout.names)
     ]

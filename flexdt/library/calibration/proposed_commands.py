@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from flexdt.library.calibration.calibration_options import CalibrationOptions
@@ -150,12 +150,8 @@ def settling_commands(
             if kept:
                 more["prior"] = ",".join(kept)
             else:
-                typed = Typed(
-                    typed.data,
-                    typed.phantom,
-                    typed.geometry,
-                    {name: value for name, value in options.items() if name != "prior"},
-                )
+                left = {n: value for n, value in options.items() if n != "prior"}
+                typed = replace(typed, options=left)
         yield typed.command(**more)
     if not (finding.per_frame or finding.free):
         yield typed.command(report="report.html")

@@ -36,7 +36,7 @@ from flexdt.twin.calibration.fit.problem import (
     FitProblem,
     Strain,
     curvature,
-    edge_factor,
+    edge_factors,
 )
 from flexdt.twin.calibration.fit.residual_structure import MOVING, larger
 from flexdt.twin.geometry.conventions import FloatArray
@@ -790,8 +790,7 @@ def expected_open(problem: FitProblem, known: Known) -> FloatArray:
         (p, p) of the columns that are parameters, edge units.
     """
     spread, own = Candidates(problem, problem.start, known, ()).expected()
-    names = problem.layout.names[: len(own)]
-    factor = np.array([edge_factor(n) for n in names])
+    factor = edge_factors(problem.layout.names[: len(own)])
     return np.asarray((spread - own) * np.outer(factor, factor))
 
 
@@ -872,9 +871,7 @@ def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResul
     if len(likely) == 1 and own is candidates.judged(next(iter(likely))):
         return fit
     at = own.covariance(candidates.count)
-    factor = np.array(
-        [edge_factor(n) for n in fit.problem.layout.names[: candidates.count]]
-    )
+    factor = edge_factors(fit.problem.layout.names[: candidates.count])
     unit = np.outer(factor, factor)
     rivals = candidates.rivals(likely, own)
     square = np.array([r.covariance + np.outer(r.off, r.off) for r in rivals])

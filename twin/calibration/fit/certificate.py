@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.special import fdtr, stdtrit
 
 from flexdt.twin.calibration.fit.curved_region import Bend, bend_of
-from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor
+from flexdt.twin.calibration.fit.problem import FitProblem, edge_factors
 from flexdt.twin.calibration.fit.residual_structure import (
     SIGNIFICANT,
     Drift,
@@ -137,7 +137,7 @@ def spectrum(
     unusable = bound / TOLERANCE["mm"]
     p = len(names)
     judged = p if reported is None else reported
-    factor = np.array([edge_factor(n) for n in names])
+    factor = edge_factors(names)
     j = jacobian / factor
     norm = np.linalg.norm(j, axis=0)
     scale = np.where(norm > 0, norm, 1.0)
@@ -530,7 +530,7 @@ def certify(
             if not asked <= i < reported and i not in strained
         ]
         spec = _of_what_was_asked(judge(fair[:, given], [names[i] for i in given]), spec)
-    factor = np.array([edge_factor(n) for n in names])
+    factor = edge_factors(names)
     # d(estimate) / d(prior mean), times the width of each prior
     pull = np.zeros((reported, len(names)))
     if spec.full and weight.any():

@@ -46,6 +46,7 @@ from flexdt.twin.calibration.fit.problem import (
     Strain,
     build_problem,
     edge_factor,
+    edge_factors,
     from_printed_reading,
     values_in,
 )
@@ -892,7 +893,7 @@ def covariance_by_step(fit: FitResult, count: int) -> list[tuple[int, FloatArray
     rows = problem.jacobian(fit.solution.x, fit.solution.use)
     rows = np.where(np.repeat(fit.solution.use.ravel(), 2)[:, None], rows, 0.0)
     parts = rows.reshape(n, 2 * k, -1)
-    factor = np.array([edge_factor(name) for name in problem.layout.names])
+    factor = edge_factors(problem.layout.names)
     reported = problem.layout.parameter_count
     out: list[tuple[int, FloatArray | None]] = []
     for frames in np.unique(

@@ -34,7 +34,7 @@ from flexdt.twin.calibration.fit.motion_model import (
     MotionModel,
 )
 from flexdt.twin.calibration.fit.motion_search import Likely, most_likely, moves
-from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor, layout
+from flexdt.twin.calibration.fit.problem import FitProblem, edge_factors, layout
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.motion import MOVABLE, Motion, require_movable
@@ -171,7 +171,7 @@ def estimate_motion(
         for g in range(len(sizes))
     )
     count = problem.layout.parameter_count
-    factor = np.array([edge_factor(column) for column in problem.layout.names[:count]])
+    factor = edge_factors(problem.layout.names[:count])
     more = added[:count, :count] * np.outer(factor, factor)
     if fit.identifiable:
         noise = max(LEAST_NOISE, fit.certificate.noise)
@@ -338,7 +338,7 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
     off = free.mean[:count] - exact.mean[:count]
     more = free.covariance(count) - exact.covariance(count) + np.outer(off, off)
     values, vectors = np.linalg.eigh(more)
-    factor = np.array([edge_factor(name) for name in problem.layout.names[:count]])
+    factor = edge_factors(problem.layout.names[:count])
     return np.asarray(
         (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(factor, factor)
     )

@@ -854,3 +854,8 @@ def edge_factor(column: str) -> float:
     if name in NAMES:
         return to_edge(name, 1.0)
     return 1.0
+
+
+def edge_factors(columns: Iterable[str]) -> FloatArray:
+    """Return `edge_factor` of each of some columns, (p,)."""
+    return np.array([edge_factor(column) for column in columns])

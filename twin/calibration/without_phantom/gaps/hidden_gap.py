@@ -37,6 +37,7 @@ from flexdt.twin.calibration.without_phantom.gaps.mirror_steps import (
     WIDTHS_PX,
     MirrorSteps,
     over_widths,
+    trusted,
 )
 from flexdt.twin.calibration.without_phantom.gaps.turn_modes import (
     ModeSteps,
@@ -80,9 +81,6 @@ OUTLINE_COLUMNS: Final = 1
 CURVED_SHARE: Final = 0.25
 """Standard deviation of a width by gradients, as a share of it: a gap moves its two sides
 apart, and bodies that curve there change the gradient (drawn ones by up to that)."""
-FOOLED_CHANCE: Final = 0.002
-"""Probability that what turns with the object passes for a gap at a column in single frames:
-2 of 30 drawn scans of natural objects have such a column among 40."""
 MODES_SHARE: Final = 0.3
 """Standard deviation of a width by the modes of the turn, as a share of it: it is that of a
 small displacement (drawn gaps of 1 to 2 px by up to that)."""
@@ -91,11 +89,6 @@ MIN_HIDDEN_PX: Final = 0.3
 it [px]."""
 SIGMAS: Final = 3.0
 """Standard deviations from which a step is significant."""
-
-
-def _trusted(found: FloatArray) -> FloatArray:
-    """Return log likelihood ratios as far as `FOOLED_CHANCE` lets them count."""
-    return found - np.logaddexp(0.0, found + math.log(FOOLED_CHANCE))
 
 
 class HiddenGap(NamedTuple):
@@ -156,10 +149,10 @@ class Evidence:
         return Evidence(self.found + more, self.width + width, self.free + both)
 
     def trusted(self) -> Evidence:
-        """Return the evidence as far as `FOOLED_CHANCE` lets single frames count: a wall
-        passes for a gap to them.
+        """Return the evidence as far as single frames count: a wall passes for a gap to
+        them (`trusted`).
         """
-        return replace(self, found=_trusted(self.found))
+        return replace(self, found=trusted(self.found))
 
     @property
     def ratio(self) -> FloatArray:
@@ -236,7 +229,7 @@ def hidden_gap(
     if profile is not None:
         of_rays = _evidence_of_rays(columns, axis, profile)
         at_rim = np.abs(beside) > profile.last
-        certain = np.where(at_rim, _trusted(of_rays), of_rays)
+        certain = np.where(at_rim, trusted(of_rays), of_rays)
         evidence = evidence.beside(certain, free=of_rays)
     if of_mean is not None and profile is not None:
         evidence = _beside_told(columns, evidence, hidden, axis, profile, of_mean)
@@ -477,7 +470,7 @@ def _shown_at_rim(
     """
     columns = np.arange(of_mean.found.shape[1])
     columns = columns[np.abs(columns - 0.5 - axis) > profile.last]
-    of_rays = _trusted(_evidence_of_rays(columns, axis, profile))
+    of_rays = trusted(_evidence_of_rays(columns, axis, profile))
     shown = over_widths(of_mean.found[:, columns] + of_rays) > math.log(REPORTED_ODDS)
     return np.asarray(columns[shown])
 

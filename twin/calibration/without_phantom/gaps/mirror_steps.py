@@ -64,7 +64,9 @@ LEAST_PLACES: Final = 4
 BANDS: Final = 4
 """Bands of rows that are judged each by itself: a gap is in all of them."""
 FOOLED_CHANCE: Final = 0.002
-"""Probability that what stands still passes for a gap at a column in a band of rows."""
+"""Probability that the object passes for a gap at a column, in single frames by what turns and
+in a band of rows of the mean by what stands still: 2 of 30 drawn scans of natural objects have
+such a column among 40 in their frames."""
 DEAD_SIGMAS: Final = 3.0
 """Distance from a dead column up to which places do not count, in sigmas of the smoothing."""
 
@@ -97,6 +99,11 @@ def _best_about(found: FloatArray, column: int, about: float) -> float:
     first = max(column - math.floor(about), 0)
     near = found[:, first : column + math.floor(about) + 1]
     return float(over_widths(near).max())
+
+
+def trusted(found: FloatArray) -> FloatArray:
+    """Return log likelihood ratios as far as `FOOLED_CHANCE` lets them count."""
+    return found - np.logaddexp(0.0, found + math.log(FOOLED_CHANCE))
 
 
 def over_widths(found: FloatArray) -> FloatArray:
@@ -133,7 +140,7 @@ def mirror_steps(
             ratio = _ratios(pairs.radius, squares, border)
             own = cells / 2.0 * np.log(ratio)
             free[:, there] += own
-            found[:, there] += own - np.logaddexp(0.0, own + math.log(FOOLED_CHANCE))
+            found[:, there] += trusted(own)
     return MirrorSteps(found, free)
 
 
