@@ -412,79 +412,134 @@ class MotionModel:
         return Course(before.shapes, best[2]).beside(best[1])
 
     def solved(self, choice: MotionChoice) -> Answer:
-        """Solve for the deviations of a choice."""
+        """Solve for the deviations of a choice.
+
+        Args:
+            choice: of each parameter.
+
+        Raises:
+            LinAlgError: the equations are singular.
+        """
         part = self._eliminated(choice)
         inverse = linalg.inv(part.left)
         fixed = inverse @ part.push
+        g = len(self.push)
+        rest = max(self.total - part.explained - float(fixed @ part.push), 0.0)
+        noise2 = rest / self.freedom
+
+        values = np.zeros(self.pull.shape)
+        variance = np.full(self.pull.shape, np.nan)
+        covariance = inverse[:g, :g] - linalg.inv(self.plain)
+        columns = fixed[:g]
+        taken = float(len(part.heights))
+        for i in dict.fromkeys(one.parameter for one in part.heights):
+            values[:, i], variance[:, i] = self._solved_courses(i, part, inverse, fixed)
+        if part.moving:
+            waves = self._solved_waves(part, inverse, fixed)
+            values[:, part.moving] = waves.values
+            variance[:, part.moving] = waves.variance
+            covariance = covariance + waves.added
+            columns = columns + waves.columns
+            taken += waves.taken
+
+        return Answer(
+            values,
+            np.sqrt(noise2 * np.maximum(variance, 0.0)),
+            noise2 * covariance / np.outer(self.scale, self.scale),
+            self.freedom / max(self.freedom - taken, 1.0),
+            columns / self.scale,
+        )
+
+    def _solved_courses(
+        self, i: int, part: _Eliminated, inverse: FloatArray, fixed: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Compute the deviations of a parameter that follows courses.
+
+        Args:
+            i: number of the parameter.
+            part: reduced equations.
+            inverse: of them.
+            fixed: their solution.
+
+        Returns:
+            Values and variances in units of the noise's, (n,) each.
+        """
+        g = len(self.push)
+        own = [at for at, one in enumerate(part.heights, g) if one.parameter == i]
+        shapes = np.stack([part.heights[at - g].shape for at in own], axis=1)
+        of_heights = inverse[np.ix_(own, own)]
+        variance = np.einsum("nc,cd,nd->n", shapes, of_heights, shapes)
+        return shapes @ fixed[own], variance
+
+    def _solved_waves(
+        self, part: _Eliminated, inverse: FloatArray, fixed: FloatArray
+    ) -> _Waves:
+        """Compute the normal deviations from their means, which are the parameters' own
+        values: the fit's columns are then the two together.
+
+        Args:
+            part: reduced equations with normal deviations.
+            inverse: of them.
+            fixed: their solution.
+        """
         n = len(self.pull)
         g = len(self.push)
         p = len(part.moving)
-        rest = max(self.total - part.explained - float(fixed @ part.push), 0.0)
-        noise2 = rest / self.freedom
-        values = np.zeros((n, len(choice)))
-        sigma = np.full((n, len(choice)), np.nan)
-        taken = 0.0
-        covariance = inverse[:g, :g]
-        columns = fixed[:g].copy()
-        for i in dict.fromkeys(one.parameter for one in part.heights):
-            own_heights = [
-                at for at, one in enumerate(part.heights, g) if one.parameter == i
-            ]
-            shapes = np.stack([part.heights[at - g].shape for at in own_heights], axis=1)
-            values[:, i] = shapes @ fixed[own_heights]
-            square = np.einsum(
-                "nc,cd,nd->n", shapes, inverse[np.ix_(own_heights, own_heights)], shapes
-            )
-            sigma[:, i] = np.sqrt(noise2 * np.maximum(square, 0.0))
-            taken += len(own_heights)
-        if p:
-            pull = self.pull[:, part.moving].ravel()
-            found = linalg.cho_solve_banded((part.band, True), pull) - part.inner @ fixed
-            square = np.einsum(
-                "ng,gh,nh->n", part.inner, inverse, part.inner, optimize=True
-            )
-            for begin in range(0, n * p, COLUMNS):
-                unit = np.eye(n * p, min(COLUMNS, n * p - begin), -begin)
-                solved = linalg.cho_solve_banded((part.band, True), unit)
-                across = np.arange(unit.shape[1])
-                square[begin + across] += solved[begin + across, across]
-            # Deviations are from their mean, which is the parameter's own value.
-            place = np.arange(n * p)
-            own = self.column[:, part.moving]
-            labels = (own - own.min() + 1) * p + np.arange(p)
-            kinds, first, mean_of = np.unique(
-                labels.ravel(), return_index=True, return_inverse=True
-            )
-            size = np.bincount(mean_of).astype(np.float64)
-            each = np.zeros((n * p, len(kinds)))
-            each[place, mean_of] = 1.0 / size[mean_of]
-            with_mean = linalg.cho_solve_banded((part.band, True), each)
-            with_fixed = -inverse @ (part.inner.T @ each)
-            with_mean -= part.inner @ with_fixed
-            of_means = np.einsum("nc,nd->cd", each, with_mean)
-            means = found @ each
-            values[:, part.moving] = (found - means[mean_of]).reshape(n, p)
-            centred = (
-                square - 2.0 * with_mean[place, mean_of] + np.diag(of_means)[mean_of]
-            )
-            # The fit's columns are then those values and the means together.
-            into = np.zeros((g, len(kinds)))
-            for kind, into_column in enumerate(own.ravel()[first].tolist()):
-                if into_column >= 0:
-                    into[into_column, kind] = self.scale[into_column]
-            both = with_fixed[:g] @ into.T
-            covariance = covariance + both + both.T + into @ of_means @ into.T
-            columns += into @ means
-            # What the data add to each deviation's prior is what they take of the freedom.
-            information = np.einsum("nii->ni", self.pairs)[:, part.moving].ravel()
-            taken += float(np.sum(np.minimum(information * square, 1.0)))
-            sigma[:, part.moving] = np.sqrt(noise2 * np.maximum(centred, 0.0)).reshape(
-                n, p
-            )
-        added = noise2 * (covariance - linalg.inv(self.plain))
-        added = added / np.outer(self.scale, self.scale)
-        inflation = self.freedom / max(self.freedom - taken, 1.0)
-        return Answer(values, sigma, added, inflation, columns / self.scale)
+        pull = self.pull[:, part.moving].ravel()
+        found = linalg.cho_solve_banded((part.band, True), pull) - part.inner @ fixed
+        square = self._variances(part, inverse)
+        information = np.einsum("nii->ni", self.pairs)[:, part.moving].ravel()
+
+        column_of_mean, mean_of, each = _averages(self.column[:, part.moving])
+        place = np.arange(n * p)
+        with_mean = linalg.cho_solve_banded((part.band, True), each)
+        with_fixed = -inverse @ (part.inner.T @ each)
+        with_mean -= part.inner @ with_fixed
+        of_means = np.einsum("nc,nd->cd", each, with_mean)
+        means = found @ each
+        centred = square - 2.0 * with_mean[place, mean_of] + np.diag(of_means)[mean_of]
+
+        into = np.zeros((g, len(means)))
+        for kind, column in enumerate(column_of_mean.tolist()):
+            if column >= 0:
+                into[column, kind] = self.scale[column]
+        both = with_fixed[:g] @ into.T
+        return _Waves(
+            (found - means[mean_of]).reshape(n, p),
+            centred.reshape(n, p),
+            both + both.T + into @ of_means @ into.T,
+            into @ means,
+            float(np.sum(np.minimum(information * square, 1.0))),
+        )
+
+    def _variances(self, part: _Eliminated, inverse: FloatArray) -> FloatArray:
+        """Compute the variances of normal deviations, in units of the noise's, (n p,)."""
+        square = np.einsum("ng,gh,nh->n", part.inner, inverse, part.inner, optimize=True)
+        total = len(square)
+        for begin in range(0, total, COLUMNS):
+            unit = np.eye(total, min(COLUMNS, total - begin), -begin)
+            solved = linalg.cho_solve_banded((part.band, True), unit)
+            across = np.arange(unit.shape[1])
+            square[begin + across] += solved[begin + across, across]
+        return np.asarray(square)
+
+
+class _Waves(NamedTuple):
+    """Normal deviations of p parameters in n frames.
+
+    Attributes:
+        values: (n, p) from their means.
+        variance: (n, p) of them, in units of the noise's variance.
+        added: (g, g) covariance that their means add to the fit's columns, in the same.
+        columns: (g,) what their means add to the fit's columns.
+        taken: degrees of freedom: what the data add to each deviation's prior.
+    """
+
+    values: FloatArray
+    variance: FloatArray
+    added: FloatArray
+    columns: FloatArray
+    taken: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -510,6 +565,29 @@ class _Eliminated:
     left: FloatArray
     push: FloatArray
     explained: float
+
+
+def _averages(
+    own: npt.NDArray[np.int64],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.intp], FloatArray]:
+    """Find the means that deviations are taken from: one of each parameter and column.
+
+    Args:
+        own: (n, p) columns of the fit to which deviations of p parameters belong.
+
+    Returns:
+        The column of each of k means, (k,); the mean that each deviation belongs to, (n p,);
+        and the matrix whose columns average the deviations, (n p, k).
+    """
+    n, p = own.shape
+    labels = (own - own.min() + 1) * p + np.arange(p)
+    kinds, first, mean_of = np.unique(
+        labels.ravel(), return_index=True, return_inverse=True
+    )
+    size = np.bincount(mean_of).astype(np.float64)
+    each = np.zeros((n * p, len(kinds)))
+    each[np.arange(n * p), mean_of] = 1.0 / size[mean_of]
+    return own.ravel()[first], mean_of, each
 
 
 def _stiffness(size: int, waves: float) -> float:
