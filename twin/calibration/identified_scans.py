@@ -171,7 +171,6 @@ def _fits_anew(
     scan: Scan,
     start: Offsets,
 ) -> bool:
-    """Check whether the spots of a scan fit the phantom at the angles that its frames show."""
-    shown = replace(scan.poses, angle=numbers.angles(scan.poses.angle))
-    found = attempt(detections, model, shown, start=start)
+    """Check whether the spots of a scan fit the phantom at the poses that its frames show."""
+    found = attempt(detections, model, numbers.shown(scan.poses), start=start)
     return found is not None and convincing(found)

@@ -94,6 +94,16 @@ def test_a_lost_frame_is_named_in_few_frames_too(seed: int) -> None:
     assert any(said.startswith("frame_numbers") for said in found.said), found
 
 
+@pytest.mark.parametrize("kind", ["frame_lost", "frame_doubled"])
+@pytest.mark.parametrize("seed", [1, 5])
+def test_a_renumbered_frame_of_a_helix_shows_another_height_too(
+    kind: str, seed: int
+) -> None:
+    """At another frame's angle and its own height it fitted no number: a slip was named."""
+    found = scored(f"{kind}@helix", seed)
+    assert found.verdict == "right", found
+
+
 @pytest.mark.slow
 @pytest.mark.campaign(4)
 @pytest.mark.parametrize("setup", SETUPS)

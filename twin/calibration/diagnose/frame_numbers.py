@@ -1,16 +1,16 @@
-"""The angle that each frame really shows: lost, doubled and exposed-again frames.
+"""The pose that each frame really shows: lost, doubled and exposed-again frames.
 
-The number of the angle that a frame shows, less its own number, is hidden and mostly
+The number of the pose that a frame shows, less its own number, is hidden and mostly
 stays from frame to frame. The most likely sequence (Viterbi, IEEE Trans. Inf. Theory 13
 (1967) 260) is found from the distances of each frame's spots from the beads' places at
-neighbouring angles.
+neighbouring poses: a stage that rises as it turns is at another angle and height.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -47,19 +47,14 @@ class FrameNumbers:
     shift: npt.NDArray[np.int64]
     fits: npt.NDArray[np.bool_]
 
-    def angles(self, angle: FloatArray) -> FloatArray:
-        """Compute the angle that each frame shows; beyond the ends, the first and the last
+    def shown(self, poses: Poses) -> Poses:
+        """Compute the pose that each frame shows; beyond the ends, the first and the last
         step go on.
 
         Args:
-            angle: (n,) of the frames by their own numbers [rad], two at least.
+            poses: of the n frames by their own numbers, n two at least.
         """
-        n = len(angle)
-        shown = np.arange(n) + self.shift
-        inside = np.clip(shown, 0, n - 1)
-        beyond = shown - inside
-        step = np.where(beyond < 0, angle[1] - angle[0], angle[-1] - angle[-2])
-        return np.asarray(angle[inside] + beyond * step)
+        return _at_numbers(poses, np.arange(len(poses)) + self.shift)
 
     @property
     def again(self) -> npt.NDArray[np.intp]:
@@ -185,8 +180,11 @@ def frame_numbers(
     costs = np.zeros((n, len(shifts)))
     near = np.zeros((n, len(shifts)))
     for column, step in enumerate(shifts.tolist()):
-        turned = replace(poses, angle=_angles(poses.angle, step))
-        places = turned.cone_vec(offsets).project_points(beads, detections[0].shape)
+        places = (
+            _at_numbers(poses, np.arange(n) + step)
+            .cone_vec(offsets)
+            .project_points(beads, detections[0].shape)
+        )
         for i in np.flatnonzero(there).tolist():
             gap = np.linalg.norm(detections[i].centers[:, None] - places[i][None], axis=2)
             square = (gap.min(axis=1) / spread) ** 2
@@ -202,22 +200,29 @@ def frame_numbers(
     return FrameNumbers(found - found[0], fits & there)
 
 
-def _angles(angle: FloatArray, shift: int) -> FloatArray:
-    """Return the angles of frames `shift` numbers further on; beyond the ends, the first
-    and the last step go on.
+def _at_numbers(poses: Poses, numbers: npt.NDArray[np.int64]) -> Poses:
+    """Return the poses of given numbers; beyond the ends, the first and the last step
+    go on.
 
     Args:
-        angle: (n,) [rad], two at least.
-        shift: at most MOST_SHIFT either way.
+        poses: two at least.
+        numbers: (m,) of frames, below 0 and above the last, too.
     """
-    n = len(angle)
-    first = angle[1] - angle[0]
-    last = angle[-1] - angle[-2]
-    beyond = np.arange(1, MOST_SHIFT + 1)
-    whole = np.concatenate(
-        [angle[0] - first * beyond[::-1], angle, angle[-1] + last * beyond]
-    )
-    return np.asarray(whole[MOST_SHIFT + shift : MOST_SHIFT + shift + n])
+    last = len(poses) - 1
+    inside = np.clip(numbers, 0, last)
+    beyond = numbers - inside
+
+    def continued(values: FloatArray) -> FloatArray:
+        """Return the values of the numbers, (m,) or (m, 3) of (n,) or (n, 3)."""
+        before = beyond < 0
+        step = np.where(
+            before.reshape(-1, *(1,) * (values.ndim - 1)),
+            values[1] - values[0],
+            values[last] - values[last - 1],
+        )
+        return np.asarray(values[inside] + (beyond * step.T).T)
+
+    return Poses(*(continued(getattr(poses, f.name)) for f in fields(Poses)))
 
 
 def _likeliest(costs: FloatArray) -> npt.NDArray[np.intp]:
