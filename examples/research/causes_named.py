@@ -5,9 +5,10 @@
 each and says whether the cause was named right, vaguely or not at all, and how many sigmas the
 worst of an answer that was offered is off. More than four is a confident wrong answer, and the
 command fails. `--pairs N` draws N scans with two causes or of unusual setups instead
-(`faults_paired`; a name of one, `strain_z+frame_lost@helix`, is a kind, too). `--json` prints
-a line as soon as a scan is judged, one scan of every kind before the second of any, and the
-sums last.
+(`faults_paired`; a name of one, `strain_z+frame_lost@helix`, is a kind, too). `--placed` joins
+scans of a phantom that is placed anew between them (`placements_drawn`; so is a kind
+`slip@two_placements`). `--json` prints a line as soon as a scan is judged, one scan of every
+kind before the second of any, and the sums last.
 
 Geometry and shadows come from `faults_drawn`; nothing of the fit or of its diagnoses is in
 them.
@@ -26,10 +27,12 @@ from typing import Final
 import numpy as np
 from faults_drawn import KINDS, Faulty, drawn
 from faults_paired import drawn_names, drawn_together
+from placements_drawn import PLACED, PLACEMENTS, Placed, angles_apart, drawn_placed
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.fit import image_quantities
+from flexdt.twin.calibration.fit.problem import Reading
 from flexdt.twin.calibration.frame_source import (
     FrameSpots,
     FrameState,
@@ -85,19 +88,33 @@ class Scored:
 
 
 def calibrated(
-    scan: Faulty,
+    scan: Faulty | Placed,
     per_frame: tuple[str, ...] = (),
     free: tuple[str, ...] = (),
     bead_tolerance_mm: float | None = None,
 ) -> Calibration:
-    """Calibrate a drawn scan from its spots, with the operator's beliefs.
+    """Calibrate drawn scans from their spots, with the operator's beliefs.
 
     Args:
-        scan: the scan.
+        scan: the scan, or several of one phantom.
         per_frame: parameters that may differ from frame to frame.
         free: parameters that are free beside the operator's.
         bead_tolerance_mm: standard deviation of the beads' places.
     """
+    scans = scan.scans if isinstance(scan, Placed) else (scan,)
+    b = scans[0].believed
+    request = CalibrationRequest(
+        free=tuple(dict.fromkeys((*b.free, *free))), start=Offsets.from_edge(b.held),
+        priors=b.priors, second_look=False, per_frame=per_frame,
+        bead_tolerance_mm=bead_tolerance_mm,
+    )  # fmt: skip
+    if isinstance(scan, Placed) and scan.per_scan:
+        request = replace(request, reading=Reading.MOUNT_SHIFT, per_scan=scan.per_scan)
+    return calibrate([_seen(one) for one in scans], BeadModel(b.beads, b.radii), request)
+
+
+def _seen(scan: Faulty) -> Scan:
+    """Return a drawn scan as a calibration takes it: its spots, and what is believed."""
     looks = []
     for frame in scan.spots:
         if frame is None:
@@ -110,38 +127,39 @@ def calibrated(
     rise = b.pitch / 360.0 * b.angles
     stage = np.stack([0 * rise, 0 * rise + b.sod, rise], axis=1)
     poses = Poses.upright([0, 0, 0], stage, [0, b.sdd, 0], b.pixel, np.radians(b.angles))
-    request = CalibrationRequest(
-        free=tuple(dict.fromkeys((*b.free, *free))), start=Offsets.from_edge(b.held),
-        priors=b.priors, second_look=False, per_frame=per_frame,
-        bead_tolerance_mm=bead_tolerance_mm,
-    )  # fmt: skip
-    taken = Scan(SpotFrames(looks), poses, arc=b.arc)
-    return calibrate([taken], BeadModel(b.beads, b.radii), request)
+    return Scan(SpotFrames(looks), poses, arc=b.arc)
 
 
 def scored(kind: str, seed: int) -> Scored:
-    """Draw a scan of a kind, or of a pair or setup (`faults_paired`), calibrate it, and
-    judge findings and values; a refusal is scored, too.
+    """Draw a scan of a kind, of a pair or setup (`faults_paired`), or scans of several
+    placements, calibrate, and judge findings and values; a refusal is scored, too.
     """
+    placed: Placed | None = None
     if kind in KINDS:
         scan = drawn(kind, seed)
         causes: tuple[tuple[str, ...], ...] = (scan.names,)
+    elif kind.partition("@")[2] in PLACEMENTS:
+        placed = drawn_placed(kind, seed)
+        scan = placed.scans[0]
+        causes = (scan.names,)
     else:
         scan, causes = drawn_together(kind, seed)
     try:
-        result = calibrated(scan)
+        result = calibrated(placed or scan)
     except TwinError as error:
         said: tuple[str, ...] = (f"refused: {error}",)
         return Scored(
             kind, seed, _verdict(scan, causes, said, False), False, 0.0, "", said
         )
     said = tuple(f"{f.code}: {f.text}" for f in result.findings)
-    worst, where = worst_error(result, scan) if result.identifiable else (0.0, "")
+    worst, where = 0.0, ""
+    if result.identifiable:
+        worst, where = worst_error(result, placed or scan)
     verdict = _verdict(scan, causes, said, result.identifiable)
     return Scored(kind, seed, verdict, result.identifiable, worst, where, said)
 
 
-def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
+def worst_error(result: Calibration, scan: Faulty | Placed) -> tuple[float, str]:
     """Find the parameter or image quantity with the largest error [sigma], and its name;
     (0, "") if all are exact.
 
@@ -151,26 +169,30 @@ def worst_error(result: Calibration, scan: Faulty) -> tuple[float, str]:
     """
     assert result.fit is not None
     worst, where = 0.0, ""
+    truths = scan.truths if isinstance(scan, Placed) else scan.truth
     for name, e in result.fit.certificate.estimates.items():
-        low, high = scan.truth.get(name, (0.0, 0.0))
+        low, high = truths.get(name, (0.0, 0.0))
         value = e.value
-        if name == "alpha":
-            middle = (low + high) / 2
-            value = middle + (value - middle + 180.0) % 360.0 - 180.0
+        if name.startswith("alpha"):
+            value = angles_apart(value, (low, high))
         off = max(low - value, value - high, 0.0) / max(e.sigma, 1e-12)
         if off > worst:
             worst, where = off, name
-    moves = any(low < high for low, high in scan.truth.values())
-    told = any(low < high for low, high in scan.image_ends.values())
-    if scan.after is not None or (moves and not told):
-        return worst, where
-    for name, e in image_quantities(result.fit)[0].items():
-        low = high = scan.image.get(name, e.value)
-        if moves and not result.motions:
-            low, high = scan.image_ends.get(name, (e.value, e.value))
-        off = max(low - e.value, e.value - high) / max(e.sigma, 1e-12)
-        if off > worst:
-            worst, where = off, name
+    scans = scan.scans if isinstance(scan, Placed) else (scan,)
+    images = image_quantities(result.fit)
+    # Without values of their own, scans have one geometry.
+    for one, estimates in zip(scans, images, strict=len(images) > 1):
+        moves = any(low < high for low, high in one.truth.values())
+        told = any(low < high for low, high in one.image_ends.values())
+        if one.after is not None or (moves and not told):
+            continue
+        for name, e in estimates.items():
+            low = high = one.image.get(name, e.value)
+            if moves and not result.motions:
+                low, high = one.image_ends.get(name, (e.value, e.value))
+            off = max(low - e.value, e.value - high) / max(e.sigma, 1e-12)
+            if off > worst:
+                worst, where = off, name
     return worst, where
 
 
@@ -206,6 +228,9 @@ def _to_judge(args: argparse.Namespace) -> list[tuple[str, int]]:
     pairs and setups.
     """
     kinds = args.kinds.split(",")
+    if args.placed:
+        some = [k for k in PLACED if k in kinds]
+        kinds = [f"{kind}@{placements}" for kind in some for placements in PLACEMENTS]
     if args.pairs:
         return drawn_names(args.pairs, args.seed, kinds)
     seeds = range(args.seed, args.seed + args.each)
@@ -225,6 +250,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument(
         "--pairs", type=int, default=0, help="scans of drawn pairs and setups"
+    )
+    parser.add_argument(
+        "--placed", action="store_true", help="join scans of several placements"
     )
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)

@@ -884,7 +884,7 @@ def _held_zero(*names: str) -> Fault:
     return fault
 
 
-def _usual(draft: Draft, rng: Rng) -> Draft:
+def usual(draft: Draft, rng: Rng) -> Draft:
     """Panel and axis are not exactly where they are said to be, as usual."""
     offsets = {name: float(rng.normal(0.0, width)) for name, width in UNSEEN.items()}
     world = replace(draft.world, offsets={**offsets, **draft.world.offsets})
@@ -896,7 +896,7 @@ def _right(draft: Draft, rng: Rng) -> Draft:
     and each of its strains, to 0.1 % rms; findings of strain or narrow priors are
     allowed, none is right, too.
     """
-    draft = _usual(draft, rng)
+    draft = usual(draft, rng)
     change = (1.0 + 1e-3 * rng.normal()) * np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
     world = replace(draft.world, beads=draft.world.beads @ change.T)
     return replace(draft, world=world, silent=True,
@@ -937,7 +937,7 @@ def _with_causes(moving: bool) -> Fault:
             pick = float(rng.choice(some))
             return pick if there else 0.0
 
-        draft = _usual(draft, rng)
+        draft = usual(draft, rng)
         world = draft.world
         beads = world.beads
         stretch = width(*STRAIN_WIDTHS) or STRAIN
@@ -1023,7 +1023,7 @@ def _strained(kind: str) -> Fault:
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         """Draw the strain; below 0.3 % silence is right, too."""
-        draft = _usual(draft, rng)
+        draft = usual(draft, rng)
         size = _sign(rng) * math.exp(rng.uniform(math.log(5e-4), math.log(1e-2)))
         change = np.eye(3)
         i, j = {"x": (0, 0), "y": (1, 1), "z": (2, 2), "shear": (0, 1), "lean": (0, 2)}[
@@ -1044,7 +1044,7 @@ def _exposed_long(draft: Draft, rng: Rng) -> Draft:
     """Expose while the stage turns, for 0.1 to 1 of a step, and expect a finding of it;
     below 3 deg silence is right, too.
     """
-    draft = _usual(draft, rng)
+    draft = usual(draft, rng)
     step = draft.believed.step
     share = float(rng.uniform(0.1, 1.0))
     world = replace(draft.world, arc=share * step)
@@ -1067,7 +1067,7 @@ def _renumbered(shift: int) -> Fault:
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         """Draw the frame, and expect it or the one before to be named."""
-        draft = _usual(draft, rng)
+        draft = usual(draft, rng)
         n = len(draft.world.angles)
         at = int(rng.integers(1, n))
         step = draft.believed.step
@@ -1083,7 +1083,7 @@ def _exposed_again(draft: Draft, rng: Rng) -> Draft:
     """Expose one frame at the angle of the one before, and expect `frames_inconsistent`
     with its number.
     """
-    draft = _usual(draft, rng)
+    draft = usual(draft, rng)
     at = int(rng.integers(1, len(draft.world.angles)))
     angles = draft.world.angles.copy()
     angles[at] = angles[at - 1]
@@ -1126,7 +1126,7 @@ def _source_moves(axis: int, low: float, high: float, jumps: bool) -> Fault:
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         """Draw the frame and the way."""
-        draft = _usual(draft, rng)
+        draft = usual(draft, rng)
         n = len(draft.world.angles)
         at = int(rng.integers(n // 4, 3 * n // 4))
         course = (np.arange(n) >= at) if jumps else np.linspace(0.0, 1.0, n)
@@ -1149,14 +1149,14 @@ def _usual_jump(name: str, low: float, high: float) -> Fault:
     and axis are not exactly where they are said to be.
     """
     jump = _jump(name, low, high)
-    return lambda draft, rng: jump(_usual(draft, rng), rng)
+    return lambda draft, rng: jump(usual(draft, rng), rng)
 
 
 def _jumps_twice(draft: Draft, rng: Rng) -> Draft:
     """Let the object jump aside twice by 0.05 to 0.3 mm, there and partly back, in the
     middle three fifths of the scan, and expect a finding of motion.
     """
-    draft = _usual(draft, rng)
+    draft = usual(draft, rng)
     n = len(draft.world.angles)
     first, second = np.sort(rng.choice(np.arange(n // 5, 4 * n // 5), 2, replace=False))
     course = rng.uniform(0.05, 0.3) * (np.arange(n) >= first)
@@ -1169,7 +1169,7 @@ def _grows(draft: Draft, rng: Rng) -> Draft:
     """Let the phantom grow by 0.05 to 0.7 % during the scan, as one that warms up, and
     expect a finding of growth or motion; dO_z may be that of any frame.
     """
-    draft = _usual(draft, rng)
+    draft = usual(draft, rng)
     size = float(rng.uniform(5e-4, 7e-3))
     n = len(draft.world.angles)
     # All its lengths, so its distance too, are those of any frame.
@@ -1185,7 +1185,7 @@ def _other_pitch(draft: Draft, rng: Rng) -> Draft:
     """Make the true pixels 1 to 8 % larger or smaller than the stated ones, and expect a
     finding of the pixel.
     """
-    draft = _usual(draft, rng)
+    draft = usual(draft, rng)
     factor = 1.0 + _sign(rng) * rng.uniform(0.01, 0.08)
     world = replace(draft.world, pixel=draft.world.pixel * factor)
     return replace(draft, world=world, names=("pixel",), silent=False)
