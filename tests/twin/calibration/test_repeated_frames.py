@@ -94,6 +94,23 @@ def test_a_doubled_frame_is_named_as_far_as_frames_tell() -> None:
     assert "a frame is lost between frames 10 and 12" in lost.text
 
 
+def test_two_frames_in_exchange_are_neither_lost_nor_doubled() -> None:
+    """Frames 4 and 5 show each other's angles; three in a ring are renumbered."""
+    shift = np.zeros(12, dtype=np.int64)
+    shift[4:6] = 1, -1
+    fits = np.ones(12, dtype=bool)
+    for last in (12, 6):
+        exchanged = FrameNumbers(shift[:last], fits[:last]).judged("scan")
+        assert exchanged is not None
+        assert exchanged.code == "frames_inconsistent"
+        assert (
+            "frame 4 shows what frame 5 should; frame 5 shows what frame 4"
+            in exchanged.text
+        )
+    shift[4:7] = 1, 1, -2
+    assert FrameNumbers(shift, fits).renumbered
+
+
 def test_a_whole_step_too_many_or_too_few_is_a_lost_or_a_doubled_frame() -> None:
     for sense in (1.0, -1.0):
         angles = sense * np.radians(10.0 * np.arange(36))

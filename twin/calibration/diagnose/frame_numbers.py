@@ -69,13 +69,20 @@ class FrameNumbers:
     @property
     def _settled(self) -> npt.NDArray[np.int64]:
         """Shift of frame numbers (n,) without changes that last one frame, or that only
-        the last frame has: such frames get the shift before.
+        the last frame has, and without two frames in exchange: such frames get the shift
+        before.
         """
         out = self.shift.copy()
         n = len(out)
         for i in range(1, n):
-            if out[i] != out[i - 1] and (i == n - 1 or self.shift[i + 1] == out[i - 1]):
-                out[i] = out[i - 1]
+            before = out[i - 1]
+            after = self.shift[i + 1 : i + 3] - before
+            if out[i] == before:
+                continue
+            if not len(after) or after[0] == 0:
+                out[i] = before
+            elif out[i] == before + 1 and after[0] == -1 and not after[1:].any():
+                out[i : i + 2] = before
         return out
 
     def _last_before(self, frame: int) -> int:
