@@ -158,6 +158,9 @@ def check_fixed(
         if judged is not None and judged.forbids:  # With the sigmas of causes left open.
             judged = judge_exact(fit, explain(state, usual, freed)[0], exact)
         found += listed(judged)
+    if any(f.forbids and f.code != "misfit" for f in explained):
+        # What spoils the fit moves it as a scanner elsewhere would.
+        return fit, [*explained, *(f for f in found if f.forbids)]
 
     def without(name: str) -> FitResult:
         """Fit with one parameter's prior so wide that the images alone determine it,

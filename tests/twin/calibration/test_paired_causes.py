@@ -104,6 +104,43 @@ def test_a_renumbered_frame_of_a_helix_shows_another_height_too(
     assert found.verdict == "right", found
 
 
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        # No cause by itself left little enough, and only single ones were tried.
+        ("drift_across+tiles_apart", 8022),
+        ("bead_tolerance+source_jumps", 97618),
+        ("jump_across+four_tiles", 97643),
+        # Motion was sought in 12 frames at least.
+        ("grows@few_frames", 8124),
+        # Angles that grow evenly were wrong angles, and the source was not told.
+        ("angle_factor+source_jumps", 8135),
+        # Two frames in exchange were one lost, one doubled twice and one lost again.
+        ("panel_pitches+frames_swapped@few_frames", 97601),
+        # A scanner twice as far off as stated, and other pixels, of what the axis did.
+        ("wobble+exposed_long@limited_arc", 97657),
+    ],
+)
+def test_a_refusal_names_what_is_there(kind: str, seed: int) -> None:
+    found = scored(kind, seed)
+    assert found.verdict == "right", found
+    assert not found.offered or not found.wrong
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "code"),
+    [
+        ("wobble+angle_factor", 8234, "wobble"),
+        # Frames 0 to 8 were told to be all that fits, and numbers to be wrong.
+        ("wobble+bead_displaced", 8230, "bead_displaced"),
+    ],
+)
+def test_a_refusal_names_one_of_two_causes(kind: str, seed: int, code: str) -> None:
+    found = scored(kind, seed)
+    assert found.verdict == "part", found
+    assert {said.partition(":")[0] for said in found.said} == {code}
+
+
 @pytest.mark.slow
 @pytest.mark.campaign(4)
 @pytest.mark.parametrize("setup", SETUPS)

@@ -126,12 +126,15 @@ class Found:
         applied: names of causes that are columns of the fit.
         open: names of causes that the data neither show nor exclude.
         strain: of the phantom, (10,) and its covariance (10, 10); None: it is not judged.
+        beside_motion: the fit with causes that are likely where something moves, too, and
+            those causes; None where that is not so.
     """
 
     odds: dict[str, float] = field(default_factory=dict)
     applied: tuple[str, ...] = ()
     open: tuple[str, ...] = ()
     strain: tuple[FloatArray, FloatArray] | None = None
+    beside_motion: tuple[FitResult, Found] | None = None
 
     def named(self, name: str) -> bool:
         """Check whether a cause of the fit is beyond doubt."""
@@ -688,8 +691,8 @@ def explained_by_causes(
 
     Returns:
         The new fit and the causes that were found; as `_undetermined` says if a fit with
-        them is not identifiable; `fit` with the odds alone if the object moves and more
-        than `MAX_REST_SHARE` of the residuals is left.
+        them is not identifiable; `fit` with the odds, and `Found.beside_motion`, if the
+        object moves and more than `MAX_REST_SHARE` of the residuals is left.
     """
     first = fit
     borders: tuple[Border, ...] = ()
@@ -723,7 +726,11 @@ def explained_by_causes(
             pick if c.name in MOTIONS else 0.0
             for c, pick in zip(candidates.causes, choice, strict=True)
         )
-        return _widened(first, candidates, nothing), Found(odds)
+        beside = None
+        if names := _applied(candidates, choice):
+            beside = (fit, Found(odds, names, (), candidates.strain(choice)))
+        whole = Found(odds, beside_motion=beside)
+        return _widened(first, candidates, nothing), whole
     names = _applied(candidates, choice)
     doubtful = tuple(
         n

@@ -42,8 +42,6 @@ MOST_LEFT_OUT = 12
 """Beads of a phantom of which each is left out in turn to see whether it is the cause."""
 WIDE_GATE_PX = 25.0
 """Gate of an assignment to beads that may be moving [px]."""
-LEAST_FRAMES = 12
-"""Least number of frames in which motion is separable from noise."""
 LEAST_TURN_DEG = 0.2
 """Turn between two parts of a scan from which it is reported [deg]."""
 FEW_TURNED = math.radians(75.0)
@@ -336,6 +334,15 @@ def _missing(found: Identification) -> list[int]:
     return missing
 
 
+def _leaves_less(some: Identification, every: Identification) -> bool:
+    """Check whether an assignment to some beads leaves fewer spots and beads without each
+    other, and the others closer, than one to every bead: so it is without a bead that is
+    elsewhere and has now and then a stray spot at its stated place.
+    """
+    without = [2.0 - found.explained - found.found for found in (some, every)]
+    return without[0] < without[1] and some.rms_px < every.rms_px
+
+
 def _plausible(found: Identification) -> bool:
     return found.explained >= 0.85 and found.found >= 0.85 and found.rms_px < 4.0
 
@@ -459,6 +466,7 @@ def _alternative(
             found is None
             or other.rms_px < 0.3 * found.rms_px
             or (other.explained > found.explained + 0.2)
+            or (code == "bead_displaced" and _leaves_less(other, found))
         )
         # A mistake that explains all spots comes before one that fits most of them more
         # closely: four of the LEGO phantom's five beads are a helix, which turns round into
@@ -490,15 +498,12 @@ def _in_motion(
         start: offsets that are known before.
 
     Returns:
-        The finding that names the motion; None if there is none, if the spots do not fit
-        the beads even with a gate of `WIDE_GATE_PX`, or for fewer than `LEAST_FRAMES`
-        frames.
+        The finding that names the motion; None if there is none, or if the spots do not
+        fit the beads even with a gate of `WIDE_GATE_PX`.
     """
     wide = Search(gate_px=WIDE_GATE_PX)
     found = attempt(detections, model, poses, search=wide, start=start)
     if found is None or min(found.explained, found.found) < GOOD_SHARE:
-        return None
-    if len(poses) < LEAST_FRAMES:
         return None
     shape = np.array([d.shape for d in detections], dtype=np.float64)
     here = poses

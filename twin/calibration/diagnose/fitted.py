@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -16,10 +17,11 @@ from scipy.special import chdtri
 
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.refine import Refined
-from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose import Finding, error, listed, warning
 from flexdt.twin.calibration.diagnose.causes import (
     LEAST_BEADS,
     NAMED_LOG_ODDS,
+    Found,
     Known,
     Refit,
     explained_by_causes,
@@ -96,6 +98,8 @@ ALIKE_MOTION: Final = {
 """Parameter -> other motions that look like this motion of the object."""
 OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
 """Codes of findings on motion that may be followed from frame to frame."""
+MAX_CURVED: Final = 0.2
+"""Part of a turn that a factor on the angles may leave for it to be one."""
 UNEXPLAINED_MOTION: Final = ("dO_x", "dO_y", "alpha")
 """Parameters that are advised to differ between frames where no cause explains a misfit."""
 MOST_FRAMES: Final = 720
@@ -323,7 +327,7 @@ def explain_residuals(
 
     If the residuals
     exceed the limit, or too many positions were left out, a factor on the angles is
-    tried; then, beyond the limit, a motion, a wobble of the axis, else the error "misfit"
+    tried; then, beyond the limit, what moves (`_moving_beside`), else the error "misfit"
     is given, beside which only lost beads are reported.
 
     Args:
@@ -353,16 +357,62 @@ def explain_residuals(
     if not bad:
         return fit, out
     # What else the residuals show has no meaning where no cause explains them.
-    explained = moving(plain, lambda motion: refit(motion=motion))
-    explained = explained or wobble(plain)
-    explained = explained or error(
-        "misfit",
-        f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
-        "looked for explains them: check that nothing is loose, or let frames differ, "
-        f"--per-frame {','.join(UNEXPLAINED_MOTION)}",
-        per_frame=UNEXPLAINED_MOTION,
+    explained = _moving_beside(plain, fit, named, causes, refit) or [
+        error(
+            "misfit",
+            f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
+            "looked for explains them: check that nothing is loose, or let frames differ, "
+            f"--per-frame {','.join(UNEXPLAINED_MOTION)}",
+            per_frame=UNEXPLAINED_MOTION,
+        )
+    ]
+    return fit, [*_lost_beads(fit), *explained]
+
+
+def _moving_beside(
+    plain: FitResult,
+    fit: FitResult,
+    named: Sequence[Finding],
+    causes: Found,
+    refit: Refit,
+) -> list[Finding]:
+    """Name a motion, or a wobble of the axis, that explains the residuals: by itself, else
+    beside the causes of the residuals, else beside a factor on the angles.
+
+    Args:
+        plain: without causes.
+        fit: with those of `causes`.
+        named: its findings.
+        causes: of the residuals, and those that are likely where something moves.
+        refit: fits again with more parameters free.
+
+    Returns:
+        An error, and the findings on what stands beside it; empty if nothing explains the
+        residuals.
+    """
+    beside = [(plain, list[Finding]())]
+    if causes.applied:
+        beside.append((fit, list(named)))
+    if causes.beside_motion is not None:
+        other, which = causes.beside_motion
+        beside.append((other, named_causes(other, which)))
+    for base, others in beside:
+        found = moving(base, partial(_refit_moving, base, refit)) or wobble(base)
+        if found is not None:
+            return [found, *(f for f in others if f.code != "causes_open")]
+    # A motion takes up such a factor, but a lean does not.
+    return listed(wobble(refit(extra=("angle_scale",))))
+
+
+def _refit_moving(fit: FitResult, refit: Refit, motion: MotionFit) -> FitResult:
+    """Fit again with a motion, and the causes of a fit."""
+    return refit(
+        motion=motion,
+        panel=fit.problem.panel,
+        strain=fit.strain_prior,
+        arc=fit.problem.curvature is not None,
+        bead_tolerance_mm=fit.bead_prior_mm or None,
     )
-    return fit, [*_lost_beads(fit), explained]
 
 
 def _drifts(fit: FitResult) -> list[Finding]:
@@ -545,21 +595,22 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     Returns:
         An error with the parameter that has most effect and how it moves: wrong angles or
         a named turn for alpha, else a vibration if it goes from frame to frame, or a
-        drift. None if no motion explains them or it cannot be fitted, for scans of fewer
-        than 12 or more than `MOST_FRAMES` frames, or if nothing may move.
+        drift. None if no motion explains them or it cannot be fitted, for scans of more
+        than `MOST_FRAMES` frames, or if nothing may move.
     """
     problem = fit.problem
     before = fit.certificate.rms_px
     sizes = np.bincount(problem.group)
     names = [n for n in MOVING if n in fit.values or n + "@0" in fit.values]
-    if sizes.min() < 12 or sizes.max() > MOST_FRAMES or not names or not fit.identifiable:
+    if sizes.max() > MOST_FRAMES or not names or not fit.identifiable:
         return None
     try:
         better, found = follow_motion(fit, names, refit)
     except TwinError:
         return None
     remaining = largest_residual(better, EXPLAINED_CHANCE)
-    if not better.certificate.rms_px < min(0.5 * before, remaining) or not found.moving:
+    after = _after_motion(better, found)
+    if not after < min(0.5 * before, remaining) or not found.moving:
         return None
     names = list(found.motions[0].names)
     use = problem.seen
@@ -570,7 +621,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         )
         effects.append(reach * max(float(np.ptp(m.values[:, i])) for m in found.motions))
     first = int(np.argmax(effects))
-    motion = max(found.motions, key=lambda m: float(np.ptp(m.values[:, first])))
+    group = int(np.argmax([np.ptp(m.values[:, first]) for m in found.motions]))
+    motion = found.motions[group]
     name = names[first]
     curve = motion.values[:, first]
     motions = [
@@ -580,17 +632,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     ]
     how, jump = _shape(curve)
     if name == "alpha":
-        if jump is not None:
-            height = to_edge(name, float(curve[jump + 1] - curve[jump]))
-            code, text = named_turn(height, problem.poses.angle)
-            return error(code, f"between frames {jump} and {jump + 1} {text}")
-        off = np.array([to_edge(name, v) for v in curve - np.median(curve)])
-        return error(
-            "angles_wrong",
-            f"the frames' angles differ from the stated ones by {np.std(off):.3f} deg "
-            "rms (up to "
-            f"{np.abs(off).max():.3f})",
-        )
+        others = ", ".join(motions[1:])
+        return _turned(curve, jump, problem.poses.angle[problem.group == group], others)
     if how.startswith("from frame"):
         code = "vibration"
     else:
@@ -603,6 +646,58 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         f"{', '.join(motions)} moves during the scan, {how}{_alternatives(alike)}: "
         f"--per-frame {','.join(names)} follows it",
         per_frame=names,
+    )
+
+
+def _after_motion(fit: FitResult, held: MotionFit) -> float:
+    """Compute the residual of a fit as it would be with its motion's freedom counted: a
+    value in each frame, less one, for each parameter that moves.
+
+    Args:
+        fit: to poses that hold the motion.
+        held: the motion.
+
+    Returns:
+        [px]; inf if no freedom is left.
+    """
+    frames = len(fit.problem.seen)
+    count = 2 * int(fit.certificate.used.sum()) - len(fit.problem.layout.names)
+    left = count - len(held.moving) * (frames - 1)
+    if left <= 0:
+        return math.inf
+    return fit.certificate.rms_px * math.sqrt(count / left)
+
+
+def _turned(
+    curve: FloatArray, jump: int | None, angle: FloatArray, others: str
+) -> Finding:
+    """Name how an object turns otherwise than stated.
+
+    Args:
+        curve: (n,) turn of each frame beyond the stated one [rad].
+        jump: number of the frame before a jump, None without one.
+        angle: (n,) stated [rad].
+        others: what else moves, and by how much; "" if nothing does.
+    """
+    beside = f"; beside that, {others} moves during the scan" if others else ""
+    if jump is not None:
+        height = to_edge("alpha", float(curve[jump + 1] - curve[jump]))
+        code, text = named_turn(height, angle)
+        return error(code, f"between frames {jump} and {jump + 1} {text}{beside}")
+    turn = angle - angle.mean()
+    share = float(turn @ curve) / max(float(turn @ turn), 1e-300)
+    if float(np.std(curve - share * turn)) < MAX_CURVED * float(np.std(curve)):
+        return error(
+            "angle_scale",
+            f"the frame angles are off by a factor {1.0 + share:.5f}; correct "
+            f"them, or free angle_scale{beside}",
+            free=("angle_scale",),
+        )
+    off = np.array([to_edge("alpha", v) for v in curve - np.median(curve)])
+    return error(
+        "angles_wrong",
+        f"the frames' angles differ from the stated ones by {np.std(off):.3f} deg "
+        f"rms (up to {np.abs(off).max():.3f}){beside}",
     )
 
 
