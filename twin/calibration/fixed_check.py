@@ -83,7 +83,7 @@ def explain(
         fit,
         known=known,
         refit=lambda **changes: refit_scans(state, request, fit, **changes),
-        sigmas_known=bool(state.measured),
+        sigmas_known=weighed,
         misfit_px=request.misfit_px,
     )
 

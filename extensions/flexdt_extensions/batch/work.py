@@ -28,8 +28,12 @@ from flexdt.phantoms.scan_limits import (
     check_tube,
     open_beam_doubts,
 )
-from flexdt.twin.calibration import FitResult, bead_model, estimate_geometry
-from flexdt.twin.calibration.fit.priors import known, known_strain
+from flexdt.twin.calibration import BeadModel, FitResult, bead_model
+from flexdt.twin.calibration.bead_model import spot_radii
+from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.fit.forecast import visible_beads
+from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFrames
+from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -582,8 +586,9 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
 def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, Any]]:
     """Calibrate an item, from noisy bead points or from rendered images.
 
-    Noise depends on the item's seed. Images are rendered with noise, and their beads
-    detected.
+    Both go through the same calibration, with all causes that it looks for. Noise depends
+    on the item's seed. Images are rendered with noise, and their beads detected; of points
+    the beads are known.
 
     Args:
         plan: of the batch.
@@ -594,35 +599,53 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
     """
     model = bead_model(item.phantom)
     free = tuple(plan.calibrate.free)
-    if plan.calibrate.fidelity == "points":
-        tracks = item.poses.cone_vec(item.truth).project_points(model.beads, item.shape)
-        rng = np.random.default_rng(seed_of(plan, item.index, NOISE))
-        noisy = tracks + item.noise_px * rng.normal(size=tracks.shape)
-        fit = estimate_geometry(
-            noisy,
-            model,
-            item.poses,
-            free,
-            shape=item.shape,
-            noise_px=item.noise_px,
-            priors=known(free, plan.calibrate.priors),
-            strain=known_strain(model, given=plan.calibrate.priors, free=free),
-        )
-        return {}, _compare_with_truth(fit, item, free, fit.identifiable, "")
-    from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
-    from flexdt_extensions.studies.rendered_runs import Rendering, render
-
-    camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
-    key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
-    frames = render(
-        item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape
-    )
     request = CalibrationRequest(free=free, priors=plan.calibrate.stated_priors)
-    result = calibrate(
-        [Scan(frames, item.poses)], model, request, scene=item.phantom.scene
-    )
+    if plan.calibrate.fidelity == "points":
+        scan = _seen_points(plan, item, model)
+        result = calibrate([scan], model, replace(request, second_look=False))
+    else:
+        from flexdt_extensions.studies.rendered_runs import Rendering, render
+
+        camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
+        key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
+        frames = render(
+            item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape
+        )
+        result = calibrate(
+            [Scan(frames, item.poses)], model, request, scene=item.phantom.scene
+        )
     note = "; ".join(f.text for f in result.errors)
     return {}, _compare_with_truth(result.fit, item, free, result.identifiable, note)
+
+
+def _seen_points(plan: Plan, item: Item, model: BeadModel) -> Scan:
+    """Project the centres of an item's beads, and add noise.
+
+    Args:
+        plan: of the batch.
+        item: with the noise of a coordinate [px].
+        model: k beads.
+
+    Returns:
+        The scan, the bead of each spot known; beads that are not entirely on the panel are
+        not seen.
+    """
+    cone = item.poses.cone_vec(item.truth)
+    tracks = cone.project_points(model.beads, item.shape)
+    rng = np.random.default_rng(seed_of(plan, item.index, NOISE))
+    noisy = tracks + item.noise_px * rng.normal(size=tracks.shape)
+    radii = spot_radii(model, cone)
+    sizes = np.tile(np.array(item.shape, dtype=np.float64), (len(item.poses), 1))
+    seen = visible_beads(model, item.poses, sizes, item.truth)
+    looks = [
+        FrameSpots(
+            Detections.of_points(spots[there], item.noise_px, size[there], item.shape),
+            FrameState.USABLE,
+        )
+        for spots, size, there in zip(noisy, radii, seen, strict=True)
+    ]
+    index = np.where(seen, np.cumsum(seen, axis=1) - 1, -1)
+    return Scan(SpotFrames(looks), item.poses, index=index)
 
 
 def _compare_with_truth(
