@@ -1,14 +1,15 @@
 """Does a spoilt scan get the right name, and is none offered that is wrong?
 
 `python examples/research/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--pairs 0]
-[--json]` spoils scans of drawn bead phantoms in the ways of `faults_drawn.KINDS`, calibrates
-each and says whether the cause was named right, vaguely or not at all, and how many sigmas the
-worst of an answer that was offered is off. More than four is a confident wrong answer, and the
-command fails. `--pairs N` draws N scans with two causes or of unusual setups instead
-(`faults_paired`; a name of one, `strain_z+frame_lost@helix`, is a kind, too). `--placed` joins
-scans of a phantom that is placed anew between them (`placements_drawn`; so is a kind
-`slip@two_placements`). `--json` prints a line as soon as a scan is judged, one scan of every
-kind before the second of any, and the sums last.
+[--placed] [--panel flexray] [--json]` spoils scans of drawn bead phantoms in the ways of
+`faults_drawn.KINDS`, calibrates each and says whether the cause was named right, vaguely or
+not at all, and how many sigmas the worst of an answer that was offered is off. More than four
+is a confident wrong answer, and the command fails. `--pairs N` draws N scans with two causes
+or of unusual setups instead (`faults_paired`; a name of one, `strain_z+frame_lost@helix`, is
+a kind, too). `--placed` joins scans of a phantom that is placed anew between them
+(`placements_drawn`; so is a kind `slip@two_placements`). `--panel` takes another panel or
+magnification. `--json` prints a line as soon as a scan is judged, one scan of every kind
+before the second of any, and the sums last.
 
 Geometry and shadows come from `faults_drawn`; nothing of the fit or of its diagnoses is in
 them.
@@ -25,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
-from faults_drawn import KINDS, Faulty, drawn
+from faults_drawn import KINDS, PANELS, Faulty, drawn
 from faults_paired import drawn_names, drawn_together
 from placements_drawn import PLACED, PLACEMENTS, Placed, angles_apart, drawn_placed
 
@@ -130,16 +131,17 @@ def _seen(scan: Faulty) -> Scan:
     return Scan(SpotFrames(looks), poses, arc=b.arc)
 
 
-def scored(kind: str, seed: int) -> Scored:
+def scored(kind: str, seed: int, panel: str = "flexray") -> Scored:
     """Draw a scan of a kind, of a pair or setup (`faults_paired`), or scans of several
-    placements, calibrate, and judge findings and values; a refusal is scored, too.
+    placements, calibrate, and judge findings and values; a refusal is scored, too. All but
+    pairs and setups are of a machine of PANELS.
     """
     placed: Placed | None = None
     if kind in KINDS:
-        scan = drawn(kind, seed)
+        scan = drawn(kind, seed, panel)
         causes: tuple[tuple[str, ...], ...] = (scan.names,)
     elif kind.partition("@")[2] in PLACEMENTS:
-        placed = drawn_placed(kind, seed)
+        placed = drawn_placed(kind, seed, panel)
         scan = placed.scans[0]
         causes = (scan.names,)
     else:
@@ -254,11 +256,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--placed", action="store_true", help="join scans of several placements"
     )
+    parser.add_argument("--panel", choices=PANELS, default="flexray", help="of the scans")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
+    if args.pairs and args.panel != "flexray":
+        parser.error("pairs and setups are of the panel flexray")
     all_of_them = []
     for kind, seed in _to_judge(args):
-        all_of_them.append(scored(kind, seed))
+        all_of_them.append(scored(kind, seed, args.panel))
         if args.json:
             print(json.dumps(asdict(all_of_them[-1])), flush=True)
     wrong = [s for s in all_of_them if s.wrong]

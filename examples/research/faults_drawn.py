@@ -31,6 +31,36 @@ RANGE: Final = {
     "tau_x": 2.0,
     "tau_z": 2.0,
 }
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A scanner.
+
+    Attributes:
+        pixel: [mm].
+        shape: (rows, cols) of the panel.
+        sod, sdd: least and largest [mm].
+        scale: of phantoms, of their places and of what object and source move by, against
+            those that are drawn for FleX-ray.
+    """
+
+    pixel: float = PIXEL
+    shape: tuple[int, int] = SHAPE
+    sod: tuple[float, float] = (540.0, 640.0)
+    sdd: tuple[float, float] = (1000.0, 1100.0)
+    scale: float = 1.0
+
+
+FLEX_RAY: Final = Machine()
+PANELS: Final[Mapping[str, Machine]] = {
+    "flexray": FLEX_RAY,
+    "fine": Machine(0.075, (1520, 1912)),
+    "demonstration": Machine(0.2992, (380, 478)),
+    "coarse": Machine(0.6, (190, 239)),
+    "micro": Machine(0.075, (1520, 1912), sod=(27.0, 32.0), scale=0.05),
+}
+"""Machines by name: the usual one, others of other pixels, and one of a magnification of 36."""
 TOUCHING: Final = 8
 """Points of an outline that are projected."""
 
@@ -49,6 +79,8 @@ class World:
         arc: the object turns by so much while a frame is exposed [deg].
         size: (n,) of the phantom in each frame, as a factor; None: it stays.
         pitch: the stage rises by so much a turn [mm].
+        shape: (rows, cols) of the panel.
+        scale: see `Machine`.
     """
 
     beads: Array
@@ -63,6 +95,8 @@ class World:
     arc: float = 0.0
     size: Array | None = None
     pitch: float = 0.0
+    shape: tuple[int, int] = SHAPE
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +177,11 @@ def in_images(world: World) -> dict[str, float]:
     """
     still = {n: float(np.mean(v)) for n, v in world.offsets.items()}
     tau = np.array([still.get("tau_x", 0.0), still.get("tau_z", 0.0), 0.0])
-    reach = 0.5
+    reach = 0.5 * world.scale
     points = tau + np.array(
         [
-            [0, 0, 9.0],
-            [0, 0, -9.0],
+            [0, 0, 9.0 * world.scale],
+            [0, 0, -9.0 * world.scale],
             [reach, 0, 0],
             [-reach, 0, 0],
             [0, reach, 0],
@@ -155,12 +189,12 @@ def in_images(world: World) -> dict[str, float]:
         ]
     )
     first = replace(
-        world, beads=points, radii=np.full(6, 1e-4), offsets=still, angles=world.angles[:1],
-        spot=world.spot.mean(axis=0, keepdims=True), shown=np.ones((1, 6), dtype=bool),
-        arc=0.0, size=None,
+        world, beads=points, radii=np.full(6, 1e-4 * world.scale), offsets=still,
+        angles=world.angles[:1], spot=world.spot.mean(axis=0, keepdims=True),
+        shown=np.ones((1, 6), dtype=bool), arc=0.0, size=None,
     )  # fmt: skip
     ((up, down, *ends),) = shadows(first)[0]
-    middle = (SHAPE[0] - 1) / 2
+    middle = (world.shape[0] - 1) / 2
     column = down[0] + (up[0] - down[0]) * (middle - down[1]) / (up[1] - down[1])
     # A horizontal line that the panel shows along its rows, of the two that were projected.
     turn = math.radians(float(world.angles[0]) + still.get("alpha", 0.0))
@@ -243,7 +277,8 @@ def shadows(world: World) -> tuple[Array, Array]:
             middle = np.linalg.solve([[2, bb], [bb, 2 * cc]], [-dd, -ee])
             centres[i, k] = middle + [mu, mv]
             radii[i, k] = np.sqrt((p - middle[0]) ** 2 + (q - middle[1]) ** 2).min()
-    return centres + [(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2], radii
+    rows, cols = world.shape
+    return centres + [(cols - 1) / 2, (rows - 1) / 2], radii
 
 
 def phantom(rng: Rng, beads: int) -> Array:
@@ -275,30 +310,35 @@ class Draft:
     slow_part: float = 0.0
 
 
-def drawn(kind: str, seed: int) -> Faulty:
+def drawn(kind: str, seed: int, panel: str = "flexray") -> Faulty:
     """Draw a scanner, a phantom and a scan with the fault `kind`, of DRAWS, and compute its
     noisy spots.
 
     Args:
         kind: of the fault.
         seed: of all draws, together with the kind.
+        panel: the machine, of PANELS.
 
     Returns:
         The scan, with what is believed, the true least and greatest value of each
         parameter, and the expected findings.
     """
-    rng = np.random.default_rng([seed, *kind.encode()])
-    return taken(DRAWS[kind](right_draft(rng), rng), rng)
+    machine = PANELS[panel]
+    more = b"" if machine is FLEX_RAY else panel.encode()
+    rng = np.random.default_rng([seed, *kind.encode(), *more])
+    return taken(DRAWS[kind](right_draft(rng, machine), rng), rng)
 
 
-def right_draft(rng: Rng) -> Draft:
+def right_draft(rng: Rng, machine: Machine = FLEX_RAY) -> Draft:
     """Draw a scanner, a phantom and a full turn without a fault."""
     n, k = int(rng.choice([24, 36, 60])), int(rng.integers(5, 8))
-    beads = phantom(rng, k)
-    radii = np.full(k, float(rng.uniform(0.8, 1.5)))
+    beads = phantom(rng, k) * machine.scale
+    radii = np.full(k, float(rng.uniform(0.8, 1.5))) * machine.scale
     angles = 360.0 * np.arange(n) / n
     offsets = {name: float(rng.uniform(-r, r)) for name, r in RANGE.items()}
-    sod, sdd = float(rng.uniform(540, 640)), float(rng.uniform(1000, 1100))
+    for name in offsets:
+        offsets[name] *= 1.0 if name == "alpha" else machine.scale
+    sod, sdd = float(rng.uniform(*machine.sod)), float(rng.uniform(*machine.sdd))
     world = World(
         beads,
         radii,
@@ -308,10 +348,13 @@ def right_draft(rng: Rng) -> Draft:
         np.ones((n, k), dtype=bool),
         sod,
         sdd,
+        machine.pixel,
+        shape=machine.shape,
+        scale=machine.scale,
     )
     return Draft(
         world,
-        Believed(beads, radii, angles, sod, sdd),
+        Believed(beads, radii, angles, sod, sdd, machine.pixel),
         float(rng.uniform(0.005, 0.04)),
     )
 
@@ -328,9 +371,8 @@ def taken(draft: Draft, rng: Rng) -> Faulty:
     for place, size, shown in zip(centres, sizes, draft.world.shown, strict=True):
         rows = np.column_stack([place, size])[shown]
         rows[:, :2] += draft.noise_px * rng.normal(size=(len(rows), 2))
-        inside = (rows[:, :2] > 0).all(axis=1) & (rows[:, :2] < [SHAPE[1], SHAPE[0]]).all(
-            axis=1
-        )
+        inside = (rows[:, :2] > 0) & (rows[:, :2] < draft.world.shape[::-1])
+        inside = inside.all(axis=1)
         spots.append(rng.permutation(rows[inside]))
     if draft.after is not None:
         spots = draft.after(spots)
@@ -351,6 +393,7 @@ def taken(draft: Draft, rng: Rng) -> Faulty:
         draft.beside,
         draft.silent,
         draft.noise_px,
+        shape=draft.world.shape,
         after=draft.after,
         image=in_images(draft.world),
         image_ends={n: (min(values), max(values)) for n, values in ends.items()},
@@ -439,6 +482,8 @@ def _offset(
 
 
 def _varying(draft: Draft, name: str, change: Array) -> Draft:
+    if name.startswith("dO"):
+        change = change * draft.world.scale
     offsets = {**draft.world.offsets, name: draft.world.offsets.get(name, 0.0) + change}
     return replace(draft, world=replace(draft.world, offsets=offsets))
 
@@ -488,7 +533,7 @@ def _spot_drift(draft: Draft, rng: Rng) -> Draft:
     object drifting the other way, and a finding of motion is expected.
     """
     n = len(draft.world.angles)
-    way = np.array([_sign(rng) * rng.uniform(0.05, 0.3), 0.0, 0.0])
+    way = np.array([_sign(rng) * rng.uniform(0.05, 0.3), 0.0, 0.0]) * draft.world.scale
     world = replace(draft.world, spot=np.linspace(0, 1, n)[:, None] * way)
     # The object seen from a spot that stands still moves by so much; alpha hardly.
     truth = {"dO_x": draft.world.offsets["dO_x"] + np.array([-1.0, 1.0]) * way[0]}
@@ -644,9 +689,8 @@ def _lost(count: int) -> Fault:
 def _extra(draft: Draft, rng: Rng) -> Draft:
     """Add one or two balls to the beads, and expect `extra_spots`."""
     more = rng.uniform([-10, -10, -22], [10, 10, 22], size=(int(rng.integers(1, 3)), 3))
-    return _beads(
-        draft, np.concatenate([draft.world.beads, more]), "extra_spots", beside=OTHERS
-    )
+    beads = np.concatenate([draft.world.beads, more * draft.world.scale])
+    return _beads(draft, beads, "extra_spots", beside=OTHERS)
 
 
 def _displaced(draft: Draft, rng: Rng) -> Draft:
@@ -656,7 +700,7 @@ def _displaced(draft: Draft, rng: Rng) -> Draft:
     beads = draft.world.beads.copy()
     one = int(rng.integers(len(beads)))
     way = rng.normal(size=3)
-    beads[one] += way / np.linalg.norm(way) * rng.uniform(0.3, 1.5)
+    beads[one] += way / np.linalg.norm(way) * rng.uniform(0.3, 1.5) * draft.world.scale
     return _beads(
         draft, beads, rf"(bead_displaced|bead_tolerance).*\b{one}\b", beside=OTHERS
     )
@@ -666,9 +710,8 @@ def _tolerance(draft: Draft, rng: Rng) -> Draft:
     """Displace all beads at random, by 0.03 to 0.1 mm rms along each axis, and expect a
     finding of the beads' tolerance or errors.
     """
-    beads = draft.world.beads + rng.uniform(0.03, 0.1) * rng.normal(
-        size=draft.world.beads.shape
-    )
+    width = rng.uniform(0.03, 0.1) * draft.world.scale
+    beads = draft.world.beads + width * rng.normal(size=draft.world.beads.shape)
     return _beads(
         draft, beads, "bead_tolerance|bead_errors", beside=(*OTHERS, "bead_displaced")
     )
@@ -688,7 +731,8 @@ def _tolerance_and_roll(draft: Draft, rng: Rng) -> Draft:
 
 
 def _other_phantom(draft: Draft, rng: Rng) -> Draft:
-    return _beads(draft, phantom(rng, len(draft.world.beads)), "wrong_phantom")
+    other = phantom(rng, len(draft.world.beads)) * draft.world.scale
+    return _beads(draft, other, "wrong_phantom")
 
 
 def _mirror_image(draft: Draft, rng: Rng) -> Draft:
@@ -727,7 +771,7 @@ def _symmetric(draft: Draft, rng: Rng) -> Draft:
     """
     quarter = 0.5 * math.pi * np.arange(4)
     ring = 9.0 * np.stack([np.cos(quarter), np.sin(quarter), 0 * quarter], axis=1)
-    beads = np.concatenate([ring - [0, 0, 14.0], ring + [0, 0, 14.0]])
+    beads = np.concatenate([ring - [0, 0, 14.0], ring + [0, 0, 14.0]]) * draft.world.scale
     draft = _beads(draft, beads, "ambiguous")
     return replace(
         draft,
@@ -751,7 +795,7 @@ def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
             for s in spots:
                 assert s is not None
                 for a in axes:
-                    s[:, a] = SHAPE[1 - a] - 1 - s[:, a]
+                    s[:, a] = draft.world.shape[1 - a] - 1 - s[:, a]
             return spots
 
         return replace(draft, after=after, names=names)
@@ -760,8 +804,8 @@ def _flipped(axes: tuple[int, ...], *names: str) -> Fault:
 
 
 def _distorted(terms: str) -> Fault:
-    """Make a fault that distorts the panel's image smoothly, by 0.3 to 1 px at 305 px
-    from its middle.
+    """Make a fault that distorts the panel's image smoothly, by 0.3 to 1 px at 0.64 of the
+    way from its middle to its sides.
 
     Args:
         terms: "radial", "decentred", or else any polynomial of second and third order.
@@ -769,13 +813,15 @@ def _distorted(terms: str) -> Fault:
 
     def fault(draft: Draft, rng: Rng) -> Draft:
         """Draw the distortion's size and coefficients."""
-        half = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])
+        rows, cols = draft.world.shape
+        half = np.array([(cols - 1) / 2, (rows - 1) / 2])
+        unit = 305.0 * cols / SHAPE[1]
         size = float(_sign(rng) * rng.uniform(0.3, 1.0))
         one, two = rng.normal(size=2) / math.sqrt(2)
         bent = rng.normal(size=(2, 7))
 
         def shift(x: Array, y: Array) -> Array:
-            """Compute the shift (m, 2) at places x, y in units of 305 px from the middle."""
+            """Compute the shift (m, 2) at places x, y from the middle, in that unit."""
             square = x * x + y * y
             if terms == "radial":
                 return np.stack([x * square, y * square], axis=1)
@@ -791,7 +837,7 @@ def _distorted(terms: str) -> Fault:
             """Shift the spots of all frames, in place."""
             for s in spots:
                 assert s is not None
-                x, y = ((s[:, :2] - half) / 305.0).T
+                x, y = ((s[:, :2] - half) / unit).T
                 s[:, :2] += size * shift(x, y)
             return spots
 
@@ -803,7 +849,7 @@ def _distorted(terms: str) -> Fault:
 def _tiles_apart(draft: Draft, rng: Rng) -> Draft:
     """Move two tiles of the panel apart by 0.5 to 2 px, which the image leaves out."""
     axis = int(rng.integers(2))
-    border = SHAPE[1 - axis] * rng.uniform(0.4, 0.6)
+    border = draft.world.shape[1 - axis] * rng.uniform(0.4, 0.6)
     gap = rng.uniform(0.5, 2.0)
 
     def after(spots: list[Array | None]) -> list[Array | None]:
@@ -829,7 +875,9 @@ def _row_offset(draft: Draft, rng: Rng) -> Draft:
             s[:, 1] += rows
         return spots
 
-    return replace(draft, after=after, silent=True, truth={"dD_y": rows * PIXEL})
+    return replace(
+        draft, after=after, silent=True, truth={"dD_y": rows * draft.world.pixel}
+    )
 
 
 def _binned(draft: Draft, rng: Rng) -> Draft:
@@ -852,6 +900,7 @@ def _held(name: str, low: float, high: float) -> Fault:
     def fault(draft: Draft, rng: Rng) -> Draft:
         """Draw the error, and hold the parameter."""
         off = _sign(rng) * math.exp(rng.uniform(math.log(low), math.log(high)))
+        off *= draft.world.scale
         value = draft.world.offsets[name]
         assert isinstance(value, float)
         believed = replace(
@@ -951,7 +1000,7 @@ def _with_causes(moving: bool) -> Fault:
         bent = width(*PANEL_WIDTHS_PX) * rng.normal(size=16)
         gap = width(*GAP_WIDTHS_PX) * rng.normal(size=2)
         axis = int(rng.integers(2))
-        border = SHAPE[1 - axis] * rng.uniform(LEAST_TILE, 1.0 - LEAST_TILE)
+        border = draft.world.shape[1 - axis] * rng.uniform(LEAST_TILE, 1.0 - LEAST_TILE)
         world = replace(world, beads=beads, arc=arc * 360.0 / len(world.angles))
         truth = {n: float(np.ravel(v)[0]) for n, v in world.offsets.items()}
         moved = dict(world.offsets)
@@ -964,7 +1013,8 @@ def _with_causes(moving: bool) -> Fault:
 
         def after(spots: list[Array | None]) -> list[Array | None]:
             """Shift the spots of all frames by the panel's bend and its gap, in place."""
-            middle = [(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2]
+            rows, cols = draft.world.shape
+            middle = [(cols - 1) / 2, (rows - 1) / 2]
             beyond = np.concatenate(
                 [s[:, axis] >= border for s in spots if s is not None]
             )
@@ -973,7 +1023,7 @@ def _with_causes(moving: bool) -> Fault:
             shift = gap if parted else np.zeros(2)
             for s in spots:
                 assert s is not None
-                x, y = ((s[:, :2] - middle) / (max(SHAPE) / 2)).T
+                x, y = ((s[:, :2] - middle) / (max(rows, cols) / 2)).T
                 powers = np.array([x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3])
                 affine = np.array([bent[0] * x + bent[1] * y, bent[1] * x - bent[0] * y])
                 smooth = affine + bent[2:].reshape(2, 7) @ powers
@@ -1096,8 +1146,9 @@ def _four_tiles(draft: Draft, rng: Rng) -> Draft:
     the columns, by 0.3 to 2 px, and each a little across that; `panel_distorted` is
     expected.
     """
-    column = SHAPE[1] * rng.uniform(0.42, 0.58)
-    row = SHAPE[0] * rng.uniform(0.42, 0.58)
+    rows, cols = draft.world.shape
+    column = cols * rng.uniform(0.42, 0.58)
+    row = rows * rng.uniform(0.42, 0.58)
     across, down = (float(_sign(rng) * rng.uniform(0.3, 2.0)) for _ in range(2))
     askew = rng.normal(size=(2, 2)) * 0.1
 
@@ -1131,7 +1182,7 @@ def _source_moves(axis: int, low: float, high: float, jumps: bool) -> Fault:
         at = int(rng.integers(n // 4, 3 * n // 4))
         course = (np.arange(n) >= at) if jumps else np.linspace(0.0, 1.0, n)
         way = np.zeros(3)
-        way[axis] = _sign(rng) * rng.uniform(low, high)
+        way[axis] = _sign(rng) * rng.uniform(low, high) * draft.world.scale
         world = replace(draft.world, spot=course[:, None] * way)
         # Seen from a spot that stands still, all else moves by so much.
         name = ("dO_x", "dO_z", "dO_y")[axis]

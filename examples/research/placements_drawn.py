@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from faults_drawn import DRAWS, Draft, Faulty, Rng, right_draft, taken, usual
+from faults_drawn import DRAWS, PANELS, Draft, Faulty, Rng, right_draft, taken, usual
 
 PLACEMENTS: Final[Mapping[str, int]] = {
     "two_placements": 2,
@@ -84,6 +84,7 @@ def _placed_anew(draft: Draft, rng: Rng) -> Draft:
     offsets = dict(draft.world.offsets)
     for name, most in ASIDE.items():
         change = float(rng.uniform(-most, most))
+        change *= 1.0 if name == "alpha" else draft.world.scale
         offsets[name] = offsets[name] + change
         if name.startswith("tau"):
             offsets["dO" + name[3:]] = offsets["dO" + name[3:]] - change
@@ -92,7 +93,8 @@ def _placed_anew(draft: Draft, rng: Rng) -> Draft:
 
 def _further(draft: Draft, rng: Rng) -> Draft:
     """Move the stage along the beam."""
-    sod = draft.world.sod + float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.0)) * FURTHER
+    way = float(rng.choice([-1, 1]) * rng.uniform(0.5, 1.0)) * FURTHER
+    sod = draft.world.sod + way * draft.world.scale
     return replace(
         draft,
         world=replace(draft.world, sod=sod),
@@ -100,17 +102,18 @@ def _further(draft: Draft, rng: Rng) -> Draft:
     )
 
 
-def drawn_placed(name: str, seed: int) -> Placed:
+def drawn_placed(name: str, seed: int, panel: str = "flexray") -> Placed:
     """Draw scans of one phantom with a fault.
 
     Args:
         name: `FAULT@PLACEMENTS`.
         seed: of all draws, together with the name.
+        panel: the machine, of `faults_drawn.PANELS`.
     """
     rng = np.random.default_rng([seed, *name.encode()])
     fault, _, placements = name.partition("@")
     count = PLACEMENTS[placements]
-    draft = usual(right_draft(rng), rng)
+    draft = usual(right_draft(rng, PANELS[panel]), rng)
     moved = _further if placements == "two_distances" else _placed_anew
     drafts = [draft, *(moved(draft, rng) for _ in range(count - 1))]
     spoilt = int(rng.integers(count)) if fault in OF_ONE_SCAN else None
