@@ -11,8 +11,10 @@ import numpy as np
 from flexdt.twin.calibration.diagnose import Finding, listed
 from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.fitted import (
+    OF_MOTION,
     OF_RESIDUALS,
     explain_residuals,
+    moving,
 )
 from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,
@@ -137,10 +139,14 @@ def check_fixed(
     verdict = judge_priors(loose_fit, exact)
     errors = {f.code for f in explained if f.forbids}
     if verdict.finding is not None and errors <= OF_RESIDUALS | {"misfit"}:
-        return fit, [
-            *_left_by_priors(state, usual, loose_fit, explained),
-            verdict.finding,
-        ]
+        left = _left_by_priors(state, usual, loose_fit, explained)
+        if any(f.code in OF_MOTION for f in left):
+            moved = moving(
+                fit, lambda motion: refit_scans(state, asked, fit, motion=motion)
+            )
+            if moved is not None:  # Beside the stated priors it explains all there is.
+                return fit, [*(f for f in left if f.code not in OF_MOTION), moved]
+        return fit, [*left, verdict.finding]
     found = []
     if verdict.factor > 1.0:
         found.append(narrow_priors(verdict))
@@ -172,6 +178,8 @@ def check_fixed(
     fit, pitch = with_rival_pitch(
         doubtful(fit, verdict, without), known((), None, (s.priors for s in state.scans))
     )
+    if _moves(explained):  # What moves looks like other pixels in part.
+        return fit, [*explained, *found]
     return fit, [*explained, *found, *listed(pitch)]
 
 
@@ -269,6 +277,11 @@ def _left_by_priors(
         f for f in explained if f.code == "bead_tolerance" and loose_fit.bead_prior_mm
     ]
     return [*(f for f in left if f.code != "misfit"), *moved]
+
+
+def _moves(findings: Sequence[Finding]) -> bool:
+    """Check whether a motion forbids the use of a fit."""
+    return any(f.forbids and f.code in OF_MOTION for f in findings)
 
 
 def _doubted(

@@ -263,12 +263,12 @@ def _judged_places(
         explained: findings on the residuals; not added.
 
     Returns:
-        The state with at most one further finding, and without `extra_spots` where a
+        The state with at most one further finding a scan, and without `extra_spots` where a
         displaced bead explains them.
     """
     if not any(f.forbids and f.code != "misfit" for f in explained):
         # Of what moves, or turns otherwise than is said, all frames are elsewhere.
-        state = state.with_findings(*listed(judge_places(fit, state.looks)))
+        state = state.with_findings(*judge_places(fit, state.looks))
     if any(
         f.code == "bead_displaced" for f in explained
     ):  # the other spots are that bead's

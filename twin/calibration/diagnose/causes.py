@@ -11,12 +11,13 @@ cause is named where its odds exceed NAMED_LOG_ODDS.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import lapack
 
 from flexdt.twin.calibration.diagnose.tiles import (
@@ -87,7 +88,8 @@ NO_PANEL_PX: Final = 1e-4
 SHAPES: Final = ("stretch", "shear")
 """The causes of a phantom of another shape."""
 MOTION_OF: Final = "motion of "
-MOTIONS: Final = frozenset(MOTION_OF + name for name in MOVING)
+APART: Final = " between scans"
+"""End of the name of a motion from scan to scan."""
 MAX_REST_SHARE: Final = 0.5
 """Part of the residuals that other causes may leave where something seems to move, too."""
 RIVALS: Final = (MOTION_OF, "priors")
@@ -207,8 +209,8 @@ class Candidates:
             1.0, OUTLIER_SIGMAS * self.noise / np.maximum(lengths, 1e-12)
         )
         share = np.repeat(bounded, 2)[:, None]
-        motion = [rows_of for name in self._moving() for rows_of in self._motion(name)]
-        table = np.concatenate([rows, *motion], axis=1) * share
+        motions = self._motions()
+        table = np.concatenate([rows, *motions.values()], axis=1) * share
         causes = there - everything.start
         causes[: self.count] = 0.0
         values = left.ravel() + rows @ causes
@@ -216,43 +218,47 @@ class Candidates:
         self.values = values * share[:, 0]
         self.table = Table(self.rows, self.values, known.floor, alike)
         self.visible = self._visible(rows.shape[1])
-        self.causes = self._causes(everything)
+        self.causes = self._causes(everything, motions)
         self._judged: dict[Choice, Judged | None] = {}
         self.means = np.zeros(table.shape[1])
         self.means[: self.count] = (problem.prior_mean - x)[: self.count]
         self.means[everything.layout.arc_column] = (known.arc or 0.0) ** 2
 
-    def _moving(self) -> list[str]:
-        """List the free parameters whose motion can be a cause: those of MOVING that the
-        fit estimates; empty for several scans or fewer than `MIN_MOVING_FRAMES` frames.
-        """
-        sizes = np.bincount(self.problem.group)
-        if len(sizes) != 1 or sizes[0] < MIN_MOVING_FRAMES:
-            return []
-        return [n for n in MOVING if n in self.problem.layout.names[: self.count]]
+    def _motions(self) -> dict[str, FloatArray]:
+        """Compute the image shifts of everything that may move: each free parameter of
+        MOVING in each scan of `MIN_MOVING_FRAMES` frames or more, as a ramp and as one to
+        `WAVES` - 1 half waves, and one that scans share from scan to scan.
 
-    def _motion(self, name: str) -> Iterator[FloatArray]:
-        """Yield the image shifts of a parameter that changes over the scan as a ramp or
-        as one to `WAVES` - 1 half waves.
-
-        Args:
-            name: of the parameter.
-
-        Yields:
-            `WAVES` columns (2 x seen positions, 1), of unit length.
+        Returns:
+            Name of the cause -> (2 x seen positions, columns) of unit length.
         """
         problem = self.problem
         n, k = self.use.shape
-        slope = derivative(problem, self.x, name, self.use).reshape(n, 2 * k)
-        place = (np.arange(n) + 0.5) / n
         seen = np.repeat(self.use.ravel(), 2)
-        shapes = [
-            place - 0.5,
-            *(np.cos(math.pi * wave * place) for wave in range(1, WAVES)),
+        scans = [
+            np.flatnonzero(problem.group == g) for g in range(problem.group.max() + 1)
         ]
-        for shape in shapes:
-            column = (slope * shape[:, None]).ravel()[seen]
-            yield (column / max(float(np.linalg.norm(column)), 1e-300))[:, None]
+        free = problem.layout.names[: self.count]
+        shared = frozenset(free)
+        bases = {name.split("@")[0] for name in free}
+        out: dict[str, FloatArray] = {}
+        for name in MOVING:
+            if name not in bases:
+                continue
+            slope = derivative(problem, self.x, name, self.use).reshape(n, 2 * k)
+            some = {}
+            for scan, frames in enumerate(scans):
+                if len(frames) >= MIN_MOVING_FRAMES:
+                    where = f" in scan {scan + 1}" if len(scans) > 1 else ""
+                    some[where] = _waves(frames, n)
+            if len(scans) > 1 and name in shared:
+                some[APART] = np.equal.outer(problem.group, range(len(scans)))
+            for where, shapes in some.items():
+                columns = (slope[:, :, None] * shapes[:, None]).reshape(2 * n * k, -1)
+                columns = columns[seen]
+                length = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+                out[MOTION_OF + name + where] = columns / length
+        return out
 
     def _visible(self, first: int) -> FloatArray:
         """Compute which part of each column's length widths are meant for: of a motion,
@@ -284,7 +290,9 @@ class Candidates:
         out[first:] = np.sqrt(np.maximum(1.0 - taken / power, LEAST_VISIBLE**2))
         return out
 
-    def _causes(self, everything: FitProblem) -> tuple[Cause, ...]:
+    def _causes(
+        self, everything: FitProblem, motions: Mapping[str, FloatArray]
+    ) -> tuple[Cause, ...]:
         """List the causes of the table: shape, beads, arc, panel, borders, motion and
         priors, in this order.
 
@@ -293,7 +301,8 @@ class Candidates:
         Only widths above 1.5 times the stated one are tried.
 
         Args:
-            everything: problem with a column for each cause.
+            everything: problem with a column for each cause but motions.
+            motions: the columns of those, which are the table's last.
 
         Returns:
             Causes with their columns, the widths to try, and a width that always holds.
@@ -334,11 +343,11 @@ class Candidates:
                     Cause(border_name(border), (at, at + 1), GAP_WIDTHS_PX, chance)
                 )
         first = len(layout.names)
-        for name in self._moving():
-            columns = tuple(range(first, first + WAVES))
-            widths = tuple(w * self.noise for w in MOTION_WIDTHS)
-            out.append(Cause(MOTION_OF + name, columns, widths))
-            first += WAVES
+        widths = tuple(w * self.noise for w in MOTION_WIDTHS)
+        for name, own in motions.items():
+            columns = tuple(range(first, first + own.shape[1]))
+            out.append(Cause(name, columns, widths))
+            first += own.shape[1]
         out.append(Cause("priors", (), PRIOR_FACTORS, PRIOR_LOG_CHANCE))
         return tuple(out)
 
@@ -487,7 +496,7 @@ class Candidates:
         Args:
             choice: must be separable.
         """
-        moves = [c.name in MOTIONS for c in self.causes]
+        moves = [c.name.startswith(MOTION_OF) for c in self.causes]
         still = tuple(0.0 if m else w for m, w in zip(moves, choice, strict=True))
         model = self.judged(still) or self.judged(choice)
         assert model is not None
@@ -653,6 +662,23 @@ class Candidates:
         )
 
 
+def _waves(frames: npt.NDArray[np.intp], count: int) -> FloatArray:
+    """Make the shapes of a motion: a ramp, and one to `WAVES` - 1 half waves.
+
+    Args:
+        frames: of a scan, in their order.
+        count: of all frames.
+
+    Returns:
+        (count, WAVES), 0 in the frames of other scans.
+    """
+    place = (np.arange(len(frames)) + 0.5) / len(frames)
+    out = np.zeros((count, WAVES))
+    out[frames] = np.cos(math.pi * place[:, None] * np.arange(WAVES))
+    out[frames, 0] = place - 0.5
+    return out
+
+
 def _arc(column: int, share: float | None) -> list[Cause]:
     """Make the cause that the object turns while a frame is exposed.
 
@@ -718,12 +744,13 @@ def explained_by_causes(
         alike = fit.certificate.enlargement
     odds = candidates.odds()
     moves = any(
-        p for c, p in zip(candidates.causes, choice, strict=True) if c.name in MOTIONS
+        pick and c.name.startswith(MOTION_OF)
+        for c, pick in zip(candidates.causes, choice, strict=True)
     )
     # What moves looks like other causes in part, and most of it stays in the residuals.
     if moves and fit.certificate.rms_px > MAX_REST_SHARE * first.certificate.rms_px:
         nothing: Choice = tuple(
-            pick if c.name in MOTIONS else 0.0
+            pick if c.name.startswith(MOTION_OF) else 0.0
             for c, pick in zip(candidates.causes, choice, strict=True)
         )
         beside = None

@@ -13,9 +13,11 @@ from functools import partial
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtri
 
 from flexdt.twin.calibration.camera_lag import Lag
+from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose import Finding, error, listed, warning
 from flexdt.twin.calibration.diagnose.causes import (
@@ -32,7 +34,12 @@ from flexdt.twin.calibration.diagnose.named_causes import named_causes
 from flexdt.twin.calibration.diagnose.wobble import wobble
 from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
 from flexdt.twin.calibration.fit.fit import FitResult
-from flexdt.twin.calibration.fit.fitted_motion import MotionFit, derivative, follow_motion
+from flexdt.twin.calibration.fit.fitted_motion import (
+    MotionFit,
+    counted,
+    derivative,
+    follow_motion,
+)
 from flexdt.twin.calibration.fit.residual_structure import MOVING
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, nothing
 from flexdt.twin.calibration.identify import Identification
@@ -60,6 +67,9 @@ BLOCK_SHARE = 0.7
 """Part of the frames of a block, from the first or to the last of a scan, that do not fit."""
 MOST_USED = 0.9
 """Share of the positions below which a fit is good only because it left the others out."""
+MOST_LEFT_OUT: Final = 0.3
+"""Largest part of a scan, frames or positions, that may be left out: a fit to less is a fit to
+another scan."""
 BEAD_ERROR_SIGMAS = 1.0
 """Errors that repeat with the turn, in standard deviations of a position, up to which they
 widen the intervals alone and are no finding."""
@@ -106,14 +116,14 @@ MOST_FRAMES: Final = 720
 """Scans of more frames are not looked at: four motions at once take seconds there."""
 
 
-def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Finding | None:
+def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> list[Finding]:
     """Judge frames whose spots are not at the fitted places: wrong angles, a slip, a
     repeated image.
 
     A frame is bad if most of its complete spots are 5 px or more from every prediction, or
     most of its positions had to be left out of the fit; frames of fewer than two spots and
-    repeated ones have no spots to judge. Of one scan, wrong frame numbers come
-    first. Otherwise a block of frames at an end, with no drift but the angle's, is an
+    repeated ones have no spots to judge. Every scan is judged by itself: wrong frame numbers
+    come first. Otherwise a block of frames at an end, with no drift but the angle's, is an
     error ("angle_step"); else "frames_inconsistent": an error for more than 30 % of the
     frames, else a warning. At most 12 frames are listed, a block as first to last.
 
@@ -122,57 +132,87 @@ def judge_places(fit: FitResult, looks: Sequence[Sequence[FrameSpots]]) -> Findi
         looks: spots and state of each frame of each scan.
 
     Returns:
-        One finding that lists the frames, or names their numbers; None if all fit.
+        One finding a scan at most, that lists the frames, or names their numbers.
     """
-    detections = [
-        nothing(look.detections.shape)
-        if look.state is FrameState.REPEATED
-        else look.detections
-        for some in looks
-        for look in some
-    ]
+    group = np.repeat(np.arange(len(looks)), [len(some) for some in looks])
     predicted = fit.problem.residuals(fit.solution.x)[0]
-    seen = fit.problem.seen.sum(axis=1)
-    used = fit.certificate.used.sum(axis=1)
+    out: list[Finding] = []
+    for scan, some in enumerate(looks):
+        detections = [
+            nothing(look.detections.shape)
+            if look.state is FrameState.REPEATED
+            else look.detections
+            for look in some
+        ]
+        out += listed(_judged_scan(fit, scan, group == scan, detections, predicted))
+    return out
+
+
+def _judged_scan(
+    fit: FitResult,
+    scan: int,
+    own: npt.NDArray[np.bool_],
+    detections: Sequence[Detections],
+    predicted: FloatArray,
+) -> Finding | None:
+    """Judge the places of the spots of one scan, see `judge_places`.
+
+    Args:
+        fit: to the frames of all scans.
+        scan: its number.
+        own: which frames are its own.
+        detections: spots of each of them.
+        predicted: places of the beads in all frames.
+    """
+    of_scan = f" of scan {scan + 1}" if not own.all() else ""
+    seen = fit.problem.seen[own].sum(axis=1)
+    used = fit.certificate.used[own].sum(axis=1)
     bad = np.flatnonzero((seen >= 2) & (used < 0.5 * seen)).tolist()
-    for i, d in enumerate(detections):
+    for i, (d, beads) in enumerate(zip(detections, predicted[own], strict=True)):
         places = d.centers[d.whole]
         if len(places) < 2:
             continue
-        gap = np.linalg.norm(predicted[i][:, None] - places[None], axis=2).min(axis=0)
+        gap = np.linalg.norm(beads[:, None] - places[None], axis=2).min(axis=0)
         near = int((gap < 5.0).sum())
-        if near < 0.5 * min(len(places), len(predicted[i])):
+        if near < 0.5 * min(len(places), len(beads)):
             bad.append(i)
     bad = sorted(set(bad))
     if not bad:
         return None
     n = len(detections)
-    spread = float(np.nanmedian(fit.certificate.rms_per_frame[used > 0]))
-    if len(looks) == 1 and len(fit.group_parameters) == 1:
-        numbers = frame_numbers(
-            detections, fit.beads, fit.problem.poses, fit.parameters, 2.0 * spread
-        )
-        if numbers is not None and (odd := numbers.judged("the scan")) is not None:
+    whole = fit.certificate.used.sum(axis=1) > 0
+    spread = float(np.nanmedian(fit.certificate.rms_per_frame[whole]))
+    numbers = frame_numbers(
+        detections,
+        fit.beads,
+        fit.problem.poses[np.flatnonzero(own)],
+        fit.group_parameters[scan],
+        2.0 * spread,
+    )
+    if numbers is not None:
+        odd = numbers.judged(f"scan {scan + 1}" if of_scan else "the scan")
+        if odd is not None:
             return odd
     # A frame of a block that happens to fit is of it all the same.
     at_end = bad[0] == 0 or bad[-1] == n - 1
-    block = len(bad) >= 2 and at_end and len(bad) >= BLOCK_SHARE * (bad[-1] - bad[0] + 1)
+    block = len(bad) >= BLOCK_SHARE * (bad[-1] - bad[0] + 1)
+    block = block and at_end and 2 <= len(bad) < n
     if block:
-        listed = f"{bad[0]} to {bad[-1]}"
+        places_of = f"{bad[0]} to {bad[-1]}"
     else:
-        listed = ", ".join(str(i) for i in bad[:12])
+        places_of = ", ".join(str(i) for i in bad[:12])
     # A drift of something else leaves its ends out, too.
     if block and all(d.column.split("@")[0] == "alpha" for d in fit.certificate.drifts):
         return error(
             "angle_step",
-            f"in frames {listed} of {n} the shadows are not where the others put them: frames "
-            "are missing there, or the phantom slipped",
+            f"in frames {places_of} of {n}{of_scan} the shadows are not where the others put "
+            "them: frames are missing there, or the phantom slipped",
         )
-    many = len(bad) > 0.3 * n
+    many = len(bad) > MOST_LEFT_OUT * n
     return (error if many else warning)(
         "frames_inconsistent",
-        f"in {len(bad)} of {n} frames ({listed}) the shadows are not where the others put "
-        "them" + ("" if many else "; those frames are not used"),
+        f"in {len(bad)} of {n} frames{of_scan} ({places_of}) the shadows are not where the "
+        "others put them" + ("" if many else "; those frames are not used"),
     )
 
 
@@ -325,10 +365,10 @@ def explain_residuals(
 ) -> tuple[FitResult, list[Finding]]:
     """Judge the residuals of the final fit; name the causes that would explain them.
 
-    If the residuals
-    exceed the limit, or too many positions were left out, a factor on the angles is
-    tried; then, beyond the limit, what moves (`_moving_beside`), else the error "misfit"
-    is given, beside which only lost beads are reported.
+    If the residuals exceed the limit, or too many positions were left out, a factor on
+    the angles is tried; then, beyond the limit or where `MOST_LEFT_OUT` of a scan were
+    left out, what moves (`_moving_beside`); else, beyond the limit, the error "misfit" is
+    given. Beside these only lost beads are reported.
 
     Args:
         fit: to be judged; nothing is judged if it is not identifiable.
@@ -354,19 +394,23 @@ def explain_residuals(
         turned = _angle_scale(plain, refit)
         if turned is not None:
             return plain, [turned]
-    if not bad:
+    if not bad and max(map(_share_left_out, (plain, fit))) <= MOST_LEFT_OUT:
         return fit, out
     # What else the residuals show has no meaning where no cause explains them.
-    explained = _moving_beside(plain, fit, named, causes, refit) or [
-        error(
-            "misfit",
-            f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
-            "looked for explains them: check that nothing is loose, or let frames differ, "
-            f"--per-frame {','.join(UNEXPLAINED_MOTION)}",
-            per_frame=UNEXPLAINED_MOTION,
-        )
-    ]
-    return fit, [*_lost_beads(fit), *explained]
+    explained = _moving_beside(plain, fit, named, causes, refit)
+    if explained:  # Positions were left out because of it.
+        lost = [f for f in _lost_beads(fit) if f.code != "too_many_outliers"]
+        return fit, [*lost, *explained]
+    if not bad:
+        return fit, out
+    misfit = error(
+        "misfit",
+        f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
+        "looked for explains them: check that nothing is loose, or let frames differ, "
+        f"--per-frame {','.join(UNEXPLAINED_MOTION)}",
+        per_frame=UNEXPLAINED_MOTION,
+    )
+    return fit, [*_lost_beads(fit), misfit]
 
 
 def _moving_beside(
@@ -415,6 +459,18 @@ def _refit_moving(fit: FitResult, refit: Refit, motion: MotionFit) -> FitResult:
     )
 
 
+def _share_left_out(fit: FitResult) -> float:
+    """Compute the largest share of frames or positions that a fit left out of a scan; a
+    frame counts if most of its positions were left out.
+    """
+    group = fit.problem.group
+    seen = fit.problem.seen.sum(axis=1)
+    used = fit.certificate.used.sum(axis=1)
+    frames = np.bincount(group, (used < 0.5 * seen) & (seen >= 2)) / np.bincount(group)
+    kept = np.bincount(group, used) / np.maximum(np.bincount(group, seen), 1.0)
+    return float(max(frames.max(), 1.0 - kept.min()))
+
+
 def _drifts(fit: FitResult) -> list[Finding]:
     """List warnings: the strongest drift or jump of a parameter, then errors that the
     beads of a frame share (vibration), then those that a bead repeats in each turn, if
@@ -432,6 +488,8 @@ def _drifts(fit: FitResult) -> list[Finding]:
             how = "during the scan"
         else:
             how = f"near frame {drift.step_at}"
+        if fit.problem.group.max() > 0:
+            how += f" of scan {drift.scan + 1}"
         out.append(
             warning(
                 "drift",
@@ -599,7 +657,6 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         than `MOST_FRAMES` frames, or if nothing may move.
     """
     problem = fit.problem
-    before = fit.certificate.rms_px
     sizes = np.bincount(problem.group)
     names = [n for n in MOVING if n in fit.values or n + "@0" in fit.values]
     if sizes.max() > MOST_FRAMES or not names or not fit.identifiable:
@@ -608,6 +665,9 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         better, found = follow_motion(fit, names, refit)
     except TwinError:
         return None
+    # Frames that were left out are what is to be explained.
+    off = problem.pixels - problem.residuals(fit.solution.x)[0]
+    before = float(np.sqrt(np.mean(off[counted(problem, fit)] ** 2)))
     remaining = largest_residual(better, EXPLAINED_CHANCE)
     after = _after_motion(better, found)
     if not after < min(0.5 * before, remaining) or not found.moving:
@@ -621,8 +681,11 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         )
         effects.append(reach * max(float(np.ptp(m.values[:, i])) for m in found.motions))
     first = int(np.argmax(effects))
-    group = int(np.argmax([np.ptp(m.values[:, first]) for m in found.motions]))
-    motion = found.motions[group]
+    scan = max(
+        range(len(sizes)), key=lambda g: float(np.ptp(found.motions[g].values[:, first]))
+    )
+    motion = found.motions[scan]
+    of_scan = f" of scan {scan + 1}" if len(sizes) > 1 else ""
     name = names[first]
     curve = motion.values[:, first]
     motions = [
@@ -632,8 +695,8 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     ]
     how, jump = _shape(curve)
     if name == "alpha":
-        others = ", ".join(motions[1:])
-        return _turned(curve, jump, problem.poses.angle[problem.group == group], others)
+        angles = problem.poses.angle[problem.group == scan]
+        return _turned(curve, jump, angles, ", ".join(motions[1:]), of_scan)
     if how.startswith("from frame"):
         code = "vibration"
     else:
@@ -643,7 +706,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         alike += ALIKE_MOTION[name]
     return error(
         code,
-        f"{', '.join(motions)} moves during the scan, {how}{_alternatives(alike)}: "
+        f"{', '.join(motions)} moves during the scan, {how}{of_scan}{_alternatives(alike)}: "
         f"--per-frame {','.join(names)} follows it",
         per_frame=names,
     )
@@ -669,7 +732,7 @@ def _after_motion(fit: FitResult, held: MotionFit) -> float:
 
 
 def _turned(
-    curve: FloatArray, jump: int | None, angle: FloatArray, others: str
+    curve: FloatArray, jump: int | None, angle: FloatArray, others: str, of_scan: str
 ) -> Finding:
     """Name how an object turns otherwise than stated.
 
@@ -678,25 +741,28 @@ def _turned(
         jump: number of the frame before a jump, None without one.
         angle: (n,) stated [rad].
         others: what else moves, and by how much; "" if nothing does.
+        of_scan: which one of several; "" of a single one.
     """
     beside = f"; beside that, {others} moves during the scan" if others else ""
     if jump is not None:
         height = to_edge("alpha", float(curve[jump + 1] - curve[jump]))
         code, text = named_turn(height, angle)
-        return error(code, f"between frames {jump} and {jump + 1} {text}{beside}")
+        return error(
+            code, f"between frames {jump} and {jump + 1}{of_scan} {text}{beside}"
+        )
     turn = angle - angle.mean()
     share = float(turn @ curve) / max(float(turn @ turn), 1e-300)
     if float(np.std(curve - share * turn)) < MAX_CURVED * float(np.std(curve)):
         return error(
             "angle_scale",
-            f"the frame angles are off by a factor {1.0 + share:.5f}; correct "
+            f"the frame angles{of_scan} are off by a factor {1.0 + share:.5f}; correct "
             f"them, or free angle_scale{beside}",
             free=("angle_scale",),
         )
     off = np.array([to_edge("alpha", v) for v in curve - np.median(curve)])
     return error(
         "angles_wrong",
-        f"the frames' angles differ from the stated ones by {np.std(off):.3f} deg "
+        f"the frames' angles{of_scan} differ from the stated ones by {np.std(off):.3f} deg "
         f"rms (up to {np.abs(off).max():.3f}){beside}",
     )
 

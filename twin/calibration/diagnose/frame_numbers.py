@@ -163,8 +163,8 @@ def frame_numbers(
     from its own, by the cheapest path: a change of shift costs `CHANGE_COST`, a spot without a bead
     `ASTRAY_COST`.
 
-    A frame that fits no angle has the shift of the one before; shifts are relative to the
-    first frame's.
+    A frame that fits no angle has the shift of the one before, or of the first that fits;
+    shifts are relative to the first frame's.
 
     Args:
         detections: spots of each of the n frames.
@@ -201,10 +201,12 @@ def frame_numbers(
     fits = near[np.arange(n), path] > 0.5
     if fits[there].mean() < GOOD_SHARE:
         return None
-    # A frame that fits no angle tells nothing: it has the shift of the one before.
-    last = np.maximum.accumulate(np.where(fits & there, np.arange(n), 0))
+    # A frame that fits no angle tells nothing: it has the shift of the one before, and the
+    # first ones that of the first that fits.
+    told = fits & there
+    last = np.maximum.accumulate(np.where(told, np.arange(n), np.argmax(told)))
     found = np.asarray(shifts[path[last]], dtype=np.int64)
-    return FrameNumbers(found - found[0], fits & there)
+    return FrameNumbers(found - found[0], told)
 
 
 def _at_numbers(poses: Poses, numbers: npt.NDArray[np.int64]) -> Poses:

@@ -191,7 +191,7 @@ def _model(fit: FitResult, names: Sequence[str], known: MotionFit | None) -> Mot
     problem = fit.problem
     x = fit.solution.x
     group = problem.group
-    use = _used(problem, fit)
+    use = counted(problem, fit)
     keep = np.repeat(use.ravel(), 2)
     frame = np.repeat(np.arange(len(group)), 2 * problem.seen.shape[1])[keep]
     noise = max(
@@ -344,7 +344,7 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
     )
 
 
-def _used(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
+def counted(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
     """Mark the used positions, and all seen ones of a frame whose positions were mostly
     left out, (n, k).
 

@@ -43,9 +43,10 @@ class Drift:
     Attributes:
         column: the parameter.
         size: end minus start, edge unit.
-        step_at: frame of a jump, or None for a steady drift.
+        step_at: frame of a jump, counted in its scan, or None for a steady drift.
         score: its size in standard deviations.
         bias: (p,) its effect on the fitted values, edge units.
+        scan: number of the group of frames that drifts.
     """
 
     column: str
@@ -53,6 +54,7 @@ class Drift:
     step_at: int | None
     score: float
     bias: FloatArray
+    scan: int = 0
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -132,7 +134,7 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
         ramp = np.where(inside, place / (n - 1) - 0.5, 0.0)
         shapes: list[tuple[int | None, FloatArray]] = [(None, ramp)]
         for at in np.unique(np.linspace(2, n - 2, 11).round().astype(int)).tolist():
-            shapes.append((int(members[at]), np.where(inside, (place >= at) - 0.5, 0.0)))
+            shapes.append((at, np.where(inside, (place >= at) - 0.5, 0.0)))
         if not columns:
             continue
         vectors = np.stack(
@@ -163,7 +165,14 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
                     size = float(push[part][at] / power[part][at])
                     bias = unit_covariance @ (absorbed[:, part][:, at] * size)
                     among.append(
-                        Drift(names[c], size, shapes[at][0], float(each[at]), bias)
+                        Drift(
+                            names[c],
+                            size,
+                            shapes[at][0],
+                            float(each[at]),
+                            bias,
+                            int(group),
+                        )
                     )
     if not any(d.score > SIGNIFICANT for d in found):
         return tuple(suspects)
