@@ -119,6 +119,8 @@ def test_a_renumbered_frame_of_a_helix_shows_another_height_too(
         ("panel_pitches+frames_swapped@few_frames", 97601),
         # A scanner twice as far off as stated, and other pixels, of what the axis did.
         ("wobble+exposed_long@limited_arc", 97657),
+        # Where all beads are about where they should be, the residuals tell more.
+        ("angle_jitter+bead_displaced", 97663),
     ],
 )
 def test_a_refusal_names_what_is_there(kind: str, seed: int) -> None:

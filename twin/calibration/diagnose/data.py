@@ -383,8 +383,9 @@ def _alternative(
 
     Tried are endpoint errors of the angles, mirrored or turned phantoms and images, a
     reversed or resting stage, and each bead left out (5 to `MOST_LEFT_OUT` beads). Only
-    if none is convincing and clearly better than `found`: motion, parts of the scan,
-    another turn, and single frames; these not for a plausible assignment.
+    if none is convincing and clearly better than `found`: motion, a bead without which
+    less is left, parts of the scan, another turn, and single frames; these not for a
+    plausible assignment.
 
     Args:
         found: the poor assignment, or None.
@@ -458,6 +459,7 @@ def _alternative(
         "detections": detections, "model": model, "poses": poses, "start": start,
     }  # fmt: skip
     best: tuple[float, float, str, str] | None = None
+    elsewhere = (math.inf, math.inf, "", "")
     for code, text, change in trials:
         other = attempt(**(given | change))
         if other is None:
@@ -466,20 +468,28 @@ def _alternative(
             found is None
             or other.rms_px < 0.3 * found.rms_px
             or (other.explained > found.explained + 0.2)
-            or (code == "bead_displaced" and _leaves_less(other, found))
         )
         # A mistake that explains all spots comes before one that fits most of them more
         # closely: four of the LEGO phantom's five beads are a helix, which turns round into
         #     itself.
         off = (round(1.0 - other.explained, 1), other.rms_px)
-        if convincing(other) and better and (best is None or off < best[:2]):
+        if not convincing(other):
+            continue
+        if better and (best is None or off < best[:2]):
             best = (*off, code, text)
+        if code == "bead_displaced" and found is not None and _leaves_less(other, found):
+            elsewhere = min(elsewhere, (*off, code, text), key=lambda one: one[:2])
     if best is not None:
         return error(*best[2:])
-    if found is not None and _plausible(found) and found.typical_px > 0.3 * found.rms_px:
+    plausible = found is not None and _plausible(found)
+    if found is not None and plausible and found.typical_px > 0.3 * found.rms_px:
         return None  # The right beads in about the right places: the residuals will tell.
+    without = None
+    if elsewhere[2] and not plausible:
+        without = error(*elsewhere[2:])
     return (
         _in_motion(detections, model, poses, start)
+        or without
         or _in_parts(detections, model, poses, start)
         or _other_turn(detections, model, poses, start)
         or _one_by_one(detections, model, poses, start)
