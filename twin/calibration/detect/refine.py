@@ -29,7 +29,13 @@ from flexdt.twin.calibration.detect.patches import (
     take,
     usable,
 )
-from flexdt.twin.calibration.detect.seen_body import NO_BODY, SeenBody, see_body
+from flexdt.twin.calibration.detect.seen_body import (
+    BLURRED_FINE,
+    NO_BODY,
+    SeenBody,
+    adjusted,
+    see_body,
+)
 from flexdt.twin.calibration.detect.sharpness import (
     BODY_BLUR_PX,
     CHECK_FINE,
@@ -208,13 +214,20 @@ def measure_beads(
         alone = blurred_windows(beads, rest)
         # Fewer rays than the images' place a rim by where the lattice lies.
         if not draft and len(sample):
-            rough = rendering_error(sharp, balls, patches, sample, cone, alone, fine)
+            noise = ring_noise(first, sample)
+            rough = rendering_error(
+                sharp, balls, patches, sample, cone, alone, fine, noise
+            )
         if body is not None:
             # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
             # body adds to the line integral depends on the bead in front of it.
-            seen = see_body(images, described, cone, model, windows, sharp.true)
+            left = rest_of_blur(sharp.true, BLURRED_FINE)
+            seen = see_body(images, described, cone, model, windows, left, seen)
             both = render_windows(seen.scene(described), cone, windows, fine, balls)
-            data = images - (blurred_windows(both, rest) - alone)
+            behind = blurred_windows(both, rest) - alone
+            if not draft:
+                seen, behind = adjusted(images, behind, cone, model, windows, seen)
+            data = images - behind
             patches = replace(patches, flat=data.reshape(n * k, side, side))
     measured = _measured(patches, None if draft else alone, body, sharp)
     return replace(
@@ -222,7 +235,6 @@ def measure_beads(
         body=seen,
         as_fitted=as_fitted,
         covariances=measured.covariances + rough**2 * np.eye(2),
-        sampling_px=max(measured.sampling_px, rough),
     )
 
 

@@ -32,6 +32,9 @@ MAX_STILL_SPREAD = 0.1
 """Largest spread of a dead pixel's values over the frames, in units of the noise."""
 DEAD_SIGMAS = 5.0
 """Least difference of a dead pixel from its neighbours in some frame, in units of the noise."""
+EVEN_STEPS = (0.7548776662466927, 0.5698402909980532)
+"""Parts of a pixel from one window's lattice to the next one's: multiples of them are spread
+evenly over a square (powers of 1 / 1.3247..., the root of x^3 = x + 1)."""
 WIDEST_DEAD = 4
 """Pixels along the shorter side of a gap that is filled."""
 
@@ -300,7 +303,7 @@ def render_windows(
         balls: beads that harden the beam, besides the scene.
     """
     if fine == 1:
-        return _hardened_rays(scene, cone, windows, (0.0, 0.0), balls)
+        return _hardened_rays(scene, cone, windows, np.zeros(2), balls)
     return np.asarray(
         -np.log(window_intensities(scene, cone, windows, fine, balls)), dtype=np.float32
     )
@@ -323,9 +326,11 @@ def window_intensities(
     """
     n, k = windows.corner.shape[:2]
     total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
-    for place in lattice(fine):
-        total += np.exp(-_hardened_rays(scene, cone, windows, place, balls))
-    return total * np.float32(1.0 / fine**2)
+    for place, weight in spread_lattice(windows, fine):
+        light = np.exp(-_hardened_rays(scene, cone, windows, place, balls))
+        light *= weight[..., None, None]
+        total += light
+    return total
 
 
 def lattice(fine: int) -> list[tuple[float, float]]:
@@ -344,11 +349,39 @@ def lattice(fine: int) -> list[tuple[float, float]]:
     return out
 
 
+def spread_lattice(windows: Windows, fine: int) -> list[tuple[FloatArray, Float32Array]]:
+    """Return places of fine^2 rays in the pixels of n frames of k windows, and their
+    weights.
+
+    Each window has the lattice shifted by another part of its step, and weights that keep
+    the middle of the light in that of the pixel. An edge that stays at one place of the
+    pixel grid, as of a body at the source's height, would else be misplaced alike in all
+    frames.
+
+    Args:
+        windows: of the beads.
+        fine: rays along each side of a pixel, 2 at least.
+
+    Returns:
+        For each ray its place (column, row) from the pixel's centre, (n, k, 2), and its
+        weight (n, k), of sum 1 over the rays.
+    """
+    n, k = windows.corner.shape[:2]
+    number = np.arange(n)[:, None] + n * np.arange(k)
+    shift = (number[..., None] * np.array(EVEN_STEPS) % 1.0 - 0.5) / fine**2
+    places = np.array(lattice(fine))
+    tilt = shift @ np.linalg.inv(places.T @ places)
+    return [
+        (place + shift, (1.0 / fine**2 - tilt @ place).astype(np.float32))
+        for place in places
+    ]
+
+
 def _hardened_rays(
     scene: Scene,
     cone: ConeVec,
     windows: Windows,
-    place: tuple[float, float],
+    place: FloatArray,
     balls: Balls,
 ) -> Float32Array:
     """Render line integrals of a scene and of beads that harden the beam, (n, k, side, side),
@@ -362,7 +395,7 @@ def _hardened_rays(
 
 
 def window_rays(
-    scene: Scene, cone: ConeVec, windows: Windows, place: tuple[float, float]
+    scene: Scene, cone: ConeVec, windows: Windows, place: FloatArray
 ) -> Float32Array:
     """Render line integrals of windows, for rays through one place in each pixel; also
     pixels off the image.
@@ -371,7 +404,7 @@ def window_rays(
         scene: to render.
         cone: geometry of n frames.
         windows: k windows a frame.
-        place: right and down from the pixel's centre [px].
+        place: right and down from the pixel's centre, (2,) or (n, k, 2) [px].
 
     Returns:
         (n, k, side, side) line integrals.
@@ -379,12 +412,7 @@ def window_rays(
     n, k = windows.corner.shape[:2]
     rows, cols = windows.shape
     side = windows.side
-    at = (
-        windows.corner
-        + (side - 1) / 2
-        - (np.array([cols, rows]) - 1) / 2
-        + np.array(place)
-    )
+    at = windows.corner + (side - 1) / 2 - (np.array([cols, rows]) - 1) / 2 + place
     detector = (
         cone.detector[:, None]
         + at[..., :1] * cone.u[:, None]
