@@ -81,6 +81,8 @@ class World:
         pitch: the stage rises by so much a turn [mm].
         shape: (rows, cols) of the panel.
         scale: see `Machine`.
+        rows_turn: the object turns by so much between the readings of the first and the last
+            row of a frame, whose angle is that of the middle row [deg].
     """
 
     beads: Array
@@ -97,6 +99,7 @@ class World:
     pitch: float = 0.0
     shape: tuple[int, int] = SHAPE
     scale: float = 1.0
+    rows_turn: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +216,8 @@ def shadows(world: World) -> tuple[Array, Array]:
     Returns:
         Centres (n, k, 2), and least distances of centre and outline (n, k) [px].
     """
+    if world.rows_turn:
+        return _read_by_rows(world)
     if world.arc:
         # Legendre's points and weights of an even turn.
         points, weights = np.polynomial.legendre.leggauss(9)
@@ -279,6 +284,30 @@ def shadows(world: World) -> tuple[Array, Array]:
             radii[i, k] = np.sqrt((p - middle[0]) ** 2 + (q - middle[1]) ** 2).min()
     rows, cols = world.shape
     return centres + [(cols - 1) / 2, (rows - 1) / 2], radii
+
+
+def _read_by_rows(world: World) -> tuple[Array, Array]:
+    """Compute shadows of which each is where it is when its own row is read: the time of the
+    row follows from the place, and the place from the time, by iteration.
+    """
+    late = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    some = [
+        shadows(replace(world, angles=world.angles + t * world.rows_turn, rows_turn=0.0))
+        for t in late
+    ]
+    places = np.stack([centres for centres, _ in some])
+    when = np.zeros(places.shape[1:3])
+    for _ in range(6):
+        # Lagrange's polynomial through the five.
+        weights = np.array(
+            [
+                np.prod([(when - b) / (a - b) for b in late if b != a], axis=0)
+                for a in late
+            ]
+        )
+        here = np.einsum("tnk,tnkc->nkc", weights, places)
+        when = here[..., 1] / (world.shape[0] - 1) - 0.5
+    return here, some[2][1]
 
 
 def phantom(rng: Rng, beads: int) -> Array:
@@ -1110,6 +1139,17 @@ def _exposed_as_said(draft: Draft, rng: Rng) -> Draft:
     return replace(draft, believed=replace(draft.believed, arc=share))
 
 
+def _rows_in_turn(draft: Draft, rng: Rng) -> Draft:
+    """Read the rows one after the other while the stage turns, for 0.05 to 1 of a step, and
+    expect a finding of it.
+    """
+    draft = _usual(draft, rng)
+    share = math.exp(rng.uniform(math.log(0.05), 0.0)) * _sign(rng)
+    world = replace(draft.world, rows_turn=share * draft.believed.step)
+    return replace(draft, world=world, names=("rows_in_turn|rows are read one after",),
+                   beside=(*draft.beside, "causes_open", "bead_tolerance"))  # fmt: skip
+
+
 def _renumbered(shift: int) -> Fault:
     """Make a fault: from a frame on, images are those of `shift` frames later, -1 where
     one was doubled, 1 where one was lost.
@@ -1331,6 +1371,7 @@ KINDS: Final[Mapping[str, Fault]] = {
     "strain_lean": _strained("lean"),
     "exposed_long": _exposed_long,
     "exposed_as_said": _exposed_as_said,
+    "rows_in_turn": _rows_in_turn,
     "frame_doubled": _renumbered(-1),
     "frame_lost": _renumbered(1),
     "exposed_again": _exposed_again,

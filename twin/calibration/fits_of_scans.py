@@ -94,6 +94,7 @@ def fit_scans(
     panel: PanelModel | None = None,
     strain: Strain | None = None,
     arc: bool = False,
+    rows: bool = False,
 ) -> FitResult:
     """Fit to the best positions: of the second measurement, else of the first.
 
@@ -109,6 +110,7 @@ def fit_scans(
         panel: distortion to estimate; None: no distortion.
         strain: prior of the phantom's strains; None: the usual one.
         arc: whether an exposure lasts a part of the step.
+        rows: whether a part of the step passes from a frame's first row to its last.
 
     Returns:
         The fit; with motion, its sigmas contain the motion's uncertainty.
@@ -143,6 +145,7 @@ def fit_scans(
         panel=panel,
         strain=strain_prior(state.model, request) if strain is None else strain,
         arc=arc,
+        rows=rows,
     )
     if state.motion is None:
         return fit
@@ -161,6 +164,7 @@ def refit_scans(
     panel: PanelModel | None = None,
     strain: Strain | None = None,
     arc: bool | None = None,
+    rows: bool | None = None,
 ) -> FitResult:
     """Fit again with more parameters free, or with causes of the residuals; see
     `fit_scans`.
@@ -168,7 +172,7 @@ def refit_scans(
     Args:
         state: the scans and their measurements; not changed.
         request: the parameters free otherwise.
-        fit: the last one, whose distortion, strain and arc are kept.
+        fit: the last one, whose distortion, strain, arc and rows are kept.
         extra: parameters that are free too.
         motion: of the scans, applied to their poses first; None: none besides that in
             `state`.
@@ -178,6 +182,7 @@ def refit_scans(
         panel: distortion to estimate; None: the last fit's.
         strain: prior of the phantom's strains; None: the last fit's.
         arc: whether an exposure lasts a part of the step; None: as in the last fit.
+        rows: whether rows are read one after another; None: as in the last fit.
     """
     if motion is not None:
         scans = zip(state.scans, motion.motions, strict=True)
@@ -185,10 +190,7 @@ def refit_scans(
         state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
     freed = replace(request, free=tuple(dict.fromkeys((*request.free, *extra))))
-    if arc is None:
-        turning = fit.problem.curvature is not None
-    else:
-        turning = arc
+    columns = fit.problem.layout
     return fit_scans(
         state,
         freed,
@@ -196,7 +198,8 @@ def refit_scans(
         bead_tolerance_mm,
         panel or fit.problem.panel,
         fit.strain_prior if strain is None else strain,
-        turning,
+        columns.arc_column >= 0 if arc is None else arc,
+        columns.rows_column >= 0 if rows is None else rows,
     )
 
 

@@ -25,6 +25,7 @@ SHAPE = (760, 956)
 SAID = (
     "phantom_strained",
     "exposure_arc",
+    "rows_in_turn",
     "panel_distorted",
     "bead_tolerance",
     "causes_open",
@@ -80,6 +81,31 @@ def test_the_mean_of_an_arc_is_that_of_its_positions(frames: int) -> None:
         np.abs(problem.residuals(problem.start)[0] - mean).max()
         > 20 * 0.3 / frames**2 * 12
     )
+
+
+@pytest.mark.parametrize("share", [0.2, -0.2])
+def test_each_position_is_that_of_the_time_at_which_its_row_is_read(share: float) -> None:
+    """Against the place and the time of each bead, found in turn."""
+    frames = 60
+    when = np.zeros((frames, len(BEADS)))
+    for _ in range(8):
+        seen = np.stack(
+            [
+                [
+                    upright(frames, late).cone_vec().project_points(BEADS, SHAPE)[i, k]
+                    for k, late in enumerate(row)
+                ]
+                for i, row in enumerate(when.tolist())
+            ]
+        )
+        when = share * (seen[..., 1] - (SHAPE[0] - 1) / 2) / SHAPE[0]
+    poses, model = upright(frames), BeadModel(BEADS, np.ones(5))
+    problem = build_problem(seen, model, poses, free=("dO_x",), shape=SHAPE, rows=True)
+    x = problem.start
+    x[problem.layout.rows_column] = share
+    # What is left grows with the square of the arc: of 0.6 deg at most.
+    assert problem.residuals(x)[0] == pytest.approx(seen, abs=0.01)
+    assert np.abs(problem.residuals(problem.start)[0] - seen).max() > 0.5
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -190,7 +216,8 @@ def test_borders_without_positions_between_them_are_one() -> None:
     [
         ("strain_z", 1), ("strain_x", 2), ("exposed_long", 2), ("as_assumed", 3),
         ("frame_doubled", 4), ("frame_doubled", 1011), ("frame_lost", 5), ("frame_lost", 1008),
-        ("exposed_again", 6), ("tiles_apart", 58000), ("bead_tolerance", 73003),
+        ("rows_in_turn", 109), ("exposed_again", 6), ("tiles_apart", 58000),
+        ("bead_tolerance", 73003),
     ],
 )  # fmt: skip
 def test_a_drawn_cause_is_named_and_what_is_offered_holds(kind: str, seed: int) -> None:
@@ -205,7 +232,8 @@ def test_a_drawn_cause_is_named_and_what_is_offered_holds(kind: str, seed: int) 
 @pytest.mark.parametrize(
     "kind",
     ["strain_x", "strain_y", "strain_z", "strain_shear", "strain_lean", "exposed_long",
-     "frame_doubled", "frame_lost", "exposed_again", "four_tiles", "grows", "source_jumps"],
+     "rows_in_turn", "frame_doubled", "frame_lost", "exposed_again", "four_tiles", "grows",
+     "source_jumps"],
 )  # fmt: skip
 def test_no_drawn_cause_is_offered_wrong(kind: str, seed: int) -> None:
     assert not scored(kind, 500 + seed).wrong

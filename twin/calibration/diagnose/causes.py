@@ -1,7 +1,7 @@
 """Causes of the residuals: one table of causes, judged by their evidence.
 
 A cause is a group of columns added to those of the geometry, with a prior of unknown
-width: the phantom is strained, the object turns while it is exposed, beads are elsewhere,
+width: the phantom is strained, the object turns while it is exposed or read, beads are elsewhere,
 the panel distorts, a tile begins, something moves, priors are too narrow. Every
 combination that is tried has its evidence (`fit.evidence`). The most likely is fitted;
 the results of all are averaged, so that the sigmas contain what the data leave open; a
@@ -31,13 +31,14 @@ from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.problem import (
     ARC_PRIOR,
+    ROWS_PRIOR,
     STRAINS,
     STRETCHES,
     ColumnLayout,
     FitProblem,
     Strain,
-    curvature,
     edge_factors,
+    turning_shifts,
 )
 from flexdt.twin.calibration.fit.residual_structure import MOVING, larger
 from flexdt.twin.geometry.conventions import FloatArray
@@ -293,10 +294,10 @@ class Candidates:
     def _causes(
         self, everything: FitProblem, motions: Mapping[str, FloatArray]
     ) -> tuple[Cause, ...]:
-        """List the causes of the table: shape, beads, arc, panel, borders, motion and
-        priors, in this order.
+        """List the causes of the table: shape, beads, arc, rows, panel, borders, motion
+        and priors, in this order.
 
-        Exact beads have no cause of shape or position, a stage at rest none of an arc;
+        Exact beads have no cause of shape or position, a stage at rest none of arc or rows;
         beads need three at least; panel and borders only where the problem has a panel.
         Only widths above 1.5 times the stated one are tried.
 
@@ -328,6 +329,8 @@ class Candidates:
                 )
                 out.append(Cause("beads", columns, widths, always=stated))
         out += _arc(layout.arc_column, known.arc)
+        if known.arc != 0.0:
+            out.append(Cause("rows", (layout.rows_column,), (ROWS_PRIOR,)))
         panel = everything.panel
         if panel is not None:
             first = layout.panel_column
@@ -711,7 +714,7 @@ def explained_by_causes(
     Args:
         fit: of the geometry, the phantom's strain with its prior.
         known: statements on the phantom and the positions.
-        refit: fits again with `strain`, `arc`, `bead_tolerance_mm` and `panel`.
+        refit: fits again with `strain`, `arc`, `rows`, `bead_tolerance_mm` and `panel`.
         left_out: beads that are elsewhere; where some turn out to be, the causes of the
             other beads' residuals are searched anew.
 
@@ -954,9 +957,9 @@ def _options(
         borders: of tiles.
 
     Returns:
-        `strain` (None if it is as stated before), `arc` (bool), `bead_tolerance_mm` (None
-        if not chosen) and `panel` (None without bends and borders, or where images differ
-        in shape).
+        `strain` (None if it is as stated before), `arc` and `rows` (bool),
+        `bead_tolerance_mm` (None if not chosen) and `panel` (None without bends and borders,
+        or where images differ in shape).
     """
     stated = candidates.known.strain
     strain = tuple(
@@ -971,6 +974,7 @@ def _options(
     return {
         "strain": None if strain == stated else strain,
         "arc": bool(candidates.width(choice, "arc")),
+        "rows": bool(candidates.width(choice, "rows")),
         "bead_tolerance_mm": beads or None,
         "panel": panel,
     }
@@ -1028,7 +1032,7 @@ def _with_every_column(
 ) -> tuple[FitProblem, FloatArray]:
     """Add a column for every cause to a problem.
 
-    Layout: the fit's parameters, beads, strain, arc, panel; all beads are free.
+    Layout: the fit's parameters, beads, strain, arc, rows, panel; all beads are free.
 
     Args:
         problem: of the fit; not changed.
@@ -1048,6 +1052,7 @@ def _with_every_column(
         *(f"bead {b} {axis}" for b in range(k) for axis in "xyz"),
         *(f"strain {term}" for term in STRAINS),
         "arc",
+        "rows",
         *(f"panel {term}" for term in terms),
     ]
     strain = count + 3 * k
@@ -1059,19 +1064,21 @@ def _with_every_column(
         count,
         strain,
         arc,
-        count,
         arc + 1,
+        count,
+        arc + 2,
         old.active,
         old.held,
     )
     base = problem.spread(x)[0]
+    rows = problem.measured[..., 1] / (2.0 * problem.origin[:, None, 1] + 1.0)
     whole = replace(
         problem,
         layout=layout,
         panel=panel,
         base=base,
-        curvature=curvature(
-            problem.poses, problem.model, base, problem.group, problem.reading
+        turning=turning_shifts(
+            problem.poses, problem.model, base, problem.group, problem.reading, rows
         ),
     )
     there = whole.start

@@ -19,10 +19,11 @@ CAUSE_WORDS: Final = {
     "shear": "a phantom of another shape",
     "beads": "beads elsewhere",
     "arc": "a stage that turns while a frame is exposed",
+    "rows": "a stage that turns while the rows of a frame are read",
     "panel": "a panel that distorts",
 }
 """Cause that may be left open -> its words."""
-SHAPE_LIKE_CAUSES: Final = ("arc", "beads", "panel")
+SHAPE_LIKE_CAUSES: Final = ("arc", "rows", "beads", "panel")
 """Causes that may look like a phantom of another shape."""
 LENGTHS: Final = {
     "xx": ("longer along x", "shorter along x"),
@@ -79,7 +80,7 @@ def named_causes(fit: FitResult, found: Found) -> list[Finding]:
         found: which there are, and their odds.
 
     Returns:
-        In the order shape, arc, beads, panel, doubtful ones; empty if there is none.
+        In the order shape, arc, rows, beads, panel, doubtful ones; empty if there is none.
     """
     out: list[Finding] = []
     panel = fit.panel
@@ -88,6 +89,8 @@ def named_causes(fit: FitResult, found: Found) -> list[Finding]:
     out += listed(strained)
     if found.named("arc"):
         out.append(_turning(fit))
+    if found.named("rows"):
+        out.append(_read_in_turn(fit))
     if found.named("beads"):
         out.append(_elsewhere(fit))
     if found.named("panel") or any(found.named(border_name(b)) for b in borders):
@@ -179,6 +182,26 @@ def _turning(fit: FitResult) -> Finding:
         "step: the mean of the arc was fitted; volumes are blurred along the turn, and "
         "angles are "
         "those of the middle of each exposure",
+    )
+
+
+def _read_in_turn(fit: FitResult) -> Finding:
+    """Make the warning that the object turns while the rows of a frame are read, with the
+    arc from the first row to the last [deg] and its share of a step.
+
+    Args:
+        fit: with a column of the rows' turn.
+    """
+    share = float(fit.solution.x[fit.problem.layout.rows_column])
+    step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
+    first, last = ("first", "last") if share > 0.0 else ("last", "first")
+    return warning(
+        "rows_in_turn",
+        "a frame's rows are read one after another while the object turns: by "
+        f"{abs(share) * step:.2g} deg, {abs(share):.2f} of a step, from the {first} row to the "
+        f"{last} (or the phantom is twisted so, which looks alike). It was fitted, and angles "
+        "are those of the middle row; volumes of such scans are twisted by as much: stop the "
+        "stage for each frame, or expose all rows at once",
     )
 
 

@@ -58,6 +58,7 @@ SOURCES = {
     "bead": "beads",
     "strain": "the phantom's scale",
     "arc": "the exposure's arc",
+    "rows": "the turn while rows are read",
     "panel": "the panel's distortion",
 }
 """First word of a column's name that is no parameter -> its source, in words."""

@@ -473,6 +473,7 @@ def estimate_geometry(
     panel: PanelModel | None = None,
     strain: Strain = UNSTRAINED,
     arc: bool = False,
+    rows: bool = False,
 ) -> FitResult:
     """Fit offsets (true minus nominal) to measured bead positions.
 
@@ -514,6 +515,7 @@ def estimate_geometry(
         panel: terms of a distortion of the panel, estimated too; None: no distortion.
         strain: standard deviations of the phantom's stretches and shears [1], estimated too.
         arc: the object may turn while a frame is exposed, by an unknown share of a step.
+        rows: the same while the rows of a frame are read one after another.
 
     Returns:
         The fit with its certificate, also where not everything is determined.
@@ -555,6 +557,7 @@ def estimate_geometry(
         panel=panel,
         strain=strain,
         arc=arc,
+        rows=rows,
         expected_spread=0.0 if solver is None else solver.spread_px,
     )
     if not problem.seen.any():

@@ -374,6 +374,6 @@ def derivative(
     params, beads = problem.spread(x)
     groups = len(params)
     alone = layout((name,), groups, (name,), len(beads), False)
-    still = replace(problem, base=params, layout=alone, panel=None, curvature=None)
+    still = replace(problem, base=params, layout=alone, panel=None, turning=None)
     moved = replace(still, model=replace(problem.model, beads=beads))
     return np.asarray(moved.jacobian(moved.start, use).sum(axis=1))

@@ -46,8 +46,11 @@ LEAST_STRAIN = 1e-7
 """Width of absent stretches or shears next to present ones."""
 ARC_PRIOR = 0.5
 """Standard deviation of the squared share of a step that an exposure lasts; it is 0 to 1."""
+ROWS_PRIOR = 0.5
+"""Standard deviation of the share of a step by which the last row of a frame is read later
+than the first; it is -1 to 1."""
 ARC_ANGLE_RAD = 0.02
-"""Of the differences that give the curvature of the beads' paths."""
+"""Of the differences that give the curvature and the slope of the beads' paths."""
 
 GAUGES = (("dS_x", "dO_x", "dD_x"), ("dS_y", "dO_y", "dD_y"))
 """Parameters whose common shift changes no image: the first is fixed when all three are
@@ -90,12 +93,13 @@ class ColumnLayout:
 
     Attributes:
         names: label of each column: a parameter, `parameter@group`, `bead k x|y|z`, `strain ab`,
-            `arc`, or `panel term`.
+            `arc`, `rows`, or `panel term`.
         asked: number of requested columns; those after them are there for their prior.
         colmap: (groups, 17) column of each group's parameter, -1 if not free.
         bead_column: first column of the beads' coordinates, -1 if fixed.
         strain_column: first column of the phantom's strain, -1 without strain.
         arc_column: of the exposure's arc, -1 without arc.
+        rows_column: of the turn while the rows are read, -1 without it.
         parameter_count: columns that are geometric parameters; all others come after.
         panel_column: first column of the panel's distortion, the last ones; the number of
             columns without distortion.
@@ -109,6 +113,7 @@ class ColumnLayout:
     bead_column: int
     strain_column: int
     arc_column: int
+    rows_column: int
     parameter_count: int
     panel_column: int
     active: npt.NDArray[np.int64]
@@ -133,12 +138,14 @@ class ColumnLayout:
 
     @property
     def shift_column(self) -> int:
-        """First of the columns whose coefficients shift the positions, arc and panel; the
-        number of columns if there are none.
+        """First of the columns whose coefficients shift the positions, arc, rows and panel;
+        the number of columns if there are none.
         """
-        if self.arc_column < 0:
-            return self.panel_column
-        return self.arc_column
+        if self.arc_column >= 0:
+            return self.arc_column
+        if self.rows_column >= 0:
+            return self.rows_column
+        return self.panel_column
 
 
 def require_names(names: Iterable[str]) -> None:
@@ -181,9 +188,10 @@ def layout(
     panel: Sequence[str] = (),
     strained: bool = False,
     arc: bool = False,
+    rows: bool = False,
 ) -> ColumnLayout:
     """Assign columns: parameters (requested, then those with a prior alone) in the order
-    of NAMES, then beads, strain, arc, panel.
+    of NAMES, then beads, strain, arc, rows, panel.
 
     Where source, object and detector could shift together without priors, the source is
     held. With one group `per_group` has no effect.
@@ -198,6 +206,7 @@ def layout(
         panel: terms of the panel's distortion.
         strained: whether the phantom may be strained.
         arc: whether the object may turn while a frame is exposed.
+        rows: whether it may turn while the rows of a frame are read.
 
     Raises:
         UnknownNameError: a name that is no parameter.
@@ -238,7 +247,7 @@ def layout(
         if name in wanted:
             asked = len(names)
     count = len(names)
-    bead_column = strain_column = arc_column = -1
+    bead_column = strain_column = arc_column = rows_column = -1
     if free_beads:
         bead_column = len(names)
         names += [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
@@ -248,6 +257,9 @@ def layout(
     if arc:
         arc_column = len(names)
         names.append("arc")
+    if rows:
+        rows_column = len(names)
+        names.append("rows")
     panel_column = len(names)
     names += [f"panel {term}" for term in panel]
     active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
@@ -258,6 +270,7 @@ def layout(
         bead_column,
         strain_column,
         arc_column,
+        rows_column,
         count,
         panel_column,
         active,
@@ -284,8 +297,9 @@ class FitProblem:
         prior_mean, prior_sigma: of each column, internal units; sigma inf without a
             prior.
         panel: terms of the panel's distortion; None: no distortion.
-        curvature: (n, k, 2, 1) shifts of the positions by an exposure of a full step, or
-            (n, k, 2, 0): each exposure is an instant.
+        turning: (n, k, 2, m) shifts of the positions by an exposure of a full step, and by
+            rows that are read over one, as far as they have columns (`turning_shifts`);
+            None: each frame is an instant.
         expected_spread: of the whitened residuals, expected before they are seen; 0: nothing is
             expected.
     """
@@ -304,7 +318,7 @@ class FitProblem:
     prior_mean: FloatArray
     prior_sigma: FloatArray
     panel: PanelModel | None = None
-    curvature: FloatArray | None = None
+    turning: FloatArray | None = None
     expected_spread: float = 0.0
 
     @property
@@ -406,11 +420,11 @@ class FitProblem:
     @cached_property
     def shift_terms(self) -> FloatArray:
         """(n, k, 2, m) shifts of the positions by a coefficient of 1 of the exposure's
-        arc, if there is one, and each of the panel's terms [px].
+        arc and of the rows' turn, if there are any, and each of the panel's terms [px].
         """
-        if self.curvature is None:
+        if self.turning is None:
             return self.panel_terms
-        return np.concatenate([self.curvature, self.panel_terms], axis=-1)
+        return np.concatenate([self.turning, self.panel_terms], axis=-1)
 
     @cached_property
     def panel_terms(self) -> FloatArray:
@@ -573,6 +587,7 @@ def build_problem(
     panel: PanelModel | None = None,
     strain: Strain = UNSTRAINED,
     arc: bool = False,
+    rows: bool = False,
     expected_spread: float = 0.0,
 ) -> FitProblem:
     """Check the arguments of a fit and put them into arrays.
@@ -599,6 +614,7 @@ def build_problem(
         panel: distortion of the panel to estimate.
         strain: distortion of the phantom to estimate, with its prior; (0, 0): none.
         arc: the arc that the object turns during an exposure is estimated, too.
+        rows: the arc that it turns while a frame's rows are read is estimated, too.
         expected_spread: see `FitProblem`.
 
     Returns:
@@ -637,8 +653,9 @@ def build_problem(
     widths = {n: to_internal(n, w) for n, w in (priors or {}).items() if w > 0}
     terms, of_terms = ((), ()) if panel is None else (panel.names, panel.sigmas)
     columns = layout(
-        free, count, per_group, k, free_beads, tuple(widths), terms, max(strain) > 0, arc
-    )
+        free, count, per_group, k, free_beads, tuple(widths), terms, max(strain) > 0, arc,
+        rows,
+    )  # fmt: skip
     centres = base[0]
     if prior_centre is not None:
         centres = values_in(from_printed_reading(prior_centre, reading))
@@ -648,6 +665,11 @@ def build_problem(
         strains = strain_widths(strain)
     else:
         strains = np.zeros(0)
+    turning = None
+    if arc or rows:
+        places = measured[..., 1] / (2.0 * origin[:, None, 1] + 1.0)
+        turning = turning_shifts(poses, model, base, group, reading, places)
+        turning = turning[..., [arc, rows]]
     mean = [centres[NAMES.index(n)] for n in bases]
     sigma = [widths.get(n, math.inf) for n in bases]
     return FitProblem(
@@ -663,7 +685,11 @@ def build_problem(
         bias=bias_factors(centre, (n, k)),
         origin=origin,
         prior_mean=np.concatenate(
-            [mean, model.beads.ravel()[:beads], np.zeros(len(strains) + arc + len(terms))]
+            [
+                mean,
+                model.beads.ravel()[:beads],
+                np.zeros(len(strains) + arc + rows + len(terms)),
+            ]
         ),
         prior_sigma=np.concatenate(
             [
@@ -671,11 +697,12 @@ def build_problem(
                 np.full(beads, bead_tolerance_mm),
                 strains,
                 np.full(int(arc), ARC_PRIOR),
+                np.full(int(rows), ROWS_PRIOR),
                 of_terms,
             ]
         ),
         panel=panel,
-        curvature=curvature(poses, model, base, group, reading) if arc else None,
+        turning=turning,
         expected_spread=expected_spread,
     )
 
@@ -686,18 +713,20 @@ def strain_widths(strain: Strain) -> FloatArray:
     return np.array([stretch] * STRETCHES + [shear] * (len(STRAINS) - STRETCHES))
 
 
-def curvature(
+def turning_shifts(
     poses: Poses,
     model: BeadModel,
     base: FloatArray,
     group: npt.NDArray[np.int64],
     reading: Reading,
+    places: FloatArray,
 ) -> FloatArray:
-    """Compute shifts of the beads' mean positions by exposures of a full step, the median
-    step of the frame's group.
+    """Compute shifts of the beads' positions by a stage that turns on, by the median step
+    of the frame's group: while a frame is exposed, and while its rows are read.
 
     A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the
-    fourth power of the arc: 2e-4 px of 100 px for a step of 15 deg.
+    fourth power of the arc: 2e-4 px of 100 px for a step of 15 deg. What a row shows that
+    is read by a share of a step later is further on its path by p' of that share.
 
     Args:
         poses: nominal geometry of the n frames.
@@ -705,17 +734,19 @@ def curvature(
         base: (groups, 17) offsets, internal units, in the reading.
         group: (n,) of each frame.
         reading: of eq. 5.4.
+        places: (n, k) row of each position, from the panel's middle, in panel heights.
 
     Returns:
-        (n, k, 2, 1) [px]; 0 in groups of one frame.
+        (n, k, 2, 2) [px], of the exposure and of the rows; 0 in groups of one frame.
     """
-    out = np.zeros((len(poses), len(model), 2, 1))
+    out = np.zeros((len(poses), len(model), 2, 2))
     for g, row in enumerate(base):
         mine = group == g
         some = poses[np.flatnonzero(mine)]
         if len(some) < 2:
             continue
-        step = float(np.median(np.abs(np.diff(some.angle))))
+        steps = np.diff(some.angle)
+        step = float(np.median(np.abs(steps)))
         offsets = to_printed_reading(Offsets(*row), reading)
         turned = (
             replace(some, angle=some.angle + turn).cone_vec(offsets)
@@ -726,6 +757,9 @@ def curvature(
         )
         bent = (ahead - 2.0 * here + behind) / ARC_ANGLE_RAD**2
         out[mine, ..., 0] = bent * step**2 / 24.0
+        slope = (ahead - behind) / (2.0 * ARC_ANGLE_RAD)
+        way = float(np.sign(np.median(steps)))
+        out[mine, ..., 1] = slope * (way * step * places[mine])[..., None]
     return out
 
 
