@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,6 +69,34 @@ def test_what_forbids_a_calibration_is_said_first_with_what_to_type(
     assert document["next"]
     for line in document["next"]:
         known(line)
+
+
+def test_lengths_in_another_unit_are_told(tmp_path: Path) -> None:
+    """A phantom's file in metres: its beads are a thousandth of what is seen."""
+    few = fx.ConeVec.circular(sod=600, sdd=1059, angles=6, shape=(380, 478), pixel=0.2992)
+    beads = np.array([[5, 0, -12], [-4, 3, 0], [0, -6, 9.0]])
+    files = []
+    for millimetres in (1.0, 1000.0):
+        lines = "".join(
+            f"[[bead]]\nposition_mm = {bead}\nradius_mm = {2.0 / millimetres}\n"
+            f'material = "steel"\n'
+            for bead in (beads / millimetres).tolist()
+        )
+        file = tmp_path / f"{millimetres:g}.toml"
+        file.write_text(f'schema = 1\nname = "mine"\n{lines}')
+        files.append(str(file))
+    seen = fx.simulate(files[0], few, noise=1)
+    said = seen.calibrate(files[1]).document["problems"][0]["text"]
+    assert said.endswith("another phantom, or some lengths are in m, not in mm")
+
+
+def test_frames_that_are_all_dark_leave_no_others() -> None:
+    counts = np.full((6, 380, 478), 300, dtype=np.uint16)
+    few = fx.ConeVec.circular(sod=600, sdd=1059, angles=6, shape=(380, 478), pixel=0.2992)
+    flat = np.full((380, 478), 40000, dtype=np.uint16)
+    dark = fx.DataSet.from_arrays(counts, few, flat=flat)
+    said = dark.calibrate("lego").document["problems"][0]["text"]
+    assert said.endswith("6 of 6 frames are dark")
 
 
 @pytest.mark.parametrize("code", sorted(NEXT))

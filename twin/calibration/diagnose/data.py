@@ -59,6 +59,10 @@ SHOWN_AT_LEAST = 0.5
 """Least share of the frames with spots for another reading of the images to be reported."""
 MAX_SHOWN = 5
 """Largest number of unusable files that are named."""
+UNITS_MM = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
+"""Unit in which somebody may have written lengths -> its millimetres."""
+SAME_SIZE = 1.3
+"""Largest ratio of two radii that are the same, measured roughly."""
 _STATES = {
     FrameState.MISSING: ("frames_missing", "missing"),
     FrameState.DARK: ("frames_dark", "dark"),
@@ -91,7 +95,8 @@ def judge_frames(
     for state, (code, words) in _STATES.items():
         some = [look for look in looks if look.state is state]
         files = sorted({look.unusable for look in some if look.unusable})
-        text = f"{name}: {len(some)} of {n} frames are {words}; the others are used"
+        rest = "; the others are used" if len(some) < n else ""
+        text = f"{name}: {len(some)} of {n} frames are {words}{rest}"
         if files:
             if len(files) > MAX_SHOWN:
                 more = f" (and {len(files) - MAX_SHOWN} more)"
@@ -175,10 +180,21 @@ def judge_emptiness(
             error(
                 "wrong_phantom",
                 f"{scan.name}: the images show round shadows of radius {seen:.1f} px where the "
-                f"beads of {model.name!r} would cast {expected:.1f} px: another phantom",
+                f"beads of {model.name!r} would cast {expected:.3g} px: another phantom"
+                f"{_of_unit(seen / expected)}",
             )
         )
     return out
+
+
+def _of_unit(ratio: float) -> str:
+    """Name the unit of length by which sizes differ by a ratio, as the end of a sentence;
+    "" if none does.
+    """
+    for unit, millimetres in UNITS_MM.items():
+        if abs(abs(math.log(ratio)) - math.log(millimetres)) < math.log(SAME_SIZE):
+            return f", or some lengths are in {unit}, not in mm"
+    return ""
 
 
 def explain_identification(
@@ -224,7 +240,8 @@ def explain_identification(
         return error(
             "ambiguous",
             f"{name}: the beads cannot be told apart: start angles {listed} deg explain the "
-            "shadows equally well; use a phantom without that symmetry",
+            "shadows equally well: state how the phantom stands, --start alpha=DEG --prior "
+            "alpha=5, or take its beads for markers, --phantom unknown",
         )
     if found is not None:
         found = _without_bad_frames(found)
@@ -416,7 +433,8 @@ def _alternative(
     trials += [
         (
             "mirrored_phantom",
-            "the phantom is the mirror image of its model",
+            "the phantom is the mirror image of its model, or the images are mirrored "
+            "left to right and the stage turns the other way, which looks alike",
             {"model": model.mirrored()},
         ),
         (
@@ -430,7 +448,12 @@ def _alternative(
             "the images are mirrored left to right",
             {"detections": across},
         ),
-        ("image_upside_down", "the images are upside down", {"detections": along}),
+        (
+            "image_upside_down",
+            "the images are upside down, or each z of the phantom has the wrong sign, which "
+            "looks alike",
+            {"detections": along},
+        ),
         (
             "image_turned",
             "the images are upside down and mirrored: turned by 180 deg",
