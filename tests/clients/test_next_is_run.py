@@ -209,6 +209,44 @@ def test_everything_a_report_proposes_ends_right_or_more_careful(
     run_what_is_proposed(CASES[name], tmp_path)
 
 
+PAIRS = np.array([[12.0, 0, -15], [-12, 0, -15], [0, 9, 15], [0, -9, 15]])
+"""Four beads that half a turn maps onto themselves [mm]."""
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_symmetric_phantom_is_calibrated_in_both_ways_that_are_advised(
+    stated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    beads = "".join(
+        f'[[bead]]\nposition_mm = {p}\nradius_mm = 2\nmaterial = "steel"\n'
+        for p in PAIRS.tolist()
+    )
+    Path("pairs.toml").write_text(f'schema = 1\nname = "pairs"\n{beads}')
+    geometry = turned().cone_vec(Offsets.from_edge(TRUTH)).with_shape(SHAPE)
+    data = fx.simulate("pairs.toml", geometry, noise=1)
+    with_geometry(data, turned().cone_vec(Offsets()).with_shape(SHAPE)).save("scan")
+    document = calibrated(["scan", "--phantom", "pairs.toml"], tmp_path / "first.json")
+    (problem,) = [p for p in document["problems"] if p["severity"] == "error"]
+    assert problem["code"] == "ambiguous"
+    if stated:
+        assert "--start alpha=DEG --prior alpha=5" in problem["text"]
+        turn = ["--start", "alpha=24", "--prior", "alpha=5"]
+        words = ["scan", "--phantom", "pairs.toml", *turn]
+    else:
+        (line,) = document["next"]
+        words = shlex.split(line)[2:]
+    document = calibrated(words, tmp_path / "next.json")
+    assert document["identifiable"]
+    column = document["image_space"][0]["axis_column"]
+    across = TRUTH["dO_x"] + TRUTH["tau_x"]
+    beam = SDD_MM / (SOD_MM + TRUTH["dO_z"] + TRUTH["tau_z"]) / PIXEL_MM
+    true = (SHAPE[1] - 1) / 2 + across * beam
+    assert abs(column["value"] - true) < SIGMAS * column["sigma"]
+    if stated:
+        require_right_or_careful(document)
+
+
 def test_every_command_of_the_table_has_a_case() -> None:
     unrun = {"bead_size"}  # as `wrong_phantom`
     assert set(NEXT) <= {case.code for case in CASES.values()} | unrun

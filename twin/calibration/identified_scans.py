@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -23,7 +24,7 @@ from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers, frame_n
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, nothing
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
-from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
 from flexdt.twin.geometry.offsets import Offsets
 
 MAX_BEAD_SHARE: Final = 0.6
@@ -36,6 +37,10 @@ CLEAR_PX: Final = 0.6
 """The same up to which an entire scan determines the geometry better than its parts [px]."""
 LEAST_TYPICAL_PX: Final = 0.3
 """Least value of that distance: a part of a scan determines the geometry less well [px]."""
+TURN_SIGMAS: Final = 5.0
+"""Standard deviations of its prior by which alpha may be from its start in the search."""
+LEAST_TURN_DEG: Final = 3.0
+"""Least of that; start angles so near each other are one to the search."""
 
 
 def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibration:
@@ -61,7 +66,15 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         if scan.index is not None:
             out.append(identified(scan.index, detections, request.start))
             continue
-        seek = partial(attempt, detections, state.model, scan.poses, start=request.start)
+        search = Search(turn=_stated_turn(scan, request))
+        seek = partial(
+            attempt,
+            detections,
+            state.model,
+            scan.poses,
+            start=request.start,
+            search=search,
+        )
         found = seek()
         numbers = _numbers(found, detections, state.model, scan, request.start)
         if numbers is not None and (odd := numbers.judged(scan.name)) is not None:
@@ -71,15 +84,16 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             looks[i] = _without(looks[i], numbers.again.tolist())
             detections = _spots(scan, looks[i])
             seek = partial(
-                attempt, detections, state.model, scan.poses, start=request.start
-            )
+                attempt, detections, state.model, scan.poses, start=request.start,
+                search=search,
+            )  # fmt: skip
             found = seek()
         finding = explain_identification(
             found, detections, state.model, scan.poses, scan.name, request.start
         )
         if request.per_frame and finding is not None and finding.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
-            found = seek(search=Search(gate_px=WIDE_GATE_PX)) or found
+            found = seek(search=replace(search, gate_px=WIDE_GATE_PX)) or found
             finding = None
         findings += listed(finding)
         if found is None:
@@ -87,6 +101,16 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         out.append(found)
     found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
     return found_so_far.with_findings(*findings)
+
+
+def _stated_turn(scan: Scan, request: CalibrationRequest) -> float:
+    """Return how far alpha may be from the request's start [rad], `TURN_SIGMAS` of its
+    prior but no less than `LEAST_TURN_DEG`; inf: it has no prior.
+    """
+    priors = stated_priors([scan], request)
+    if "alpha" not in priors:
+        return math.inf
+    return math.radians(max(TURN_SIGMAS * priors["alpha"], LEAST_TURN_DEG))
 
 
 def _spots(scan: Scan, looks: Sequence[FrameSpots]) -> list[Detections]:

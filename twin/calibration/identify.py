@@ -57,11 +57,20 @@ class Search:
         starts: number of start angles round the circle.
         frames: at most so many frames take part in the search.
         gate_px: final gate; a spot further from its prediction is not that bead.
+        turn: how far alpha may be from its start [rad]. Further ones count only if they
+            explain the spots better; inf: alpha is not known before.
     """
 
     starts: int = 18
     frames: int = 20
     gate_px: float = 6.0
+    turn: float = math.inf
+
+    def allows(self, x: FloatArray, start: FloatArray) -> bool:
+        """Check whether the six parameters `x` turn the phantom as far from `start`, (6,),
+        as `turn` says.
+        """
+        return not math.isinf(self.turn) and _turn_between(x, start) <= self.turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +214,9 @@ def identify(
     hypotheses = [_Hypothesis(base + i * turn, math.inf, 0) for i in range(how.starts)]
     # All start angles get the wide rounds; only the promising ones the narrow.
     hypotheses = _best_first(_rounds(problem, some, h, WIDE_PX) for h in hypotheses)
-    hypotheses = hypotheses[: max(MAX_FINALISTS, how.starts // 2)]
+    most = max(MAX_FINALISTS, how.starts // 2)
+    stated = [h for h in hypotheses[most:] if how.allows(h.x, base)]
+    hypotheses = hypotheses[:most] + stated
     hypotheses = _best_first(_rounds(problem, some, h, NARROW_PX) for h in hypotheses)
     whole = build_problem(
         np.full((len(poses), len(model), 2), np.nan),
@@ -216,7 +227,7 @@ def identify(
         start=start,
     )
     finals = _best_first(
-        _finish(whole, scene, h, how) for h in _different(hypotheses)[:MAX_FINALISTS]
+        _finish(whole, scene, h, how) for h in _finalists(hypotheses, base, how)
     )
     if finals and (loose or finals[0].loss > LOOSE_PX**2):
         # A rolled panel or a leaning axis looks like another phantom: only loose priors tell.
@@ -561,6 +572,22 @@ def _different(hypotheses: Sequence[_Hypothesis]) -> list[_Hypothesis]:
     return out
 
 
+def _finalists(
+    hypotheses: Sequence[_Hypothesis], base: FloatArray, how: Search
+) -> list[_Hypothesis]:
+    """Choose the best different hypotheses, `MAX_FINALISTS` of all and as many of those that
+    turn the phantom as is stated.
+
+    Args:
+        hypotheses: best first.
+        base: (6,) start of the search.
+        how: settings.
+    """
+    different = _different(hypotheses)
+    stated = [h for h in different[MAX_FINALISTS:] if how.allows(h.x, base)]
+    return different[:MAX_FINALISTS] + stated[:MAX_FINALISTS]
+
+
 def _turn_between(a: FloatArray, b: FloatArray) -> float:
     """Return the smallest angle between the start angles of two hypotheses [rad]."""
     return abs((float(a[3] - b[3]) + math.pi) % (2.0 * math.pi) - math.pi)
@@ -605,7 +632,9 @@ def _report(
     """Make the identification of the best hypothesis: tracks, quality and rivals.
 
     Rivals are hypotheses over 3 deg away whose excess of squared residuals is below
-    `MAX_RIVAL_EXCESS` variances of the best. Spots that overlap their neighbours in the
+    `MAX_RIVAL_EXCESS` variances of the best. Where the turn is stated, the best is the best
+    of those so near the start, unless another is better by as much; those near it are no
+    rivals if they see the same beads in all spots. Spots that overlap their neighbours in the
     prediction get no track. The start angle is reduced to half a turn about that of
     `start`.
 
@@ -627,6 +656,13 @@ def _report(
             "the shadows found do not fit the phantom in any orientation",
             {"detections": int(shadows.counts.sum()), "beads": len(model)},
         )
+    count = max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
+    base = np.array([getattr(start, n) for n in SIX])
+    stated = [h for h in finals if how.allows(h.x, base)]
+    if stated:
+        least = max(finals[0].loss, 0.02**2)
+        if (stated[0].loss - finals[0].loss) * count < MAX_RIVAL_EXCESS * least:
+            finals = stated
     best = finals[0]
     predicted = _predicted(problem, best.x)
     index = assign(predicted, shadows.points, shadows.counts, how.gate_px)
@@ -650,11 +686,16 @@ def _report(
         if _turn_between(h.x, best.x) < math.radians(3.0):
             continue
         # Difference of squared residuals in units of the best one's variance.
-        excess = (h.loss - best.loss) * max(
-            int(np.minimum(shadows.counts, len(model)).sum()), 1
-        )
-        if excess < MAX_RIVAL_EXCESS * max(spread, 0.02) ** 2:
-            rivals.append(_at(problem, h.x, start))
+        excess = (h.loss - best.loss) * count
+        if excess >= MAX_RIVAL_EXCESS * max(spread, 0.02) ** 2:
+            continue
+        if how.allows(best.x, base):
+            other = assign(
+                _predicted(problem, h.x), shadows.points, shadows.counts, how.gate_px
+            )
+            if (other[seen] == index[seen]).all():
+                continue
+        rivals.append(_at(problem, h.x, start))
     view = visible_beads(model, poses, shapes, geometry) & ~touching
     return Identification(
         tracks=tracks,

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from flexdt.library.calibration.calibration_options import CalibrationOptions
 from flexdt.twin.calibration.diagnose import Finding
+from flexdt.twin.calibration.unknown_markers import UNKNOWN
 
 IN_MEMORY: Final = "DATASET"
 """Stands for a scan in memory, which has no folder to type."""
@@ -136,6 +137,10 @@ def settling_commands(
         yield typed.command(phantom=other)
         return
     options = typed.options or {}
+    if finding.code == "ambiguous":
+        frames = {name: options[name] for name in ("frames",) if name in options}
+        yield replace(typed, options=frames).command(phantom=UNKNOWN)
+        return
     if finding.per_frame:
         moving = [name for name in options.get("per-frame", "").split(",") if name]
         yield typed.command(

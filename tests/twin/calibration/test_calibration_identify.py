@@ -12,8 +12,9 @@ from numpy.testing import assert_array_equal
 
 from flexdt.twin.calibration import BeadModel
 from flexdt.twin.calibration.frame_source import nothing
-from flexdt.twin.calibration.identify import assign, identify, identify_beads
+from flexdt.twin.calibration.identify import Search, assign, identify, identify_beads
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.offsets import NOMINAL
 
 
 @pytest.mark.daily(1)
@@ -57,6 +58,23 @@ def test_a_symmetric_phantom_is_reported_not_guessed() -> None:
     assert abs(abs(found.rivals[0].alpha - found.parameters.alpha) - np.pi) < 0.05
     with pytest.raises(TwinError, match="cannot be told apart"):
         identify_beads(detections, model, poses)
+
+
+@pytest.mark.parametrize("turned", [0.0, np.pi])
+def test_a_stated_turn_tells_the_sides_of_a_symmetric_phantom(turned: float) -> None:
+    """Either start finds its own of two solutions; one that fits neither hides nothing."""
+    model = BeadModel(
+        np.array([[12.0, 0, -15], [-12, 0, -15], [0, 9, 15], [0, -9, 15]]), np.array(2.0)
+    )
+    poses, truth = scenario("G0", 24)
+    detections = shadows(exact_tracks(poses, truth, model), 1)
+    near = Search(turn=np.radians(20.0))
+    start = replace(NOMINAL, alpha=truth.alpha + turned + 0.1)
+    found = identify(detections, model, poses, start=start, search=near)
+    assert not found.ambiguous
+    assert abs(found.parameters.alpha - truth.alpha - turned) < 0.05
+    across = replace(NOMINAL, alpha=truth.alpha + 0.5 * np.pi)
+    assert identify(detections, model, poses, start=across, search=near).ambiguous
 
 
 def test_identify_beads_returns_tracks_with_nan_where_unseen() -> None:
