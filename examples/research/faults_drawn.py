@@ -1143,7 +1143,7 @@ def _rows_in_turn(draft: Draft, rng: Rng) -> Draft:
     """Read the rows one after the other while the stage turns, for 0.05 to 1 of a step, and
     expect a finding of it.
     """
-    draft = _usual(draft, rng)
+    draft = usual(draft, rng)
     share = math.exp(rng.uniform(math.log(0.05), 0.0)) * _sign(rng)
     world = replace(draft.world, rows_turn=share * draft.believed.step)
     return replace(draft, world=world, names=("rows_in_turn|rows are read one after",),

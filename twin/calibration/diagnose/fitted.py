@@ -454,7 +454,8 @@ def _refit_moving(fit: FitResult, refit: Refit, motion: MotionFit) -> FitResult:
         motion=motion,
         panel=fit.problem.panel,
         strain=fit.strain_prior,
-        arc=fit.problem.curvature is not None,
+        arc=fit.problem.layout.arc_column >= 0,
+        rows=fit.problem.layout.rows_column >= 0,
         bead_tolerance_mm=fit.bead_prior_mm or None,
     )
 
