@@ -83,6 +83,21 @@ def mirror_map(view: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(rays, flip @ rays))
 
 
+def border_room(cols: int) -> float:
+    """Return the distance from a tile's border, at the finest smoothing, up to which pixels do
+    not count in the fit [px].
+
+    Args:
+        cols: of the panel.
+    """
+    return _room(max(cols / LEVELS[-1], 1.0))
+
+
+def _room(sigma: float) -> float:
+    """Return that distance for a smoothing by `sigma` [px]."""
+    return 1.0 + 2.5 * sigma
+
+
 def first_column(mean: FloatArray, nominal: float) -> tuple[float, float]:
     """Find the column, to half a pixel, about which the mean is most symmetric, within
     `REACH` of the nominal one.
@@ -341,7 +356,7 @@ class _Level:
         inside &= (image[1] > self.margin) & (image[1] < self.shape[0] - 1 - self.margin)
         inside &= self.at[0] < image[0]
         for column in (self.at[0], image[0]) if self.border is not None else ():
-            inside &= np.abs(column - self.border + 0.5) > 1.0 + 2.5 * self.sigma
+            inside &= np.abs(column - self.border + 0.5) > _room(self.sigma)
         if inside.sum() < max(100.0, MIN_OVERLAP / 4 * self.at.shape[1]):
             return None
         return _MirrorPairs(self, here, self.at[:, inside])

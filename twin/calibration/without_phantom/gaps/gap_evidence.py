@@ -33,6 +33,7 @@ from flexdt.twin.calibration.without_phantom.gaps.mirror_steps import (
     MirrorSteps,
     mirror_steps,
 )
+from flexdt.twin.calibration.without_phantom.mirror_symmetry import border_room
 from flexdt.twin.calibration.without_phantom.tile_gap import (
     SIDE,
     Gap,
@@ -143,8 +144,26 @@ def find_gap(
         return GapFound(None, hidden)
     _require_one(gap, step)
     inside = profile.at(abs(gap.column - 0.5 - axis))
-    gap = gap._replace(beside_axis=not (told or np.isfinite(inside.sigma)))
+    far_enough = abs(gap.column - 0.5 - axis) > 2.0 * border_room(rays.cols)
+    in_mean = told and far_enough
+    gap = gap._replace(beside_axis=not (in_mean or np.isfinite(inside.sigma)))
+    if told:
+        gap = _beside_mean(gap, of_mean.width(gap.column, about))
     return GapFound(gap, None if likely is None else hidden, behind)
+
+
+def _beside_mean(gap: Gap, of_mean: tuple[float, float]) -> Gap:
+    """Raise the sigma of a gap's width as far as the mean over the turn contradicts it.
+
+    Steps of few distances from the axis are less sure than they say.
+
+    Args:
+        gap: by rays, or by frames.
+        of_mean: width and standard deviation by the mean [px].
+    """
+    width, sigma = of_mean
+    apart = abs(gap.width - width) / math.hypot(gap.sigma, sigma)
+    return gap._replace(sigma=gap.sigma * max(apart, 1.0))
 
 
 def _by_mean(hidden: HiddenGap | None, of_mean: MirrorSteps) -> Gap | None:

@@ -27,7 +27,7 @@ from scipy.ndimage import (
     maximum_filter1d,
     spline_filter,
 )
-from scipy.special import log_softmax, logsumexp
+from scipy.special import log_softmax, logsumexp, softmax
 
 from flexdt.twin.calibration.without_phantom.circular_scan import CircularScan
 from flexdt.twin.calibration.without_phantom.conjugate_rays import SMOOTHING
@@ -57,6 +57,15 @@ YAWS_PX: Final = np.arange(-1.0, 1.01, 0.1)
 yaw passes for a gap [px]."""
 COARSER: Final = (4.0, 4.0, 1.0, 1.0)
 """Factors on the smoothing in each step towards the column and the roll of the mean."""
+LEAST_ACROSS_PX: Final = 0.7
+LONG: Final = 2.5
+"""Least smoothing across the columns [px], and the usual one over it, at the finest: across a
+gap it mixes what is on both of its sides, along the rows nothing."""
+PAIR_PX: Final = 0.05
+"""Standard deviation by which mirrored places are displaced otherwise: the step of the
+displacements that are tried, samples that are interpolated [px]."""
+NOBODYS_PX: Final = (-0.15, 0.0, 0.15)
+"""Steps that right pairs have: sampled edges, and hardening, displace pairs by as much [px]."""
 OUTLYING_SIGMAS: Final = 3.0
 """Differences, in standard deviations, from which a place counts less in them."""
 LEAST_PLACES: Final = 4
@@ -88,6 +97,17 @@ class MirrorSteps(NamedTuple):
     def told(self, column: int, about: float) -> bool:
         """Check whether the mean shows a gap about a column, by odds of `REPORTED_ODDS`."""
         return _best_about(self.found, column, about) > math.log(REPORTED_ODDS)
+
+    def width(self, column: int, about: float) -> tuple[float, float]:
+        """Give the width of a gap about a column, and its standard deviation [px]."""
+        first = max(column - math.floor(about), 0)
+        near = self.free[:, first : column + math.floor(about) + 1]
+        best = near[:, int(over_widths(near).argmax())]
+        share = softmax(best + LOG_PRIOR[:, 0])
+        width = float(share @ WIDTHS_PX)
+        step = float(WIDTHS_PX[1] - WIDTHS_PX[0])
+        variance = float(share @ np.square(WIDTHS_PX - width)) + step**2 / 12.0
+        return width, math.sqrt(variance)
 
     def denied(self, column: int, about: float) -> bool:
         """Check whether the mean favours none over any gap about a column."""
@@ -136,9 +156,12 @@ def mirror_steps(
     for side in (-1, 1):
         there = np.sign(beside) == side
         border = np.abs(beside[there])
-        for cells, squares in zip(pairs.cells, pairs.squares(side), strict=True):
-            ratio = _ratios(pairs.radius, squares, border)
-            own = cells / 2.0 * np.log(ratio)
+        squares = pairs.squares(side)
+        for band, cells in enumerate(pairs.cells.tolist()):
+            ratio = [_ratios(pairs.radius, one[band], border) for one in squares]
+            both = cells / 2.0 * np.log(ratio)
+            # The odd error was fitted without a gap: it may hide one, or pass for another.
+            own = np.maximum(both.min(axis=0), 0.0) + np.minimum(both.max(axis=0), 0.0)
             free[:, there] += own
             found[:, there] += trusted(own)
     return MirrorSteps(found, free)
@@ -177,20 +200,21 @@ class MirrorPairs:
             side: of the fixed end: 1 right of the axis, -1 left of it.
 
         Returns:
-            By band of rows, displacement (FINE_PX) and distance of the fixed end from the
-            axis, (BANDS, d, r).
+            With the flat field's odd error and without, by band of rows, displacement
+            (FINE_PX) and distance of the fixed end from the axis, (2, BANDS, d, r).
         """
         fixed, other = (self.at, self.image) if side > 0 else (self.image, self.at)
-        aim = read_spline(self.spline, fixed) - side * self.flat
-        coarse = np.empty((len(DISPLACEMENTS_PX), BANDS, len(self.radius)))
+        here = read_spline(self.spline, fixed)
+        aims = (here - side * self.flat, here)
+        coarse = np.empty((len(DISPLACEMENTS_PX), 2, BANDS, len(self.radius)))
         for i, moved in enumerate(DISPLACEMENTS_PX.tolist()):
             seen = read_spline(self.spline, other - np.array([[side * moved], [0.0]]))
-            whole = self.weight * np.square(seen - aim)
-            # Bounded: dead columns, or a strip that stands still, are few places.
-            whole = whole / (1.0 + whole / self.largest)
-            coarse[i] = _of_bands(whole, len(self.radius))
+            for one, aim in zip(coarse[i], aims, strict=True):
+                whole = self.weight * np.square(seen - aim)
+                # Bounded: dead columns, or a strip that stands still, are few places.
+                one[:] = _of_bands(whole / (1.0 + whole / self.largest), len(self.radius))
         fine = CubicSpline(DISPLACEMENTS_PX, coarse)(FINE_PX)
-        return np.asarray(np.maximum(fine, 0.0).transpose(1, 0, 2))
+        return np.asarray(np.maximum(fine, 0.0).transpose(1, 2, 0, 3))
 
 
 def _pairs(
@@ -216,13 +240,17 @@ def _pairs(
     for coarser in COARSER:
         if soft != coarser * finest:
             soft = coarser * finest
-            spline = spline_filter(gaussian_filter(mean, soft, mode="nearest"))
-            reach = math.ceil(DEAD_SIGMAS * soft)
+            across = soft if coarser > 1.0 else max(soft / LONG, LEAST_ACROSS_PX)
+            # As much noise is left as by `soft` both ways.
+            along = soft**2 / across
+            softened = gaussian_filter(mean, (along, across), mode="nearest")
+            spline = spline_filter(softened)
+            reach = math.ceil(DEAD_SIGMAS * across)
             near_dead = maximum_filter1d(dead, 2 * reach + 1)
-            apart = max(1.0, soft / 2.0)
-            down = np.arange(MARGIN * soft, rows - 1 - MARGIN * soft, max(2.0, soft))
+            apart = max(1.0, across / 2.0)
+            down = np.arange(soft, rows - 1 - soft, max(2.0, along))
         axis = scan.column(values)
-        edge = min(cols - 1 - axis, axis) - MARGIN * soft + float(DISPLACEMENTS_PX[0])
+        edge = min(cols - 1 - axis, axis) - MARGIN * across + float(DISPLACEMENTS_PX[0])
         radius = np.arange(0.5, edge, apart)
         if min(len(radius), len(down)) < LEAST_PLACES:
             return None
@@ -245,15 +273,23 @@ def _pairs(
         odd = np.stack([x, x * y, x**3, x * y * y], axis=1)
         # A yaw is fitted beside the flat field, which would contain it.
         bent = slope * np.square(beside / radius[-1])
+        # To coarse smoothing, a round body a little aside looks like an odd error.
+        odd = odd * (coarser <= 1.0)
         table = np.column_stack([slope, slope * below, bent, odd])
         fitted, scale = _robust(table, rest, weight)
         values[0] -= fitted[0] / 2.0 / scan.slopes(values, scan.scales[: len(values)])[0]
         values[1] -= fitted[1] / 2.0
-    # Smoothed noise has slopes of its own, smaller by the root of 8 sigmas of differences.
-    steep = np.square(slope) * weight > MIN_EDGE_SIGMAS**2 * scale / (8.0 * soft**2)
+    steep = _is_steep(slope, weight, scale, across)
+    # What is round about the axis has gentle slopes there, in many places.
+    further = COARSER[0] * finest
+    gentle = spline_filter(gaussian_filter(mean, further, mode="nearest"))
+    slope_there = (_slope(gentle, at) - _slope(gentle, image)) / 2.0
+    left = scale * (finest / further) ** 2
+    steep |= _is_steep(slope_there, weight, left, further)
     if not steep.any():
         return None
-    area = apart * float(down[1] - down[0]) / (4.0 * math.pi * soft**2)
+    weight = weight / (1.0 + weight * np.square(PAIR_PX * slope) / scale)
+    area = apart * float(down[1] - down[0]) / (4.0 * math.pi * finest**2)
     return MirrorPairs(
         axis,
         radius,
@@ -272,6 +308,22 @@ def _of_bands(values: FloatArray, radii: int) -> FloatArray:
     table = values.reshape(-1, radii)
     first = np.arange(BANDS) * len(table) // BANDS
     return np.asarray(np.add.reduceat(table, first, axis=0))
+
+
+def _is_steep(
+    slope: FloatArray, weight: FloatArray, scale: float, across: float
+) -> npt.NDArray[np.bool_]:
+    """Mark places whose slopes are above those of smoothed noise, which are smaller than the
+    sigma of differences by the root of 8 sigmas of the smoothing.
+
+    Args:
+        slope: (m,).
+        weight: (m,).
+        scale: variance of weighted differences by noise.
+        across: sigma of the smoothing across the columns [px].
+    """
+    least = MIN_EDGE_SIGMAS**2 * scale / (8.0 * across**2)
+    return np.asarray(np.square(slope) * weight > least)
 
 
 def _slope(spline: FloatArray, at: FloatArray) -> FloatArray:
@@ -323,7 +375,7 @@ def _ratios(radius: FloatArray, squares: FloatArray, border: FloatArray) -> Floa
     step = float(FINE_PX[1] - FINE_PX[0])
     bent = np.square(radius / radius[-1])
     place = np.searchsorted(radius, border)
-    usual = math.inf
+    usual = np.full(len(radius) + 1, math.inf)
     gaps = np.full((len(WIDTHS_PX), len(radius) + 1), math.inf)
     for yaw in YAWS_PX.tolist():
         by_yaw = np.rint(yaw * bent / step).astype(np.intp)
@@ -331,9 +383,27 @@ def _ratios(radius: FloatArray, squares: FloatArray, border: FloatArray) -> Floa
         moved = np.take_along_axis(squares, places.clip(0, len(FINE_PX) - 1), axis=0)
         inside = np.pad(np.cumsum(moved, axis=1), ((0, 0), (1, 0)))
         beyond = inside[:, -1:] - inside
-        usual = min(usual, float(inside[:, -1].min()))
+        for width in NOBODYS_PX:
+            usual = np.minimum(usual, _least(inside, beyond, round(width / step)))
         for i, width in enumerate(WIDTHS_PX.tolist()):
-            by = round(width / step)
-            gaps[i] = np.minimum(gaps[i], (inside[:-by] + beyond[by:]).min(axis=0))
+            gaps[i] = np.minimum(gaps[i], _least(inside, beyond, round(width / step)))
     least = np.finfo(np.float64).tiny
-    return np.asarray((max(usual, least) / np.maximum(gaps, least))[:, place])
+    ratio = np.maximum(usual, least) / np.maximum(gaps, least)
+    return np.asarray(ratio[:, place])
+
+
+def _least(inside: FloatArray, beyond: FloatArray, step: int) -> FloatArray:
+    """Find the least sums of squares over common displacements, with a step.
+
+    Args:
+        inside: sums over the distances nearer than each border, (d, c).
+        beyond: over the others, (d, c).
+        step: displacements by which the others differ.
+
+    Returns:
+        (c,).
+    """
+    low, high = max(-step, 0), max(step, 0)
+    count = len(inside) - low - high
+    whole = inside[low : low + count] + beyond[high : high + count]
+    return np.asarray(whole.min(axis=0))
