@@ -40,7 +40,11 @@ from flexdt.twin.calibration.fit.problem import (
     edge_factors,
     turning_shifts,
 )
-from flexdt.twin.calibration.fit.residual_structure import MOVING, larger
+from flexdt.twin.calibration.fit.residual_structure import (
+    MOVING,
+    correlation_length,
+    larger,
+)
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.panel import Border, PanelModel
 
@@ -582,6 +586,18 @@ class Candidates:
         models = [self._model(choice) for choice in choices]
         return self.table.expected(models, drawn, self.noise, self.count)
 
+    def correlated(self, choice: Choice) -> float:
+        """Return the correlation length of the residuals that a choice leaves [frames]; 1
+        if it cannot be judged.
+        """
+        model = self.judged(choice)
+        if model is None:
+            return 1.0
+        left = np.zeros((*self.use.shape, 2))
+        explained = self.rows[:, model.columns] @ model.mean
+        left[self.use] = (self.values - explained).reshape(-1, 2)
+        return correlation_length(left, self.use, self.problem.group)
+
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
         """Return the phantom's strain (10,) in a choice, in the order of STRAINS, and its
         covariance (10, 10); None if a stated strain is 0 or the choice cannot be judged.
@@ -708,8 +724,8 @@ def explained_by_causes(
 
     Causes, up to `MOST_BORDERS` borders between panel tiles among them, are searched
     again after each new fit, until they stay the same or for `MOST_ROUNDS`. Residuals that
-    a fit leaves correlated from frame to frame count by their correlation length, so that
-    slow errors are no evidence of slow causes.
+    a fit, and what moves, leave correlated from frame to frame count by their correlation
+    length, so that slow errors are no evidence of slow causes.
 
     Args:
         fit: of the geometry, the phantom's strain with its prior.
@@ -736,7 +752,10 @@ def explained_by_causes(
         options = _options(candidates, choice, borders)
         chosen = tuple(options.values())
         settled = chosen == applied or not (applied or any(chosen))
-        if settled and alike == fit.certificate.enlargement:
+        # What moves is no column of the fit, and correlates its residuals itself.
+        moves = any(pick for name, pick in before.items() if name.startswith(MOTION_OF))
+        beside = candidates.correlated(choice) if moves else None
+        if settled and alike == (beside or fit.certificate.enlargement):
             break
         if not settled:
             applied = chosen
@@ -744,12 +763,8 @@ def explained_by_causes(
             if not better.identifiable:
                 return _undetermined(first, better, candidates, choice)
             fit = better
-        alike = fit.certificate.enlargement
+        alike = beside or fit.certificate.enlargement
     odds = candidates.odds()
-    moves = any(
-        pick and c.name.startswith(MOTION_OF)
-        for c, pick in zip(candidates.causes, choice, strict=True)
-    )
     # What moves looks like other causes in part, and most of it stays in the residuals.
     if moves and fit.certificate.rms_px > MAX_REST_SHARE * first.certificate.rms_px:
         nothing: Choice = tuple(
