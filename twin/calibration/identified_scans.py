@@ -99,6 +99,9 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         if found is None:
             break
         out.append(found)
+    if any(f.code == "bead_displaced" for f in findings):
+        # In other scans of the same phantom the spots of that bead are no others.
+        findings = [f for f in findings if f.code != "extra_spots"]
     found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
     return found_so_far.with_findings(*findings)
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from causes_named import calibrated, scored, worst_error
-from faults_drawn import drawn
+from faults_drawn import World, drawn, shadows
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.named_causes import strain_words
@@ -290,6 +290,25 @@ def test_a_growth_that_is_followed_as_a_motion_is_not_offered_wrong(seed: int) -
     result = calibrated(scan, tuple(asked.split(",")))
     assert result.identifiable, result.findings
     assert worst_error(result, scan)[0] < 4.0
+
+
+def test_a_growth_is_no_cause_that_images_tell_from_a_motion() -> None:
+    """A phantom that is a part larger casts the shadows of one that is nearer to the source
+    by that part of its distance, to the last digit: both are told, and neither alone."""
+    n = 12
+    angles = 360.0 * np.arange(n) / n
+    size = 1.0 + 7e-3 * np.linspace(-0.5, 0.5, n)
+    place = {"dO_x": 3.0, "dO_y": -2.0, "dO_z": 5.0}
+    still = World(
+        BEADS, np.full(5, 1e-4), {**place, "alpha": 30.0}, angles, np.zeros((n, 3)),
+        np.ones((n, 5), dtype=bool), 600.0, 1059.0,
+    )  # fmt: skip
+    nearer = {name: np.full(n, value) / size for name, value in place.items()}
+    nearer["dO_z"] += 600.0 / size - 600.0
+    grown = shadows(replace(still, size=size))[0]
+    moved = shadows(replace(still, offsets={**nearer, "alpha": 30.0}))[0]
+    assert np.abs(grown - shadows(still)[0]).max() > 0.5
+    assert grown == pytest.approx(moved, abs=1e-6)
 
 
 def test_pixels_of_another_pitch_are_named_beside_the_distance() -> None:
