@@ -195,6 +195,7 @@ def in_images(world: World) -> dict[str, float]:
         world, beads=points, radii=np.full(6, 1e-4 * world.scale), offsets=still,
         angles=world.angles[:1], spot=world.spot.mean(axis=0, keepdims=True),
         shown=np.ones((1, 6), dtype=bool), arc=0.0, size=None,
+        rows_turn=0.0,
     )  # fmt: skip
     ((up, down, *ends),) = shadows(first)[0]
     middle = (world.shape[0] - 1) / 2
@@ -490,8 +491,8 @@ def _low_dose(draft: Draft, rng: Rng) -> Draft:
 def _offset(
     name: str, low: float, high: float, *names: str, silent: bool = False
 ) -> Fault:
-    """Make a fault that offsets one parameter by `low` to `high` [mm, deg], to either
-    side.
+    """Make a fault that offsets one parameter from what is stated by `low` to `high` [mm,
+    deg], to either side.
 
     Args:
         name: of the parameter.
@@ -503,7 +504,8 @@ def _offset(
     def fault(draft: Draft, rng: Rng) -> Draft:
         """Draw the offset, and expect a finding of one of the names."""
         value = _sign(rng) * float(rng.uniform(low, high))
-        world = replace(draft.world, offsets={**draft.world.offsets, name: value})
+        true = draft.believed.held.get(name, 0.0) + value
+        world = replace(draft.world, offsets={**draft.world.offsets, name: true})
         pattern = (f"(held_parameter|priors_narrow).*({'|'.join(names or (name,))})",)
         return replace(draft, world=world, names=pattern, silent=silent)
 
