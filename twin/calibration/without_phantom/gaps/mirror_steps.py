@@ -212,7 +212,8 @@ class MirrorPairs:
             for one, aim in zip(coarse[i], aims, strict=True):
                 whole = self.weight * np.square(seen - aim)
                 # Bounded: dead columns, or a strip that stands still, are few places.
-                one[:] = _of_bands(whole / (1.0 + whole / self.largest), len(self.radius))
+                whole = whole / (1.0 + whole / self.largest)
+                one[:] = _of_bands(whole, len(self.radius))
         fine = CubicSpline(DISPLACEMENTS_PX, coarse)(FINE_PX)
         return np.asarray(np.maximum(fine, 0.0).transpose(1, 2, 0, 3))
 
@@ -299,7 +300,7 @@ def _pairs(
         odd @ fitted[3:],
         np.where(steep, weight, 0.0),
         OUTLYING_SIGMAS**2 * scale,
-        area * _of_bands(steep * 1.0, len(radius)).sum(axis=1),
+        area * _of_bands(steep.astype(np.float64), len(radius)).sum(axis=1),
     )
 
 
