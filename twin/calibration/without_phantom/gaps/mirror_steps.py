@@ -9,7 +9,9 @@ contains walls about the axis, all rows, and what is nearer to the axis than all
 The displacement by distance from the axis is compared with a common one and a yaw, with
 and without a step. The likelihood is that of differences of unknown scale: whatever makes
 the mean unsymmetric otherwise (rings, a flat field, something that stands still) is in both,
-and makes a step count for less. Only places with slopes above the noise count.
+and makes a step count for less. Steps of sampled edges are nobody's, and evidence counts as
+far as it is the same with and without an odd error of the flat field. Only places with slopes
+above the noise count, theirs or those of a smoother copy.
 """
 
 from __future__ import annotations
@@ -361,8 +363,8 @@ def _robust(
 
 
 def _ratios(radius: FloatArray, squares: FloatArray, border: FloatArray) -> FloatArray:
-    """Compare the least sums of squares with and without a step, over all common
-    displacements and yaws.
+    """Compare the least sums of squares without a step (or one of NOBODYS_PX) and with one,
+    over all common displacements and yaws.
 
     Args:
         radius: distances from the axis, (r,) [px].
