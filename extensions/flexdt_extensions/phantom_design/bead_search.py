@@ -22,6 +22,7 @@ from scipy.optimize import linear_sum_assignment
 from flexdt.twin.calibration import (
     IN_IMAGES,
     BeadModel,
+    Prediction,
     axis_in_image,
     estimate_geometry,
     identifiability,
@@ -276,13 +277,13 @@ def forecast(
     )
 
 
-def stated(model: BeadModel, planned: PlannedScans) -> dict[str, float] | None:
-    """Predict the sigmas that `flexdt calibrate` states, with the phantom's strain and what
-    other causes leave open; touching spots count.
+def stated(model: BeadModel, planned: PlannedScans) -> Prediction | None:
+    """Predict what `flexdt calibrate` states, with the phantom's strain and what other
+    causes leave open; touching spots count.
 
     Returns:
-        Parameters and IN_IMAGES -> standard deviation, edge units; None if the scans do not
-        determine all of them.
+        Sigmas of parameters and IN_IMAGES, edge units, and their ranges; None if the scans
+        do not determine all parameters.
     """
     found = identifiability(
         model,
@@ -293,7 +294,7 @@ def stated(model: BeadModel, planned: PlannedScans) -> dict[str, float] | None:
         bead_tolerance_mm=planned.bead_tolerance_mm,
         priors=planned.widths,
     )
-    return found.sigmas | found.image_sigmas if found.identifiable else None
+    return found if found.identifiable else None
 
 
 def design(

@@ -13,7 +13,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -26,7 +26,7 @@ from flexdt.library.figures import COLOURS, DPI, blank, require_plots, svg
 from flexdt.library.report_page import bullets, heading, page, paragraph, table
 from flexdt.phantoms import Phantom, cuboid_with_beads, spiral_positions
 from flexdt.phantoms.bricks import Brickwork, lego_phantom
-from flexdt.twin.calibration import IN_IMAGES, BeadModel
+from flexdt.twin.calibration import IN_IMAGES, BeadModel, Prediction
 from flexdt.twin.calibration.fit.weak_directions import BOUND, TOLERANCE, unit_of
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings
@@ -218,7 +218,7 @@ def run_design(
                 "sigmas": guess.sigmas,
                 "image_sigmas": guess.image_sigmas,
                 "measured": measured,
-                "stated": stated(model, scans),
+                **_said(stated(model, scans)),
                 "shadows_used": guess.used,
                 "determined": guess.worst <= BOUND / TOLERANCE["mm"],
                 "identified": share_identified(model, scans, seed=request.seed),
@@ -268,8 +268,9 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
 
     Returns:
         Name, unit, predicted and measured of the design and what `flexdt calibrate` states
-        of it, predicted and measured of the spiral, and the gain: the spiral's prediction
-        divided by the design's ("-" where the document has no gain), as text.
+        of it (half of the scans less; in brackets the range of eight in ten), predicted and
+        measured of the spiral, and the gain: the spiral's prediction divided by the
+        design's ("-" where the document has no gain), as text.
     """
     ours = document["design"]
     theirs = document["spiral"]
@@ -279,7 +280,7 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
             IN_IMAGES[name] if kind == "image_sigmas" else unit_of(name),
             f"{sigma:.3g}",
             _of(ours["measured"], name),
-            _of(ours["stated"], name),
+            _with_range(ours, name),
             f"{theirs[kind][name]:.3g}",
             _of(theirs["measured"], name),
             "-" if document["gain"] is None else f"{theirs[kind][name] / sigma:.2f}",
@@ -477,6 +478,26 @@ def _of(measured: dict[str, float] | None, name: str) -> str:
     if measured is None:
         return "-"
     return f"{measured[name]:.3g}"
+
+
+def _said(found: Prediction | None) -> dict[str, Any]:
+    """Return what scans state (`stated`), and the range of eight in ten (`stated_ranges`),
+    by quantity; None where they do not determine the geometry.
+    """
+    if found is None:
+        return {"stated": None, "stated_ranges": None}
+    return {
+        "stated": found.sigmas | found.image_sigmas,
+        "stated_ranges": {name: list(ends) for name, ends in found.ranges.items()},
+    }
+
+
+def _with_range(entry: Mapping[str, Any], name: str) -> str:
+    if entry["stated"] is None:
+        return "-"
+    text = f"{entry['stated'][name]:.3g}"
+    low, high = (f"{end:.3g}" for end in entry["stated_ranges"][name])
+    return text if low == high else f"{text} ({low} to {high})"
 
 
 SCALE_PX_MM = 12.0

@@ -33,6 +33,11 @@ def test_lego_design_is_written_whole(
     assert set(ours["image_sigmas"]) == felt
     assert set(ours["measured"]) == set(document["free"]) | felt
     assert set(ours["stated"]) == set(document["free"]) | felt
+    for name, (low, high) in ours["stated_ranges"].items():
+        assert low <= ours["stated"][name] <= high, name
+    # What looks like a drift is stated, too.
+    low, high = ours["stated_ranges"]["dO_z"]
+    assert high > 1.05 * low
     # Nobody said that the phantom is exact, so that its millimetre is known to 0.1 %.
     assert ours["stated"]["magnification"] > 10 * ours["image_sigmas"]["magnification"]
     assert document["priors"]["dD_x"] > 0
@@ -121,4 +126,9 @@ def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
     assert verdict(document).startswith("spiral-50 does not determine the geometry")
     assert [row[0] for row in table_rows(document)] == ["axis_column (optimised)", "dO_x"]
     assert table_rows(document)[0][-1] == "-"
+    open_ = {"dO_x": 0.2, "axis_column": 0.02}
+    ranges = {"dO_x": [0.1, 0.35], "axis_column": [0.02, 0.02]}
+    said = {**entry, "stated": open_, "stated_ranges": ranges}
+    rows = table_rows(document | {"design": said})
+    assert [row[4] for row in rows] == ["0.02", "0.2 (0.1 to 0.35)"]
     assert "2.00 times better than spiral-50" in verdict(document | {"gain": 2.0})

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
+import forecasts
 import numpy as np
 import numpy.typing as npt
 import prior_coverage as own
@@ -20,7 +22,9 @@ from flexdt.twin.calibration import (
     identifiability,
 )
 from flexdt.twin.calibration.fit.fit import image_quantities
+from flexdt.twin.calibration.fit.forecast import MOST, Stated, forecast
 from flexdt.twin.calibration.fit.priors import Given, exact, known, known_strain
+from flexdt.twin.calibration.fit.problem import build_problem
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.offsets import Offsets
@@ -55,15 +59,15 @@ def beads_of(kind: str) -> npt.NDArray[np.float64]:
 def assert_as_forecast(
     fit: FitResult, model: BeadModel, priors: Given | None, causes: bool
 ) -> None:
-    forecast = identifiability(
+    expected = identifiability(
         model, POSES, fit.certificate.rms_px, shape=own.SHAPE, priors=priors,
         at=Offsets.from_edge(TRUTH), causes=causes,
     )  # fmt: skip
     for name in SIX:
-        assert forecast.sigmas[name] == pytest.approx(fit.sigmas[name], rel=AGREE), name
+        assert expected.sigmas[name] == pytest.approx(fit.sigmas[name], rel=AGREE), name
     (seen,) = image_quantities(fit)
     for name, estimate in seen.items():
-        assert forecast.image_sigmas[name] == pytest.approx(estimate.sigma, rel=AGREE), (
+        assert expected.image_sigmas[name] == pytest.approx(estimate.sigma, rel=AGREE), (
             name
         )
 
@@ -128,3 +132,80 @@ def test_what_causes_leave_open_is_forecast() -> None:
     without = middle[False]["magnification"]
     assert without > 1.06
     assert abs(middle[True]["magnification"] - 1.0) < 0.5 * (without - 1.0)
+
+
+def test_scans_state_sigmas_within_their_ranges() -> None:
+    """Four plans, each scanned eight times: scanner, phantom and noise drawn by the campaign's
+    own renderer, spots calibrated with all causes. As many sigmas as the range says lie in it
+    (more where hardly anything is left to chance), and where it is narrow, they are as
+    forecast."""
+    every: list[bool] = []
+    wide: list[bool] = []
+    narrow: list[bool] = []
+    for seed in (801, 803, 804, 806):
+        plan, _ = forecasts.planned(seed)
+        plan = replace(plan, frames=min(plan.frames, 24))
+        expected = forecasts.forecast_of(plan)
+        sigmas = expected.sigmas | expected.image_sigmas
+        assert set(expected.ranges) == set(sigmas)
+        for draw in range(8):
+            rng = np.random.default_rng([seed, draw])
+            found = forecasts.stated(plan, forecasts.world_of(plan, rng), rng)
+            assert found is not None
+            for name, (low, high) in expected.ranges.items():
+                every.append(low <= found[name] <= high)
+                if high > forecasts.WIDE * low:
+                    wide.append(every[-1])
+                if high < 1.25 * sigmas[name] and low > 0.8 * sigmas[name]:
+                    narrow.append(0.8 < found[name] / sigmas[name] < 1.25)
+    assert np.mean(every) > MOST - 0.08
+    assert len(wide) > 100
+    assert np.mean(wide) == pytest.approx(MOST, abs=0.08)
+    assert len(narrow) > 50
+    assert np.mean(narrow) > 0.85
+
+
+def test_a_range_is_that_of_one_more_scan() -> None:
+    """39 scans whose sigmas are 1 to 39 times those of the fit, in any order: half state less
+    than 20, and of 40 places in the order 32 are between the fourth and the fourth from
+    above."""
+    model = BeadModel(beads_of("spiral"), np.full(5, own.RADIUS))
+    tracks = POSES.cone_vec().project_points(model.beads, own.SHAPE)
+    problem = build_problem(tracks, model, POSES, free=SIX, shape=own.SHAPE)
+    alone = forecast(problem)
+    assert alone.ranges == {}
+    times = np.random.default_rng(1).permutation(39) + 1.0
+    whole = alone.covariance * times[:, None, None] ** 2
+    images = np.array(list(alone.image_sigmas.values())) ** 2 * times[:, None] ** 2
+    found = forecast(problem, stated=Stated(whole, images))
+    for name, sigma in (alone.sigmas | alone.image_sigmas).items():
+        low, high = found.ranges[name]
+        assert low == pytest.approx(4 * sigma, rel=0.006)
+        assert high == pytest.approx(36 * sigma, rel=0.006)
+    for name, sigma in alone.sigmas.items():
+        assert found.sigmas[name] == pytest.approx(20 * sigma)
+    assert found.covariance == pytest.approx(400 * alone.covariance, rel=1e-9)
+    assert found.image_sigmas["axis_angle"] == pytest.approx(
+        20 * alone.image_sigmas["axis_angle"]
+    )
+
+
+def test_offsets_of_the_scanner_turn_the_image_of_the_axis() -> None:
+    """The axis's angle in the image is known better than the scanner's offsets turn it, so
+    that its sigma differs from scanner to scanner: of fifteen that are drawn here, each with
+    the forecast at its own place, median and spread are foreseen."""
+    plan, rng = forecasts.planned(502)
+    there = [
+        identifiability(
+            plan.model, plan.poses, plan.noise_px, shape=plan.shape, causes=False,
+            at=Offsets.from_edge(forecasts.world_of(plan, rng).offsets),
+        ).image_sigmas["axis_angle"]
+        for _ in range(15)
+    ]  # fmt: skip
+    foreseen = forecasts.forecast_of(plan)
+    assert foreseen.image_sigmas["axis_angle"] == pytest.approx(
+        np.median(there), rel=0.05
+    )
+    low, high = foreseen.ranges["axis_angle"]
+    assert low < np.quantile(there, 0.2)
+    assert high > np.quantile(there, 0.8)

@@ -137,44 +137,6 @@ def test_evidence_differs_as_densities_do(seed: int) -> None:
     assert one.evidence - two.evidence == pytest.approx(first - second, abs=1e-6)
 
 
-def test_what_models_leave_open_is_expected_as_drawn() -> None:
-    """Against data that are drawn, judged and averaged: the evidence at its expectation, and
-    the mean square about the first model's estimates."""
-    rng = np.random.default_rng(8)
-    rows = rng.normal(size=(50, 5))
-    drawn_widths = np.array([0.0, 0.0, 0.0, 0.3, 0.0])
-    flat = [np.inf, np.inf]
-    models = [
-        ([0, 1, 3], np.array([*flat, 0.3]), 0.0),
-        ([0, 1, 3], np.array([*flat, 0.9]), -2.0),
-        ([0, 1, 3, 4], np.array([*flat, 0.3, 0.2]), -2.0),
-    ]
-    noise = 0.5
-    table = Table(rows, np.zeros(50), noise)
-    spread, own = table.expected(models, drawn_widths**2, noise, 2)
-    squares = np.zeros((3, 2, 2))
-    evidence = np.zeros(3)
-    draws = 4000
-    for _ in range(draws):
-        values = noise * rng.normal(size=50) + rows @ (drawn_widths * rng.normal(size=5))
-        first = None
-        for i, (columns, widths, chance) in enumerate(models):
-            part = rows[:, columns]
-            precision = np.where(np.isinf(widths), 0.0, 1 / widths**2)
-            inverse = np.linalg.inv(part.T @ part / noise**2 + np.diag(precision))
-            mean = inverse @ part.T @ values / noise**2
-            first = mean if first is None else first
-            off = mean[:2] - first[:2]
-            squares[i] += (inverse[:2, :2] + np.outer(off, off)) / draws
-            log = -0.5 * (-np.linalg.slogdet(inverse)[1] - np.log(precision[2:]).sum())
-            log += 0.5 * values @ part @ mean / noise**2 + chance
-            evidence[i] += log / draws
-    weights = np.exp(evidence - evidence.max())
-    expected = np.einsum("m,mij->ij", weights / weights.sum(), squares)
-    assert spread == pytest.approx(expected, rel=0.01)
-    assert own == pytest.approx(squares[0], rel=1e-9)
-
-
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_tile_has_a_least_width(axis: int) -> None:
     """A shift beyond a border is found there, but not so near the edge that no tile is

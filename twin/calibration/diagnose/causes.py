@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
@@ -228,6 +229,19 @@ class Candidates:
         self.means = np.zeros(table.shape[1])
         self.means[: self.count] = (problem.prior_mean - x)[: self.count]
         self.means[everything.layout.arc_column] = (known.arc or 0.0) ** 2
+
+    def of_values(self, values: FloatArray, floor: float) -> Candidates:
+        """Return the table of other residuals.
+
+        Args:
+            values: (2 x seen positions,) whitened.
+            floor: least standard deviation of them.
+        """
+        other = copy(self)
+        other.values = values
+        other.table = self.table.of_values(self.rows, values, floor)
+        other._judged = {}
+        return other
 
     def _motions(self) -> dict[str, FloatArray]:
         """Compute the image shifts of everything that may move: each free parameter of
@@ -566,25 +580,17 @@ class Candidates:
                 out.append(weights * part / share)
         return out
 
-    def expected(self) -> tuple[FloatArray, FloatArray]:
-        """Compute the covariance of the geometry's columns averaged over no cause and every
-        single one, as it is expected of data without any, and that of no cause; internal
-        units, both (columns, columns).
-
-        The residuals' spread is `noise`; what always holds is as large as its widths.
+    @property
+    def drawn(self) -> FloatArray:
+        """(q,) standard deviations of what the columns are in scans without causes: those
+        of priors, and of what always holds; 0 for all others.
         """
-        drawn = np.zeros(len(self.means))
+        out = np.zeros(len(self.means))
+        widths = self.problem.prior_sigma[: self.count]
+        out[: self.count] = np.where(np.isfinite(widths), widths, 0.0)
         for cause in self.causes:
-            drawn[list(cause.columns)] = cause.always**2
-        nothing: Choice = (0.0,) * len(self.causes)
-        choices = [nothing] + [
-            with_pick(nothing, i, width)
-            for i, cause in enumerate(self.causes)
-            if cause.columns
-            for width in cause.widths
-        ]
-        models = [self._model(choice) for choice in choices]
-        return self.table.expected(models, drawn, self.noise, self.count)
+            out[list(cause.columns)] = cause.always
+        return out
 
     def correlated(self, choice: Choice) -> float:
         """Return the correlation length of the residuals that a choice leaves [frames]; 1
@@ -767,15 +773,11 @@ def explained_by_causes(
     odds = candidates.odds()
     # What moves looks like other causes in part, and most of it stays in the residuals.
     if moves and fit.certificate.rms_px > MAX_REST_SHARE * first.certificate.rms_px:
-        nothing: Choice = tuple(
-            pick if c.name.startswith(MOTION_OF) else 0.0
-            for c, pick in zip(candidates.causes, choice, strict=True)
-        )
-        beside = None
+        likely = None
         if names := _applied(candidates, choice):
-            beside = (fit, Found(odds, names, (), candidates.strain(choice)))
-        whole = Found(odds, beside_motion=beside)
-        return _widened(first, candidates, nothing), whole
+            likely = (fit, Found(odds, names, (), candidates.strain(choice)))
+        whole = Found(odds, beside_motion=likely)
+        return _widened(first, candidates, motions_alone(candidates, choice)), whole
     names = _applied(candidates, choice)
     doubtful = tuple(
         n
@@ -793,6 +795,15 @@ def explained_by_causes(
         return explained_by_causes(first, known, refit, lost)
     found = Found(odds, names, doubtful, candidates.strain(choice))
     return _widened(fit, candidates, choice), found
+
+
+def motions_alone(candidates: Candidates, choice: Choice) -> Choice:
+    """Return a choice without its other causes, if something moves in it."""
+    alone = tuple(
+        pick if c.name.startswith(MOTION_OF) else 0.0
+        for c, pick in zip(candidates.causes, choice, strict=True)
+    )
+    return alone if any(alone) else choice
 
 
 def _applied(candidates: Candidates, choice: Choice) -> tuple[str, ...]:
@@ -827,23 +838,6 @@ def _undetermined(
             odds, _applied(candidates, choice), (), candidates.strain(choice)
         )
     return _widened(first, candidates, nothing), Found(odds)
-
-
-def expected_open(problem: FitProblem, known: Known) -> FloatArray:
-    """Compute the covariance that the causes of a scan are expected to leave open, beyond
-    that of its fit.
-
-    Args:
-        problem: planned, with its positions as predicted at the start.
-        known: statements on the phantom and the positions; the floor is the spread of the
-            whitened residuals.
-
-    Returns:
-        (p, p) of the columns that are parameters, edge units.
-    """
-    spread, own = Candidates(problem, problem.start, known, ()).expected()
-    factor = edge_factors(problem.layout.names[: len(own)])
-    return np.asarray((spread - own) * np.outer(factor, factor))
 
 
 def _searched(
@@ -918,12 +912,40 @@ def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResul
     Returns:
         The fit with a wider certificate; itself if the choices agree.
     """
-    likely = candidates.likely(choice)
-    own = candidates.fitted(choice)
+    own, more, likely, wider = left_open(candidates, choice)
     if len(likely) == 1 and own is candidates.judged(next(iter(likely))):
         return fit
-    at = own.covariance(candidates.count)
     factor = edge_factors(fit.problem.layout.names[: candidates.count])
+    unit = np.outer(factor, factor)
+    certificate = fit.certificate
+    apart = tuple(
+        Rival(
+            rival.weight,
+            rival.off * factor,
+            _changed(certificate.covariance, rival.covariance * unit + wider),
+        )
+        for rival in candidates.rivals(likely, own)
+    )
+    return replace(fit, certificate=replace(widened(certificate, more), rivals=apart))
+
+
+def left_open(
+    candidates: Candidates, choice: Choice
+) -> tuple[Judged, FloatArray, dict[Choice, float], FloatArray]:
+    """Compute what likely choices add to the covariance of the fit with the causes of one.
+
+    Args:
+        candidates: all causes, judged.
+        choice: the most likely one.
+
+    Returns:
+        The model of the fit; the addition, (p, p), edge units; likely choices and their
+        probabilities; and the change of the covariance of each choice, (p, p), edge units.
+    """
+    likely = candidates.likely(choice)
+    own = candidates.fitted(choice)
+    at = own.covariance(candidates.count)
+    factor = edge_factors(candidates.problem.layout.names[: candidates.count])
     unit = np.outer(factor, factor)
     rivals = candidates.rivals(likely, own)
     square = np.array([r.covariance + np.outer(r.off, r.off) for r in rivals])
@@ -933,18 +955,7 @@ def _widened(fit: FitResult, candidates: Candidates, choice: Choice) -> FitResul
         wide = larger(wide, np.tensordot(given, square, 1))
     values, vectors = np.linalg.eigh((wide - at) * unit)
     more = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    certificate = fit.certificate
-    apart = tuple(
-        Rival(
-            rival.weight,
-            rival.off * factor,
-            _changed(
-                certificate.covariance, (rival.covariance + wide - mean - at) * unit
-            ),
-        )
-        for rival in rivals
-    )
-    return replace(fit, certificate=replace(widened(certificate, more), rivals=apart))
+    return own, more, likely, (wide - mean - at) * unit
 
 
 def _changed(covariance: FloatArray, change: FloatArray) -> FloatArray:

@@ -1,20 +1,21 @@
 """Forecast of the parameters that a planned scan determines, and changes to improve it.
 
-The prediction is that of the fit (`fit.forecast`), and what the causes that a calibration
-looks for are expected to leave open. The suggestions are planned scans too and are evaluated
-in the same way.
+The prediction is that of the fit (`fit.forecast`) to scans that are drawn (`foreseen`), with
+what the causes that a calibration looks for leave open of each. The suggestions are planned
+scans too and are evaluated in the same way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.diagnose.causes import Known, expected_open
+from flexdt.twin.calibration.diagnose.causes import Known
+from flexdt.twin.calibration.diagnose.foreseen import foreseen
 from flexdt.twin.calibration.fit.forecast import Forecast, forecast, visible_beads
 from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known, known_strain
 from flexdt.twin.calibration.fit.problem import (
@@ -64,6 +65,9 @@ class Prediction:
         null, weak: directions not determined, or badly.
         visible: (n, k) beads entirely in view.
         suggestions: changes that help, best first; empty if nothing is weak.
+        ranges: column or quantity of `image_sigmas` -> least and largest of the sigmas that
+            eight of ten such scans state: what a cause may hide depends on the noise. Empty
+            without causes, or where something is not determined.
     """
 
     sigmas: dict[str, float]
@@ -75,6 +79,7 @@ class Prediction:
     weak: tuple[Direction, ...]
     visible: npt.NDArray[np.bool_]
     suggestions: tuple[Suggestion, ...]
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def identifiable(self) -> bool:
@@ -120,9 +125,10 @@ def identifiability(
             alone, as `estimate_geometry` states it.
 
     Returns:
-        Predicted sigmas, rank, directions not determined, and suggestions, best first:
-        changes that lower the worst sigma, over its tolerance, by a fifth; none for a plan
-        whose directions are all determined within their tolerances.
+        Predicted sigmas (half of such scans state less, half of them more) with their
+        ranges, rank, directions not determined, and suggestions, best first: changes that
+        lower the worst sigma, over its tolerance, by a fifth; none for a plan whose
+        directions are all determined within their tolerances.
 
     Raises:
         TwinError, UnknownNameError: as `estimate_geometry`.
@@ -183,8 +189,8 @@ def identifiability(
         )
         fitted = forecast(problem, bound)
         if rivals and not fitted.spectrum.null and visible.any():
-            open_ = expected_open(problem, Known(strain, bead_tolerance_mm, 1.0))
-            return forecast(problem, bound, open_), visible
+            stated = foreseen(problem, Known(strain, bead_tolerance_mm, 1.0))
+            return forecast(problem, bound, stated), visible
         return fitted, visible
 
     sizes = frame_shapes(shape, len(poses))
@@ -210,6 +216,7 @@ def identifiability(
         weak=spec.weak,
         visible=visible,
         suggestions=tuple(suggestions),
+        ranges=expected.ranges,
     )
 
 

@@ -748,6 +748,22 @@ def _widened(
     return covariance, together is not None, size, certain
 
 
+def widened_by_structure(left: Residuals, covariance: FloatArray) -> FloatArray:
+    """Enlarge a covariance by what residuals show beyond white noise, as `certify` does.
+
+    Args:
+        left: residuals.
+        covariance: (p, p) of the fit, edge units.
+
+    Returns:
+        (p, p).
+    """
+    widths = left.problem.prior_sigma * edge_factors(left.problem.layout.names)
+    pull = left.unit_covariance[: len(covariance)] * left.noise**2 / widths
+    nowhere = np.zeros((*left.problem.seen.shape, 2))
+    return _widened(left, nowhere, covariance, cross(pull.T, pull.T), 0.0)[0]
+
+
 def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:
     """Compute whitened unit errors that follow a bead's place in the pixel grid.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,6 +77,14 @@ class Table:
         self._total = float(values @ values) / alike
         self._floor = floor
 
+    def of_values(self, rows: FloatArray, values: FloatArray, floor: float) -> Table:
+        """Return the table of other values of the same rows, none of them correlated."""
+        other = copy(self)
+        other._push = np.einsum("mq,m->q", rows, values)
+        other._total = float(values @ values)
+        other._floor = floor
+        return other
+
     def judged(
         self, columns: Sequence[int], widths: FloatArray, noise: float, means: FloatArray
     ) -> Judged | None:
@@ -134,63 +143,6 @@ class Table:
                 break
             variance = fresh
         return out
-
-    def expected(
-        self,
-        models: Sequence[tuple[Sequence[int], FloatArray, float]],
-        drawn: FloatArray,
-        noise: float,
-        count: int,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Compute the mean square of the first columns about a model's estimates that is
-        expected before there are values, averaged over models.
-
-        Squares of the values' products are replaced by their expectation.
-
-        Args:
-            models: columns, widths of their priors (inf: none) and logarithm of the
-                probability of each, as of `judged`; the first must be separable, others
-                that are not are left out.
-            drawn: (q,) variances of all columns of the table in the data.
-            noise: standard deviation of the data.
-            count: first columns, which every model has.
-
-        Returns:
-            That mean square about the first model's estimates, and that model's covariance,
-            both (count, count).
-        """
-        gram = self.gram / noise**2
-        # Of the products of rows and values, noise and what is drawn.
-        square = gram + (gram * drawn) @ gram
-        inverses = []
-        evidence = []
-        for columns, widths, chance in models:
-            at = np.asarray(columns, dtype=np.intp)
-            flat = np.isinf(widths)
-            precision = np.where(flat, 0.0, 1.0 / widths**2)
-            whole = gram[np.ix_(at, at)] + np.diag(precision)
-            scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
-            factor, inside, failed = lapack.dposv(
-                whole * np.outer(scale, scale), np.eye(len(at))
-            )
-            if failed:
-                continue
-            inverse = inside * np.outer(scale, scale)
-            explained = float(np.sum(inverse * square[np.ix_(at, at)]))
-            volume = 2.0 * float(np.log(np.diag(factor) / scale).sum())
-            volume -= float(np.log(precision[~flat]).sum())
-            gain = np.zeros((count, len(gram)))
-            gain[:, at] = inverse[:count]
-            inverses.append((inverse[:count, :count], gain))
-            evidence.append(0.5 * (explained - volume) + chance)
-        weights = np.exp(np.array(evidence) - max(evidence))
-        weights /= weights.sum()
-        own, first = inverses[0]
-        spread = np.zeros((count, count))
-        for (covariance, gain), weight in zip(inverses, weights.tolist(), strict=True):
-            off = gain - first
-            spread += weight * (covariance + off @ square @ off.T)
-        return spread, own
 
 
 def freedom_log(count: float, variance: float) -> float:

@@ -6,7 +6,9 @@ It is the Cramer-Rao bound of the reprojection residuals at the planned geometry
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +22,24 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
+MOST: Final = 0.8
+"""Part of the scans whose sigmas are within the range of a forecast."""
+FIRST_ORDER: Final = 0.005
+"""Relative error of a sigma that is computed to first order; ranges are wider by it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """What m scans state.
+
+    Attributes:
+        covariances: (m, p, p) of all columns that are parameters, edge units.
+        image_variances: (m, 3) of IN_IMAGES.
+    """
+
+    covariances: FloatArray
+    image_variances: FloatArray
+
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
@@ -30,16 +50,19 @@ class Forecast:
         image_sigmas: of IN_IMAGES.
         covariance: (p, p) of the requested columns, edge units.
         spectrum: rank, condition, null and weak directions of the requested columns.
+        ranges: requested column or one of IN_IMAGES -> least and largest of the sigmas that
+            `MOST` of the scans state; empty for a fit alone.
     """
 
     sigmas: dict[str, float]
     image_sigmas: dict[str, float]
     covariance: FloatArray
     spectrum: Conditioning
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def forecast(
-    problem: FitProblem, bound: float = BOUND, more: FloatArray | None = None
+    problem: FitProblem, bound: float = BOUND, stated: Stated | None = None
 ) -> Forecast:
     """Predict the certificate of a fit to the data of a problem, at its start, for
     whitened residuals of spread 1.
@@ -50,12 +73,12 @@ def forecast(
     Args:
         problem: the planned data, with priors.
         bound: as of `identifiability`.
-        more: (p, p) covariance of all columns that are parameters, edge units, that a
-            calibration adds to that of the fit; None: nothing.
+        stated: by scans of the plan; None: the fit alone.
 
     Returns:
         Sigmas of the asked parameters and those in images (infinite where not determined,
-        the latter together), covariance and spectrum.
+        the latter together), covariance and spectrum. Of several scans the medians of the
+        sigmas, with the correlation of the mean.
     """
     names = problem.layout.names
     count = problem.layout.asked
@@ -75,18 +98,52 @@ def forecast(
         unit = spec.unit_covariance
         spec = replace(alone, unit_covariance=unit, rank=rank, null=spec.null)
     whole = spec.unit_covariance[:reported, :reported]
-    if more is not None:
-        whole = whole + more
-    covariance = whole[:count, :count]
-    sigmas = dict(zip(names[:count], np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    images = dict.fromkeys(IN_IMAGES, math.inf)
-    if np.isfinite(whole).all():
-        slopes = image_slopes(problem, problem.start, 0)[1]
-        variance = np.einsum("qi,ij,qj->q", slopes, whole, slopes)
-        images = dict(
-            zip(IN_IMAGES, np.sqrt(np.maximum(variance, 0.0)).tolist(), strict=True)
-        )
-    return Forecast(sigmas, images, covariance, spec)
+    if stated is None:
+        every = whole[None]
+        felt = np.full((1, len(IN_IMAGES)), math.inf)
+        if np.isfinite(whole).all():
+            slopes = image_slopes(problem, problem.start, 0)[1]
+            felt = np.einsum("qi,mij,qj->mq", slopes, every, slopes)
+    else:
+        every = stated.covariances
+        felt = stated.image_variances
+    sigmas = np.sqrt(np.diagonal(every[:, :count, :count], axis1=1, axis2=2))
+    images = np.sqrt(np.maximum(felt, 0.0))
+    middle = np.median(sigmas, axis=0)
+    covariance = every.mean(axis=0)[:count, :count]
+    ranges = {}
+    if stated is not None:
+        share = middle / np.sqrt(np.diag(covariance))
+        covariance = covariance * np.outer(share, share)
+        ranges = _ranges(names[:count], sigmas) | _ranges(IN_IMAGES, images)
+    return Forecast(
+        dict(zip(names[:count], middle.tolist(), strict=True)),
+        dict(zip(IN_IMAGES, np.median(images, axis=0).tolist(), strict=True)),
+        covariance,
+        spec,
+        ranges,
+    )
+
+
+def _ranges(names: Iterable[str], sigmas: FloatArray) -> dict[str, tuple[float, float]]:
+    """Find between which values the sigma of one more scan lies in `MOST` of all cases.
+
+    Of m scans and one more, each place in their order is as likely as any other, whatever
+    the sigmas' distribution. What is nearly certain lies there more often, for `FIRST_ORDER`.
+
+    Args:
+        names: of the q quantities.
+        sigmas: (m, q) of m scans.
+
+    Returns:
+        Name -> least and largest.
+    """
+    ordered = np.sort(sigmas, axis=0)
+    cut = round((1.0 - MOST) / 2.0 * (len(sigmas) + 1))
+    low = ordered[cut - 1] / (1.0 + FIRST_ORDER)
+    high = ordered[-cut] * (1.0 + FIRST_ORDER)
+    ends = zip(low.tolist(), high.tolist(), strict=True)
+    return dict(zip(names, ends, strict=True))
 
 
 def visible_beads(
