@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -17,8 +18,13 @@ from flexdt.twin.calibration.fit.fitted_motion import (
     follow_motion,
 )
 from flexdt.twin.calibration.fits_of_scans import refit_scans
+from flexdt.twin.calibration.fixed_check import explain
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
+from flexdt.twin.errors import TwinError
+
+MOST_TURNS: Final = 3
+"""Times that motion and the causes of residuals are estimated beside each other."""
 
 
 def fit_with_motion(
@@ -54,11 +60,49 @@ def fit_with_motion(
     fit, found = follow_motion(
         fit,
         request.per_frame,
-        lambda motion: refit_scans(moved(motion), request, fit),
+        lambda motion: refit_scans(
+            moved(motion), request, fit, bead_tolerance_mm=fit.bead_prior_mm or None
+        ),
         state.motion,
         [name for name, width in stated.items() if width == 0],
     )
     return moved(found), fit
+
+
+def explained_with_motion(
+    state: Calibration, request: CalibrationRequest, fit: FitResult
+) -> tuple[Calibration, FitResult, list[Finding]]:
+    """Explain the residuals of a fit; where something moves beside their causes, estimate
+    motion and causes by turns until the motion stays, `MOST_TURNS` at most.
+
+    Args:
+        state: the scans, perhaps with a motion in their poses.
+        request: the free parameters, and those that may move.
+        fit: without causes.
+
+    Returns:
+        The state with the motion beside the causes, the fit with both, and the findings.
+    """
+    better, explained = explain(state, request, fit)
+    for _ in range(MOST_TURNS):
+        before = state.motion
+        if before is None or _alike(better, fit):
+            break
+        try:
+            state, _ = fit_with_motion(state, request, better)
+        except TwinError:  # Beside these causes the tracks tell too little of it.
+            break
+        fit = refit_scans(state, request, fit)
+        better, explained = explain(state, request, fit)
+        if state.motion is not None and state.motion.near(before):
+            break
+    return state, better, explained
+
+
+def _alike(one: FitResult, other: FitResult) -> bool:
+    """Check whether two fits have the same causes of residuals."""
+    same = one.problem.layout.names == other.problem.layout.names
+    return same and one.strain_prior == other.strain_prior
 
 
 def settle_motion(

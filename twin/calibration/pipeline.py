@@ -34,7 +34,11 @@ from flexdt.twin.calibration.fits_of_scans import fit_scans
 from flexdt.twin.calibration.fixed_check import check_fixed, explain
 from flexdt.twin.calibration.frame_source import FrameState, Scan, without_repeats
 from flexdt.twin.calibration.identified_scans import identify_scans
-from flexdt.twin.calibration.motion_of_scans import fit_with_motion, settle_motion
+from flexdt.twin.calibration.motion_of_scans import (
+    explained_with_motion,
+    fit_with_motion,
+    settle_motion,
+)
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, with_free
 from flexdt.twin.calibration.scans_to_calibrate import require_different, require_scans
@@ -238,8 +242,10 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
         The calibration, its fit relative to the caller's start and with the iterations of
         all fits.
     """
-    fit, explained = explain(fitted.state, fitted.request, fitted.fit)
-    state = _judged_places(fitted.state, fit, explained)
+    state, fit, explained = explained_with_motion(
+        fitted.state, fitted.request, fitted.fit
+    )
+    state = _judged_places(state, fit, explained)
     state, fit, explained = _fixed_as_asked(state, asked, fitted.request, fit, explained)
     if state.motion is not None:
         state, unsettled = settle_motion(state, fitted.request, fit)

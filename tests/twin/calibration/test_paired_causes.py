@@ -133,6 +133,21 @@ def test_a_refusal_names_what_is_there(kind: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(
+    ("kind", "seed"),
+    [("drift_across+tiles_apart", 8022), ("jump_across+four_tiles", 97643)],
+)
+def test_motion_is_followed_beside_other_causes(kind: str, seed: int) -> None:
+    """It was estimated before the tiles were, and not again: the scan was withheld."""
+    scan, _ = drawn_together(kind, seed)
+    result = calibrated(scan, ("dO_x", "dO_y", "dO_z", "alpha"))
+    assert result.identifiable, result.findings
+    assert worst_error(result, scan)[0] < 4.0
+    codes = {f.code for f in result.findings}
+    assert "panel_distorted" in codes
+    assert "motion_unsettled" not in codes
+
+
+@pytest.mark.parametrize(
     ("kind", "seed", "code"),
     [
         ("wobble+angle_factor", 8234, "wobble"),
