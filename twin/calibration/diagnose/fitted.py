@@ -434,7 +434,7 @@ def _moving_beside(
         An error, and the findings on what stands beside it; empty if nothing explains the
         residuals.
     """
-    beside = [(plain, list[Finding]())]
+    beside: list[tuple[FitResult, list[Finding]]] = [(plain, [])]
     if causes.applied:
         beside.append((fit, list(named)))
     if causes.beside_motion is not None:
