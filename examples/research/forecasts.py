@@ -271,16 +271,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     found = [compared(seed, not args.unidentified) for seed in seeds]
     some = [one for one in found if one is not None]
     rows = {name: _figures([one[name] for one in some]) for name in some[0]}
+    wide = [v.inside for one in some for v in one.values() if v.high > WIDE * v.low]
+    inside = float(np.mean(wide))
     if args.json:
-        print(json.dumps({"scans": args.scans, "offered": len(some), "ratios": rows}))
+        counts = {"scans": args.scans, "offered": len(some), "wide_inside": inside}
+        print(json.dumps({**counts, "ratios": rows}))
     else:
         print(f"{len(some)} of {args.scans} offered; stated over forecast sigma:")
         for name, row in rows.items():
             print(f"  {name:14}" + "  ".join(f"{k} {v:.2f}" for k, v in row.items()))
-    wide = [v.inside for one in some for v in one.values() if v.high > WIDE * v.low]
-    print(f"{np.mean(wide):.3f} of {len(wide)} sigmas with a wide range are in it")
+        print(f"{inside:.3f} of {len(wide)} sigmas with a wide range are in it")
     return int(
-        abs(np.mean(wide) - MOST) > INSIDE_OFF
+        abs(inside - MOST) > INSIDE_OFF
         or any(
             abs(row["median"] - 1.0) > MEDIAN_OFF
             or row["inside"] < LEAST_INSIDE
