@@ -42,6 +42,7 @@ from flexdt.twin.calibration.fit.problem import (
     turning_shifts,
 )
 from flexdt.twin.calibration.fit.residual_structure import (
+    HARMONICS,
     MOVING,
     correlation_length,
     larger,
@@ -96,9 +97,15 @@ SHAPES: Final = ("stretch", "shear")
 MOTION_OF: Final = "motion of "
 APART: Final = " between scans"
 """End of the name of a motion from scan to scan."""
+REPEATING: Final = "errors of spots"
+"""The cause that each bead's spots have errors of their own, smooth in the angle."""
+REPEATING_WIDTHS: Final = (0.1, 0.2, 0.4, 0.8, 1.6)
+"""Widths of a wave of such errors, in standard deviations of a position."""
+REPEATING_FRAMES: Final = 16
+"""Least number of frames in which errors that repeat with the turn are told from others."""
 MAX_REST_SHARE: Final = 0.5
 """Part of the residuals that other causes may leave where something seems to move, too."""
-RIVALS: Final = (MOTION_OF, "priors")
+RIVALS: Final = (MOTION_OF, REPEATING, "priors")
 """Causes that only compete: they are followed elsewhere."""
 
 
@@ -183,6 +190,7 @@ class Candidates:
         borders: Sequence[Border],
         alike: float = 1.0,
         left_out: Sequence[int] = (),
+        repeating: bool = False,
     ) -> None:
         """Tabulate the residuals' derivatives with respect to all causes, residuals of
         bad spots (beyond `OUTLIER_SIGMAS`) weighted less.
@@ -197,6 +205,7 @@ class Candidates:
             borders: panel borders that are causes, too.
             alike: number of neighbouring frames whose residuals count as one.
             left_out: beads that are elsewhere: their positions are evidence of nothing.
+            repeating: whether errors of spots that repeat with the turn are a cause, too.
         """
         self.problem = problem
         self.x = x
@@ -205,6 +214,7 @@ class Candidates:
         self.known = known
         self.alike = alike
         self.borders = tuple(borders)
+        self.repeating = repeating
         self.count = problem.layout.parameter_count
         everything, there = _with_every_column(problem, x, panel_of(problem, borders))
         rows = everything.jacobian(there, self.use)[np.repeat(self.use.ravel(), 2)]
@@ -216,14 +226,17 @@ class Candidates:
         )
         share = np.repeat(bounded, 2)[:, None]
         motions = self._motions()
-        table = np.concatenate([rows, *motions.values()], axis=1) * share
+        waves = [self._repeating()] if repeating else []
+        table = np.concatenate([rows, *motions.values(), *waves], axis=1) * share
         causes = there - everything.start
         causes[: self.count] = 0.0
         values = left.ravel() + rows @ causes
         self.rows = table
         self.values = values * share[:, 0]
         self.table = Table(self.rows, self.values, known.floor, alike)
-        self.visible = self._visible(rows.shape[1])
+        first = rows.shape[1]
+        last = first + sum(own.shape[1] for own in motions.values())
+        self.visible = self._visible(first, last)
         self.causes = self._causes(everything, motions)
         self._judged: dict[Choice, Judged | None] = {}
         self.means = np.zeros(table.shape[1])
@@ -279,7 +292,25 @@ class Candidates:
                 out[MOTION_OF + name + where] = columns / length
         return out
 
-    def _visible(self, first: int) -> FloatArray:
+    def _repeating(self) -> FloatArray:
+        """Return errors of a bead's positions, across or down, as waves in the angle up to
+        `HARMONICS` in a turn: (2 x seen positions, columns).
+
+        The first wave has a standard deviation of a position, the others are smaller by
+        their number, as of what is smooth.
+        """
+        n, k = self.use.shape
+        number = np.arange(HARMONICS + 1)
+        turn = self.problem.poses.angle[:, None] * number
+        size = 1.0 / np.maximum(number, 1)
+        waves = np.concatenate(
+            [size * np.cos(turn), size[1:] * np.sin(turn[:, 1:])], axis=1
+        )
+        own = np.einsum("nw,bc->nbwc", waves, np.eye(2 * k))
+        rows = own.reshape(n * 2 * k, -1)
+        return np.asarray(rows[np.repeat(self.use.ravel(), 2)])
+
+    def _visible(self, first: int, last: int) -> FloatArray:
         """Compute which part of each column's length widths are meant for: of a motion,
         what the geometry leaves of it, `LEAST_VISIBLE` at least.
 
@@ -289,6 +320,7 @@ class Candidates:
 
         Args:
             first: column of a motion.
+            last: column after those of motions.
 
         Returns:
             (q,), 1 for other columns than motions.
@@ -301,12 +333,12 @@ class Candidates:
         inside.flat[:: self.count + 1] += prior**2 / self.alike
         scale = 1.0 / np.sqrt(np.maximum(np.diag(inside), 1e-300))
         factor, failed = lapack.dpotrf(inside * np.outer(scale, scale), lower=1)
-        if failed or first == len(gram):  # Columns that nothing tells apart hide no more.
+        if failed or first == last:  # Columns that nothing tells apart hide no more.
             return out
-        push = scale[:, None] * gram[own, first:]
+        push = scale[:, None] * gram[own, first:last]
         taken = np.square(lapack.dtrtrs(factor, push, lower=1)[0]).sum(axis=0)
-        power = np.maximum(np.diag(gram)[first:], 1e-300)
-        out[first:] = np.sqrt(np.maximum(1.0 - taken / power, LEAST_VISIBLE**2))
+        power = np.maximum(np.diag(gram)[first:last], 1e-300)
+        out[first:last] = np.sqrt(np.maximum(1.0 - taken / power, LEAST_VISIBLE**2))
         return out
 
     def _causes(
@@ -369,6 +401,10 @@ class Candidates:
             columns = tuple(range(first, first + own.shape[1]))
             out.append(Cause(name, columns, widths))
             first += own.shape[1]
+        if self.repeating:
+            columns = tuple(range(first, len(self.rows[0])))
+            widths = tuple(w * self.noise for w in REPEATING_WIDTHS)
+            out.append(Cause(REPEATING, columns, widths))
         out.append(Cause("priors", (), PRIOR_FACTORS, PRIOR_LOG_CHANCE))
         return tuple(out)
 
@@ -511,14 +547,15 @@ class Candidates:
         return out
 
     def fitted(self, choice: Choice) -> Judged:
-        """Return the model of the fit with the causes of a choice but its motions, which
-        are no columns of it; that of the choice itself if the other was not judged.
+        """Return the model of the fit with the causes of a choice but its motions and the
+        errors of spots, which are no columns of it; that of the choice itself if the
+        other was not judged.
 
         Args:
             choice: must be separable.
         """
-        moves = [c.name.startswith(MOTION_OF) for c in self.causes]
-        still = tuple(0.0 if m else w for m, w in zip(moves, choice, strict=True))
+        besides = [c.name.startswith((MOTION_OF, REPEATING)) for c in self.causes]
+        still = tuple(0.0 if m else w for m, w in zip(besides, choice, strict=True))
         model = self.judged(still) or self.judged(choice)
         assert model is not None
         return model
@@ -867,8 +904,15 @@ def _searched(
     Returns:
         The table, with at most `MOST_BORDERS` borders, and its most likely choice.
     """
-    candidates = Candidates(fit.problem, fit.solution.x, known, borders, alike, left_out)
+    problem = fit.problem
+    x = fit.solution.x
+    candidates = Candidates(problem, x, known, borders, alike, left_out)
     choice = candidates.best([candidates.choice(before)])
+    # Only what is taken for another cause has to be told from errors of the spots.
+    if _applied(candidates, choice) and len(problem.group) >= REPEATING_FRAMES:
+        widths = candidates.widths(choice)
+        candidates = Candidates(problem, x, known, borders, alike, left_out, True)
+        choice = candidates.best([candidates.choice(widths)])
     while len(candidates.borders) < MOST_BORDERS:
         found: dict[Border, list[Choice]] = {}
         for part in candidates.parts(choice):
@@ -878,7 +922,9 @@ def _searched(
         some = []
         for border, parts in found.items():
             every = (*candidates.borders, border)
-            table = Candidates(fit.problem, fit.solution.x, known, every, alike, left_out)
+            table = Candidates(
+                problem, x, known, every, alike, left_out, candidates.repeating
+            )
             more = [
                 other
                 for part in parts
