@@ -394,13 +394,14 @@ def explain_residuals(
         turned = _angle_scale(plain, refit)
         if turned is not None:
             return plain, [turned]
-    if not bad and max(map(_share_left_out, (plain, fit))) <= MOST_LEFT_OUT:
+    crowd = max(map(_share_left_out, (plain, fit))) > MOST_LEFT_OUT
+    if not bad and not crowd:
         return fit, out
     # What else the residuals show has no meaning where no cause explains them.
     explained = _moving_beside(plain, fit, named, causes, refit)
-    if explained:  # Positions were left out because of it.
-        lost = [f for f in _lost_beads(fit) if f.code != "too_many_outliers"]
-        return fit, [*lost, *explained]
+    if explained:
+        # Most of a scan was left out because of it, and with that its beads.
+        return fit, [*([] if crowd else _lost_beads(fit)), *explained]
     if not bad:
         return fit, out
     misfit = error(
@@ -687,6 +688,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     )
     motion = found.motions[scan]
     of_scan = f" of scan {scan + 1}" if len(sizes) > 1 else ""
+    in_scan = of_scan.replace("of", "in")
     name = names[first]
     curve = motion.values[:, first]
     motions = [
@@ -707,7 +709,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         alike += ALIKE_MOTION[name]
     return error(
         code,
-        f"{', '.join(motions)} moves during the scan, {how}{of_scan}{_alternatives(alike)}: "
+        f"{', '.join(motions)} moves during the scan, {how}{in_scan}{_alternatives(alike)}: "
         f"--per-frame {','.join(names)} follows it",
         per_frame=names,
     )
