@@ -93,6 +93,13 @@ def sigmas(scan: Scan) -> float:
     return float(np.sqrt(max((least[0] - least[1]).sum(), 0.0)))
 
 
+def drawn_sigmas(kind: str, seed: int) -> tuple[tuple[int, float], float]:
+    """Return the gap of a drawn scan, and by how many sigmas the mean tells it."""
+    rng = np.random.default_rng([list(OBJECTS).index(kind), seed, True])
+    scan = drawn(kind, rng, True)
+    return scan.gap, sigmas(scan)
+
+
 def main(words: list[str] | None = None) -> int:
     """Bound drawn scans and print how many are decidable; 0."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
@@ -104,16 +111,8 @@ def main(words: list[str] | None = None) -> int:
     told: list[dict[str, Any]] = []
     for k in range(o.count):
         kind, seed = names[k % len(names)], o.seed + k // len(names)
-        rng = np.random.default_rng([list(OBJECTS).index(kind), seed, True])
-        scan = drawn(kind, rng, True)
-        told.append(
-            {
-                "kind": kind,
-                "seed": seed,
-                "gap": scan.gap,
-                "sigmas": round(sigmas(scan), 1),
-            }
-        )
+        gap, surely = drawn_sigmas(kind, seed)
+        told.append({"kind": kind, "seed": seed, "gap": gap, "sigmas": round(surely, 1)})
         print(json.dumps(told[-1]), flush=True)
     count = sum(one["sigmas"] >= DECIDABLE for one in told)
     print(
