@@ -273,6 +273,27 @@ def test_a_growth_is_no_cause_that_images_tell_from_a_motion() -> None:
     assert grown == pytest.approx(moved, abs=1e-6)
 
 
+def test_a_jump_of_what_the_camera_reads_is_no_slip_and_can_be_followed() -> None:
+    """Two columns in the last frames: they were told as frames that are missing, or a slip."""
+    scan = drawn("as_assumed", 5)
+    few = 4
+    spots = [
+        frame if frame is None or i < len(scan.spots) - few else frame + [2.0, 0.0, 0.0]
+        for i, frame in enumerate(scan.spots)
+    ]
+    jumped = replace(scan, spots=spots)
+    (said,) = (f.text for f in calibrated(jumped).errors)
+    assert "all shadows stand +2.0 columns and " in said
+    (asked,) = re.findall(r"--per-frame ([\w,]+)", said)
+    result = calibrated(jumped, tuple(asked.split(",")))
+    assert result.identifiable, result.findings
+    # Of the mean frame: the camera's own columns are another panel's.
+    column = scan.image["axis_column"] + 2.0 * few / len(spots)
+    true = replace(scan, image=dict(scan.image) | {"axis_column": column})
+    worst, where = worst_error(result, true)
+    assert worst < 4.0, where
+
+
 def test_pixels_of_another_pitch_are_named_beside_the_distance() -> None:
     scan = drawn("other_pitch", 1)
     (said,) = (f.text for f in calibrated(scan).errors)

@@ -110,6 +110,12 @@ OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
 """Codes of findings on motion that may be followed from frame to frame."""
 MAX_CURVED: Final = 0.2
 """Part of a turn that a factor on the angles may leave for it to be one."""
+ASIDE: Final = ("dO_x", "dO_y", "dO_z", "alpha", "dD_x", "dD_y")
+"""Parameters that are advised to differ between frames where all shadows stand aside."""
+ASIDE_REST: Final = 0.2
+"""Part of the shadows' distances from where they should be that stands for noise there."""
+LEAST_ASIDE: Final = 4
+"""Least number of shadows that are said to stand aside alike."""
 UNEXPLAINED_MOTION: Final = ("dO_x", "dO_y", "alpha")
 """Parameters that are advised to differ between frames where no cause explains a misfit."""
 MOST_FRAMES: Final = 720
@@ -201,6 +207,15 @@ def _judged_scan(
         places_of = f"{bad[0]} to {bad[-1]}"
     else:
         places_of = ", ".join(str(i) for i in bad[:12])
+    if block and (aside := _aside(fit, np.flatnonzero(own)[bad].tolist())) is not None:
+        column, row = aside.tolist()
+        return error(
+            "frames_inconsistent",
+            f"in frames {places_of} of {n}{of_scan} all shadows stand {column:+.1f} columns "
+            f"and {row:+.1f} rows aside: the panel, the source or the object moved, or what the camera reads of "
+            f"the panel: --per-frame {','.join(ASIDE)} follows it",
+            per_frame=ASIDE,
+        )
     # A drift of something else leaves its ends out, too.
     if block and all(d.column.split("@")[0] == "alpha" for d in fit.certificate.drifts):
         return error(
@@ -214,6 +229,26 @@ def _judged_scan(
         f"in {len(bad)} of {n} frames{of_scan} ({places_of}) the shadows are not where the "
         "others put them" + ("" if many else "; those frames are not used"),
     )
+
+
+def _aside(fit: FitResult, frames: Sequence[int]) -> FloatArray | None:
+    """Compute by how much all spots of some frames stand aside from where the fit has them.
+
+    Args:
+        fit: to all frames.
+        frames: the frames.
+
+    Returns:
+        (2,) columns and rows [px]: the median; None if it leaves more than `ASIDE_REST` of
+        the distances: what turns moves the shadows of near and far beads apart.
+    """
+    off = (fit.problem.pixels - fit.problem.residuals(fit.solution.x)[0])[list(frames)]
+    off = off[np.isfinite(off).all(axis=-1)]
+    if len(off) < LEAST_ASIDE:
+        return None
+    middle = np.asarray(np.median(off, axis=0))
+    rest = float(np.median(np.linalg.norm(off - middle, axis=1)))
+    return middle if rest < ASIDE_REST * float(np.linalg.norm(middle)) else None
 
 
 def judge_offsets(fit: FitResult) -> Finding | None:
