@@ -212,8 +212,8 @@ def _judged_scan(
         return error(
             "frames_inconsistent",
             f"in frames {places_of} of {n}{of_scan} all shadows stand {column:+.1f} columns "
-            f"and {row:+.1f} rows aside: the panel, the source or the object moved, or what the camera reads of "
-            f"the panel: --per-frame {','.join(ASIDE)} follows it",
+            f"and {row:+.1f} rows aside: the panel, the source or the object moved, or what "
+            f"the camera reads of the panel: --per-frame {','.join(ASIDE)} follows it",
             per_frame=ASIDE,
         )
     # A drift of something else leaves its ends out, too.
