@@ -221,8 +221,9 @@ def measure_beads(
         if body is not None:
             # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
             # body adds to the line integral depends on the bead in front of it.
-            left = rest_of_blur(sharp.true, BLURRED_FINE)
-            seen = see_body(images, described, cone, model, windows, left, seen)
+            if not draft:
+                left = rest_of_blur(sharp.true, BLURRED_FINE)
+                seen = see_body(images, described, cone, model, windows, left, seen)
             both = render_windows(seen.scene(described), cone, windows, fine, balls)
             behind = blurred_windows(both, rest) - alone
             if not draft:
