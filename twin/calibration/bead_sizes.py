@@ -6,7 +6,7 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import spot_radii
 from flexdt.twin.calibration.diagnose import Finding, listed
-from flexdt.twin.calibration.diagnose.fitted import judge_first_size, judge_size
+from flexdt.twin.calibration.diagnose.measured_spots import judge_first_size, judge_size
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest

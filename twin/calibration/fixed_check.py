@@ -14,7 +14,6 @@ from flexdt.twin.calibration.diagnose.fitted import (
     OF_MOTION,
     OF_RESIDUALS,
     explain_residuals,
-    moving,
 )
 from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,
@@ -26,6 +25,7 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
     narrow_priors,
 )
+from flexdt.twin.calibration.diagnose.named_motion import moving
 from flexdt.twin.calibration.diagnose.pixel_pitch import with_rival_pitch
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, Solver

@@ -21,13 +21,9 @@ from flexdt.twin.calibration.detect.bead_contrast import detector_for
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import Finding, listed
 from flexdt.twin.calibration.diagnose.data import judge_emptiness, judge_frames
-from flexdt.twin.calibration.diagnose.fitted import (
-    OF_RESIDUALS,
-    judge_body,
-    judge_lag,
-    judge_offsets,
-    judge_places,
-)
+from flexdt.twin.calibration.diagnose.fitted import OF_RESIDUALS, judge_offsets
+from flexdt.twin.calibration.diagnose.frame_places import judge_places
+from flexdt.twin.calibration.diagnose.measured_spots import judge_body, judge_lag
 from flexdt.twin.calibration.fit.fit import FitResult, with_start
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.fits_of_scans import fit_scans

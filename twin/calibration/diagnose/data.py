@@ -18,7 +18,7 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose import Finding, error, warning
-from flexdt.twin.calibration.diagnose.fitted import moving, named_turn
+from flexdt.twin.calibration.diagnose.named_motion import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
 from flexdt.twin.calibration.fit.priors import ASSUMED

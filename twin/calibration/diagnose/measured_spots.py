@@ -1,0 +1,148 @@
+"""Checks of the second measurement: sizes of spots, the body, and what the camera keeps of
+earlier frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flexdt.twin.calibration.camera_lag import Lag
+from flexdt.twin.calibration.detect.refine import Refined
+from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.frame_source import FrameSpots
+from flexdt.twin.calibration.identify import Identification
+from flexdt.twin.geometry.conventions import FloatArray
+
+MAX_SIZE_ERROR = 0.04
+"""Deviation of the spots' radii from the expected ones that indicates a wrong scale."""
+BLUR_TOLERANCE = 0.6
+"""Further deviation allowed, in units of the squared blur over radius (measured)."""
+MAX_BODY_LOG = 0.5
+"""Logarithm of the body's seen over its described attenuation from which it is reported:
+beam hardening alone stays below."""
+MAX_BODY_MM = 0.3
+"""Shift of the body from its description from which it is reported [mm]."""
+
+
+def judge_first_size(
+    found: Identification, looks: Sequence[FrameSpots], radii: FloatArray, allowed: float
+) -> Finding | None:
+    """Judge sizes coarsely from the first measurement: the median ratio of measured to
+    expected radii of complete, identified spots.
+
+    Args:
+        found: the bead of each spot.
+        looks: of every frame.
+        radii: (n, k) expected radii [px].
+        allowed: deviation that may be blur, as a share.
+
+    Returns:
+        An error on bead sizes; None if the ratio is within `allowed` of 1, or there is no
+        such spot.
+    """
+    ratios = [
+        look.detections.radii_px[j] / radii[f, b]
+        for f, look in enumerate(looks)
+        for b, j in enumerate(found.index[f].tolist())
+        if j >= 0 and look.detections.whole[j]
+    ]
+    if ratios:
+        ratio = float(np.median(ratios))
+    else:
+        ratio = 1.0
+    if abs(ratio - 1.0) < allowed:
+        return None
+    return _other_size(ratio)
+
+
+def judge_size(measured: Refined, radius_px: float) -> Finding | None:
+    """Judge the spots' size against the one of the phantom's beads at the fitted
+    geometry.
+
+    A phantom of another scale at another distance gives the same bead positions; only the
+    beads' own size reveals it.
+
+    Args:
+        measured: size (nan if unknown) and blur.
+        radius_px: expected radius of the spots.
+
+    Returns:
+        Beyond `MAX_SIZE_ERROR` a warning if blur may explain it, else an error; None if
+        the size fits or is unknown.
+    """
+    off = abs(measured.size - 1.0)
+    blur = measured.blur_px / radius_px
+    if not off >= MAX_SIZE_ERROR:
+        return None
+    if off < MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2:
+        return warning(
+            "blurred",
+            f"the images are blurred by {measured.blur_px:.1f} px and the shadows are "
+            f"{radius_px:.1f} px wide: the beads' size is known to "
+            f"{100 * (MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2):.0f} % only, "
+            "and with it the phantom's scale",
+        )
+    return _other_size(measured.size)
+
+
+def _other_size(ratio: float) -> Finding:
+    """Make the error that the shadows have another size than predicted, in per cent.
+
+    Args:
+        ratio: measured over predicted size.
+    """
+    return error(
+        "bead_size",
+        f"the shadows are {100 * abs(ratio - 1):.0f} % "
+        f"{'larger' if ratio > 1 else 'smaller'} than "
+        "those that the phantom's beads cast at the fitted geometry: beads of another "
+        "size, or a "
+        "phantom of another scale",
+    )
+
+
+def judge_body(measured: Sequence[Refined]) -> Finding | None:
+    """Judge whether the phantom's body has its described place and attenuation.
+
+    Args:
+        measured: second measurements; those without an estimate of the body are left out.
+
+    Returns:
+        None if so; else one warning: some scan does not show the body at all, or the
+        first scan that differs (beyond `MAX_BODY_LOG` or `MAX_BODY_MM`) and how.
+    """
+    bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
+    if any(body.factor == 0.0 for body in bodies):
+        return warning(
+            "body_elsewhere",
+            "the images do not show the phantom's body where it is described, so it was not "
+            "subtracted: another body, or one that is turned or shifted against the beads; "
+            "edges of the real one may pull shadows, which the intervals contain as far as "
+            "the residuals show it",
+        )
+    for body in bodies:
+        x, y, z = body.shift_mm
+        if abs(math.log(body.factor)) > MAX_BODY_LOG or math.hypot(x, y, z) > MAX_BODY_MM:
+            return warning(
+                "body_differs",
+                f"the phantom's body attenuates {body.factor:.2f} times what is described and "
+                f"stands {x:+.2f}, {y:+.2f}, {z:+.2f} mm from there; it was subtracted so",
+            )
+    return None
+
+
+def judge_lag(lag: Lag) -> Finding:
+    """Make the warning that the camera shows part of the frame before (detector lag),
+    with the part [%], whatever its size.
+    """
+    return warning(
+        "lag",
+        f"the camera still shows {100 * lag.part:.2g} % of the frame "
+        "before: it was taken out of what was measured here; a volume is blurred by it "
+        "along the "
+        "turn, but with the correction reconstruct takes it out, of scans with as long "
+        "exposures "
+        "and pauses",
+    )
