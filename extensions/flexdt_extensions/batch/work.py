@@ -28,10 +28,14 @@ from flexdt.phantoms.scan_limits import (
     check_tube,
     open_beam_doubts,
 )
-from flexdt.twin.calibration import BeadModel, FitResult, bead_model
-from flexdt.twin.calibration.bead_model import spot_radii
+from flexdt.twin.calibration import (
+    BeadModel,
+    FitResult,
+    bead_model,
+    spot_radii,
+    visible_beads,
+)
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.fit.forecast import visible_beads
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFrames
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.errors import TwinError
