@@ -14,7 +14,8 @@ from right_sets import FAR_SIGMAS, LEVELS, contains_what_is_asked, covered
 from right_sets import off as off_of
 from scipy.stats import f
 
-from flexdt.twin.calibration.diagnose import causes, fitted, tiles
+from flexdt.twin.calibration.diagnose import fitted, tiles
+from flexdt.twin.calibration.diagnose.causes import cause, columns, every_cause
 from flexdt.twin.calibration.fit import priors, problem
 from flexdt.twin.calibration.fit.certificate import Certificate, Rival, widened
 from flexdt.twin.calibration.fit.curved_region import Bend
@@ -46,16 +47,16 @@ def test_regions_of_another_size_are_told() -> None:
 def test_what_is_drawn_is_what_the_calibration_assumes() -> None:
     """Both write it out: the draws import nothing of the fit."""
     odds = np.log(faults_drawn.CAUSE_ODDS)
-    assert odds == pytest.approx(causes.LOG_CHANCE)
+    assert odds == pytest.approx(cause.LOG_CHANCE)
     assert faults_drawn.STRAIN == priors.STRAIN
-    assert causes.STRAIN_WIDTHS[1:] == faults_drawn.STRAIN_WIDTHS
-    assert faults_drawn.BEAD_SHARES == causes.BEAD_SHARES
-    assert faults_drawn.PANEL_WIDTHS_PX == causes.PANEL_WIDTHS_PX
+    assert every_cause.STRAIN_WIDTHS[1:] == faults_drawn.STRAIN_WIDTHS
+    assert faults_drawn.BEAD_SHARES == every_cause.BEAD_SHARES
+    assert faults_drawn.PANEL_WIDTHS_PX == every_cause.PANEL_WIDTHS_PX
     assert faults_drawn.GAP_WIDTHS_PX == tiles.GAP_WIDTHS_PX
     assert faults_drawn.LEAST_TILE == tiles.LEAST_TILE
     assert faults_drawn.LEAST_SIDE == tiles.LEAST_SIDE
-    assert faults_drawn.MOTION_SIGMAS == causes.MOTION_WIDTHS
-    assert faults_drawn.MOTION_SHAPES == causes.WAVES
+    assert faults_drawn.MOTION_SIGMAS == every_cause.MOTION_WIDTHS
+    assert faults_drawn.MOTION_SHAPES == columns.WAVES
     assert faults_drawn.ARC_WIDTH == problem.ARC_PRIOR
     assert faults_drawn.UNSEEN == priors.ASSUMED
 
@@ -144,7 +145,7 @@ def test_a_doubtful_cause_beside_which_nothing_is_determined_widens(
     """The likeliest choice, but not beyond doubt: the fit without it is offered, with what
     they differ by."""
     search = fitted.explained_by_causes
-    found: list[tuple[FitResult, FitResult, causes.Found]] = []
+    found: list[tuple[FitResult, FitResult, cause.Found]] = []
 
     def opened(fit: FitResult) -> FitResult:
         certificate = fit.certificate
@@ -152,8 +153,8 @@ def test_a_doubtful_cause_beside_which_nothing_is_determined_widens(
         return replace(fit, certificate=replace(certificate, spectrum=spectrum))
 
     def explained(
-        fit: FitResult, known: causes.Known, refit: causes.Refit
-    ) -> tuple[FitResult, causes.Found]:
+        fit: FitResult, known: cause.Known, refit: cause.Refit
+    ) -> tuple[FitResult, cause.Found]:
         better, odds = search(fit, known, lambda **changes: opened(refit(**changes)))
         found.append((fit, better, odds))
         return better, odds
