@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
-from faults_drawn import KINDS, PANELS, Faulty, drawn
+from faults_drawn import DRAWS, KINDS, PANELS, Faulty, drawn
 from faults_paired import drawn_names, drawn_together
 from placements_drawn import PLACED, PLACEMENTS, Placed, angles_apart, drawn_placed
 
@@ -137,7 +137,7 @@ def scored(kind: str, seed: int, panel: str = "flexray") -> Scored:
     pairs and setups are of a machine of PANELS.
     """
     placed: Placed | None = None
-    if kind in KINDS:
+    if kind in DRAWS:
         scan = drawn(kind, seed, panel)
         causes: tuple[tuple[str, ...], ...] = (scan.names,)
     elif kind.partition("@")[2] in PLACEMENTS:

@@ -83,6 +83,7 @@ class World:
         scale: see `Machine`.
         rows_turn: the object turns by so much between the readings of the first and the last
             row of a frame, whose angle is that of the middle row [deg].
+        loose: (n, k, 3) of the balls from their places in each frame [mm]; None: they stay.
     """
 
     beads: Array
@@ -100,6 +101,7 @@ class World:
     shape: tuple[int, int] = SHAPE
     scale: float = 1.0
     rows_turn: float = 0.0
+    loose: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +197,7 @@ def in_images(world: World) -> dict[str, float]:
         world, beads=points, radii=np.full(6, 1e-4 * world.scale), offsets=still,
         angles=world.angles[:1], spot=world.spot.mean(axis=0, keepdims=True),
         shown=np.ones((1, 6), dtype=bool), arc=0.0, size=None,
-        rows_turn=0.0,
+        rows_turn=0.0, loose=None,
     )  # fmt: skip
     ((up, down, *ends),) = shadows(first)[0]
     middle = (world.shape[0] - 1) / 2
@@ -261,6 +263,8 @@ def shadows(world: World) -> tuple[Array, Array]:
     round_ = 2 * math.pi * np.arange(TOUCHING) / TOUCHING
     for i in range(n):
         beads = world.beads * (1.0 if world.size is None else world.size[i])
+        if world.loose is not None:
+            beads = beads + world.loose[i]
         at = lean[i].apply(spin[i].apply(beads - tau[i])) + foot[i] - world.spot[i]
         inverse = np.linalg.inv(np.stack([panel[i], *steps[i]], axis=1))
         for k, (ball, r) in enumerate(zip(at, world.radii, strict=True)):
@@ -1284,6 +1288,100 @@ def _other_pitch(draft: Draft, rng: Rng) -> Draft:
     return replace(draft, world=world, names=("pixel",), silent=False)
 
 
+LOOSE: Final = "beads_moved|moves during the scan"
+"""Findings of beads that move against each other; what most of them do is a motion, too."""
+COURSES: Final = ("at_once", "slowly", "and_back")
+"""Ways in which something comes loose."""
+
+
+def _course(frames: int, how: str, rng: Rng) -> Array:
+    """Draw the share of a way that is gone in each frame, (n,): all of it from a frame in
+    the middle four fifths on, or evenly from there to the last, or there and back.
+    """
+    first = int(rng.integers(frames // 10 + 1, frames - frames // 10))
+    place = np.arange(frames)
+    if how == "at_once":
+        return (place >= first) * 1.0
+    if how == "slowly":
+        first = first // 2
+        return np.clip((place - first) / (frames - 1 - first), 0.0, 1.0)
+    last = int(rng.integers(first // 2, first))
+    return ((place >= last) & (place < first)) * 1.0
+
+
+def _way(rng: Rng, scale: float) -> Array:
+    """Draw a displacement of 0.02 to 0.5 mm times `scale`, (3,)."""
+    way = rng.normal(size=3)
+    size = math.exp(rng.uniform(math.log(0.02), math.log(0.5)))
+    return np.asarray(way * scale * size / np.linalg.norm(way))
+
+
+def _loosened(draft: Draft, moved: Array, turn: float = 0.0) -> Draft:
+    """Move balls in the object, and expect a finding of it; the object's place and angle
+    may be those of any ball.
+
+    Args:
+        draft: of the scan.
+        moved: (n, k, 3) [mm].
+        turn: largest turn about the vertical axis [deg].
+    """
+    way = float(np.linalg.norm(moved, axis=2).max())
+    near = dict.fromkeys(("dO_x", "dO_y", "dO_z", "tau_x", "tau_z"), way)
+    near["alpha"] = abs(turn)
+    ends = np.array([-1.0, 1.0])
+    truth = {name: draft.world.offsets[name] + off * ends for name, off in near.items()}
+    world = replace(draft.world, loose=moved)
+    return replace(draft, world=world, names=(LOOSE,), beside=OTHERS, truth=truth)
+
+
+def _part_slips(side: int, how: str) -> Fault:
+    """Make a fault: the balls above or below a height slip against the others, by 0.02 to
+    0.5 mm, and turn about the vertical axis by up to a degree.
+
+    Args:
+        side: 1: the upper ones, -1: the lower ones.
+        how: of COURSES.
+    """
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the height between two balls, the frame, the way and the turn."""
+        draft = usual(draft, rng)
+        beads, k = draft.world.beads, len(draft.world.beads)
+        order = np.argsort(side * beads[:, 2])
+        part = np.zeros(k, dtype=bool)
+        part[order[int(rng.integers(2, k - 1)) :]] = True
+        way = _way(rng, draft.world.scale)
+        turn = float(rng.uniform(-1.0, 1.0)) * float(rng.integers(0, 2))
+        middle = beads[part].mean(axis=0)
+        spin = Rotation.from_rotvec([0.0, 0.0, math.radians(turn)])
+        ends = spin.apply(beads - middle) + middle - beads + way
+        course = _course(len(draft.world.angles), how, rng)
+        moved = course[:, None, None] * np.where(part[:, None], ends, 0.0)
+        return _loosened(draft, moved, turn)
+
+    return fault
+
+
+def _beads_loose(count: int, how: str) -> Fault:
+    """Make a fault: some balls come loose, each by itself, by 0.02 to 0.5 mm.
+
+    Args:
+        count: of the balls.
+        how: of COURSES.
+    """
+
+    def fault(draft: Draft, rng: Rng) -> Draft:
+        """Draw the balls, and the frame and way of each."""
+        draft = usual(draft, rng)
+        n, k = draft.world.shown.shape
+        moved = np.zeros((n, k, 3))
+        for bead in rng.choice(k, count, replace=False):
+            moved[:, bead] = _course(n, how, rng)[:, None] * _way(rng, draft.world.scale)
+        return _loosened(draft, moved)
+
+    return fault
+
+
 ROLLS: Final = ("det_roll", "axis_tilt_z")
 LEANS: Final = ("dD_y", "det_pitch", "axis_tilt_x")
 TURNS: Final = ("dD_x", "det_yaw")
@@ -1391,8 +1489,20 @@ KINDS: Final[Mapping[str, Fault]] = {
     "panel_jumps_up": _usual_jump("dD_y", 0.02, 0.3),
     "grows": _grows,
     "other_pitch": _other_pitch,
+    "part_slips": _part_slips(1, "at_once"),
 }  # fmt: skip
 """Every fault."""
+MOVED: Final[Mapping[str, Fault]] = {
+    "one_loose": _beads_loose(1, "at_once"),
+    "one_creeps": _beads_loose(1, "slowly"),
+    "one_and_back": _beads_loose(1, "and_back"),
+    "two_loose": _beads_loose(2, "at_once"),
+    "two_creep": _beads_loose(2, "slowly"),
+    "lower_slips": _part_slips(-1, "at_once"),
+    "upper_creeps": _part_slips(1, "slowly"),
+    "lower_and_back": _part_slips(-1, "and_back"),
+}
+"""Further beads that move against each other."""
 RIGHT: Final[Mapping[str, Fault]] = {
     "as_assumed": _right,
     "with_causes": _with_causes(moving=False),
@@ -1400,5 +1510,5 @@ RIGHT: Final[Mapping[str, Fault]] = {
 }
 """Scans as a calibration assumes them to be: without further causes, with those of the
 phantom, the exposure and the panel, and with motion as well."""
-DRAWS: Final = {**KINDS, **RIGHT}
+DRAWS: Final = {**KINDS, **RIGHT, **MOVED}
 """Every kind of scan."""

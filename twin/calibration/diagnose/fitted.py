@@ -29,6 +29,7 @@ from flexdt.twin.calibration.diagnose.named_motion import (
     moving,
 )
 from flexdt.twin.calibration.diagnose.residual_limit import largest_residual
+from flexdt.twin.calibration.diagnose.slipped import Verdict, with_loose_beads
 from flexdt.twin.calibration.diagnose.wobble import wobble
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import (
@@ -95,7 +96,8 @@ def explain_residuals(
     If the residuals exceed the limit, or too many positions were left out, a factor on
     the angles is tried; then, beyond the limit or where `MOST_LEFT_OUT` of a scan were
     left out, what moves (`_moving_beside`); else, beyond the limit, the error "misfit" is
-    given. Beside these only lost beads are reported.
+    given. Beside these only lost beads are reported. Beads that move against each other
+    (`beads_moved`) are the only finding, and widen the sigmas where they are open.
 
     Args:
         fit: to be judged; nothing is judged if it is not identifiable.
@@ -123,12 +125,18 @@ def explain_residuals(
             return plain, [turned]
     crowd = max(map(_share_left_out, (plain, fit))) > MOST_LEFT_OUT
     if not bad and not crowd:
+        fit, loose = with_loose_beads(plain, fit, known)
+        if loose is not None:
+            return fit, [loose.finding(fit.problem.group)]
         return fit, out
     # What else the residuals show has no meaning where no cause explains them.
     explained = _moving_beside(plain, fit, named, causes, refit)
     if explained:
         # Most of a scan was left out because of it, and with that its beads.
         return fit, [*([] if crowd else _lost_beads(fit)), *explained]
+    fit, loose = with_loose_beads(plain, fit, known)
+    if loose is not None and _explains(loose, plain, limit):
+        return fit, [loose.finding(fit.problem.group)]
     if not bad:
         return fit, out
     misfit = error(
@@ -139,6 +147,14 @@ def explain_residuals(
         per_frame=UNEXPLAINED_MOTION,
     )
     return fit, [*_lost_beads(fit), misfit]
+
+
+def _explains(loose: Verdict, fit: FitResult, limit: float) -> bool:
+    """Check whether beads that move explain the residuals of a fit: they leave less than a
+    limit [px].
+    """
+    certificate = fit.certificate
+    return loose.rest * certificate.rms_px < limit * certificate.noise
 
 
 def _moving_beside(

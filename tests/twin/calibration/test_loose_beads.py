@@ -1,0 +1,103 @@
+"""Beads that move against each other during a scan, drawn with the shadows of `faults_drawn`.
+
+What really moves, from which frame and how far is taken from the drawn laboratory, which shares
+no code with the fit.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from causes_named import calibrated, scored, worst_error
+from faults_drawn import DRAWS, Array, drawn, right_draft
+
+from flexdt.twin.calibration.diagnose import fitted, slipped
+from flexdt.twin.calibration.diagnose.slipped import Piece
+from flexdt.twin.calibration.pipeline import Calibration
+
+
+def ways(kind: str, seed: int) -> Array:
+    """Displacements of the balls of a drawn scan, (n, k, 3) [mm]."""
+    rng = np.random.default_rng([seed, *kind.encode()])
+    moved = DRAWS[kind](right_draft(rng), rng).world.loose
+    assert moved is not None
+    return moved
+
+
+def said(result: Calibration) -> str:
+    """The error that beads move; "" without it."""
+    return "".join(f.text for f in result.errors if f.code == "beads_moved")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_part_that_slips_is_named_with_its_beads_frame_and_way(seed: int) -> None:
+    """Both were offered: as displaced beads, and as a drift."""
+    moved = np.linalg.norm(ways("part_slips", seed), axis=2)
+    result = calibrated(drawn("part_slips", seed))
+    assert not result.identifiable
+    found = re.search(
+        r"beads ([\d, ]+) move by ([\d.]+) mm from frame (\d+) on", said(result)
+    )
+    assert found is not None, result.findings
+    assert [int(b) for b in found[1].split(", ")] == np.flatnonzero(moved[-1]).tolist()
+    assert float(found[2]) == pytest.approx(moved.max(), rel=0.1)
+    assert int(found[3]) == np.flatnonzero(moved.any(axis=1))[0]
+
+
+def test_two_loose_beads_are_named_by_their_frames() -> None:
+    moved = np.linalg.norm(ways("two_loose", 1), axis=2)
+    text = said(calibrated(drawn("two_loose", 1)))
+    assert text
+    for bead in np.flatnonzero(moved[-1]).tolist():
+        first = int(np.flatnonzero(moved[:, bead])[0])
+        assert re.search(rf"\b{bead}\b[^;]* from frame {first} on", text), text
+
+
+def test_slow_errors_of_spots_are_no_beads_that_move(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Steps of beads explain much of them, and slow errors explain them better."""
+    odds = []
+    judged = slipped._Trial.judged
+
+    def kept(trial: slipped._Trial, pieces: tuple[Piece, ...]) -> slipped.Verdict:
+        odds.append(judged(trial, pieces))
+        return odds[-1]
+
+    monkeypatch.setattr(slipped._Trial, "judged", kept)
+    found = scored("slow_errors", 700)
+    assert odds
+    assert max(one.odds for one in odds) < 0.0
+    assert found.verdict == "right", found.said
+
+
+def test_what_is_open_is_in_the_sigmas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two beads came loose in the last frames, of which few spots are identified."""
+    scan = drawn("two_loose", 0)
+    wide = calibrated(scan)
+    monkeypatch.setattr(fitted, "with_loose_beads", lambda plain, fit, known: (fit, None))
+    narrow = calibrated(scan)
+    assert wide.fit is not None
+    assert narrow.fit is not None
+    assert wide.identifiable
+    assert worst_error(wide, scan)[0] < 4.0
+    ratio = [
+        wide.fit.certificate.estimates[name].sigma / estimate.sigma
+        for name, estimate in narrow.fit.certificate.estimates.items()
+    ]
+    assert min(ratio) > 0.999
+    assert max(ratio) > 1.1
+
+
+@pytest.mark.parametrize(
+    ("piece", "course"),
+    [
+        (Piece((0,), 3, False), [0, 0, 0, 1, 1, 1]),
+        (Piece((0,), 3, True), [0, 0, 0, 1 / 3, 2 / 3, 1]),
+        (Piece((0,), 1, True), [0, 0.2, 0.4, 0.6, 0.8, 1]),
+    ],
+)
+def test_a_way_is_gone_at_once_or_evenly(piece: Piece, course: list[float]) -> None:
+    assert piece.course(6) == pytest.approx(course)
