@@ -22,20 +22,19 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtri, gammaln, logsumexp
 
 from flexdt.twin.calibration.diagnose import Finding, error
-from flexdt.twin.calibration.diagnose.causes import (
-    LEAST_BEADS,
+from flexdt.twin.calibration.diagnose.causes import LEAST_BEADS, Candidates, Choice, Known
+from flexdt.twin.calibration.diagnose.causes.candidates import OUTLIER_SIGMAS
+from flexdt.twin.calibration.diagnose.causes.cause import (
     LOG_CHANCE,
-    MOTION_WIDTHS,
     NAMED_LOG_ODDS,
-    OUTLIER_SIGMAS,
-    PRIOR_FACTORS,
     REPEATING,
-    REPEATING_FRAMES,
-    WAVES,
-    Candidates,
-    Choice,
-    Known,
 )
+from flexdt.twin.calibration.diagnose.causes.columns import WAVES
+from flexdt.twin.calibration.diagnose.causes.every_cause import (
+    MOTION_WIDTHS,
+    PRIOR_FACTORS,
+)
+from flexdt.twin.calibration.diagnose.causes.explained import REPEATING_FRAMES
 from flexdt.twin.calibration.diagnose.wobble import LEANS
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.evidence import Judged, Table
