@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from causes_named import calibrated, scored, worst_error
-from faults_drawn import drawn
+from faults_drawn import drawn, right_draft, taken
 from faults_paired import MILD, PAIRS, SETUPS, drawn_names, drawn_together, together
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.causes import Candidates, Known
 from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.geometry.poses import Poses
-
-UNTOLD = [("bead_tolerance@few_beads", 30_044)]
-"""Scans whose images do not tell what is wrong; the phantom's turn is 5.8 sigma off."""
 
 
 def test_a_pair_has_both_of_its_faults() -> None:
@@ -60,6 +58,17 @@ def test_what_a_cause_hides_behind_the_geometry_is_in_the_sigmas(
     kind: str, seed: int
 ) -> None:
     found = scored(kind, seed)
+    assert found.offered
+    assert not found.wrong, found
+
+
+@pytest.mark.parametrize("seed", [30_044, 30_069, 30_073])
+def test_three_beads_that_happen_to_keep_their_shape_are_not_taken_to_be_in_place(
+    seed: int,
+) -> None:
+    """Displaced by 0.03 to 0.06 mm, their triangle hardly changes: the phantom's turn was 5.8,
+    6.6 and 5.4 sigmas off."""
+    found = scored("bead_tolerance@few_beads", seed)
     assert found.offered
     assert not found.wrong, found
 
@@ -173,9 +182,7 @@ def test_an_unusual_scan_that_is_right_is_offered(setup: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.campaign(8)
-@pytest.mark.parametrize(
-    ("kind", "seed"), [n for n in drawn_names(48, 30_000) if n not in UNTOLD]
-)
+@pytest.mark.parametrize(("kind", "seed"), drawn_names(48, 30_000))
 def test_no_drawn_pair_is_offered_wrong(kind: str, seed: int) -> None:
     assert not scored(kind, seed).wrong
 
@@ -202,8 +209,16 @@ def test_a_motion_counts_by_what_the_geometry_leaves_of_it() -> None:
     assert candidates.visible[cause.columns[0]] < 0.05
 
 
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="moving three beads anywhere is straining them")
-@pytest.mark.parametrize(("kind", "seed"), UNTOLD)
-def test_three_displaced_beads_are_told_from_a_strain(kind: str, seed: int) -> None:
-    assert not scored(kind, seed).wrong
+def test_a_phantom_that_shrinks_within_its_stated_tolerance_is_in_the_sigmas() -> None:
+    """Beads were independent of each other: of 14 all off by one tolerance, in proportion to
+    their place, the magnification was 3 sigmas off."""
+    rng = np.random.default_rng(1)
+    draft = SETUPS["many_beads"](right_draft(rng), rng)
+    beads = draft.world.beads
+    tolerance_mm = 0.02
+    reach = np.sqrt(np.mean(np.sum(beads**2, axis=1)))
+    shrunk = replace(draft.world, beads=beads * (1.0 - tolerance_mm / reach))
+    scan = taken(replace(draft, world=shrunk), rng)
+    result = calibrated(scan, bead_tolerance_mm=tolerance_mm)
+    assert result.identifiable, result.findings
+    assert worst_error(result, scan)[0] < 2.0

@@ -92,28 +92,35 @@ def known_strain(
     bead_tolerance_mm: float | None = None,
 ) -> Strain:
     """Compute standard deviations [1] of the phantom's stretches and shears: `STRAIN`, or
-    the phantom's tolerance over its size (root mean square distance of beads) if that is
-    less.
+    the beads' tolerance over the phantom's size (root mean square distance of beads) if
+    that is less.
+
+    Errors within a tolerance may be alike: a phantom that shrinks by it has all beads
+    within it.
 
     Args:
         model: the phantom's beads.
         free: parameters that are estimated.
         given: widths that a user states of the scanner; None: no widths.
-        bead_tolerance_mm: of the beads, stated by a user; None: not stated.
+        bead_tolerance_mm: of the beads, stated by a user in place of the phantom's; None:
+            not stated.
 
     Returns:
-        Of stretches, and of shears, equal. `UNSTRAINED` (0, 0) if a tolerance is stated,
-        0 or not, or every offset of the scanner that is not free is stated as exact.
+        Of stretches, and of shears, equal. `UNSTRAINED` (0, 0) if the beads are stated to
+        be exact or anywhere in the phantom, or every offset of the scanner that is not
+        free is stated as exact.
     """
     stated = exact(free) if given == "none" else given or {}
-    if bead_tolerance_mm is not None:
-        return UNSTRAINED
     if all(stated.get(name) == 0.0 for name in ASSUMED if name not in free):
         return UNSTRAINED
     reach = float(np.sqrt(np.mean(np.sum(model.beads**2, axis=1))))
-    if not model.tolerance_mm > 0 or not reach > 0:
-        return STRAIN, STRAIN
-    width = min(STRAIN, model.tolerance_mm / reach)
+    if bead_tolerance_mm is None:
+        tolerance = model.tolerance_mm or math.inf
+    else:
+        tolerance = bead_tolerance_mm
+        if not 0.0 < tolerance < reach:
+            return UNSTRAINED
+    width = min(STRAIN, tolerance / reach) if reach > 0 else STRAIN
     return width, width
 
 

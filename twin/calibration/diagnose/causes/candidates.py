@@ -14,6 +14,7 @@ import numpy as np
 from flexdt.twin.calibration.diagnose.causes.cause import (
     LOG_CHANCE,
     MOTION_OF,
+    OPEN_LOG_ODDS,
     REPEATING,
     Choice,
     Known,
@@ -262,6 +263,32 @@ class Candidates:
             if choice == before:
                 return choice
 
+    def with_open_places(self, choice: Choice) -> Choice:
+        """Return a choice with the places of beads as wide as the images leave them open:
+        the largest width that they speak against by odds of `OPEN_LOG_ODDS` at most, and
+        the phantom's tolerance if that is less.
+
+        No phantom has its beads exactly in their places, and of three or four any
+        displacement is a strain: how far they are off is hardly in the images. Of more
+        beads they leave little open.
+
+        Args:
+            choice: separable; returned as it is where the request states the tolerance,
+                or places are no cause.
+        """
+        at = next((i for i, c in enumerate(self.causes) if c.name == "beads"), None)
+        if at is None or self.known.bead_tolerance_mm is not None:
+            return choice
+        cause = self.causes[at]
+        said = {w: self.evidence(with_pick(choice, at, w)) for w in cause.widths}
+        # What is assumed of this cause before the scan does not count.
+        before = cause.chance - math.log(len(cause.widths))
+        said[0.0] = self.evidence(with_pick(choice, at, 0.0)) + before
+        least = max(said.values()) - OPEN_LOG_ODDS
+        widest = max(width for width, evidence in said.items() if evidence >= least)
+        limit = self.problem.model.tolerance_mm or math.inf
+        return with_pick(choice, at, max(choice[at], min(widest, limit)))
+
     def odds(self) -> dict[str, float]:
         """Compute the logarithm of the odds of each cause, present to absent, summed over
         all choices judged so far.
@@ -294,7 +321,8 @@ class Candidates:
 
     def likely(self, choice: Choice) -> dict[Choice, float]:
         """List all judged choices whose evidence is at most `MAX_EVIDENCE_LOSS` below the
-        largest, and their probabilities, of sum 1.
+        largest, and their probabilities, of sum 1; all with places of beads as wide as
+        the choice leaves them open (`with_open_places`), if that is wider.
 
         Choices with other widths of the priors than one are left out: statements on the
         scanner are believed where the images do not contradict them.
@@ -307,14 +335,13 @@ class Candidates:
             for other, model in self._judged.items()
             if model is not None and other[-1] == choice[-1]
         }
-        best = max(evidence.values())
-        some = {
-            other: math.exp(one - best)
-            for other, one in evidence.items()
-            if one > best - MAX_EVIDENCE_LOSS
-        }
-        total = sum(some.values())
-        return {other: weight / total for other, weight in some.items()}
+        likely = _probabilities(evidence)
+        whole = self.with_open_places(choice)
+        if whole == choice:
+            return likely
+        at = next(i for i, c in enumerate(self.causes) if c.name == "beads")
+        opened = {with_pick(other, at, whole[at]) for other in likely}
+        return _probabilities({other: self.evidence(other) for other in opened})
 
     def rivals(self, likely: Mapping[Choice, float], at: Judged) -> list[Rival]:
         """List what the geometry's columns are in likely choices, about the values of one
@@ -454,6 +481,20 @@ class Candidates:
             shape,
             self.borders,
         )
+
+
+def _probabilities(evidence: Mapping[Choice, float]) -> dict[Choice, float]:
+    """Compute the probabilities, of sum 1, of the choices whose evidence is at most
+    `MAX_EVIDENCE_LOSS` below the largest.
+    """
+    best = max(evidence.values())
+    some = {
+        choice: math.exp(one - best)
+        for choice, one in evidence.items()
+        if one > best - MAX_EVIDENCE_LOSS
+    }
+    total = sum(some.values())
+    return {choice: weight / total for choice, weight in some.items()}
 
 
 def _total(evidence: Sequence[float]) -> float:

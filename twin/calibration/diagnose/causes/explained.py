@@ -82,7 +82,7 @@ def explained_by_causes(
             applied = chosen
             better = refit(**options)
             if not better.identifiable:
-                return _undetermined(first, better, candidates, choice)
+                return _undetermined(first, better, candidates, choice, refit)
             fit = better
         alike = beside or fit.certificate.enlargement
     odds = candidates.odds()
@@ -92,9 +92,8 @@ def explained_by_causes(
         if names := _applied(candidates, choice):
             likely = (fit, Found(odds, names, (), candidates.strain(choice)))
         whole = Found(odds, beside_motion=likely)
-        return widened_by_causes(
-            first, candidates, motions_alone(candidates, choice)
-        ), whole
+        alone = motions_alone(candidates, choice)
+        return _stated(first, candidates, alone, (), refit), whole
     names = _applied(candidates, choice)
     doubtful = tuple(
         n
@@ -111,7 +110,36 @@ def explained_by_causes(
     if elsewhere:
         return explained_by_causes(first, known, refit, lost)
     found = Found(odds, names, doubtful, candidates.strain(choice))
-    return widened_by_causes(fit, candidates, choice), found
+    return _stated(fit, candidates, choice, borders, refit), found
+
+
+def _stated(
+    fit: FitResult,
+    candidates: Candidates,
+    choice: Choice,
+    borders: Sequence[Border],
+    refit: Refit,
+) -> FitResult:
+    """Fit with the places of beads that a choice leaves open as columns, too, and add what
+    likely choices differ by to the covariance.
+
+    Args:
+        fit: with the causes of `choice`.
+        candidates: all causes, judged.
+        choice: the most likely one, or what moves in it.
+        borders: of tiles, in the fit.
+        refit: as of `explained_by_causes`.
+
+    Returns:
+        The fit with a wider certificate; not identifiable if beads that are so far off
+        determine too little.
+    """
+    whole = candidates.with_open_places(choice)
+    if whole != choice:
+        fit = refit(**_options(candidates, whole, borders))
+        if not fit.identifiable:
+            return fit
+    return widened_by_causes(fit, candidates, choice)
 
 
 def _searched(
@@ -199,7 +227,11 @@ def _applied(candidates: Candidates, choice: Choice) -> tuple[str, ...]:
 
 
 def _undetermined(
-    first: FitResult, better: FitResult, candidates: Candidates, choice: Choice
+    first: FitResult,
+    better: FitResult,
+    candidates: Candidates,
+    choice: Choice,
+    refit: Refit,
 ) -> tuple[FitResult, Found]:
     """Choose what is stated where the images do not determine the geometry beside the most
     likely causes.
@@ -209,6 +241,7 @@ def _undetermined(
         better: fit with those of `choice`, not identifiable.
         candidates: all causes, judged.
         choice: the most likely one.
+        refit: as of `explained_by_causes`.
 
     Returns:
         `better` with its causes if they are beyond doubt: no geometry can be offered then.
@@ -220,7 +253,7 @@ def _undetermined(
         return better, Found(
             odds, _applied(candidates, choice), (), candidates.strain(choice)
         )
-    return widened_by_causes(first, candidates, nothing), Found(odds)
+    return _stated(first, candidates, nothing, (), refit), Found(odds)
 
 
 def _options(

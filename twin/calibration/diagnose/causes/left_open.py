@@ -32,7 +32,7 @@ def widened_by_causes(
     probable it is without them is assumed, and may be wrong.
 
     Args:
-        fit: with the causes of `choice`.
+        fit: with the causes of `choice`, and the places of beads that it leaves open.
         candidates: all causes, judged.
         choice: the most likely one.
 
@@ -59,7 +59,8 @@ def widened_by_causes(
 def left_open(
     candidates: Candidates, choice: Choice
 ) -> tuple[Judged, FloatArray, dict[Choice, float], FloatArray]:
-    """Compute what likely choices add to the covariance of the fit with the causes of one.
+    """Compute what likely choices add to the covariance of the fit with the causes of one,
+    and the places of beads that it leaves open.
 
     Args:
         candidates: all causes, judged.
@@ -70,7 +71,7 @@ def left_open(
         probabilities; and the change of the covariance of each choice, (p, p), edge units.
     """
     likely = candidates.likely(choice)
-    own = candidates.fitted(choice)
+    own = candidates.fitted(candidates.with_open_places(choice))
     at = own.covariance(candidates.count)
     factor = edge_factors(candidates.problem.layout.names[: candidates.count])
     unit = np.outer(factor, factor)
