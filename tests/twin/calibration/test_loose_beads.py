@@ -74,8 +74,9 @@ def test_slow_errors_of_spots_are_no_beads_that_move(
 
 
 def test_what_is_open_is_in_the_sigmas(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two beads came loose in the last frames, of which few spots are identified."""
-    scan = drawn("two_loose", 0)
+    """Nothing is named here, as where the images show less of the same slip."""
+    scan = drawn("part_slips", 2)
+    monkeypatch.setattr(slipped, "NAMED_LOG_ODDS", np.inf)
     wide = calibrated(scan)
     monkeypatch.setattr(fitted, "with_loose_beads", lambda plain, fit, known: (fit, None))
     narrow = calibrated(scan)
@@ -88,7 +89,7 @@ def test_what_is_open_is_in_the_sigmas(monkeypatch: pytest.MonkeyPatch) -> None:
         for name, estimate in narrow.fit.certificate.estimates.items()
     ]
     assert min(ratio) > 0.999
-    assert max(ratio) > 1.1
+    assert max(ratio) > 1.2
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,8 @@ LEAST_SIDE: Final = 2
 """Least number of frames before a bead moves, and after."""
 COARSE_STEPS: Final = 12
 """Number of frames that are tried at first."""
+STARTS: Final = 4
+"""Number of starts of the search for beads that move."""
 MOST_PIECES: Final = 4
 """Largest number of sets of beads that move, each from a frame of its own."""
 SHARES: Final = tuple(2e-4 * 4.0**k for k in range(5))
@@ -641,8 +643,8 @@ class _Search:
         return self.score(piece).gain
 
     def best(self, before: Sequence[Piece]) -> Piece:
-        """Find the most likely piece: the best of three sets of beads, each with its frame,
-        from which no single change is more likely.
+        """Find the most likely piece, from `STARTS` sets of beads and ways to move, each with
+        its best frame, by single changes.
 
         Args:
             before: pieces of the model, whose beads and frames are tried, too.
@@ -655,11 +657,11 @@ class _Search:
             Piece(beads, frame, slow)
             for beads, frame, slow in itertools.product(sets, frames, (False, True))
         ]
-        starts: dict[tuple[int, ...], Piece] = {}
+        starts: dict[tuple[tuple[int, ...], bool], Piece] = {}
         for piece in sorted(some, key=self._gain, reverse=True):
-            starts.setdefault(piece.beads, piece)
-        tops = [self._climbed(piece) for piece in itertools.islice(starts.values(), 3)]
-        return max(tops, key=self._gain)
+            starts.setdefault((piece.beads, piece.slow), piece)
+        likely = itertools.islice(starts.values(), STARTS)
+        return max(map(self._climbed, likely), key=self._gain)
 
     def _sets(self) -> set[tuple[int, ...]]:
         """List sets of beads: each alone, and those on either side of a plane across each
@@ -680,12 +682,12 @@ class _Search:
         n = self._trial.frames
         k = self._trial.beads
         coarse = max(n // COARSE_STEPS // 2, 1)
-        reach = sorted({sign * step for sign in (-1, 1) for step in (1, 2, coarse)})
+        reach = sorted({sign * step for sign in (-1, 1) for step in (0, 1, 2, coarse)})
         while True:
-            some = [piece, piece._replace(slow=not piece.slow)]
-            for step in reach:
+            some = [piece]
+            for step, slow in itertools.product(reach, (False, True)):
                 if LEAST_SIDE <= piece.frame + step <= n - LEAST_SIDE:
-                    some.append(piece._replace(frame=piece.frame + step))
+                    some.append(Piece(piece.beads, piece.frame + step, slow))
             for bead in range(k):
                 beads = tuple(sorted({*piece.beads} ^ {bead}))
                 if 0 < len(beads) < k:
