@@ -29,6 +29,8 @@ CLUSTER_SIGMAS = 3.2
 """The same for errors that the beads of a frame share."""
 HARMONICS = 3
 """Number of harmonics of the turn in which errors of single beads are sought."""
+MIN_MOVING_FRAMES = 2
+"""Least number of frames between which something may move."""
 HINT_SIGMAS = 1.5
 """The same for a second drift once a first is found."""
 MOVING = ("dO_x", "dO_y", "dO_z", "alpha")
@@ -94,9 +96,9 @@ class Residuals:
 
 def drifts(left: Residuals) -> tuple[Drift, ...]:
     """Find drifts and jumps of single parameters (MOVING) in the residuals, strongest
-    first, in each group of at least 12 frames.
+    first, in each group of `MIN_MOVING_FRAMES` or more.
 
-    A column's ramp and 11 jumps are compared. If some drift exceeds `SIGNIFICANT`, hints
+    A column's ramp and 11 jumps at most are compared. If some drift exceeds `SIGNIFICANT`, hints
     of others (`HINT_SIGMAS`) count, too.
 
     Args:
@@ -125,7 +127,7 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
     for group in np.unique(problem.group):
         members = np.flatnonzero(problem.group == group)
         n = len(members)
-        if n < 12:
+        if n < MIN_MOVING_FRAMES:
             continue
         order = np.full(len(problem.group), 0.0)
         order[members] = np.arange(n)
@@ -313,13 +315,16 @@ def turning_errors(left: Residuals) -> TurningErrors | None:
     for f, of_kind in zip(found, (kind == 0, kind > 0), strict=True):
         if f is not None:
             excess[present & of_kind] = f
-    usable = present & (np.diag(gram) > 0.05 * whole)
+    left_of = np.diag(gram)
+    # A wave counts by what is seen of it: nothing at its zeros.
+    told = np.where(present & (left_of > 0.05 * whole), left_of, 0.0)
     out = np.zeros_like(unit_covariance)
     for c in (0, 1):
         variances = []
         for m in range(HARMONICS + 1):
-            mine = (coordinate == c) & ((kind + 1) // 2 == m) & usable
-            variances.append(float(excess[mine].mean()) if mine.any() else 0.0)
+            mine = (coordinate == c) & ((kind + 1) // 2 == m)
+            total = float(told[mine].sum())
+            variances.append(float(told[mine] @ excess[mine]) / max(total, 1e-300))
         variances[0] = max(variances)
         for m, variance in enumerate(variances):
             part = gain[:, (coordinate == c) & ((kind + 1) // 2 == m)]

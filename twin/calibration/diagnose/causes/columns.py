@@ -19,7 +19,11 @@ from flexdt.twin.calibration.fit.problem import (
     FitProblem,
     turning_shifts,
 )
-from flexdt.twin.calibration.fit.residual_structure import HARMONICS, MOVING
+from flexdt.twin.calibration.fit.residual_structure import (
+    HARMONICS,
+    MIN_MOVING_FRAMES,
+    MOVING,
+)
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.panel import Border, PanelModel
 
@@ -27,9 +31,6 @@ LEAST_VISIBLE: Final = 1e-3
 """Part of a motion that the geometry must leave, for it to be told."""
 WAVES: Final = 8
 """Number of shapes of a motion here: a ramp, and half waves in a scan."""
-MIN_MOVING_FRAMES: Final = 2
-"""Least number of frames between which something may move. In few of them motion is not told
-from noise, and stays in the sigmas."""
 
 
 def motion_columns(
