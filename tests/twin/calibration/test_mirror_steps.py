@@ -81,6 +81,12 @@ def test_a_gap_is_told_at_its_column_with_its_width(beside: int) -> None:
     assert over_widths(found.found).max() > math.log(100.0)
 
 
+def test_a_mean_that_says_next_to_nothing_denies_no_gap() -> None:
+    nothing = np.zeros((len(WIDTHS_PX), COLUMNS))
+    assert not MirrorSteps(nothing, nothing - 0.01).denied(40, 2.0)
+    assert MirrorSteps(nothing, nothing - 5.0).denied(40, 2.0)
+
+
 def test_a_right_mean_tells_none() -> None:
     for seed in range(8):
         found = judged(mean_of(np.random.default_rng(seed)))

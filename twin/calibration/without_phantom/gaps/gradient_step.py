@@ -6,7 +6,7 @@ gradient beside it, less the gradient's square, is that width times this square.
 gradient is the mean of both sides, near and further off, so that the object's curvature
 has little part in it and noise a known one; what is left of both, the other borders of
 the scan show: they are the null, in mean and scatter. Steep edges are left to
-`hidden_gap.py`; a liquid, a wall that hardly moves, and the inside of a bottle have
+`frame_evidence.py`; a liquid, a wall that hardly moves, and the inside of a bottle have
 gradients only.
 """
 

@@ -112,8 +112,8 @@ class MirrorSteps(NamedTuple):
         return width, math.sqrt(variance)
 
     def denied(self, column: int, about: float) -> bool:
-        """Check whether the mean favours none over any gap about a column."""
-        return _best_about(self.free, column, about) < 0.0
+        """Check whether the mean has odds of `REPORTED_ODDS` against a gap about a column."""
+        return _best_about(self.free, column, about) < -math.log(REPORTED_ODDS)
 
 
 def _best_about(found: FloatArray, column: int, about: float) -> float:
