@@ -29,7 +29,7 @@ from flexdt.twin.calibration.diagnose.causes.cause import (
     NAMED_LOG_ODDS,
     REPEATING,
 )
-from flexdt.twin.calibration.diagnose.causes.columns import WAVES
+from flexdt.twin.calibration.diagnose.causes.columns import LEAST_VISIBLE, WAVES
 from flexdt.twin.calibration.diagnose.causes.every_cause import (
     MOTION_WIDTHS,
     PRIOR_FACTORS,
@@ -57,6 +57,8 @@ STARTS: Final = 4
 """Number of starts of the search for beads that move."""
 MOST_PIECES: Final = 4
 """Largest number of sets of beads that move, each from a frame of its own."""
+LEAST_TOLD: Final = 0.05
+"""Part of the largest displacement from which others are told."""
 SHARES: Final = tuple(2e-4 * 4.0**k for k in range(5))
 """Widths of a displacement, as parts of the phantom's size."""
 SLOW_ERRORS: Final = tuple(itertools.product((0.7, 0.9, 0.97), (1.0, 3.0, 10.0, 30.0)))
@@ -109,17 +111,20 @@ class Model:
     Attributes:
         columns: (c,).
         widths: (c,) of the priors; inf without one.
+        chance: logarithm of its probability before the scan is seen, where it is one of many.
     """
 
     columns: npt.NDArray[np.intp]
     widths: FloatArray
+    chance: float = 0.0
 
-    def beside(self, columns: Iterable[int], width: float) -> Model:
+    def beside(self, columns: Iterable[int], width: float, chance: float = 0.0) -> Model:
         """Add columns of one width; those that are there get the larger of both."""
         there = dict(zip(self.columns.tolist(), self.widths.tolist(), strict=True))
         for column in columns:
             there[column] = max(there.get(column, 0.0), width)
-        return Model(np.array(list(there), np.intp), np.array(list(there.values())))
+        widths = np.array(list(there.values()))
+        return Model(np.array(list(there), np.intp), widths, self.chance + chance)
 
     def wider(self, count: int, factor: float) -> Model:
         """Multiply the widths of the first columns by a factor."""
@@ -158,10 +163,12 @@ class Verdict:
             group: (n,) scan of each frame.
         """
         ends = list(itertools.accumulate(len(piece.beads) for piece in self.pieces))
+        sizes = np.linalg.norm(self.ways, axis=1)
         parts = []
         for piece, end in zip(self.pieces, ends, strict=True):
-            ways = self.ways[end - len(piece.beads) : end]
-            size = float(np.linalg.norm(ways, axis=1).max())
+            size = float(sizes[end - len(piece.beads) : end].max())
+            if size < LEAST_TOLD * sizes.max():
+                continue
             scan = int(group[piece.frame])
             frame = piece.frame - int(np.flatnonzero(group == scan)[0])
             place = f"frame {frame}" + (f" of scan {scan + 1}" if group.max() > 0 else "")
@@ -197,7 +204,7 @@ def with_loose_beads(
         frames or `LEAST_BEADS` beads, and where no bead steps more than chance makes it.
     """
     n, k = plain.problem.seen.shape
-    if n < LEAST_FRAMES or k < LEAST_BEADS or not _steps(fit):
+    if n < LEAST_FRAMES or k < LEAST_BEADS or not _steps(fit, known.floor):
         return fit, None
     trial = _Trial(plain, fit, known)
     best: Verdict | None = None
@@ -213,7 +220,11 @@ def with_loose_beads(
 
 
 def _widened(plain: FitResult, fit: FitResult, verdict: Verdict) -> FitResult:
-    """Widen the sigmas of a fit to those that it has where beads move, too."""
+    """Widen the sigmas of a fit to those that it has where beads move, too; not of one that
+    is not identifiable.
+    """
+    if not fit.identifiable:
+        return fit
     count = plain.problem.layout.parameter_count
     factor = edge_factors(plain.problem.layout.names[:count])
     change = fit.solution.x[:count] - plain.solution.x[:count]
@@ -224,15 +235,19 @@ def _widened(plain: FitResult, fit: FitResult, verdict: Verdict) -> FitResult:
     return replace(fit, certificate=widened(fit.certificate, both - own))
 
 
-def _steps(fit: FitResult) -> bool:
+def _steps(fit: FitResult, floor: float) -> bool:
     """Check whether a bead's place before or after some frame differs from what the fit has,
     by more than chance makes it in `SEEN_CHANCE` of scans.
+
+    Args:
+        fit: whose residuals are looked at.
+        floor: least standard deviation of whitened residuals.
     """
     problem = fit.problem
     n, k = problem.seen.shape
     residual = problem.whitened(fit.solution.x)
     lengths = np.linalg.norm(residual, axis=2)
-    noise = float(np.median(lengths[problem.seen])) / RAYLEIGH_MEDIAN
+    noise = max(float(np.median(lengths[problem.seen])) / RAYLEIGH_MEDIAN, floor)
     if not noise > 0.0:
         return False
     share = _clipped(lengths, noise)[..., None]
@@ -352,14 +367,11 @@ class _Trial:
         """Find pieces that explain what a model leaves, step by step, `MOST_PIECES` at
         most, each further one beyond doubt; in the order of their frames.
         """
-        c = self.candidates
-        rows = c.rows[:, base.columns]
-        widths = base.widths
-        values = c.values - rows @ np.where(np.isinf(widths), 0.0, c.means[base.columns])
-        noise = c.noise
+        rows, widths, values = self._rows_of(base)
+        noise = self.candidates.noise
         out: list[Piece] = []
         while len(out) < MOST_PIECES:
-            search = _Search(self, rows, widths, values, noise)
+            search = _Search(self, _Left(rows, widths, values, noise))
             piece = search.best(out)
             gain, width, noise = search.score(piece)
             if gain < (NAMED_LOG_ODDS if out else 0.0) or piece in out:
@@ -385,6 +397,9 @@ class _Trial:
         contest = _Contest(self, rows, ways, pieces)
         moving = sorted({bead for piece in pieces for bead in piece.beads})
         rivals = self._rivals(moving, range(c.rows.shape[1], first))
+        rivals += [
+            self._moving_as_one(base, motions) for base in (self.nothing, self.rival)
+        ]
         contest.compare(rivals)
         if contest.odds > LOG_CHANCE:
             likely = [rivals[i] for i in contest.likely()]
@@ -405,7 +420,7 @@ class _Trial:
     def _rivals(self, moving: Sequence[int], motions: range) -> list[Model]:
         """List the rivals of beads that move: nothing, the most likely causes, these with wide
         priors, with errors that repeat, with those beads elsewhere in all frames, and with
-        motions of everything.
+        all motions of everything.
         """
         c = self.candidates
         likely = self.rival
@@ -417,6 +432,44 @@ class _Trial:
         out += [likely.beside(own, share * self.size) for share in SHARES]
         out += [likely.beside(motions, width * c.noise) for width in MOTION_WIDTHS]
         return out
+
+    def _moving_as_one(self, base: Model, motions: FloatArray) -> Model:
+        """Add single motions of everything to a model, the one that explains most after the
+        other, as long as that is more likely, `MOST_PIECES` at most.
+
+        Args:
+            base: the model.
+            motions: (m, columns) behind those of the causes.
+        """
+        first = self.candidates.rows.shape[1]
+        rows, widths, values = self._rows_of(base)
+        chance = LOG_CHANCE - math.log(motions.shape[1])
+        noise = self.candidates.noise
+        out = base
+        for _ in range(MOST_PIECES):
+            left = _Left(rows, widths, values, noise)
+            push = motions.T @ left.values - (left.basis.T @ motions).T @ left.along
+            power = 1.0 - np.square(left.basis.T @ motions).sum(axis=0)
+            power = np.maximum(power, LEAST_VISIBLE**2)
+            best = int(np.argmax(push**2 / power))
+            width = max(abs(float(push[best] / power[best])), left.noise)
+            score = left.score(power[best : best + 1, None], push[best : best + 1], width)
+            if score.gain + chance < 0.0:
+                break
+            noise = score.noise
+            out = out.beside([first + best], width, chance)
+            rows = np.concatenate([rows, motions[:, best : best + 1]], axis=1)
+            widths = np.append(widths, width)
+        return out
+
+    def _rows_of(self, base: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the columns of a model, (m, c), their widths, (c,), and the residuals, (m,),
+        about the means of its priors.
+        """
+        c = self.candidates
+        rows = c.rows[:, base.columns]
+        means = np.where(np.isinf(base.widths), 0.0, c.means[base.columns])
+        return rows, base.widths, c.values - rows @ means
 
     def _motions(self, pieces: Sequence[Piece]) -> FloatArray:
         """Return the shifts by motions of object, source, panel and axis, (m, columns) of
@@ -566,35 +619,71 @@ class _Contest:
         return sorted(out)
 
 
-class _Search:
-    """What displacements of beads explain of the residuals that a model leaves."""
+class _Left:
+    """What a model leaves of the residuals.
+
+    Attributes:
+        values: (m,) residuals.
+        basis: (m, c) of what the model takes up, with its priors.
+        along: (c,) products of both.
+        noise: standard deviation of what is left.
+    """
 
     def __init__(
-        self,
-        trial: _Trial,
-        rows: FloatArray,
-        widths: FloatArray,
-        values: FloatArray,
-        noise: float,
+        self, rows: FloatArray, widths: FloatArray, values: FloatArray, noise: float
     ) -> None:
         """Project the residuals.
 
         Args:
-            trial: the residuals.
             rows, widths: (m, c) columns of the model, and (c,) widths of their priors.
             values: (m,) to be explained, priors of mean 0.
             noise: standard deviation of the values.
         """
-        self._trial = trial
         weight = np.where(np.isinf(widths), 0.0, noise / widths)
         size = np.sqrt(np.einsum("mc,mc->c", rows, rows) + weight**2)
         size = np.where(size > 0, size, 1.0)
         table = np.concatenate([rows / size, np.diag(weight / size)])
-        self._basis = np.linalg.qr(table)[0][: len(rows)]
-        self._values = values
-        self._along = self._basis.T @ values
-        self._total = float(values @ values - self._along @ self._along)
-        self._noise = math.sqrt(self._total / len(values))
+        self.values = values
+        self.basis = np.linalg.qr(table)[0][: len(rows)]
+        self.along = self.basis.T @ values
+        square = float(values @ values)
+        total = square - float(self.along @ self.along)
+        self._total = max(total, LEAST_SHARE * square)
+        self.noise = math.sqrt(self._total / len(values))
+
+    def score(self, gram: FloatArray, push: FloatArray, width: float) -> Score:
+        """Judge further columns of a width.
+
+        Args:
+            gram: (q, q) products of the columns, less what the model takes up.
+            push: (q,) products with the residuals, likewise.
+            width: of their priors.
+        """
+        one = np.eye(len(push))
+        count = len(self.values)
+        noise = self.noise
+        for _ in range(2):
+            whole = gram + (noise / width) ** 2 * one
+            left = self._total - float(push @ np.linalg.solve(whole, push))
+            left = max(left, LEAST_SHARE * self._total)
+            noise = math.sqrt(left / count)
+        volume = float(np.linalg.slogdet(one + gram * (width / noise) ** 2)[1])
+        gain = -0.5 * (count * math.log(left / self._total) + volume)
+        return Score(gain, width, noise)
+
+
+class _Search:
+    """The pieces that explain most of what a model leaves of the residuals."""
+
+    def __init__(self, trial: _Trial, left: _Left) -> None:
+        """Begin without any piece.
+
+        Args:
+            trial: the residuals.
+            left: of them by the model.
+        """
+        self._trial = trial
+        self._left = left
         self._products: dict[tuple[int, bool], tuple[FloatArray, FloatArray]] = {}
         self._scores: dict[Piece, Score] = {}
 
@@ -606,36 +695,28 @@ class _Search:
         if key not in self._products:
             every = Piece(tuple(range(self._trial.beads)), frame, slow)
             columns = self._trial.columns(every)
-            taken = self._basis.T @ columns
+            taken = self._left.basis.T @ columns
             self._products[key] = (
                 columns.T @ columns - taken.T @ taken,
-                columns.T @ self._values - taken.T @ self._along,
+                columns.T @ self._left.values - taken.T @ self._left.along,
             )
         return self._products[key]
 
     def score(self, piece: Piece) -> Score:
         """Judge a piece, once (cached), with the width that its displacements have."""
-        if piece in self._scores:
-            return self._scores[piece]
-        gram, push = self._of_all_beads(piece.frame, piece.slow)
-        at = [3 * bead + axis for bead in piece.beads for axis in range(3)]
-        gram = gram[np.ix_(at, at)]
-        push = push[at]
-        size = self._trial.size
-        one = np.eye(len(at))
-        count = len(self._values)
-        found = np.linalg.solve(gram + (self._noise / size) ** 2 * one, push)
-        width = float(np.sqrt(np.mean(found**2)))
-        width = min(max(width, SHARES[0] * size), size)
-        noise = self._noise
-        for _ in range(2):
-            whole = gram + (noise / width) ** 2 * one
-            left = self._total - float(push @ np.linalg.solve(whole, push))
-            left = max(left, LEAST_SHARE * self._total)
-            noise = math.sqrt(left / count)
-        volume = float(np.linalg.slogdet(one + gram * (width / noise) ** 2)[1])
-        gain = -0.5 * (count * math.log(left / self._total) + volume)
-        self._scores[piece] = Score(gain + self._trial.chance(piece), width, noise)
+        if piece not in self._scores:
+            gram, push = self._of_all_beads(piece.frame, piece.slow)
+            at = [3 * bead + axis for bead in piece.beads for axis in range(3)]
+            gram = gram[np.ix_(at, at)]
+            push = push[at]
+            size = self._trial.size
+            least = (self._left.noise / size) ** 2 * np.eye(len(at))
+            found = np.linalg.solve(gram + least, push)
+            width = float(np.sqrt(np.mean(found**2)))
+            width = min(max(width, SHARES[0] * size), size)
+            score = self._left.score(gram, push, width)
+            chance = self._trial.chance(piece)
+            self._scores[piece] = score._replace(gain=score.gain + chance)
         return self._scores[piece]
 
     def _gain(self, piece: Piece) -> float:
