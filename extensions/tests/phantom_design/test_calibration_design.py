@@ -11,6 +11,7 @@ from scipy.spatial.distance import pdist
 from flexdt.phantoms import load_phantom
 from flexdt.phantoms.bricks import Brickwork
 from flexdt.twin.calibration import BeadModel, bead_model, identifiability
+from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.poses import Poses
 from flexdt_extensions.phantom_design.bead_search import (
@@ -40,15 +41,18 @@ def circle(frames: int) -> Poses:
 LEGO = bead_model(load_phantom("lego"))
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 0.1])
+@pytest.mark.parametrize(("tolerance", "priors"), [(0.0, None), (0.1, exact())])
 def test_forecast_is_the_public_prediction_where_no_shadows_touch(
-    tolerance: float,
+    tolerance: float, priors: dict[str, float] | None
 ) -> None:
-    planned = PlannedScans(circle(36), SHAPE, bead_tolerance_mm=tolerance)
+    """Of a scanner that is exactly known the phantom is not strained, which a search leaves
+    out."""
+    planned = PlannedScans(circle(36), SHAPE, bead_tolerance_mm=tolerance, priors=priors)
     ours = forecast(LEGO, planned)
     theirs = identifiability(
-        LEGO, planned.poses, 0.1, shape=SHAPE, bead_tolerance_mm=tolerance, causes=False
-    )
+        LEGO, planned.poses, 0.1, shape=SHAPE, bead_tolerance_mm=tolerance, priors=priors,
+        causes=False,
+    )  # fmt: skip
     assert ours.used == 1.0
     for name, sigma in (theirs.sigmas | theirs.image_sigmas).items():
         assert (ours.sigmas | ours.image_sigmas)[name] == pytest.approx(sigma, rel=1e-6)

@@ -18,6 +18,7 @@ from flexdt.twin.calibration import (
     fit_geometry,
     identifiability,
 )
+from flexdt.twin.calibration.fit.priors import STRAIN
 from flexdt.twin.errors import NotIdentifiableError, TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
@@ -301,7 +302,10 @@ def test_bundle_adjustment_is_honest_about_bead_tolerance() -> None:
     assert widened >= 17
     assert honest >= 17
     predicted = identifiability(nominal, poses, 0.02, shape=SHAPE, bead_tolerance_mm=0.05)
-    assert 0.2 < predicted.sigmas["dO_z"] < 1.0
+    # Each bead by itself, the phantom as a whole, and less from the panel's distance.
+    sod = float(np.median(poses.sod))
+    least = math.hypot(bundle.estimates["dO_z"].sigma, STRAIN * sod)
+    assert least < predicted.sigmas["dO_z"] < 1.5 * least
 
 
 def test_free_beads_need_a_tolerance() -> None:
