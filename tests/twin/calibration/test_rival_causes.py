@@ -10,9 +10,15 @@ import numpy as np
 import pytest
 from causes_named import calibrated, scored, worst_error
 from faults_drawn import World, drawn, shadows
+from scipy.spatial.transform import Rotation
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.named_causes import strain_words
+from flexdt.twin.calibration.diagnose.causes import Found
+from flexdt.twin.calibration.diagnose.named_causes import (
+    _strained,
+    lean_of,
+    strain_words,
+)
 from flexdt.twin.calibration.diagnose.tiles import alike_places, likely_border
 from flexdt.twin.calibration.fit.evidence import Table
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
@@ -318,3 +324,32 @@ def test_a_phantom_that_is_off_in_one_length_is_told_so(
 ) -> None:
     mean = np.array([strain.get(name, 0.0) for name in STRAINS])
     assert strain_words(mean, 1e-12 * np.eye(len(mean))) == words
+
+
+def test_a_rigid_phantom_that_leans_is_no_phantom_of_another_shape() -> None:
+    """It was told as "+3.5 % aslant along x, -3.5 % tilted along x"."""
+    a, b = 0.035, -0.02
+    turn = Rotation.from_rotvec([-b, a, 0.0]).as_matrix() - np.eye(3)
+    mean = np.array(
+        [0.0] + [turn["xyz".index(n[0]), "xyz".index(n[1])] for n in STRAINS[1:]]
+    )
+    covariance = 1e-10 * np.eye(len(mean))
+    leans, rest = lean_of(mean, covariance)
+    assert leans == pytest.approx({"+x": a, "-y": -b}, rel=1e-3)
+    assert strain_words(rest, covariance, max(leans.values())) == ""
+    said = _strained(Found(strain=(mean, covariance)))
+    assert said is not None
+    assert said.text.startswith(
+        "the phantom leans on the stage: by 2 deg towards its +x and by 1.1 deg towards its -y"
+    )
+    assert "not as its file says" not in said.text
+    mean[STRAINS.index("zz")] = 0.02
+    said = _strained(Found(strain=(mean, covariance)))
+    assert said is not None
+    assert "not as its file says: 2 % taller" in said.text
+
+
+def test_layers_that_slide_on_one_another_are_no_lean() -> None:
+    mean = np.zeros(len(STRAINS))
+    mean[STRAINS.index("xz")] = 0.02
+    assert lean_of(mean, 1e-10 * np.eye(len(mean)))[0] == {}

@@ -39,6 +39,10 @@ SHEARS: Final[dict[str, dict[str, float]]] = {
     "tilted along y": {"zy": 1.0},
 }
 """Words on a shear -> its weights of STRAINS."""
+LEANS: Final = {"x": ("xz", "zx"), "y": ("yz", "zy")}
+"""Direction -> the two shears that are opposite where a rigid phantom leans that way."""
+LEAST_PART: Final = 0.3
+"""Part of the largest strain below which another is not told."""
 
 
 def _row(terms: Mapping[str, float]) -> FloatArray:
@@ -113,12 +117,43 @@ def named_causes(fit: FitResult, found: Found) -> list[Finding]:
     return out
 
 
-def strain_words(mean: FloatArray, covariance: FloatArray) -> str:
-    """Write the parts of a strain beyond `SIGNIFICANT` sigmas that are above 0.3 of the
-    largest, such as "0.3 % taller"; "" if there is none.
+def lean_of(
+    mean: FloatArray, covariance: FloatArray
+) -> tuple[dict[str, float], FloatArray]:
+    """Split the lean of a rigid phantom off a strain.
+
+    Directions lean where both shears are beyond `SIGNIFICANT` sigmas and opposite, but for
+    `LEAST_PART`.
 
     Args:
         mean, covariance: (len(STRAINS),) and its square.
+
+    Returns:
+        Direction of the phantom, such as "-x", -> angle by which its upper end goes there
+        [rad]; and the strain without it.
+    """
+    rest = mean.copy()
+    leans = {}
+    for axis, names in LEANS.items():
+        at = [STRAINS.index(n) for n in names]
+        up, down = mean[at]
+        sigmas = np.sqrt(covariance[at, at])
+        lean = 0.5 * (up - down)
+        if np.all(np.abs(mean[at]) > SIGNIFICANT * sigmas) and abs(
+            up + down
+        ) < LEAST_PART * abs(lean):
+            leans["+-"[int(lean < 0.0)] + axis] = float(abs(lean))
+            rest[at] = 0.0
+    return leans, rest
+
+
+def strain_words(mean: FloatArray, covariance: FloatArray, beside: float = 0.0) -> str:
+    """Write the parts of a strain beyond `SIGNIFICANT` sigmas that are above `LEAST_PART` of
+    the largest, such as "0.3 % taller"; "" if there is none.
+
+    Args:
+        mean, covariance: (len(STRAINS),) and its square.
+        beside: size of what else is told, among the largest.
     """
     certain = {}
     for words, row in _parts(mean):
@@ -126,11 +161,19 @@ def strain_words(mean: FloatArray, covariance: FloatArray) -> str:
         sigma = max(float(np.sqrt(row @ covariance @ row)), 1e-12)
         if abs(value) > SIGNIFICANT * sigma:
             certain[words] = value
-    most = max(map(abs, certain.values()), default=0.0)
+    most = max([beside, *map(abs, certain.values())])
     return ", ".join(
         f"{100 * value:{'+' if words in SHEARS else ''}.2g} % {words}"
         for words, value in certain.items()
-        if abs(value) > 0.3 * most
+        if abs(value) > LEAST_PART * most
+    )
+
+
+def lean_words(leans: Mapping[str, float]) -> str:
+    """Write angles of a lean [rad] by their directions."""
+    return " and ".join(
+        f"by {np.degrees(angle):.2g} deg towards its {way}"
+        for way, angle in leans.items()
     )
 
 
@@ -147,9 +190,17 @@ def _strained(found: Found) -> Finding | None:
     """
     if found.strain is None:
         return None
-    strains = strain_words(*found.strain)
-    if not strains:
+    mean, covariance = found.strain
+    leans, rest = lean_of(mean, covariance)
+    # What a turn leaves in second order is no other shape.
+    strains = strain_words(rest, covariance, max(leans.values(), default=0.0))
+    if not strains and not leans:
         return None
+    said = []
+    if leans:
+        said.append(f"the phantom leans on the stage: {lean_words(leans)}")
+    if strains:
+        said.append(f"the phantom is not as its file says: {strains}")
     alike = [
         CAUSE_WORDS[n] for n in SHAPE_LIKE_CAUSES if n in found.open or n in found.applied
     ]
@@ -159,9 +210,9 @@ def _strained(found: Found) -> Finding | None:
         rival = ""
     return warning(
         "phantom_strained",
-        f"the phantom is not as its file says: {strains}{rival}. Its shape was fitted, its "
-        "size is not in the images: lengths, dO_z and the magnification hold as far as its "
-        "millimetre; measure it, or give --bead-tolerance MM",
+        f"{', and '.join(said)}{rival}. Its shape was fitted, its size is not in the images: "
+        "lengths, dO_z and the magnification hold as far as its millimetre; "
+        + ("measure it, or give --bead-tolerance MM" if strains else "mount it upright"),
     )
 
 
