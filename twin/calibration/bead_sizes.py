@@ -46,7 +46,7 @@ def judge_first_sizes(
 
 def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
     """Judge in each scan the bead sizes of the second measurement, or of the first (with
-    `OTHER_BEADS`) where the second measured no size.
+    `OTHER_BEADS`) where the second measured no size and the spots are not smeared.
 
     Args:
         state: scans, spots, identifications and the second measurements.
@@ -60,7 +60,7 @@ def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
         radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
         if np.isfinite(state.measured[g].size):
             out += listed(judge_size(state.measured[g], float(np.median(radii))))
-        else:
+        elif not state.measured[g].smear.told:
             first = state.identifications[g], state.looks[g], radii
             out += listed(judge_first_size(*first, OTHER_BEADS))
     return out

@@ -80,6 +80,7 @@ def explain(
         request.bead_tolerance_mm,
         (MEASURED if weighed else Solver()).floor_px,
         _stated_arc(state),
+        _arc_left(state),
     )
     return explain_residuals(
         fit,
@@ -98,6 +99,14 @@ def _stated_arc(state: Calibration) -> float | None:
     """
     arcs = {scan.arc for scan in state.scans}
     return arcs.pop() if len(arcs) == 1 else None
+
+
+def _arc_left(state: Calibration) -> float | None:
+    """Return the standard deviation of the squared share of a step that the spots' smear
+    leaves in their positions, the largest of all scans; None where it is not measured.
+    """
+    left = [measured.smear.left for measured in state.measured]
+    return max(left) if left and math.isfinite(max(left)) else None
 
 
 def check_fixed(

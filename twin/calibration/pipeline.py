@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from flexdt.twin.calibration.bead_model import (
     BeadModel,
     BeadPhantom,
@@ -23,7 +25,11 @@ from flexdt.twin.calibration.diagnose import Finding, listed
 from flexdt.twin.calibration.diagnose.data import judge_emptiness, judge_frames
 from flexdt.twin.calibration.diagnose.fitted import OF_RESIDUALS, judge_offsets
 from flexdt.twin.calibration.diagnose.frame_places import judge_places
-from flexdt.twin.calibration.diagnose.measured_spots import judge_body, judge_lag
+from flexdt.twin.calibration.diagnose.measured_spots import (
+    judge_body,
+    judge_lag,
+    judge_smear,
+)
 from flexdt.twin.calibration.fit.fit import FitResult, with_start
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.fits_of_scans import fit_scans
@@ -219,6 +225,13 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
         state = state.with_findings(*judge_sizes(state, fit))
     state = state.with_findings(*listed(judge_body(state.measured)))
     state = state.with_findings(*(judge_lag(lag) for lag in state.lags if lag.seen))
+    for scan, measured in zip(state.scans, state.measured, strict=True):
+        step = (
+            float(np.median(np.abs(np.diff(scan.poses.angle))))
+            if len(scan.poses) > 1
+            else 0.0
+        )
+        state = state.with_findings(*listed(judge_smear(measured.smear, step)))
     if request.per_frame:
         state, fit = fit_with_motion(state, request, fit)
     return Fitted(state, request, fit, fitted.iterations + iterations)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,15 +10,16 @@ import numpy as np
 from flexdt.twin.calibration.camera_lag import lag_of, without_lag
 from flexdt.twin.calibration.detect.bead_contrast import seen_contrasts
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, measure_beads
-from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows
+from flexdt.twin.calibration.detect.smear import UNMEASURED
+from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows, ways
 from flexdt.twin.calibration.diagnose import Finding, error
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fits_of_scans import fit_scans
-from flexdt.twin.calibration.frame_source import (
-    FrameState,
-)
+from flexdt.twin.calibration.frame_source import FrameState, Scan
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection.analytic_solids import Scene
 
 CLOSE_PX = 0.02
@@ -58,11 +59,12 @@ def measure_again(
         measured, plans = _measured(state, fit, solids, draft)
         if lost := _judge_confirmation(measured):
             return first[0].with_findings(*lost), first[1], iterations
+        settled = not draft and _arcs_told(state) == _arcs_told(measured)
         state = measured
         fit = fit_scans(state, request, fit.group_parameters)
         iterations += fit.iterations
         moved = _moved_px(state, fit, plans)
-        if moved < CLOSE_PX and not draft:
+        if moved < CLOSE_PX and settled:
             break
         draft = draft and moved > FAR_PX
     return state, fit, iterations
@@ -92,7 +94,12 @@ def _measured(
     model = replace(state.model, beads=fit.beads)
     for g, scan in enumerate(state.scans):
         cone = scan.poses.cone_vec(fit.group_parameters[g])
+        turning = _turning(scan, fit.group_parameters[g])
+        smear = state.measured[g].smear if state.measured else UNMEASURED
         plan = plan_windows(model, cone, scan.frames.shape)
+        if smear.told and turning is not None:
+            way = np.linalg.norm(ways(plan, model, turning), axis=2)
+            plan = plan_windows(model, cone, scan.frames.shape, smear.share * way)
         spots = [look.detections for look in state.looks[g]]
         contrast = seen_contrasts(model, spots, state.identifications[g].index)
         images = scan.frames.windows(plan)
@@ -110,12 +117,43 @@ def _measured(
         images = mended(images, plan)
         measured.append(
             measure_beads(
-                images, plan, cone, model, contrast, solids, draft=draft, known=known
+                images,
+                plan,
+                cone,
+                model,
+                contrast,
+                solids,
+                draft=draft,
+                known=known,
+                turning=turning,
+                smear=smear,
             )
         )
         lags.append(lag)
         plans.append(plan)
     return replace(state, measured=tuple(measured), lags=tuple(lags)), plans
+
+
+def _turning(scan: Scan, parameters: Offsets) -> Callable[[float], ConeVec] | None:
+    """Make the function from a part of a step to the geometry of all frames so much later;
+    None where the stage is at rest in an exposure, as is stated, or never turns.
+
+    Args:
+        scan: gives the poses.
+        parameters: its offsets.
+    """
+    angles = scan.poses.angle
+    step = float(np.median(np.abs(np.diff(angles)))) if len(angles) > 1 else 0.0
+    if scan.arc == 0.0 or not step > 0.0:
+        return None
+    return lambda part: replace(scan.poses, angle=angles + part * step).cone_vec(
+        parameters
+    )
+
+
+def _arcs_told(state: Calibration) -> list[bool]:
+    """Tell of each scan whether its spots were measured as smeared by an exposure's arc."""
+    return [m.smear.told for m in state.measured] or [False] * len(state.scans)
 
 
 def _judge_confirmation(state: Calibration) -> list[Finding]:

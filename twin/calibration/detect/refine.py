@@ -10,6 +10,7 @@ fitted, and no bead is missed.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +38,7 @@ from flexdt.twin.calibration.detect.seen_body import (
     see_body,
 )
 from flexdt.twin.calibration.detect.sharpness import (
+    BLURS,
     BODY_BLUR_PX,
     CHECK_FINE,
     RADIUS_RAYS,
@@ -44,17 +46,30 @@ from flexdt.twin.calibration.detect.sharpness import (
     Sharp,
     balls_of,
     fine_rays,
+    hardened_balls,
     rendering_error,
     rest_of_blur,
     seen_sharpness,
     sharpness,
+    spread,
+)
+from flexdt.twin.calibration.detect.smear import (
+    SMEAR_SAMPLE,
+    UNMEASURED,
+    Smear,
+    Step,
+    small,
+    solved,
+    squared_step,
 )
 from flexdt.twin.calibration.detect.windows import (
     Balls,
     Windows,
     blurred_windows,
     edged,
+    exposed,
     render_windows,
+    ways,
     without_beads,
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -93,6 +108,10 @@ SAMPLING_PX = 0.0005
 rendered spots: images of other rays a pixel, blur estimated (measured without noise)."""
 SHARP_SAMPLING_PX = 0.0001
 """The same where nothing is blurred, and the rendered rays are the images' own."""
+MOST_ROUNDS = 3
+"""Most measurements with an arc of an exposure, each with the arc that the last one found."""
+Turning = Callable[[float], ConeVec]
+"""Gives the geometry of all frames at a part of a step from the middle of each exposure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +130,7 @@ class Refined:
         body: the phantom's, as seen in the images.
         as_fitted: blur and size of the best fit, which a geometry that is almost the same
             does not change; None unless from `measure_beads`.
+        smear: the arc that the object turns in an exposure; positions are those of its middle.
     """
 
     tracks: FloatArray
@@ -122,6 +142,7 @@ class Refined:
     sampling_px: float
     body: SeenBody = NO_BODY
     as_fitted: Sharp | None = None
+    smear: Smear = UNMEASURED
 
 
 def measure_beads(
@@ -134,6 +155,9 @@ def measure_beads(
     *,
     draft: bool = False,
     known: Sharp | None = None,
+    turning: Turning | None = None,
+    smear: Smear = UNMEASURED,
+    rounds: int = MOST_ROUNDS,
 ) -> Refined:
     """Measure every bead in its window.
 
@@ -153,36 +177,22 @@ def measure_beads(
             and needs a geometry that is right to a few hundredths of a pixel.
         known: blur and size that an earlier measurement of these images found (`as_fitted`);
             None, or values that were not seen: they are estimated.
+        turning: geometry within an exposure; None: the object is at rest.
+        smear: the arc of an exposure that an earlier measurement of these images found.
+        rounds: most measurements, each with the arc that the last one found.
 
     Returns:
         Positions, nan where a spot fails the checks of `_accept`.
     """
+    if turning is not None:
+        windows = exposed(windows, model, turning, smear.share)
     n, k = windows.corner.shape[:2]
     side = windows.side
-    body: Float32Array | None = None
-    data = images
-    seen = NO_BODY
+    described = Scene(()) if scene is None else without_beads(scene, model)
+    seen, body = _body(images, described, cone, model, windows)
+    data = images if body is None else images - body
+    patches = _patches(data, windows, contrast)
     rough = 0.0
-    if scene is None:
-        described = Scene(())
-    else:
-        described = without_beads(scene, model)
-    if described.solids:
-        seen = see_body(images, described, cone, model, windows)
-        if seen.factor > 0:
-            body = render_windows(seen.scene(described), cone, windows)
-            data = images - body
-    patches = Patches(
-        data.reshape(n * k, side, side),
-        (windows.predicted - windows.corner).reshape(-1, 2),
-        windows.radii.ravel(),
-        windows.stretch.reshape(-1, 3),
-        np.broadcast_to(np.asarray(contrast, dtype=np.float64), (n, k)).ravel().copy(),
-        windows,
-        np.flatnonzero(windows.whole),
-    )
-    there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
-    patches = replace(patches, entire=patches.entire[there])
     sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
     first = centroids(patches, sample)
     patches = replace(patches, peaks=contrasts(first, patches))
@@ -194,6 +204,10 @@ def measure_beads(
     if draft:
         plain = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
         balls: Balls = ((plain, None),)
+    elif windows.moments:
+        # The profile of a round blur tells neither blur nor size of smeared spots.
+        sharp = replace(sharp, scale=1.0, size=1.0, seen=False, true=smear.blur)
+        balls = hardened_balls(sharp, patches, cone, model)[0]
     else:
         sharp, balls = seen_sharpness(sharp, patches, sample, cone, model)
     if sharp.blur < BODY_BLUR_PX:
@@ -230,13 +244,129 @@ def measure_beads(
                 seen, behind = adjusted(images, behind, cone, model, windows, seen)
             data = images - behind
             patches = replace(patches, flat=data.reshape(n * k, side, side))
+    if turning is not None and alone is not None and not draft:
+        before = smear.share**2
+        smear = _smeared(patches, alone, sharp, balls, cone, model, turning, smear.share)
+        change = abs(smear.share**2 - before)
+        if rounds > 1 and not small(change, before, smear.sigma):
+            return measure_beads(
+                images, windows, cone, model, contrast, scene, known=as_fitted,
+                turning=turning, smear=smear, rounds=rounds - 1,
+            )  # fmt: skip
     measured = _measured(patches, None if draft else alone, body, sharp)
     return replace(
         measured,
         body=seen,
         as_fitted=as_fitted,
+        smear=smear,
         covariances=measured.covariances + rough**2 * np.eye(2),
     )
+
+
+def _body(
+    images: Float32Array,
+    described: Scene,
+    cone: ConeVec,
+    model: BeadModel,
+    windows: Windows,
+) -> tuple[SeenBody, Float32Array | None]:
+    """Estimate the phantom's body in the images, and render it.
+
+    Args:
+        images: (n, k, side, side) line integrals.
+        described: the body's solids.
+        cone, model, windows: as of `measure_beads`.
+
+    Returns:
+        The body, and its line integrals; None where none is described or seen.
+    """
+    if not described.solids:
+        return NO_BODY, None
+    seen = see_body(images, described, cone, model, windows)
+    if not seen.factor > 0:
+        return seen, None
+    return seen, render_windows(seen.scene(described), cone, windows)
+
+
+def _patches(
+    data: Float32Array, windows: Windows, contrast: float | FloatArray
+) -> Patches:
+    """Put windows into the form of the kernels, with the spots whose middle has a value.
+
+    Args:
+        data: (n, k, side, side) line integrals, less the body.
+        windows: their places.
+        contrast: of a bead, one or (k,).
+    """
+    n, k = windows.corner.shape[:2]
+    side = windows.side
+    patches = Patches(
+        data.reshape(n * k, side, side),
+        (windows.predicted - windows.corner).reshape(-1, 2),
+        windows.radii.ravel(),
+        windows.stretch.reshape(-1, 3),
+        np.broadcast_to(np.asarray(contrast, dtype=np.float64), (n, k)).ravel().copy(),
+        windows,
+        np.flatnonzero(windows.whole),
+    )
+    there = np.isfinite(patches.flat[patches.entire, side // 2, side // 2])
+    return replace(patches, entire=patches.entire[there])
+
+
+def _smeared(
+    patches: Patches,
+    alone: Float32Array,
+    sharp: Sharp,
+    balls: Balls,
+    cone: ConeVec,
+    model: BeadModel,
+    turning: Turning,
+    share: float,
+) -> Smear:
+    """Estimate the arc that the object turns in an exposure from `SMEAR_SAMPLE` complete spots.
+
+    Where it is more likely than an object at rest, the spots are rendered with it, until
+    they are as smeared as in the images (`solved`).
+
+    Args:
+        patches: the windows, less the body.
+        alone: beads rendered alone, (n, k, side, side) or (n k, side, side).
+        sharp, balls: with which they are.
+        cone: geometry of the frames.
+        model: the beads.
+        turning: geometry within an exposure.
+        share: of a step, with which `alone` is rendered.
+
+    Returns:
+        The arc; `UNMEASURED` where the spots do not determine it.
+    """
+    windows = patches.windows
+    sample = spread(patches.entire, SMEAR_SAMPLE)
+    frames, beads = np.divmod(sample, windows.corner.shape[1])
+    few = windows.pick(frames, beads)
+    way = ways(windows, model, turning)[frames, beads]
+    seen = patches.flat[sample]
+
+    variance = sharp.true**2
+
+    def step_at(square: float) -> Step:
+        """Render the spots with an arc, and compare; the blur follows."""
+        nonlocal variance
+        now = exposed(windows, model, turning, math.sqrt(square)).pick(frames, beads)
+        fine = 1 if sharp.blur < BODY_BLUR_PX else fine_rays(now, RADIUS_RAYS, CHECK_FINE)
+        rays = render_windows(Scene(()), cone[frames], now, fine, balls)
+        blur = math.sqrt(variance)
+        drawn = blurred_windows(rays, blur if fine == 1 else rest_of_blur(blur, fine))
+        step = squared_step(seen, drawn[:, 0], now, way, math.sqrt(square))
+        variance = max(variance + step.variance, BLURS[0] ** 2)
+        return step
+
+    drawn = alone.reshape(patches.flat.shape)[sample]
+    first = squared_step(seen, drawn, few, way, share)
+    if share > 0.0:
+        variance = max(variance + first.variance, BLURS[0] ** 2)
+    found = solved(share**2, first, step_at)
+    return replace(found, blur=math.sqrt(variance)) if found.told else found
 
 
 def _measured(

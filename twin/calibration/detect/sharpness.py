@@ -28,8 +28,8 @@ from flexdt.twin.calibration.detect.windows import (
     blurred_light,
     blurred_windows,
     distances2,
+    rays_of,
     render_windows,
-    spread_lattice,
     window_rays,
 )
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -53,6 +53,8 @@ CHECK_FINE = 3
 """Least number of rays along a pixel's side there."""
 MOST_FINE = 6
 """Largest number of rays along a pixel's side."""
+EXPOSED_FINE = 2
+"""The same in each moment of an exposure, of which there are many."""
 SMALL_STEP = 0.05
 """Relative change of blur and contrast below which corrections stop; the remainder is of
 second order."""
@@ -128,7 +130,12 @@ def fine_rays(windows: Windows, rays: int, least: int) -> int:
         windows: of the beads.
         rays: along the radius of the typical bead.
         least: fewest along a pixel's side.
+
+    Returns:
+        The number; `EXPOSED_FINE` where frames are exposed over moments.
     """
+    if windows.moments:
+        return EXPOSED_FINE
     fine = math.ceil(rays / float(np.median(windows.radii)))
     return min(max(fine, least), MOST_FINE)
 
@@ -190,7 +197,7 @@ def seen_sharpness(
     slight = sharp.blur < SLIGHT_BLUR_PX
     few = sample
     if sharp.blur >= BODY_BLUR_PX:
-        few = _spread(sample, CHECK_SAMPLE)
+        few = spread(sample, CHECK_SAMPLE)
     trial = replace(sharp, true=sharp.blur, size=1.0)
     for _ in range(MOST_ROUNDS):
         balls, blur = hardened_balls(trial, patches, cone, model)
@@ -216,7 +223,7 @@ def seen_sharpness(
     return replace(sharp, true=blur), balls
 
 
-def _spread(index: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
+def spread(index: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
     """Pick at most `most` of some indices, evenly from the first to the last."""
     places = np.linspace(0, len(index) - 1, min(most, len(index)))
     return np.asarray(index[places.astype(np.intp)])
@@ -245,7 +252,7 @@ def hardened_balls(
     groups = []
     for group in np.split(order, breaks):
         spots = patches.entire[np.isin(patches.entire % k, group)]
-        spots = _spread(spots, PROFILES)
+        spots = spread(spots, PROFILES)
         ball = Scene(tuple(solids[i] for i in group))
         groups.append((ball, _profiles_of(ball, sharp, patches, spots, cone)))
     variance = 0.0
@@ -311,13 +318,11 @@ def _profiles_of(
     slight = sharp.blur < SLIGHT_BLUR_PX
     sampled = sharp.blur < BODY_BLUR_PX
     fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
-    every = np.ones((len(spots), 1), np.float32)
-    lattice = [(np.zeros(2), every)] if sampled else spread_lattice(few, fine)
     factors = -np.array(ATTENUATIONS, dtype=np.float32)[:, None, None, None]
     light = np.zeros((len(ATTENUATIONS), len(spots), few.side, few.side), np.float32)
     most = 0.0
-    for place, weight in lattice:
-        rays = window_rays(ball, cone[frames], few, place)[:, 0]
+    for moment, place, weight in rays_of(cone[frames], few, 1 if sampled else fine):
+        rays = window_rays(ball, moment, few, place)[:, 0]
         most = max(most, float(rays.max()))
         light += np.exp(factors * rays) * weight[:, :, None]
     if slight:

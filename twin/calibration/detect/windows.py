@@ -7,6 +7,7 @@ beads without processing entire images.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,6 +38,9 @@ EVEN_STEPS = (0.7548776662466927, 0.5698402909980532)
 evenly over a square (powers of 1 / 1.3247..., the root of x^3 = x + 1)."""
 WIDEST_DEAD = 4
 """Pixels along the shorter side of a gap that is filled."""
+MOMENTS = (4, 24)
+"""Least and largest number of moments of an exposure; one for two pixels of a bead's longest
+way in between."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,8 @@ class Windows:
         whole: (n, k) the spot and some space around it are in the image, and no other
             spot is.
         shape: (rows, cols).
+        moments: geometry of the frames at moments that are spread evenly over each exposure;
+            none: images of instants.
     """
 
     corner: npt.NDArray[np.int64]
@@ -65,6 +71,7 @@ class Windows:
     crowded: npt.NDArray[np.bool_]
     whole: npt.NDArray[np.bool_]
     shape: tuple[int, int]
+    moments: tuple[ConeVec, ...] = ()
 
     def pick(self, frames: npt.NDArray[np.intp], beads: npt.NDArray[np.intp]) -> Windows:
         """Select the windows of m (frame, bead) pairs, as if of m frames with one bead
@@ -72,12 +79,21 @@ class Windows:
         """
 
         arrays: dict[str, Any] = {
-            n: a for n, a in vars(self).items() if n not in ("side", "shape")
+            n: a for n, a in vars(self).items() if n not in ("side", "shape", "moments")
         }
-        return replace(self, **{n: a[frames, beads][:, None] for n, a in arrays.items()})
+        return replace(
+            self,
+            moments=tuple(cone[frames] for cone in self.moments),
+            **{n: a[frames, beads][:, None] for n, a in arrays.items()},
+        )
 
 
-def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Windows:
+def plan_windows(
+    model: BeadModel,
+    cone: ConeVec,
+    shape: tuple[int, int],
+    smear: FloatArray | float = 0.0,
+) -> Windows:
     """Plan windows around the expected spots of all beads.
 
     All windows have one odd side, for the largest spot. Spots closer than 1.12 times both
@@ -88,11 +104,13 @@ def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Win
         model: the beads.
         cone: geometry of the n frames, as well as it is known.
         shape: (rows, cols) of the images.
+        smear: length by which each spot is smeared in an exposure, (n, k) or one [px].
     """
     predicted = cone.project_points(model.beads, shape)
     minor, stretch = shadow_ellipses(model, cone, predicted, shape)
     major = minor * stretch[..., 2]
-    side = 2 * math.ceil(float(1.62 * np.nanmax(major)) + 8.0) + 1
+    half = np.broadcast_to(0.5 * np.asarray(smear), major.shape)
+    side = 2 * math.ceil(float(np.nanmax(1.62 * major + half)) + 8.0) + 1
     corner = np.floor(np.nan_to_num(predicted) + 0.5).astype(np.int64) - side // 2
     rows, cols = shape
     # Share of the disc inside, from the segment cut off at each edge (corners: product).
@@ -101,10 +119,11 @@ def plan_windows(model: BeadModel, cone: ConeVec, shape: tuple[int, int]) -> Win
         for distance in (predicted[..., axis] + 0.5, size - 0.5 - predicted[..., axis]):
             share = share * _disc_share(distance / major)
     gap = np.linalg.norm(predicted[:, :, None] - predicted[:, None], axis=3)
-    touch = gap < 1.12 * (major[:, :, None] + major[:, None]) + 3.0
+    wide = 1.12 * major + half
+    touch = gap < wide[:, :, None] + wide[:, None] + 3.0
     touch &= ~np.eye(len(model), dtype=bool)
     crowded = touch.any(axis=2)
-    room = (1.15 * major + 2.5)[..., None]
+    room = (1.15 * major + half + 2.5)[..., None]
     inside = ((predicted > room) & (predicted < np.array([cols, rows]) - 1 - room)).all(
         axis=2
     )
@@ -302,7 +321,7 @@ def render_windows(
             does. One ray (1, the default) puts an edge up to half a pixel off.
         balls: beads that harden the beam, besides the scene.
     """
-    if fine == 1:
+    if fine == 1 and not windows.moments:
         return _hardened_rays(scene, cone, windows, np.zeros(2), balls)
     return np.asarray(
         -np.log(window_intensities(scene, cone, windows, fine, balls)), dtype=np.float32
@@ -326,11 +345,64 @@ def window_intensities(
     """
     n, k = windows.corner.shape[:2]
     total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
-    for place, weight in spread_lattice(windows, fine):
-        light = np.exp(-_hardened_rays(scene, cone, windows, place, balls))
+    for near, place, weight in rays_of(cone, windows, fine):
+        light = np.exp(-_hardened_rays(scene, near, windows, place, balls))
         light *= weight[..., None, None]
         total += light
     return total
+
+
+def rays_of(
+    cone: ConeVec, windows: Windows, fine: int
+) -> list[tuple[ConeVec, FloatArray, Float32Array]]:
+    """List the rays whose light makes a pixel: the geometry of each, its place in the pixel
+    and its weight, see `spread_lattice`. Each moment of an exposure has as many.
+
+    Args:
+        cone: n views, of instants.
+        windows: k windows in each.
+        fine: rays along each side of a pixel; 1: through its middle.
+    """
+    moments = windows.moments or (cone,)
+    if fine == 1:
+        share = np.full(windows.corner.shape[:2], 1.0 / len(moments), np.float32)
+        return [(near, np.zeros(2), share) for near in moments]
+    return [
+        (near, place, weight / np.float32(len(moments)))
+        for m, near in enumerate(moments)
+        for place, weight in spread_lattice(windows, fine, m)
+    ]
+
+
+def exposed(
+    windows: Windows, model: BeadModel, turning: Callable[[float], ConeVec], share: float
+) -> Windows:
+    """Return windows of frames that are exposed over a share of a step; 0: of instants.
+
+    Args:
+        windows: of the beads.
+        model: the beads.
+        turning: gives the geometry at a part of a step from the middle of each frame.
+        share: of a step.
+    """
+    if share == 0.0:
+        return replace(windows, moments=())
+    way = float(np.linalg.norm(ways(windows, model, turning), axis=2).max()) * share
+    least, most = MOMENTS
+    count = min(max(least, math.ceil(0.5 * way)), most)
+    # Their variance is that of an even exposure.
+    parts = (np.arange(count) + 0.5 - 0.5 * count) / math.sqrt(count**2 - 1.0)
+    return replace(windows, moments=tuple(turning(share * t) for t in parts.tolist()))
+
+
+def ways(
+    windows: Windows, model: BeadModel, turning: Callable[[float], ConeVec]
+) -> FloatArray:
+    """Compute the way of each bead's image in a step of the stage, (n, k, 2) [px]."""
+    before, after = (
+        turning(part).project_points(model.beads, windows.shape) for part in (-0.5, 0.5)
+    )
+    return np.asarray(after - before)
 
 
 def lattice(fine: int) -> list[tuple[float, float]]:
@@ -349,7 +421,9 @@ def lattice(fine: int) -> list[tuple[float, float]]:
     return out
 
 
-def spread_lattice(windows: Windows, fine: int) -> list[tuple[FloatArray, Float32Array]]:
+def spread_lattice(
+    windows: Windows, fine: int, moment: int = 0
+) -> list[tuple[FloatArray, Float32Array]]:
     """Return places of fine^2 rays in the pixels of n frames of k windows, and their
     weights.
 
@@ -361,13 +435,14 @@ def spread_lattice(windows: Windows, fine: int) -> list[tuple[FloatArray, Float3
     Args:
         windows: of the beads.
         fine: rays along each side of a pixel, 2 at least.
+        moment: number of a moment of the exposure; others have another shift.
 
     Returns:
         For each ray its place (column, row) from the pixel's centre, (n, k, 2), and its
         weight (n, k), of sum 1 over the rays.
     """
     n, k = windows.corner.shape[:2]
-    number = np.arange(n)[:, None] + n * np.arange(k)
+    number = np.arange(n)[:, None] + n * np.arange(k) + n * k * moment
     shift = (number[..., None] * np.array(EVEN_STEPS) % 1.0 - 0.5) / fine**2
     places = np.array(lattice(fine))
     tilt = shift @ np.linalg.inv(places.T @ places)

@@ -10,6 +10,7 @@ import numpy as np
 
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.refine import Refined
+from flexdt.twin.calibration.detect.smear import Smear
 from flexdt.twin.calibration.diagnose import Finding, error, warning
 from flexdt.twin.calibration.frame_source import FrameSpots
 from flexdt.twin.calibration.identify import Identification
@@ -145,4 +146,39 @@ def judge_lag(lag: Lag) -> Finding:
         "turn, but with the correction reconstruct takes it out, of scans with as long "
         "exposures "
         "and pauses",
+    )
+
+
+def judge_smear(smear: Smear, step_rad: float) -> Finding | None:
+    """Make the warning that the object turns during an exposure, with the arc [deg] and its
+    share of a step.
+
+    Args:
+        smear: of the spots of a scan.
+        step_rad: of the stage, from frame to frame.
+
+    Returns:
+        None if the smear does not show it beyond doubt.
+    """
+    if not smear.named:
+        return None
+    share = smear.share
+    return exposure_arc(
+        share * math.degrees(step_rad), share, "shadows were measured as smeared by it"
+    )
+
+
+def exposure_arc(arc_deg: float, share: float, done: str) -> Finding:
+    """Make the warning that the object turns during an exposure.
+
+    Args:
+        arc_deg: that it turns [deg].
+        share: of a step.
+        done: how the calibration took it into account.
+    """
+    return warning(
+        "exposure_arc",
+        f"the object turns while a frame is exposed, by {arc_deg:.2g} deg, {share:.2f} of a "
+        f"step: {done}; volumes are blurred along the turn, and angles are those of the "
+        "middle of each exposure",
     )

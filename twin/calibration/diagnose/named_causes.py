@@ -9,6 +9,7 @@ import numpy as np
 
 from flexdt.twin.calibration.diagnose import Finding, listed, warning
 from flexdt.twin.calibration.diagnose.causes import SHAPES, Found, border_name
+from flexdt.twin.calibration.diagnose.measured_spots import exposure_arc
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import STRAINS
 from flexdt.twin.calibration.fit.residual_structure import SIGNIFICANT
@@ -226,14 +227,7 @@ def _turning(fit: FitResult) -> Finding:
     layout = fit.problem.layout
     share = float(np.sqrt(max(fit.solution.x[layout.arc_column], 0.0)))
     step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
-    return warning(
-        "exposure_arc",
-        f"the object turns while a frame is exposed, by {share * step:.2g} deg, "
-        f"{share:.2f} of a "
-        "step: the mean of the arc was fitted; volumes are blurred along the turn, and "
-        "angles are "
-        "those of the middle of each exposure",
-    )
+    return exposure_arc(share * step, share, "the mean of the arc was fitted")
 
 
 def _read_in_turn(fit: FitResult) -> Finding:

@@ -115,7 +115,8 @@ class Candidates:
         self._judged: dict[Choice, Judged | None] = {}
         self.means = np.zeros(table.shape[1])
         self.means[: self.count] = (problem.prior_mean - x)[: self.count]
-        self.means[everything.layout.arc_column] = (known.arc or 0.0) ** 2
+        if known.arc_left is None:
+            self.means[everything.layout.arc_column] = (known.arc or 0.0) ** 2
 
     def of_values(self, values: FloatArray, floor: float) -> Candidates:
         """Return the table of other residuals.

@@ -87,12 +87,16 @@ class Known:
         floor: least standard deviation of whitened residuals.
         arc: part of a step that the object turns in an exposure, by the script, 0: it is
             at rest; None: not stated.
+        arc_left: standard deviation of the squared share of a step of which the positions
+            are not those of the middle of an exposure, by the spots' smear; None: the arc was
+            not measured.
     """
 
     strain: Strain
     bead_tolerance_mm: float | None
     floor: float
     arc: float | None = None
+    arc_left: float | None = None
 
 
 Refit = Callable[..., FitResult]

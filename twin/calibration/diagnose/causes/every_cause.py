@@ -73,7 +73,7 @@ def list_causes(
     first = len(layout.names)
     return (
         *_of_phantom(everything, known),
-        *_arc(layout.arc_column, known.arc),
+        *_arc(layout.arc_column, known),
         *_rows(layout.rows_column, known.arc),
         *_of_panel(everything, chances),
         *_motions(first, noise, motions),
@@ -106,17 +106,20 @@ def _of_phantom(everything: FitProblem, known: Known) -> list[Cause]:
     return out
 
 
-def _arc(column: int, share: float | None) -> list[Cause]:
+def _arc(column: int, known: Known) -> list[Cause]:
     """Make the cause that the object turns while a frame is exposed.
 
     Args:
         column: of the squared share of a step.
-        share: of a step, by the script; None: not stated.
+        known: of the arc, by the script and by the spots' smear.
 
     Returns:
-        One cause; more probable before the scan, and narrow, if stated. Empty for a share
-        of 0.
+        One cause; more probable before the scan, and narrow, if stated. Where smear was
+        measured it tells the arc, and what it leaves holds always. Empty for a share of 0.
     """
+    share = known.arc
+    if known.arc_left is not None:
+        return [Cause("arc", (column,), (), always=known.arc_left)]
     if share is None:
         return [Cause("arc", (column,), (ARC_PRIOR,))]
     if share == 0.0:

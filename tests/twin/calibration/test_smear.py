@@ -1,0 +1,173 @@
+"""A spot that is exposed while its bead turns is measured as smeared along the bead's path."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import arcs_drawn
+import numpy as np
+import prior_coverage as own
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.refine import Refined, measure_beads
+from flexdt.twin.calibration.detect.smear import UNMEASURED, Smear, Step, solved
+from flexdt.twin.calibration.detect.windows import Windows, plan_windows
+from flexdt.twin.calibration.diagnose.causes import Known
+from flexdt.twin.calibration.diagnose.causes.every_cause import _arc
+from flexdt.twin.calibration.diagnose.measured_spots import judge_smear
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.poses import Poses
+
+SHAPE = (300, 360)
+PIXEL = 0.3
+FRAMES = 24
+RADIUS = 1.2
+MU = 0.8
+FINE = 3
+MOMENTS = 12
+NOISE = 0.006
+STEP = 2.0 * math.pi / FRAMES
+BEADS = np.array([[9.0, 2.0, -9.0], [-8.0, 6.0, 0.0], [1.0, -9.0, 10.0]])
+
+
+def turned(part: float) -> ConeVec:
+    """The geometry of all frames, a part of a step later."""
+    angles = STEP * (np.arange(FRAMES) + part)
+    return Poses.upright([0, 0, 0], [0, 500, 0], [0, 900, 0], PIXEL, angles).cone_vec()
+
+
+@cache
+def exposed(share: float, blur: tuple[float, float]) -> tuple[np.ndarray, Windows]:
+    """Noisy line integrals of balls exposed over a share of a step, and their windows."""
+    model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
+    longest = share * STEP * 12.0 * 900 / 500 / PIXEL
+    plan = plan_windows(model, turned(0.0), SHAPE, longest)
+    parts = (np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5 if share else np.zeros(1)
+    light = np.mean([instant(share * p, plan, blur) for p in parts], axis=0)
+    noise = NOISE * np.random.default_rng(7).normal(size=light.shape)
+    return (-np.log(light) + noise).astype(np.float32), plan
+
+
+def instant(part: float, windows: Windows, blur: tuple[float, float]) -> np.ndarray:
+    """Light behind the balls by exact rays, (n, k, side, side): the witness."""
+    cone = turned(part)
+    side = windows.side
+    margin = 4
+    n = side + 2 * margin
+    fine = (np.arange(FINE * n) + 0.5) / FINE - 0.5 - margin
+    rows, cols = SHAPE
+    out = np.empty((FRAMES, len(BEADS), side, side))
+    for f, k in np.ndindex(FRAMES, len(BEADS)):
+        left, top = windows.corner[f, k]
+        x = (left + fine - (cols - 1) / 2)[None, :, None]
+        y = (top + fine - (rows - 1) / 2)[:, None, None]
+        ray = cone.detector[f] + x * cone.u[f] + y * cone.v[f] - cone.source[f]
+        ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+        path = np.zeros(ray.shape[:2])
+        for bead in BEADS:
+            middle = ray @ (bead - cone.source[f])
+            d2 = ((bead - cone.source[f]) ** 2).sum() - middle**2
+            path += 2.0 * MU * np.sqrt(np.clip(RADIUS**2 - d2, 0.0, None))
+        seen = gaussian_filter(np.exp(-path), [FINE * b for b in blur])
+        means = seen.reshape(n, FINE, n, FINE).mean(axis=(1, 3))
+        out[f, k] = means[margin:-margin, margin:-margin]
+    return out
+
+
+def measured(
+    share: float, told: bool = True, blur: tuple[float, float] = (0.6, 0.6)
+) -> tuple[Refined, np.ndarray]:
+    """Measure balls exposed over a share of a step; also their places at its middle."""
+    model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
+    cone = turned(0.0)
+    images, plan = exposed(share, blur)
+    result = measure_beads(
+        images, plan, cone, model, 2.0 * RADIUS * MU, turning=turned if told else None
+    )
+    return result, plan.predicted
+
+
+@pytest.mark.parametrize("share", [0.12, 0.5])
+def test_the_arc_of_an_exposure_is_told_and_shifts_no_position(share: float) -> None:
+    result, middle = measured(share)
+    smear = result.smear
+    assert smear.told
+    assert smear.named
+    assert smear.share == pytest.approx(share, rel=0.02, abs=3.0 * smear.sigma / share)
+    off = result.tracks - middle
+    assert np.isfinite(off).all(axis=2).mean() > 0.95
+    assert float(np.sqrt(np.nanmean(off**2))) < 0.008
+
+
+def test_a_smear_that_is_taken_for_round_blur_shifts_positions() -> None:
+    result, middle = measured(0.5, told=False)
+    assert float(np.sqrt(np.nanmean((result.tracks - middle) ** 2))) > 0.015
+
+
+@pytest.mark.parametrize("blur", [(0.6, 0.6), (0.5, 1.1), (1.1, 0.5)])
+def test_images_of_instants_are_told_from_smeared_ones_whatever_the_blur(
+    blur: tuple[float, float],
+) -> None:
+    smear = measured(0.0, blur=blur)[0].smear
+    assert smear.measured
+    assert not smear.told
+    assert abs(smear.squared) < 4.0 * smear.sigma
+    assert smear.left < 0.01
+
+
+def test_odds_grow_with_the_square_over_its_sigma() -> None:
+    odds = [Smear(s * 0.01, 0.01).log_odds for s in (-40.0, -3.0, 0.0, 3.0, 6.0, 40.0)]
+    assert odds == sorted(odds)
+    assert [Smear(s * 0.01, 0.01).named for s in (0.0, 3.0, 6.0)] == [False, False, True]
+    assert not UNMEASURED.named
+    assert UNMEASURED.share == 0.0
+
+
+@pytest.mark.parametrize("true", [0.02, 0.4, 1.7])
+def test_the_arc_is_found_where_steps_are_far_from_linear(true: float) -> None:
+    def step_at(square: float) -> Step:
+        return Step(math.tanh(3.0 * (true - square)) * (0.3 + 0.2 * square), 1e-3)
+
+    found = solved(0.0, step_at(0.0), step_at)
+    assert found.told
+    assert found.squared == pytest.approx(true, rel=0.02)
+
+
+def test_a_smear_that_no_arc_explains_is_none() -> None:
+    assert solved(0.0, Step(0.3, 0.01), lambda square: Step(0.3, 0.01)) == UNMEASURED
+
+
+def test_what_smear_leaves_of_the_arc_is_in_every_model() -> None:
+    known = Known((1e-3, 1e-3), None, 0.3, None, 0.004)
+    (cause,) = _arc(5, known)
+    assert (cause.always, cause.widths) == (0.004, ())
+    (stated,) = _arc(5, replace(known, arc_left=None))
+    assert stated.always == 0.0
+    assert stated.widths
+
+
+def test_the_finding_gives_arc_and_share() -> None:
+    finding = judge_smear(Smear(0.25, 0.01, True), math.radians(15.0))
+    assert finding is not None
+    assert finding.code == "exposure_arc"
+    assert "7.5 deg, 0.50 of a step" in finding.text
+    assert judge_smear(Smear(0.02, 0.01, True), math.radians(15.0)) is None
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_scan_that_is_exposed_while_turning_is_told_as_that_and_nothing_false(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Coarse images of the campaign `arcs_drawn`."""
+    monkeypatch.setattr(own, "SHAPE", (380, 478))
+    monkeypatch.setattr(own, "PIXEL", 0.2992)
+    monkeypatch.setattr(arcs_drawn, "FRAMES", (36,))
+    told = arcs_drawn.told(seed, 0.3, 0.6)
+    assert told.offered
+    assert told.codes == {"exposure_arc"}
+    assert told.found == pytest.approx(told.share, rel=0.03)
+    assert told.worst < 4.0
