@@ -132,8 +132,10 @@ def explain_residuals(
     # What else the residuals show has no meaning where no cause explains them.
     explained = _moving_beside(plain, fit, named, causes, refit)
     if explained:
-        # Most of a scan was left out because of it, and with that its beads.
-        return fit, [*([] if crowd else _lost_beads(fit)), *explained]
+        # Most of a scan was left out because of it, and with that its beads. A bead whose
+        # place is only open beside the motion is elsewhere if the fit without that says so.
+        still = fit if causes.applied else plain
+        return fit, [*([] if crowd else _lost_beads(still)), *explained]
     fit, loose = with_loose_beads(plain, fit, known)
     if loose is not None and _explains(loose, plain, limit):
         return fit, [loose.finding(fit.problem.group)]
