@@ -23,6 +23,7 @@ from flexdt.twin.calibration.fit.problem import (
 )
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, priors_of, strain_prior
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
@@ -137,6 +138,7 @@ def fit_scans(
         start=_start(state, request) if start is None else start,
         reading=request.reading,
         sampling_px=max((m.sampling_px for m in state.measured), default=0.0),
+        common_px=_common(state),
         solver=MEASURED if weighed else FOUND,
         priors=priors_of(state.scans, request),
         prior_centre=request.start,
@@ -150,6 +152,21 @@ def fit_scans(
     if state.motion is None:
         return fit
     return aware(fit, state.motion)
+
+
+def _common(state: Calibration) -> FloatArray | None:
+    """Join the common shifts of the scans' positions, each scan with columns of its own, (n,
+    k, 2, c); None without a second measurement.
+    """
+    if not state.measured:
+        return None
+    parts = [m.common for m in state.measured]
+    before = np.cumsum([0, *(part.shape[3] for part in parts)])
+    wide = [
+        np.pad(part, ((0, 0), (0, 0), (0, 0), (int(left), int(before[-1] - right))))
+        for part, left, right in zip(parts, before[:-1], before[1:], strict=True)
+    ]
+    return np.concatenate(wide)
 
 
 def refit_scans(

@@ -9,6 +9,7 @@ beads themselves how their contrast falls, and `evened` undoes it.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -20,22 +21,44 @@ OUTLIER_RATIO = 4.5
 outliers."""
 MEAN_ROUNDS = 10
 """Rounds in which the means of frames and beads are subtracted in turns; few are missing."""
+LEAST_WIDTH = 1e-3
+"""Least prior width of a slope: what it does to a spot is below 0.001 px."""
+USUAL_SPREAD = 0.01
+"""Usual standard deviation of a relative contrast; it counts as `USUAL_COUNT` values, so that few
+spots that agree by chance tell nothing."""
+USUAL_COUNT = 3
+WIDTHS = 24
+"""Prior widths that are tried, from `LEAST_WIDTH` on."""
+
+
+@dataclass(frozen=True)
+class Fading:
+    """How the contrast of a bead changes with the line integral behind it.
+
+    Attributes:
+        slope: relative change a unit of line integral.
+        sigma: its standard deviation. All frames have one slope, so its error shifts all
+            their spots together.
+    """
+
+    slope: float
+    sigma: float
 
 
 def fading(
     contrast: FloatArray, behind: FloatArray, seen: npt.NDArray[np.bool_]
-) -> float:
+) -> Fading:
     """Estimate how contrast changes with the line integral behind a bead, as a share of
     it.
 
     Each bead is compared with itself in other frames, and each frame's mean is
     subtracted, so beads of several sizes and a beam that drifts have no effect. Outliers
-    (`OUTLIER_RATIO`) are left out in three rounds. The estimate is shrunk by its noise
-    (James and Stein), so that no slope gives 0. Contrast C falls by at most as much as
-    the thickness behind grows, if a ball passes nothing but scattered light; where
-    scattered light is uneven it grows with the line integral, by exp(C) - 1 times as
-    much. Values beyond these are an error of the level, which is in the contrast too: the
-    result is limited to them.
+    (`OUTLIER_RATIO`) are left out in three rounds. Of few spots, or where little varies
+    behind the beads, the estimate is mostly its prior (`_shrunk`). Contrast C falls by at
+    most as much as the thickness behind grows, if a ball passes nothing but scattered
+    light; where scattered light is uneven it grows with the line integral, by exp(C) - 1
+    times as much. Values beyond these are an error of the level, which is in the contrast
+    too: the result is limited to them.
 
     Args:
         contrast: of each bead in each frame, (n, k), above 0 where seen.
@@ -43,8 +66,10 @@ def fading(
         seen: which of them are measured, (n, k).
 
     Returns:
-        Relative change a unit of line integral; 0 if too few are seen or nothing varies.
+        The slope; its prior if too few are seen or nothing varies, and 0 without spots.
     """
+    if not seen.any():
+        return Fading(0.0, 0.0)
     logarithm = np.log(np.where(seen, contrast, 1.0))
     use = seen
     for _ in range(3):
@@ -52,14 +77,48 @@ def fading(
         free = int(use.sum()) - int(use.any(axis=0).sum()) - int(use.any(axis=1).sum())
         power = float(np.square(more).sum())
         if free < 1 or power <= 0.0:
-            return 0.0
+            return _shrunk(0.0, math.inf, 1, float(np.median(contrast[seen])))
         slope = float((change * more).sum()) / power
         left = np.abs(_against_own_means(logarithm - slope * behind, seen))
         use = seen & (left <= OUTLIER_RATIO * float(np.median(left[seen])))
-    variance = max(float(np.square(change).sum()) - slope**2 * power, 0.0) / free / power
-    slope *= max(1.0 - variance / max(slope**2, 1e-30), 0.0)
+    left_over = max(float(np.square(change).sum()) - slope**2 * power, 0.0)
+    free += USUAL_COUNT
+    variance = (left_over + USUAL_COUNT * USUAL_SPREAD**2) / free / power
     usual = float(np.median(contrast[use]))
-    return min(max(slope, -1.0 / usual), math.expm1(usual) / usual)
+    found = _shrunk(slope, variance, free, usual)
+    limited = min(max(found.slope, -1.0 / usual), math.expm1(usual) / usual)
+    return Fading(limited, found.sigma)
+
+
+def _shrunk(slope: float, variance: float, free: int, contrast: float) -> Fading:
+    """Combine an estimated slope with its prior, whose width is unknown.
+
+    The prior is normal about 0. Its width is of unknown order (log-uniform), from
+    `LEAST_WIDTH` to tanh(C / 4) / C: evenly scattered light changes a contrast C by no more,
+    however much of it there is. Each width counts by its evidence, a t distribution because
+    the variance is estimated, too. A slope that is told clearly is hardly changed, also
+    beyond these widths; one that is not becomes small, and sigma states what stays open.
+
+    Args:
+        slope: by least squares.
+        variance: of it, estimated; inf: nothing is known.
+        free: degrees of freedom of the variance.
+        contrast: the usual line integral through a bead.
+
+    Returns:
+        Mean and standard deviation of the slope.
+    """
+    most = math.tanh(contrast / 4.0) / contrast
+    prior = np.geomspace(LEAST_WIDTH, max(most, LEAST_WIDTH), WIDTHS) ** 2
+    if math.isinf(variance):
+        return Fading(0.0, math.sqrt(float(prior.mean())))
+    whole = prior + variance
+    evidence = (1.0 + slope**2 / (free * whole)) ** (-0.5 * (free + 1)) / np.sqrt(whole)
+    evidence /= evidence.sum()
+    share = prior / whole
+    mean = float(evidence @ share) * slope
+    spread = share * variance + np.square(share * slope - mean)
+    return Fading(mean, math.sqrt(float(evidence @ spread)))
 
 
 def _against_own_means(values: FloatArray, seen: npt.NDArray[np.bool_]) -> FloatArray:
@@ -91,11 +150,33 @@ def evened(
     Returns:
         New windows (m, side, side).
     """
-    at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
+    at = _from_middle(flat.shape[1])
     value, right, down = plane.astype(np.float32).T[:, :, None, None]
+    level = value + right * at + down * at[:, None]
+    change = np.float32(-slope) * more_behind(plane, body, flat.shape[1])
+    return np.asarray(level + (flat - level) * np.exp(change))
+
+
+def more_behind(plane: FloatArray, body: Float32Array | None, side: int) -> Float32Array:
+    """Compute how much more is behind each pixel than behind the middle of its window.
+
+    Args:
+        plane: of `Background`, (m, 3).
+        body: line integrals of the body (m, side, side), or None.
+        side: of the windows.
+
+    Returns:
+        Line integrals (m, side, side).
+    """
+    at = _from_middle(side)
+    _, right, down = plane.astype(np.float32).T[:, :, None, None]
     more = right * at + down * at[:, None]
-    level = value + more
     if body is not None:
-        middle = flat.shape[1] // 2
+        middle = side // 2
         more = more + body - body[:, middle, middle][:, None, None]
-    return np.asarray(level + (flat - level) * np.exp(np.float32(-slope) * more))
+    return np.asarray(more)
+
+
+def _from_middle(side: int) -> Float32Array:
+    """Return the places of a window's pixels along a side, from its middle."""
+    return (np.arange(side) - (side - 1) / 2).astype(np.float32)

@@ -20,7 +20,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
 from flexdt.twin.calibration.detect.background import Background, levelled, survey
 from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
-from flexdt.twin.calibration.detect.fading import evened, fading
+from flexdt.twin.calibration.detect.fading import evened, fading, more_behind
 from flexdt.twin.calibration.detect.patches import (
     Patches,
     centroids,
@@ -90,8 +90,6 @@ FEW_WINDOWS = 600
 """Up to so many windows a bead is rendered with `RADIUS_RAYS` along its radius."""
 FEWER_RADIUS_RAYS = 12
 """Rays along a bead's radius in more windows, and in drafts."""
-FADING_FRAMES = 60
-"""Frames from which it is read how beads fade behind a body, at least if there are as many."""
 LARGEST_PX = 0.6
 """A larger systematic error of a rendered spot is not believed."""
 NEAR_PX = 0.15
@@ -127,6 +125,8 @@ class Refined:
             unknown.
         blur_px: blur of the images, estimated from the spots or assumed.
         sampling_px: what remains of the error that depends on a spot's place in the pixel grid.
+        common: (n, k, 2, c) shifts of the positions [px] by one standard deviation of each of
+            c quantities that were estimated once for all frames: they do not average out.
         body: the phantom's, as seen in the images.
         as_fitted: blur and size of the best fit, which a geometry that is almost the same
             does not change; None unless from `measure_beads`.
@@ -140,6 +140,7 @@ class Refined:
     size: float
     blur_px: float
     sampling_px: float
+    common: FloatArray
     body: SeenBody = NO_BODY
     as_fitted: Sharp | None = None
     smear: Smear = UNMEASURED
@@ -396,7 +397,7 @@ def _measured(
         behind = survey(patches.flat, alone)
         if behind.bend is not None:
             patches = replace(patches, flat=patches.flat - behind.bend)
-        patches = _evened(patches, behind, body)
+        patches, fainter = _evened(patches, behind, body, alone)
         # A fit of a spot that is cut or touched knows a level alone.
         partial = ~windows.whole.ravel()
         patches = replace(patches, flat=levelled(patches.flat, behind.slope, partial))
@@ -419,6 +420,7 @@ def _measured(
     blur = sharp.blur, sharp.veil
     fitting = fits(replace(patches, offsets=start), fitted, blur, False, masks)
     taken = take(results, fitting, fitted, windows.whole.ravel())
+    common = np.zeros((n * k, 2, 1))
     if alone is not None:
         model = replace(patches, flat=alone)
         expected = centroids(model, patches.entire, results[:, kernels.NOISE])
@@ -432,35 +434,58 @@ def _measured(
         results[sure, kernels.X] -= error[sure, 0]
         results[sure, kernels.Y] -= error[sure, 1]
         results[sure, kernels.BIAS] = 0.0
+        shifted = replace(model, flat=alone + fainter)
+        lone = np.setdiff1d(np.flatnonzero(sure), taken)
+        changed = centroids(shifted, lone, results[:, kernels.NOISE])
+        taken = taken[sure[taken]]
+        # A fit begins where it ends without the change.
+        shifted = replace(shifted, offsets=expected[:, [kernels.X, kernels.Y]].copy())
+        fitting = fits(shifted, taken, blur, False, masks[np.isin(fitted, taken)])
+        changed[taken] = fitting[taken]
+        sure &= changed[:, kernels.OK] > 0
+        common[sure, :, 0] = (changed - expected)[sure][:, [kernels.X, kernels.Y]]
     if behind is not None:
         _discount(results, behind, patches.offsets)
-    return _accept(results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp)
+    accepted = _accept(
+        results.reshape(n, k, -1), windows, patches.peaks.reshape(n, k), sharp
+    )
+    return replace(accepted, common=common.reshape(n, k, 2, -1))
 
 
-def _evened(patches: Patches, behind: Background, body: Float32Array | None) -> Patches:
-    """Return the windows with uniform contrast of each bead, by the fading found in about
-    `FADING_FRAMES` frames; the same windows if none is found.
+def _evened(
+    patches: Patches,
+    behind: Background,
+    body: Float32Array | None,
+    alone: Float32Array,
+) -> tuple[Patches, Float32Array]:
+    """Return the windows with uniform contrast of each bead, by the fading found in them.
 
     Args:
         patches: the windows.
         behind: backgrounds.
         body: line integrals of the body, or None.
+        alone: the beads alone, (m, side, side).
+
+    Returns:
+        The windows, the same if no fading is found; and the change of their line integrals by
+        one standard deviation of the fading.
     """
-    frames, beads = patches.windows.whole.shape
-    few = patches.entire[patches.entire // beads % max(1, frames // FADING_FRAMES) == 0]
-    found = centroids(patches, few)
+    found = centroids(patches, patches.entire)
     seen = found[:, kernels.OK] > 0
     level = behind.plane[:, 0]
     thick = body
     if body is not None:
         thick = np.asarray(body.reshape(-1, *patches.flat.shape[1:]))
         level = level + thick[:, thick.shape[1] // 2, thick.shape[1] // 2]
-    shape = frames, beads
+    shape = patches.windows.whole.shape
     peaks = found[:, kernels.PEAK].reshape(shape)
-    slope = fading(peaks, level.reshape(shape), seen.reshape(shape))
-    if slope == 0.0:
-        return patches
-    return replace(patches, flat=evened(patches.flat, behind.plane, thick, slope))
+    found_slope = fading(peaks, level.reshape(shape), seen.reshape(shape))
+    more = more_behind(behind.plane, thick, patches.flat.shape[1])
+    fainter = np.asarray(np.float32(found_slope.sigma) * more * alone)
+    if found_slope.slope != 0.0:
+        flat = evened(patches.flat, behind.plane, thick, found_slope.slope)
+        patches = replace(patches, flat=flat)
+    return patches, fainter
 
 
 def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> None:
@@ -524,4 +549,5 @@ def _accept(
         sharp.size if sharp.seen else math.nan,
         sharp.true,
         SHARP_SAMPLING_PX if sharp.blur < BODY_BLUR_PX else SAMPLING_PX,
+        np.zeros((*good.shape, 2, 0)),
     )

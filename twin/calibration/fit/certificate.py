@@ -701,8 +701,8 @@ def _widened(
     sampling_px: float,
 ) -> tuple[FloatArray, bool, float, tuple[Drift, ...]]:
     """Enlarge the covariance by the structure of the residuals beyond white noise: errors
-    that beads share, places in the pixel grid, errors that repeat with the turn, and
-    drifts.
+    that beads share, places in the pixel grid, quantities that all frames share, errors that
+    repeat with the turn, and drifts.
 
     A possible but uncertain drift widens the covariance, too, but is not listed.
 
@@ -722,10 +722,14 @@ def _widened(
     together = cluster_covariance(left)
     if together is not None:
         covariance = larger(covariance, together[:reported, :reported] + prior)
+    shifts = []
     if sampling_px > 0:
-        shifts = _sampling_vectors(left.problem, predicted)[left.keep]
-        gain = left.unit_covariance[:reported] @ cross(left.jacobian, shifts)
-        covariance = covariance + sampling_px**2 * gain @ gain.T
+        shifts.append(sampling_px * _sampling_vectors(left.problem, predicted))
+    if left.problem.common is not None:
+        shifts.append(_whitened_shifts(left.problem, left.problem.common))
+    for shift in shifts:
+        gain = left.unit_covariance[:reported] @ cross(left.jacobian, shift[left.keep])
+        covariance = covariance + gain @ gain.T
     turning = turning_errors(left)
     size = 0.0
     if turning is not None:
@@ -762,6 +766,14 @@ def widened_by_structure(left: Residuals, covariance: FloatArray) -> FloatArray:
     pull = left.unit_covariance[: len(covariance)] * left.noise**2 / widths
     nowhere = np.zeros((*left.problem.seen.shape, 2))
     return _widened(left, nowhere, covariance, cross(pull.T, pull.T), 0.0)[0]
+
+
+def _whitened_shifts(problem: FitProblem, shifts: FloatArray) -> FloatArray:
+    """Whiten shifts of the positions [px], (n, k, 2, c); returns (2 n k, c)."""
+    w = problem.whiten[..., None]
+    across = w[:, :, 0] * shifts[:, :, 0] + w[:, :, 1] * shifts[:, :, 1]
+    down = w[:, :, 2] * shifts[:, :, 1]
+    return np.stack([across, down], axis=2).reshape(-1, shifts.shape[-1])
 
 
 def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:

@@ -466,6 +466,7 @@ def estimate_geometry(
     reading: Reading = Reading.AXIS_AT_O_PLUS_TAU,
     centre: Centre | npt.ArrayLike = Centre.POINT,
     sampling_px: float = 0.0,
+    common_px: npt.ArrayLike | None = None,
     solver: Solver | None = None,
     priors: Mapping[str, float] | None = None,
     prior_centre: Offsets | None = None,
@@ -504,6 +505,8 @@ def estimate_geometry(
             factor of each position, (n, k), such as 0.8 for a centroid weighted by chord
             length.
         sampling_px: see `certify`; 0 for points, about 0.001 for centroids in images.
+        common_px: (n, k, 2, c) shifts of the positions by one standard deviation of each of c
+            quantities that all frames share, such as how beads fade; None: there are none.
         solver: None is Huber, trimming, then least squares.
         priors: parameter -> standard deviation of its prior [mm, deg, 1]; 0 is exactly
             known. A parameter that is not in `free` is estimated along with them. None:
@@ -559,6 +562,7 @@ def estimate_geometry(
         arc=arc,
         rows=rows,
         expected_spread=0.0 if solver is None else solver.spread_px,
+        common=common_px,
     )
     if not problem.seen.any():
         raise TwinError(

@@ -302,6 +302,8 @@ class FitProblem:
             None: each frame is an instant.
         expected_spread: of the whitened residuals, expected before they are seen; 0: nothing is
             expected.
+        common: (n, k, 2, c) shifts of the positions [px] by one standard deviation of each of c
+            quantities that all frames share; None: positions err each by itself.
     """
 
     poses: Poses
@@ -320,6 +322,7 @@ class FitProblem:
     panel: PanelModel | None = None
     turning: FloatArray | None = None
     expected_spread: float = 0.0
+    common: FloatArray | None = None
 
     @property
     def start(self) -> FloatArray:
@@ -589,6 +592,7 @@ def build_problem(
     arc: bool = False,
     rows: bool = False,
     expected_spread: float = 0.0,
+    common: npt.ArrayLike | None = None,
 ) -> FitProblem:
     """Check the arguments of a fit and put them into arrays.
 
@@ -616,6 +620,7 @@ def build_problem(
         arc: the arc that the object turns during an exposure is estimated, too.
         rows: the arc that it turns while a frame's rows are read is estimated, too.
         expected_spread: see `FitProblem`.
+        common: see `FitProblem`.
 
     Returns:
         The problem; perhaps without any seen position.
@@ -665,6 +670,11 @@ def build_problem(
         strains = strain_widths(strain)
     else:
         strains = np.zeros(0)
+    shared = None
+    if common is not None:
+        shared = np.asarray(common, dtype=np.float64)
+        if shared.shape[:-1] != t.shape:
+            raise TwinError.of_shape("common shifts", shared.shape[:-1], t.shape)
     turning = None
     if arc or rows:
         places = measured[..., 1] / (2.0 * origin[:, None, 1] + 1.0)
@@ -704,6 +714,7 @@ def build_problem(
         panel=panel,
         turning=turning,
         expected_spread=expected_spread,
+        common=shared,
     )
 
 
