@@ -334,7 +334,7 @@ class Gain(NamedTuple):
 
     @property
     def excess(self) -> FloatArray:
-        """What is more than usual, in standard deviations, (c,)."""
+        """Excess over the usual, in standard deviations, (c,)."""
         return (self.whole - self.usual) / self.spread
 
 
