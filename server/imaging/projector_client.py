@@ -28,8 +28,8 @@ _T = TypeVar("_T")
 
 CHUNK_BYTES: Final = 8 * 2**20
 """Bytes of a volume in one message."""
-MAX_TRIES: Final = 5
-"""Attempts to send a volume that other clients' volumes displace before it is projected."""
+MAX_LOSSES: Final = 5
+"""Times that a projector may lose a volume of which no other has taken the place."""
 
 
 @dataclass(eq=False, repr=False)
@@ -104,8 +104,9 @@ class ProjectorClient:
     ) -> npt.NDArray[np.float32]:
         """Compute line integrals; send the body again if the server has dropped it.
 
-        A volume that the server does not know is sent and requested again, at most
-        `MAX_TRIES` requests in all; without `body` it is an error at once.
+        A volume that the server does not know is sent and requested again: as often as
+        other clients' volumes displace it, which are projected meanwhile, and until it is lost
+        `MAX_LOSSES` times without that. Without `body` it is an error at once.
 
         Args:
             name, body: the body to project; body None if it is there already.
@@ -125,7 +126,8 @@ class ProjectorClient:
             "detector": list(shape),
         }
         sizes = (len(cone_vec), *shape)
-        for left in reversed(range(MAX_TRIES)):
+        losses = 0
+        while True:
             if body is not None:
                 await self.give(name, body)
             try:
@@ -133,20 +135,13 @@ class ProjectorClient:
                     "project", lambda c: c.ask_array("project", params, sizes)
                 )
             except RpcError as error:
-                allowed = None
-                if isinstance(error.data, Mapping):
-                    allowed = error.data.get("allowed")
-                if (
-                    body is None
-                    or not isinstance(allowed, list)
-                    or name in allowed
-                    or not left
-                ):
+                there = _volumes_there(error)
+                if body is None or there is None or name in there:
                     raise
-            self._sent.pop(
-                name, None
-            )  # it was forgotten for another, or removed by another client
-        raise AssertionError("the last try returns or raises")
+                losses += not there
+                if losses == MAX_LOSSES:
+                    raise
+            self._sent.pop(name, None)
 
     async def health(self) -> Health:
         """Request the server's version, load and memory."""
@@ -266,3 +261,13 @@ async def _send(
         data = flat[start : start + CHUNK_BYTES].data.toreadonly()
         params = {"name": name, **what, **how, "start": start, "data": data}
         await channel.ask("volume.put", params)
+
+
+def _volumes_there(error: RpcError) -> list[object] | None:
+    """Return the names that a projector lists when it does not know a volume; None for another
+    error.
+    """
+    allowed = None
+    if isinstance(error.data, Mapping):
+        allowed = error.data.get("allowed")
+    return allowed if isinstance(allowed, list) else None

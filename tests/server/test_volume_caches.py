@@ -211,3 +211,32 @@ def test_a_scan_that_no_projector_takes_fails_and_the_next_one_runs(
         assert (await lab.ended(c, first))["state"] == "done"
 
     run(tmp_path, body)
+
+
+@pytest.mark.parametrize(("there", "lost"), [(["theirs"], 40), ([], 4), ([], 5)])
+def test_a_volume_that_others_displace_is_sent_until_it_is_projected(
+    monkeypatch: pytest.MonkeyPatch, there: list[str], lost: int
+) -> None:
+    """Twins that took turns on a busy machine ended after five displacements; a projector
+    that loses volumes by itself still ends the request."""
+    client, sent = ProjectorClient(port=1), list[str]()
+    answer = np.zeros((1, *CAMERA.shape), np.float32)
+
+    async def give(name: str, body: object) -> None:
+        sent.append(name)
+
+    async def ask(method: str, work: object) -> np.ndarray[Any, np.dtype[np.float32]]:
+        if len(sent) > lost:
+            return answer
+        raise RpcError(TOO_LARGE, "unknown volume", {"allowed": there})
+
+    monkeypatch.setattr(client, "give", give)
+    monkeypatch.setattr(client, "_ask", ask)
+    work = client.project("mine", volume_of(1), POSES.cone_vec(), CAMERA.shape)
+    if there or lost < 5:
+        assert asyncio.run(work) is answer
+        assert len(sent) == lost + 1
+    else:
+        with pytest.raises(RpcError, match="unknown volume"):
+            asyncio.run(work)
+        assert len(sent) == 5
