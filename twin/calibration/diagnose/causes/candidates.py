@@ -41,6 +41,8 @@ from flexdt.twin.geometry.panel import Border, PanelModel
 
 OUTLIER_SIGMAS: Final = 5.0
 """Robust standard deviations at which residuals are clipped."""
+MOST_STRAINED: Final = 4
+"""Number of beads of which every displacement is an affine map, of twelve numbers."""
 MAX_EVIDENCE_LOSS: Final = 12.0
 """Logarithm of the evidence ratio beyond which models have no weight."""
 
@@ -270,15 +272,17 @@ class Candidates:
         the phantom's tolerance if that is less.
 
         No phantom has its beads exactly in their places, and of three or four any
-        displacement is a strain: how far they are off is hardly in the images. Of more
-        beads they leave little open.
+        displacement is a strain: how far they are off is hardly in the images. More beads
+        tell it.
 
         Args:
             choice: separable; returned as it is where the request states the tolerance,
-                or places are no cause.
+                places are no cause, or there are more than `MOST_STRAINED` beads.
         """
         at = next((i for i, c in enumerate(self.causes) if c.name == "beads"), None)
         if at is None or self.known.bead_tolerance_mm is not None:
+            return choice
+        if len(self.problem.model) > MOST_STRAINED:
             return choice
         cause = self.causes[at]
         said = {w: self.evidence(with_pick(choice, at, w)) for w in cause.widths}
