@@ -26,24 +26,21 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import prior_coverage as own
-from beam_faults import ATTENUATION, BODY, Laboratory, cylinder, rays
-
-from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.frame_source import ArrayFrames
-from flexdt.twin.calibration.pipeline import (
-    Calibration,
-    CalibrationRequest,
-    Scan,
-    calibrate,
+from beam_faults import (
+    ATTENUATION,
+    BODY,
+    WRONG_SIGMAS,
+    Array,
+    Laboratory,
+    Rng,
+    cylinder,
+    rays,
 )
-from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.poses import Poses
 
-Array = npt.NDArray[np.float64]
-Rng = np.random.Generator
+from flexdt.twin.calibration.pipeline import Calibration
+from flexdt.twin.errors import TwinError
 
 FRAMES: Final = (24, 36, 48, 60, 90, 120)
-WRONG_SIGMAS: Final = 4.0
 MOMENT_PX: Final = 2.0
 """Largest way of a ball's image from one moment of an exposure to the next [px]."""
 
@@ -149,15 +146,9 @@ def drawn(seed: int, least: float, most: float) -> tuple[Any, ...]:
 def told(seed: int, least: float = 0.1, most: float = 1.5) -> Told:
     """Make a scan, calibrate from it and compare the answer with the truth."""
     lab, beads, angles, share, truth, images = drawn(seed, least, most)
-    poses = Poses.upright(
-        [0, 0, 0], [0, own.SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(angles)
-    )
-    model = BeadModel(beads, np.full(len(beads), lab.radius_mm))
     begin = time.process_time()
     try:
-        result = calibrate(
-            [Scan(ArrayFrames(images, own.SHAPE), poses)], model, CalibrationRequest()
-        )
+        result = beam_faults.calibrated(lab, beads, angles, images)
     except TwinError as error:
         return Told(
             seed, len(angles), share, lab.body, False, math.nan, 0.0, "",
@@ -165,7 +156,7 @@ def told(seed: int, least: float = 0.1, most: float = 1.5) -> Told:
         )  # fmt: skip
     cpu = time.process_time() - begin
     said = tuple(f"{f.code}: {f.text}" for f in result.findings)
-    off = beam_faults._errors(result, truth, lab) if result.identifiable else {}
+    off = beam_faults.errors_of(result, truth, lab) if result.identifiable else {}
     where = max(off, key=lambda n: off[n], default="")
     return Told(
         seed, len(angles), share, lab.body, result.identifiable, _found(result),

@@ -425,18 +425,12 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
     truth = own.drawn(rng, 1.0, False)
     angles = 360.0 * np.arange(frames) / frames
     images = radiographs(lab, rng, beads, angles, truth)
-    poses = Poses.upright(
-        [0, 0, 0], [0, own.SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(angles)
-    )
-    model = BeadModel(beads, np.full(len(beads), lab.radius_mm))
     try:
-        result = calibrate(
-            [Scan(ArrayFrames(images, own.SHAPE), poses)], model, CalibrationRequest()
-        )
+        result = calibrated(lab, beads, angles, images)
     except TwinError as error:
         return Scored(kind, seed, False, False, 0.0, "", (f"refused: {error}",))
     said = tuple(f"{f.code}: {f.text}" for f in result.findings)
-    off = _errors(result, truth, lab) if result.identifiable else {}
+    off = errors_of(result, truth, lab) if result.identifiable else {}
     where = max(off, key=lambda n: off[n], default="")
     named = any(re.match(name, one) for one in said) if name else True
     return Scored(
@@ -444,7 +438,32 @@ def scored(kind: str, seed: int, frames: int = 24) -> Scored:
     )
 
 
-def _errors(
+def calibrated(
+    lab: Laboratory,
+    beads: Array,
+    angles: Array,
+    images: Sequence[npt.NDArray[np.float32]],
+) -> Calibration:
+    """Calibrate from radiographs of a laboratory.
+
+    Args:
+        lab: gives the balls' radius.
+        beads: (k, 3) their places by the phantom's file [mm].
+        angles: (n,) [deg].
+        images: n line integrals (rows, cols).
+
+    Raises:
+        TwinError: calibration is refused.
+    """
+    poses = Poses.upright(
+        [0, 0, 0], [0, own.SOD, 0], [0, own.SDD, 0], own.PIXEL, np.radians(angles)
+    )
+    model = BeadModel(beads, np.full(len(beads), lab.radius_mm))
+    scan = Scan(ArrayFrames(images, own.SHAPE), poses)
+    return calibrate([scan], model, CalibrationRequest())
+
+
+def errors_of(
     result: Calibration, truth: Mapping[str, float], lab: Laboratory
 ) -> dict[str, float]:
     """Compute the error [sigma] of every value that a calibration offers, by name.
