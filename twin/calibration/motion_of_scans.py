@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.calibration.diagnose import Finding, error, warning
-from flexdt.twin.calibration.diagnose.causes import OPEN_LOG_ODDS
 from flexdt.twin.calibration.diagnose.named_motion import MOTION_WORDS, open_motions
+from flexdt.twin.calibration.fit.evidence import OPEN_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import (
     MotionFit,

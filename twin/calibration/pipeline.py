@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from flexdt.twin.calibration.bead_model import (
     BeadModel,
     BeadPhantom,
@@ -31,7 +29,7 @@ from flexdt.twin.calibration.diagnose.measured_spots import (
     judge_smear,
 )
 from flexdt.twin.calibration.fit.fit import FitResult, with_start
-from flexdt.twin.calibration.fit.problem import SIX
+from flexdt.twin.calibration.fit.problem import SIX, usual_step
 from flexdt.twin.calibration.fits_of_scans import fit_scans
 from flexdt.twin.calibration.fixed_check import check_fixed, explain
 from flexdt.twin.calibration.frame_source import FrameState, Scan, without_repeats
@@ -226,11 +224,7 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
     state = state.with_findings(*listed(judge_body(state.measured)))
     state = state.with_findings(*(judge_lag(lag) for lag in state.lags if lag.seen))
     for scan, measured in zip(state.scans, state.measured, strict=True):
-        step = (
-            float(np.median(np.abs(np.diff(scan.poses.angle))))
-            if len(scan.poses) > 1
-            else 0.0
-        )
+        step = usual_step(scan.poses.angle)
         state = state.with_findings(*listed(judge_smear(measured.smear, step)))
     if request.per_frame:
         state, fit = fit_with_motion(state, request, fit)

@@ -14,6 +14,7 @@ from flexdt.twin.calibration.detect.smear import UNMEASURED
 from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows, ways
 from flexdt.twin.calibration.diagnose import Finding, error
 from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.problem import usual_step
 from flexdt.twin.calibration.fits_of_scans import fit_scans
 from flexdt.twin.calibration.frame_source import FrameState, Scan
 from flexdt.twin.calibration.outcome import Calibration
@@ -143,7 +144,7 @@ def _turning(scan: Scan, parameters: Offsets) -> Callable[[float], ConeVec] | No
         parameters: its offsets.
     """
     angles = scan.poses.angle
-    step = float(np.median(np.abs(np.diff(angles)))) if len(angles) > 1 else 0.0
+    step = usual_step(angles)
     if scan.arc == 0.0 or not step > 0.0:
         return None
     return lambda part: replace(scan.poses, angle=angles + part * step).cone_vec(

@@ -16,7 +16,7 @@ from scipy.stats import f
 
 from flexdt.twin.calibration.diagnose import fitted, tiles
 from flexdt.twin.calibration.diagnose.causes import cause, columns, every_cause
-from flexdt.twin.calibration.fit import priors, problem
+from flexdt.twin.calibration.fit import evidence, priors, problem
 from flexdt.twin.calibration.fit.certificate import Certificate, Rival, widened
 from flexdt.twin.calibration.fit.curved_region import Bend
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
@@ -47,7 +47,7 @@ def test_regions_of_another_size_are_told() -> None:
 def test_what_is_drawn_is_what_the_calibration_assumes() -> None:
     """Both write it out: the draws import nothing of the fit."""
     odds = np.log(faults_drawn.CAUSE_ODDS)
-    assert odds == pytest.approx(cause.LOG_CHANCE)
+    assert odds == pytest.approx(evidence.LOG_CHANCE)
     assert faults_drawn.STRAIN == priors.STRAIN
     assert every_cause.STRAIN_WIDTHS[1:] == faults_drawn.STRAIN_WIDTHS
     assert faults_drawn.BEAD_SHARES == every_cause.BEAD_SHARES

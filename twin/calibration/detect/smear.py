@@ -15,21 +15,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from flexdt.twin.calibration.detect.windows import Windows, distances2
+from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, NAMED_LOG_ODDS
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SMEAR_SAMPLE = 64
 """Number of spots from which the smear is estimated."""
 LEAST_SPOTS = 8
 """Least number of them: four values are common to all."""
-LOG_CHANCE = math.log(0.1)
-"""Logarithm of the probability that the object turns in an exposure, before it is seen; as of
-the other causes of residuals, assumed."""
 SQUARED_WIDTH = 0.5
 """Width of the squared share of a step before it is seen, which is 0 to 1 mostly; assumed."""
-NAMED_LOG_ODDS = math.log(1e4)
-"""Logarithm of the odds from which the arc is named, as other causes are."""
 MOST_STEPS = 10
 """Most steps to the arc."""
 LARGEST_SQUARE = 4.0
@@ -86,11 +83,7 @@ class Smear:
             return LOG_CHANCE
         total = math.hypot(self.sigma, SQUARED_WIDTH)
         pull = self.squared / self.sigma * SQUARED_WIDTH / total
-        # log(2 Phi(pull)); its tail by the first term of the asymptotic series
-        if pull > -5.0:
-            side = math.log(math.erfc(-pull / math.sqrt(2.0)))
-        else:
-            side = -0.5 * pull**2 - math.log(-pull * math.sqrt(0.5 * math.pi))
+        side = math.log(2.0) + float(log_ndtr(pull))
         return LOG_CHANCE + math.log(self.sigma / total) + 0.5 * pull**2 + side
 
     @property

@@ -11,7 +11,7 @@ from flexdt.twin.calibration.diagnose import Finding, listed, warning
 from flexdt.twin.calibration.diagnose.causes import SHAPES, Found, border_name
 from flexdt.twin.calibration.diagnose.measured_spots import exposure_arc
 from flexdt.twin.calibration.fit.fit import FitResult
-from flexdt.twin.calibration.fit.problem import STRAINS
+from flexdt.twin.calibration.fit.problem import STRAINS, usual_step
 from flexdt.twin.calibration.fit.residual_structure import SIGNIFICANT
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -226,7 +226,7 @@ def _turning(fit: FitResult) -> Finding:
     """
     layout = fit.problem.layout
     share = float(np.sqrt(max(fit.solution.x[layout.arc_column], 0.0)))
-    step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
+    step = np.degrees(usual_step(fit.problem.poses.angle))
     return exposure_arc(share * step, share, "the mean of the arc was fitted")
 
 
@@ -238,7 +238,7 @@ def _read_in_turn(fit: FitResult) -> Finding:
         fit: with a column of the rows' turn.
     """
     share = float(fit.solution.x[fit.problem.layout.rows_column])
-    step = np.degrees(np.median(np.abs(np.diff(fit.problem.poses.angle))))
+    step = np.degrees(usual_step(fit.problem.poses.angle))
     first, last = ("first", "last") if share > 0.0 else ("last", "first")
     return warning(
         "rows_in_turn",

@@ -9,10 +9,8 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.calibration.diagnose import Finding, error
-from flexdt.twin.calibration.diagnose.causes import (
-    NAMED_LOG_ODDS,
-)
 from flexdt.twin.calibration.diagnose.residual_limit import largest_residual
+from flexdt.twin.calibration.fit.evidence import NAMED_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import (
     MotionFit,

@@ -23,10 +23,8 @@ from scipy.special import chdtri, gammaln, logsumexp
 
 from flexdt.twin.calibration.diagnose import Finding, error
 from flexdt.twin.calibration.diagnose.causes import LEAST_BEADS, Candidates, Choice, Known
-from flexdt.twin.calibration.diagnose.causes.candidates import OUTLIER_SIGMAS
+from flexdt.twin.calibration.diagnose.causes.candidates import clipped, usual_noise
 from flexdt.twin.calibration.diagnose.causes.cause import (
-    LOG_CHANCE,
-    NAMED_LOG_ODDS,
     REPEATING,
 )
 from flexdt.twin.calibration.diagnose.causes.columns import LEAST_VISIBLE, WAVES
@@ -37,8 +35,8 @@ from flexdt.twin.calibration.diagnose.causes.every_cause import (
 from flexdt.twin.calibration.diagnose.causes.explained import REPEATING_FRAMES
 from flexdt.twin.calibration.diagnose.wobble import LEANS
 from flexdt.twin.calibration.fit.certificate import widened
-from flexdt.twin.calibration.fit.evidence import Judged, Table
-from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, FitResult
+from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, NAMED_LOG_ODDS, Judged, Table
+from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factors, layout
 from flexdt.twin.calibration.fit.residual_structure import HARMONICS, larger
@@ -247,10 +245,10 @@ def _steps(fit: FitResult, floor: float) -> bool:
     n, k = problem.seen.shape
     residual = problem.whitened(fit.solution.x)
     lengths = np.linalg.norm(residual, axis=2)
-    noise = max(float(np.median(lengths[problem.seen])) / RAYLEIGH_MEDIAN, floor)
+    noise = usual_noise(lengths[problem.seen], floor)
     if not noise > 0.0:
         return False
-    share = _clipped(lengths, noise)[..., None]
+    share = clipped(lengths, noise)[..., None]
     own = _own_columns(problem, fit.solution.x).reshape(n, k, 2, k, 3)
     slope = np.einsum("nbcbx->nbcx", own) * share[..., None]
     push = np.einsum("nbcx,nbc->nbx", slope, residual * share)
@@ -264,11 +262,6 @@ def _steps(fit: FitResult, floor: float) -> bool:
         steps = np.linalg.solve(squares, sums[..., None])[..., 0]
         most = max(most, float(np.einsum("nbx,nbx->nb", sums, steps).max(initial=0.0)))
     return most > noise**2 * float(chdtri(3, SEEN_CHANCE / (2 * n * k)))
-
-
-def _clipped(lengths: FloatArray, noise: float) -> FloatArray:
-    """Return the weights of residuals by their lengths: 1 up to `OUTLIER_SIGMAS`."""
-    return np.minimum(1.0, OUTLIER_SIGMAS * noise / np.maximum(lengths, 1e-12))
 
 
 def _own_columns(problem: FitProblem, x: FloatArray) -> FloatArray:
@@ -315,9 +308,7 @@ class _Trial:
         self.frame = kept // (2 * k)
         self.bead = kept // 2 % k
         self.part = kept % 2
-        left = problem.whitened(plain.solution.x)[problem.seen]
-        lengths = np.linalg.norm(left, axis=1)
-        self.share = np.repeat(_clipped(lengths, self.candidates.noise), 2)
+        self.share = self.candidates.share
         self.size = float(np.ptp(problem.model.beads, axis=0).max())
         self.nothing = self._model((0.0,) * len(self.candidates.causes))
         self.rival = self._model(self.candidates.best())
@@ -326,15 +317,8 @@ class _Trial:
         """Return the columns of causes with given widths, of the geometry, and of what always
         holds.
         """
-        c = self.candidates
-        columns = list(range(c.count))
-        widths = [c.problem.prior_sigma[: c.count] * (choice[-1] or 1.0)]
-        for cause, pick in zip(c.causes, choice, strict=True):
-            width = pick or cause.always
-            if cause.columns and width > 0.0:
-                columns += cause.columns
-                widths.append(width / c.visible[list(cause.columns)])
-        return Model(np.array(columns, np.intp), np.concatenate(widths))
+        columns, widths = self.candidates.columns_of(choice)
+        return Model(np.array(columns, np.intp), widths)
 
     def columns(self, piece: Piece) -> FloatArray:
         """Return the columns of the displacements of a piece, (m, 3 beads) [1/mm]."""

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.diagnose import Finding, error
-from flexdt.twin.calibration.diagnose.causes import NAMED_LOG_ODDS
+from flexdt.twin.calibration.fit.evidence import NAMED_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.residual_structure import MOVING

@@ -20,6 +20,12 @@ from scipy.linalg import lapack
 from flexdt.twin.calibration.fit.residual_structure import cross
 from flexdt.twin.geometry.conventions import FloatArray
 
+NAMED_LOG_ODDS = math.log(1e4)
+"""Logarithm of the odds from which a cause is named."""
+OPEN_LOG_ODDS = math.log(100.0)
+"""Logarithm of the odds against a cause up to which it is left open."""
+LOG_CHANCE = math.log(0.1)
+"""Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
 PASSES = 3
 """Steps of the search for the residuals' standard deviation."""
 LEAST_SHARE = 1e-12

@@ -724,6 +724,11 @@ def strain_widths(strain: Strain) -> FloatArray:
     return np.array([stretch] * STRETCHES + [shear] * (len(STRAINS) - STRETCHES))
 
 
+def usual_step(angle: FloatArray) -> float:
+    """Return the median step of a stage between frames at some angles [rad]; 0 for one frame."""
+    return float(np.median(np.abs(np.diff(angle)))) if len(angle) > 1 else 0.0
+
+
 def turning_shifts(
     poses: Poses,
     model: BeadModel,
@@ -756,8 +761,7 @@ def turning_shifts(
         some = poses[np.flatnonzero(mine)]
         if len(some) < 2:
             continue
-        steps = np.diff(some.angle)
-        step = float(np.median(np.abs(steps)))
+        step = usual_step(some.angle)
         offsets = to_printed_reading(Offsets(*row), reading)
         turned = (
             replace(some, angle=some.angle + turn).cone_vec(offsets)
@@ -769,7 +773,7 @@ def turning_shifts(
         bent = (ahead - 2.0 * here + behind) / ARC_ANGLE_RAD**2
         out[mine, ..., 0] = bent * step**2 / 24.0
         slope = (ahead - behind) / (2.0 * ARC_ANGLE_RAD)
-        way = float(np.sign(np.median(steps)))
+        way = float(np.sign(np.median(np.diff(some.angle))))
         out[mine, ..., 1] = slope * (way * step * places[mine])[..., None]
     return out
 

@@ -12,8 +12,6 @@ from flexdt.twin.calibration.diagnose.causes.candidates import Candidates
 from flexdt.twin.calibration.diagnose.causes.cause import (
     APART,
     MOTION_OF,
-    NAMED_LOG_ODDS,
-    OPEN_LOG_ODDS,
     SHAPES,
     Cause,
     Choice,
@@ -34,8 +32,6 @@ __all__ = [
     "APART",
     "LEAST_BEADS",
     "MOTION_OF",
-    "NAMED_LOG_ODDS",
-    "OPEN_LOG_ODDS",
     "SHAPES",
     "Candidates",
     "Cause",

@@ -12,9 +12,7 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.calibration.diagnose.causes.cause import (
-    LOG_CHANCE,
     MOTION_OF,
-    OPEN_LOG_ODDS,
     REPEATING,
     Choice,
     Known,
@@ -32,7 +30,7 @@ from flexdt.twin.calibration.diagnose.causes.columns import (
 from flexdt.twin.calibration.diagnose.causes.every_cause import list_causes
 from flexdt.twin.calibration.diagnose.tiles import alike_places, likely_border
 from flexdt.twin.calibration.fit.certificate import Rival
-from flexdt.twin.calibration.fit.evidence import Judged, Table
+from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, OPEN_LOG_ODDS, Judged, Table
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN
 from flexdt.twin.calibration.fit.problem import STRAINS, FitProblem
 from flexdt.twin.calibration.fit.residual_structure import correlation_length
@@ -88,19 +86,16 @@ class Candidates:
         rows = everything.jacobian(there, self.use)[np.repeat(self.use.ravel(), 2)]
         left = problem.whitened(x)[self.use]
         lengths = np.linalg.norm(left, axis=1)
-        self.noise = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, known.floor)
-        bounded = np.minimum(
-            1.0, OUTLIER_SIGMAS * self.noise / np.maximum(lengths, 1e-12)
-        )
-        share = np.repeat(bounded, 2)[:, None]
+        self.noise = usual_noise(lengths, known.floor)
+        self.share = np.repeat(clipped(lengths, self.noise), 2)
         motions = motion_columns(problem, x, self.use)
         waves = [repeating_columns(problem, self.use)] if repeating else []
-        table = np.concatenate([rows, *motions.values(), *waves], axis=1) * share
+        table = np.concatenate([rows, *motions.values(), *waves], axis=1)
         causes = there - everything.start
         causes[: self.count] = 0.0
         values = left.ravel() + rows @ causes
-        self.rows = table
-        self.values = values * share[:, 0]
+        self.rows = table * self.share[:, None]
+        self.values = values * self.share
         self.table = Table(self.rows, self.values, known.floor, alike)
         first = rows.shape[1]
         last = first + sum(own.shape[1] for own in motions.values())
@@ -163,26 +158,31 @@ class Candidates:
             The judged model; None if its columns are not separable.
         """
         if choice not in self._judged:
-            columns, widths, chance = self._model(choice)
+            columns, widths = self.columns_of(choice)
+            chance = self._chance(choice)
             self._judged[choice] = self._judged_model(columns, widths, chance)
         return self._judged[choice]
 
-    def _model(self, choice: Choice) -> tuple[list[int], FloatArray, float]:
-        """Return the columns of a choice, the widths of their priors, and the logarithm of
-        its probability.
+    def columns_of(self, choice: Choice) -> tuple[list[int], FloatArray]:
+        """Return the columns of a choice, those of the geometry and of what always holds
+        among them, and the widths of their priors.
         """
-        factor = choice[-1] or 1.0
         columns = list(range(self.count))
-        widths = [self.problem.prior_sigma[: self.count] * factor]
-        chance = 0.0
+        widths = [self.problem.prior_sigma[: self.count] * (choice[-1] or 1.0)]
         for cause, pick in zip(self.causes, choice, strict=True):
             width = pick or cause.always
             if cause.columns and width > 0:
                 columns += cause.columns
                 widths.append(width / self.visible[list(cause.columns)])
-            if pick:
-                chance += cause.chance - math.log(len(cause.widths))
-        return columns, np.concatenate(widths), chance
+        return columns, np.concatenate(widths)
+
+    def _chance(self, choice: Choice) -> float:
+        """Return the logarithm of the probability of a choice before the scan is seen."""
+        return sum(
+            cause.chance - math.log(len(cause.widths))
+            for cause, pick in zip(self.causes, choice, strict=True)
+            if pick
+        )
 
     def _judged_model(
         self, columns: list[int], widths: FloatArray, chance: float
@@ -207,9 +207,11 @@ class Candidates:
         size = float(np.ptp(self.problem.model.beads, axis=0).max())
         every = self.causes[at].columns
         own = [every[3 * bead + axis] for bead in beads for axis in range(3)]
-        columns, widths, chance = self._model(with_pick(choice, at, 0.0))
+        still = with_pick(choice, at, 0.0)
+        columns, widths = self.columns_of(still)
         free = dict(zip(columns, widths.tolist(), strict=True)) | dict.fromkeys(own, size)
-        chance += LOG_CHANCE - math.log(math.comb(len(every) // 3, len(beads)))
+        chance = LOG_CHANCE - math.log(math.comb(len(every) // 3, len(beads)))
+        chance += self._chance(still)
         model = self._judged_model(list(free), np.array(list(free.values())), chance)
         return model is not None and model.evidence > self.evidence(choice)
 
@@ -467,15 +469,8 @@ class Candidates:
         if model is None or shape is None:
             return None
         problem = self.problem
-        widths = np.concatenate(
-            [np.full(self.count, np.inf)]
-            + [
-                w / self.visible[list(c.columns)]
-                for c, p in zip(self.causes, choice, strict=True)
-                if c.columns and (w := p or c.always) > 0
-            ]
-        )
-        widths[: self.count] = problem.prior_sigma[: self.count]
+        # Priors are as stated, also where the choice widens them.
+        widths = self.columns_of((*choice[:-1], 0.0))[1]
         return likely_border(
             self.rows[:, model.columns],
             self.values,
@@ -486,6 +481,18 @@ class Candidates:
             shape,
             self.borders,
         )
+
+
+def usual_noise(lengths: FloatArray, floor: float) -> float:
+    """Estimate the standard deviation of whitened residuals from their lengths, `floor` at
+    least.
+    """
+    return max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, floor)
+
+
+def clipped(lengths: FloatArray, noise: float) -> FloatArray:
+    """Return the weights of residuals by their lengths: 1 up to `OUTLIER_SIGMAS`."""
+    return np.minimum(1.0, OUTLIER_SIGMAS * noise / np.maximum(lengths, 1e-12))
 
 
 def _probabilities(evidence: Mapping[Choice, float]) -> dict[Choice, float]:

@@ -7,17 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
+from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, NAMED_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import Strain
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.panel import Border
 
-NAMED_LOG_ODDS: Final = math.log(1e4)
-"""Logarithm of the odds from which a cause is named."""
-OPEN_LOG_ODDS: Final = math.log(100.0)
-"""Logarithm of the odds against a cause up to which it is left open."""
-LOG_CHANCE: Final = math.log(0.1)
-"""Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
 SHAPES: Final = ("stretch", "shear")
 """The causes of a phantom of another shape."""
 MOTION_OF: Final = "motion of "

@@ -10,8 +10,6 @@ import numpy as np
 from flexdt.twin.calibration.diagnose.causes.candidates import Candidates
 from flexdt.twin.calibration.diagnose.causes.cause import (
     MOTION_OF,
-    NAMED_LOG_ODDS,
-    OPEN_LOG_ODDS,
     RIVALS,
     SHAPES,
     Choice,
@@ -22,6 +20,7 @@ from flexdt.twin.calibration.diagnose.causes.cause import (
 )
 from flexdt.twin.calibration.diagnose.causes.columns import image_shape
 from flexdt.twin.calibration.diagnose.causes.left_open import widened_by_causes
+from flexdt.twin.calibration.fit.evidence import NAMED_LOG_ODDS, OPEN_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.geometry.panel import Border, PanelModel
 
