@@ -8,7 +8,7 @@ in elements of the C-ordered result, then the response with `parts` instead of `
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
@@ -23,13 +23,17 @@ from flexdt.protocol.method import AnyMethod, Method, read
 from flexdt.protocol.methods.document_messages import Discovery
 from flexdt.protocol.methods.scanner_messages import Bytes
 from flexdt.protocol.methods.session_messages import Hello, HelloResult
-from flexdt.protocol.rpc_errors import RpcError
+from flexdt.protocol.rpc_errors import Code, RpcError, invalid_params, problem
 
 MAX_VIEWS: Final = 100_000
 MAX_CORNERS: Final = 1 << 27
 """Vertices, or triangles, of a mesh."""
 MAX_MM: Final = 1e7
 """Farthest that anything is from the origin; also the longest u and v."""
+MAX_LISTED_NAMES: Final = 50
+"""Number of volumes that an error lists, those used last."""
+UNKNOWN_VOLUME: Final = "unknown volume"
+"""What the problem of a volume that is not there says, in the error's data."""
 Coordinate = Annotated[float, Ge(-MAX_MM), Le(MAX_MM)]
 _ROW = Annotated[list[Coordinate], Len(12, 12)]
 _ROWS_SCHEMA: Final = TypeAdapter(Annotated[list[_ROW], Len(1, MAX_VIEWS)]).json_schema()
@@ -330,3 +334,39 @@ PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
     )
 }
 """Every method of the projector server, by name."""
+
+
+def unknown_volume(name: str, there: Sequence[str]) -> RpcError:
+    """Make the error -32602 for a volume that the projector does not have; returned, not raised.
+
+    Args:
+        name: that was asked for.
+        there: names of the volumes that it has, the last used last.
+
+    Returns:
+        The error; it lists the last `MAX_LISTED_NAMES` names and how many others there are.
+    """
+    last = sorted(there[-MAX_LISTED_NAMES:])
+    older = len(there) - len(last)
+    more = f" and {older} others" if older else ""
+    return invalid_params(
+        f"no volume {name!r}; there are: {', '.join(last) or 'none'}{more}",
+        [problem("volume", UNKNOWN_VOLUME, name)],
+        last,
+    )
+
+
+def volumes_there(error: RpcError, name: str) -> list[str] | None:
+    """Return the volumes that an error of `unknown_volume` lists; None for any other error.
+
+    Args:
+        error: that a projector answered, of any data.
+        name: of the volume that was asked for.
+    """
+    match error.data:
+        case {
+            "problems": [{"path": "volume", "message": str(why), "asked": str(asked)}],
+            "allowed": [*there],
+        } if (error.code, why, asked) == (Code.INVALID_PARAMS, UNKNOWN_VOLUME, name):
+            return [str(one) for one in there]
+    return None

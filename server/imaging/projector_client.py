@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import RpcError, hello_params, image, parse_result
-from flexdt.protocol.projector import Health
+from flexdt.protocol.projector import Health, volumes_there
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -135,7 +135,7 @@ class ProjectorClient:
                     "project", lambda c: c.ask_array("project", params, sizes)
                 )
             except RpcError as error:
-                there = _volumes_there(error)
+                there = volumes_there(error, name)
                 if body is None or there is None or name in there:
                     raise
                 losses += not there
@@ -261,13 +261,3 @@ async def _send(
         data = flat[start : start + CHUNK_BYTES].data.toreadonly()
         params = {"name": name, **what, **how, "start": start, "data": data}
         await channel.ask("volume.put", params)
-
-
-def _volumes_there(error: RpcError) -> list[object] | None:
-    """Return the names that a projector lists when it does not know a volume; None for another
-    error.
-    """
-    allowed = None
-    if isinstance(error.data, Mapping):
-        allowed = error.data.get("allowed")
-    return allowed if isinstance(allowed, list) else None

@@ -21,8 +21,6 @@ from flexdt.twin.projection import Body, TriangleMesh, Volume
 LAYOUT_COPIES = 2
 """Number of copies of a volume's voxels: as they came, and z-contiguous."""
 
-MAX_LISTED_NAMES = 50
-"""Number of volumes that an error lists, those used last."""
 SOLID_BYTES = 1024
 """Memory counted for each solid of a scene [bytes]."""
 
@@ -95,18 +93,10 @@ class VolumeStore:
             The volume, mesh or scene itself, not a copy.
 
         Raises:
-            RpcError: -32602, there is none; lists the last `MAX_LISTED_NAMES` names and
-                how many others there are.
+            RpcError: -32602, there is none; as `unknown_volume`.
         """
         if name not in self._held:
-            last = list(self._held)[-MAX_LISTED_NAMES:]
-            older = len(self._held) - len(last)
-            more = f" and {older} others" if older else ""
-            raise invalid_params(
-                f"no volume {name!r}; there are: {', '.join(sorted(last)) or 'none'}{more}",
-                [problem("volume", "unknown volume", name)],
-                sorted(last),
-            )
+            raise wire.unknown_volume(name, list(self._held))
         value = self._held[name] = self._held.pop(name)
         return value
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from in_process import Lab, run, script
 
-from flexdt.protocol import RpcError
+from flexdt.protocol import Code, RpcError
+from flexdt.protocol.projector import unknown_volume
 from flexdt.server.imaging.projections import Imaging
 from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.server.imaging.projector_pool import ProjectorPool
@@ -228,7 +229,7 @@ def test_a_volume_that_others_displace_is_sent_until_it_is_projected(
     async def ask(method: str, work: object) -> np.ndarray[Any, np.dtype[np.float32]]:
         if len(sent) > lost:
             return answer
-        raise RpcError(TOO_LARGE, "unknown volume", {"allowed": there})
+        raise unknown_volume("mine", there)
 
     monkeypatch.setattr(client, "give", give)
     monkeypatch.setattr(client, "_ask", ask)
@@ -237,6 +238,33 @@ def test_a_volume_that_others_displace_is_sent_until_it_is_projected(
         assert asyncio.run(work) is answer
         assert len(sent) == lost + 1
     else:
-        with pytest.raises(RpcError, match="unknown volume"):
+        with pytest.raises(RpcError, match="no volume 'mine'"):
             asyncio.run(work)
         assert len(sent) == 5
+
+
+@pytest.mark.parametrize("data", [
+    None,
+    {"allowed": ["volume", "cone_vec", "detector"]},
+    {"problems": [{"path": "cone_vec", "message": "row 3", "asked": "mine"}], "allowed": []},
+    {"problems": [{"path": "volume", "message": "too short", "asked": "mine"}], "allowed": ["a"]},
+    unknown_volume("theirs", ["a"]).data,
+])  # fmt: skip
+def test_only_an_unknown_volume_is_sent_again(
+    monkeypatch: pytest.MonkeyPatch, data: object
+) -> None:
+    """A refused row lists the method's parameters: that was taken for volumes of others, and
+    the request repeated for ever."""
+    client, sent = ProjectorClient(port=1), list[str]()
+
+    async def give(name: str, body: object) -> None:
+        sent.append(name)
+
+    async def ask(method: str, work: object) -> np.ndarray[Any, np.dtype[np.float32]]:
+        raise RpcError(Code.INVALID_PARAMS, "refused", data)
+
+    monkeypatch.setattr(client, "give", give)
+    monkeypatch.setattr(client, "_ask", ask)
+    with pytest.raises(RpcError, match="refused"):
+        asyncio.run(client.project("mine", volume_of(1), POSES.cone_vec(), CAMERA.shape))
+    assert sent == ["mine"]
