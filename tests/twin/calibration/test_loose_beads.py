@@ -13,8 +13,8 @@ import pytest
 from causes_named import calibrated, scored, worst_error
 from faults_drawn import DRAWS, Array, drawn, right_draft
 
-from flexdt.twin.calibration.diagnose import fitted, slipped
-from flexdt.twin.calibration.diagnose.slipped import Piece
+from flexdt.twin.calibration.diagnose import fitted
+from flexdt.twin.calibration.diagnose.slipped import Piece, Verdict, trial
 from flexdt.twin.calibration.pipeline import Calibration
 
 
@@ -65,13 +65,13 @@ def test_slow_errors_and_motion_of_everything_are_no_beads_that_move(
 ) -> None:
     """Steps of beads explain much of them; without these rivals odds are e^63 and e^109."""
     odds = []
-    judged = slipped._Trial.judged
+    judged = trial.Trial.judged
 
-    def kept(trial: slipped._Trial, pieces: tuple[Piece, ...]) -> slipped.Verdict:
-        odds.append(judged(trial, pieces))
+    def kept(one: trial.Trial, pieces: tuple[Piece, ...]) -> Verdict:
+        odds.append(judged(one, pieces))
         return odds[-1]
 
-    monkeypatch.setattr(slipped._Trial, "judged", kept)
+    monkeypatch.setattr(trial.Trial, "judged", kept)
     found = scored(kind, seed)
     assert odds
     assert max(one.odds for one in odds) < 0.0
@@ -81,7 +81,7 @@ def test_slow_errors_and_motion_of_everything_are_no_beads_that_move(
 def test_what_is_open_is_in_the_sigmas(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is named here, as where the images show less of the same slip."""
     scan = drawn("part_slips", 2)
-    monkeypatch.setattr(slipped, "NAMED_LOG_ODDS", np.inf)
+    monkeypatch.setattr(trial, "NAMED_LOG_ODDS", np.inf)
     wide = calibrated(scan)
     monkeypatch.setattr(fitted, "with_loose_beads", lambda plain, fit, known: (fit, None))
     narrow = calibrated(scan)

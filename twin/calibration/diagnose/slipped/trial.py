@@ -1,0 +1,204 @@
+"""The trial of beads that move: which are found, and how likely they are."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.calibration.diagnose import Finding, error
+from flexdt.twin.calibration.diagnose.causes.cause import (
+    REPEATING,
+)
+from flexdt.twin.calibration.diagnose.causes.columns import LEAST_VISIBLE
+from flexdt.twin.calibration.diagnose.causes.every_cause import (
+    MOTION_WIDTHS,
+    PRIOR_FACTORS,
+)
+from flexdt.twin.calibration.diagnose.slipped.contest import Contest
+from flexdt.twin.calibration.diagnose.slipped.piece import SHARES, Model, Piece
+from flexdt.twin.calibration.diagnose.slipped.residuals import Residuals
+from flexdt.twin.calibration.diagnose.slipped.search import Left, Search
+from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, NAMED_LOG_ODDS, Judged
+from flexdt.twin.geometry.conventions import FloatArray
+
+MOST_PIECES: Final = 4
+"""Largest number of sets of beads that move, each from a frame of its own."""
+LEAST_TOLD: Final = 0.05
+"""Part of the largest displacement from which others are told."""
+SLOW_ERRORS: Final = tuple(itertools.product((0.7, 0.9, 0.97), (1.0, 3.0, 10.0, 30.0)))
+"""Correlations of slow errors of spots from frame to frame, and their sizes in units of errors
+that are not correlated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What is judged of pieces.
+
+    Attributes:
+        pieces: beads that move.
+        odds: logarithm of the odds that they do.
+        moved: the most likely model with them.
+        ways: (beads of all pieces, 3) their displacements [mm].
+        rest: root mean square of the whitened residuals with them.
+    """
+
+    pieces: tuple[Piece, ...]
+    odds: float
+    moved: Judged
+    ways: FloatArray
+    rest: float
+
+    @property
+    def named(self) -> bool:
+        """They move beyond doubt."""
+        return self.odds > NAMED_LOG_ODDS
+
+    def finding(self, group: npt.NDArray[np.int64]) -> Finding:
+        """Make the error that beads move against the others.
+
+        Args:
+            group: (n,) scan of each frame.
+        """
+        ends = list(itertools.accumulate(len(piece.beads) for piece in self.pieces))
+        sizes = np.linalg.norm(self.ways, axis=1)
+        parts = []
+        for piece, end in zip(self.pieces, ends, strict=True):
+            size = float(sizes[end - len(piece.beads) : end].max())
+            if size < LEAST_TOLD * sizes.max():
+                continue
+            scan = int(group[piece.frame])
+            frame = piece.frame - int(np.flatnonzero(group == scan)[0])
+            place = f"frame {frame}" + (f" of scan {scan + 1}" if group.max() > 0 else "")
+            one = len(piece.beads) == 1
+            how = "slowly, beginning at" if piece.slow else "from"
+            on = "" if piece.slow else " on"
+            parts.append(
+                f"bead{'s' * (not one)} {', '.join(map(str, piece.beads))} "
+                f"move{'s' * one} by {size:.2g} mm {how} {place}{on}"
+            )
+        return error(
+            "beads_moved",
+            "beads move against the others during the scan: "
+            f"{'; '.join(parts)}. Something is loose or slips in the phantom: fix its beads, "
+            "and measure again",
+        )
+
+
+class Trial(Residuals):
+    """The judgement of beads that move, beside everything else that may explain the residuals."""
+
+    def found(self) -> Iterator[tuple[Piece, ...]]:
+        """Yield the pieces that explain most of what is left without causes, and with the
+        most likely ones, where they are likely at all; each once.
+        """
+        before: list[tuple[Piece, ...]] = [()]
+        for base in (self.nothing, self.rival):
+            pieces = self._explaining(base)
+            if pieces not in before:
+                yield pieces
+            before.append(pieces)
+
+    def _explaining(self, base: Model) -> tuple[Piece, ...]:
+        """Find pieces that explain what a model leaves, step by step, `MOST_PIECES` at
+        most, each further one beyond doubt; in the order of their frames.
+        """
+        rows, widths, values = self.rows_of(base)
+        noise = self.candidates.noise
+        out: list[Piece] = []
+        while len(out) < MOST_PIECES:
+            search = Search(self, Left(rows, widths, values, noise))
+            piece = search.best(out)
+            gain, width, noise = search.score(piece)
+            if gain < (NAMED_LOG_ODDS if out else 0.0) or piece in out:
+                break
+            out.append(piece)
+            more = self.columns(piece)
+            rows = np.concatenate([rows, more], axis=1)
+            widths = np.append(widths, np.full(more.shape[1], width))
+        return tuple(sorted(out, key=lambda piece: piece.frame))
+
+    def judged(self, pieces: tuple[Piece, ...]) -> Verdict:
+        """Judge pieces beside all rivals, with every kind of errors of spots.
+
+        The slow errors are judged beside those rivals alone that are the most likely with
+        other errors, and only where these do not exclude the pieces.
+        """
+        c = self.candidates
+        motions = self.motions(pieces)
+        own = np.concatenate([self.columns(piece) for piece in pieces], axis=1)
+        first = c.rows.shape[1] + motions.shape[1]
+        ways = range(first, first + own.shape[1])
+        rows = np.concatenate([c.rows, motions, own], axis=1)
+        contest = Contest(self, rows, ways, pieces)
+        moving = sorted({bead for piece in pieces for bead in piece.beads})
+        rivals = self._rivals(moving, range(c.rows.shape[1], first))
+        rivals += [
+            self._moving_as_one(base, motions) for base in (self.nothing, self.rival)
+        ]
+        contest.compare(rivals)
+        if contest.odds > LOG_CHANCE:
+            likely = [rivals[i] for i in contest.likely()]
+            beads = {tuple(moving), tuple(range(self.beads))}
+            for (part, size), some in itertools.product(SLOW_ERRORS, beads):
+                contest.compare(likely, (part, size, some))
+        moved = contest.moved
+        left = (c.values - rows[:, moved.columns] @ moved.mean) / self.share
+        found = dict(zip(moved.columns.tolist(), moved.mean.tolist(), strict=True))
+        return Verdict(
+            pieces,
+            contest.odds,
+            moved,
+            np.array([found[way] for way in ways]).reshape(-1, 3),
+            float(np.sqrt(np.mean(left**2))),
+        )
+
+    def _rivals(self, moving: Sequence[int], motions: range) -> list[Model]:
+        """List the rivals of beads that move: nothing, the most likely causes, these with wide
+        priors, with errors that repeat, with those beads elsewhere in all frames, and with
+        all motions of everything.
+        """
+        c = self.candidates
+        likely = self.rival
+        out = [self.nothing, likely, likely.wider(c.count, max(PRIOR_FACTORS))]
+        for cause in c.causes:
+            if cause.name == REPEATING:
+                out += [likely.beside(cause.columns, width) for width in cause.widths]
+        own = [c.count + 3 * bead + axis for bead in moving for axis in range(3)]
+        out += [likely.beside(own, share * self.size) for share in SHARES]
+        out += [likely.beside(motions, width * c.noise) for width in MOTION_WIDTHS]
+        return out
+
+    def _moving_as_one(self, base: Model, motions: FloatArray) -> Model:
+        """Add single motions of everything to a model, the one that explains most after the
+        other, as long as that is more likely, `MOST_PIECES` at most.
+
+        Args:
+            base: the model.
+            motions: (m, columns) behind those of the causes.
+        """
+        first = self.candidates.rows.shape[1]
+        rows, widths, values = self.rows_of(base)
+        chance = LOG_CHANCE - math.log(motions.shape[1])
+        noise = self.candidates.noise
+        out = base
+        for _ in range(MOST_PIECES):
+            left = Left(rows, widths, values, noise)
+            push = motions.T @ left.values - (left.basis.T @ motions).T @ left.along
+            power = 1.0 - np.square(left.basis.T @ motions).sum(axis=0)
+            power = np.maximum(power, LEAST_VISIBLE**2)
+            best = int(np.argmax(push**2 / power))
+            width = max(abs(float(push[best] / power[best])), left.noise)
+            score = left.score(power[best : best + 1, None], push[best : best + 1], width)
+            if score.gain + chance < 0.0:
+                break
+            noise = score.noise
+            out = out.beside([first + best], width, chance)
+            rows = np.concatenate([rows, motions[:, best : best + 1]], axis=1)
+            widths = np.append(widths, width)
+        return out
