@@ -1290,29 +1290,45 @@ def _other_pitch(draft: Draft, rng: Rng) -> Draft:
 
 LOOSE: Final = "beads_moved|moves during the scan"
 """Findings of beads that move against each other; what most of them do is a motion, too."""
-COURSES: Final = ("at_once", "slowly", "and_back")
+COURSES: Final = (
+    "at_once", "slowly", "and_back", "relaxing", "two_speeds", "swinging", "briefly",
+)  # fmt: skip
 """Ways in which something comes loose."""
 
 
 def _course(frames: int, how: str, rng: Rng) -> Array:
     """Draw the share of a way that is gone in each frame, (n,): all of it from a frame in
-    the middle four fifths on, or evenly from there to the last, or there and back.
+    the middle four fifths on, or evenly from there to the last, or there and back; or ever
+    slower, or at two speeds, or swinging to and fro, or away for three to six frames.
     """
     first = int(rng.integers(frames // 10 + 1, frames - frames // 10))
     place = np.arange(frames)
     if how == "at_once":
         return (place >= first) * 1.0
-    if how == "slowly":
-        first = first // 2
-        return np.clip((place - first) / (frames - 1 - first), 0.0, 1.0)
-    last = int(rng.integers(first // 2, first))
-    return ((place >= last) & (place < first)) * 1.0
+    if how == "briefly":
+        last = first + int(rng.integers(3, 7))
+        return ((place >= first) & (place < last)) * 1.0
+    if how == "and_back":
+        last = int(rng.integers(first // 2, first))
+        return ((place >= last) & (place < first)) * 1.0
+    if how == "swinging":
+        waves, late = float(rng.uniform(0.5, 2.5)), float(rng.uniform(0.0, 2.0 * math.pi))
+        swing = np.sin(2.0 * math.pi * waves * place / frames + late)
+        return np.asarray(swing - swing[0])
+    first = first // 2
+    gone = np.clip((place - first) / (frames - 1 - first), 0.0, 1.0)
+    if how == "relaxing":
+        return np.asarray(1.0 - np.exp(-gone / float(rng.uniform(0.05, 0.4))))
+    if how == "two_speeds":
+        turn, share = rng.uniform(0.2, 0.8, 2).tolist()
+        return np.interp(gone, [0.0, turn, 1.0], [0.0, share, 1.0])
+    return gone
 
 
-def _way(rng: Rng, scale: float) -> Array:
-    """Draw a displacement of 0.02 to 0.5 mm times `scale`, (3,)."""
+def _way(rng: Rng, scale: float, least: float = 0.02, most: float = 0.5) -> Array:
+    """Draw a displacement of `least` to `most` mm times `scale`, (3,)."""
     way = rng.normal(size=3)
-    size = math.exp(rng.uniform(math.log(0.02), math.log(0.5)))
+    size = math.exp(rng.uniform(math.log(least), math.log(most)))
     return np.asarray(way * scale * size / np.linalg.norm(way))
 
 
@@ -1362,12 +1378,13 @@ def _part_slips(side: int, how: str) -> Fault:
     return fault
 
 
-def _beads_loose(count: int, how: str) -> Fault:
-    """Make a fault: some balls come loose, each by itself, by 0.02 to 0.5 mm.
+def _beads_loose(count: int, how: str, least: float = 0.02, most: float = 0.5) -> Fault:
+    """Make a fault: some balls come loose, each by itself.
 
     Args:
         count: of the balls.
         how: of COURSES.
+        least, most: displacement [mm] of a phantom of usual size.
     """
 
     def fault(draft: Draft, rng: Rng) -> Draft:
@@ -1376,7 +1393,8 @@ def _beads_loose(count: int, how: str) -> Fault:
         n, k = draft.world.shown.shape
         moved = np.zeros((n, k, 3))
         for bead in rng.choice(k, count, replace=False):
-            moved[:, bead] = _course(n, how, rng)[:, None] * _way(rng, draft.world.scale)
+            way = _way(rng, draft.world.scale, least, most)
+            moved[:, bead] = _course(n, how, rng)[:, None] * way
         return _loosened(draft, moved)
 
     return fault
@@ -1501,6 +1519,15 @@ MOVED: Final[Mapping[str, Fault]] = {
     "lower_slips": _part_slips(-1, "at_once"),
     "upper_creeps": _part_slips(1, "slowly"),
     "lower_and_back": _part_slips(-1, "and_back"),
+    "one_relaxes": _beads_loose(1, "relaxing"),
+    "one_at_two_speeds": _beads_loose(1, "two_speeds"),
+    "one_swings": _beads_loose(1, "swinging"),
+    "one_briefly": _beads_loose(1, "briefly"),
+    "three_creep_far": _beads_loose(3, "slowly", 0.7, 1.5),
+    "upper_relaxes": _part_slips(1, "relaxing"),
+    "upper_at_two_speeds": _part_slips(1, "two_speeds"),
+    "upper_swings": _part_slips(1, "swinging"),
+    "upper_briefly": _part_slips(1, "briefly"),
 }
 """Further beads that move against each other."""
 RIGHT: Final[Mapping[str, Fault]] = {

@@ -15,6 +15,7 @@ from faults_drawn import DRAWS, Array, drawn, right_draft
 
 from flexdt.twin.calibration.diagnose import fitted
 from flexdt.twin.calibration.diagnose.slipped import Piece, Verdict, trial
+from flexdt.twin.calibration.diagnose.slipped.piece import walk
 from flexdt.twin.calibration.pipeline import Calibration
 
 
@@ -57,6 +58,25 @@ def test_two_loose_beads_are_named_by_their_frames() -> None:
     for bead in np.flatnonzero(moved[-1]).tolist():
         first = int(np.flatnonzero(moved[:, bead])[0])
         assert re.search(rf"\b{bead}\b[^;]* from frame {first} on", text), text
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("one_swings", 1),
+        pytest.param("upper_swings", 1, marks=pytest.mark.slow),
+        pytest.param("upper_relaxes", 2, marks=pytest.mark.slow),
+    ],
+)
+def test_beads_that_swing_or_creep_ever_slower_are_named(kind: str, seed: int) -> None:
+    """None was: a bead that swings was offered as displaced, parts were a misfit."""
+    moved = np.linalg.norm(ways(kind, seed), axis=2)
+    result = calibrated(drawn(kind, seed))
+    assert not result.identifiable
+    found = re.search(r"beads? ([\d, ]+) moves? by ([\d.]+) mm unevenly", said(result))
+    assert found is not None, result.findings
+    assert [int(b) for b in found[1].split(", ")] == np.flatnonzero(moved.max(0)).tolist()
+    assert float(found[2]) == pytest.approx(moved.max(), rel=0.15)
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("slow_errors", 9001), ("drift_along", 700)])
@@ -107,3 +127,23 @@ def test_what_is_open_is_in_the_sigmas(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_a_way_is_gone_at_once_or_evenly(piece: Piece, course: list[float]) -> None:
     assert piece.course(6) == pytest.approx(course)
+
+
+@pytest.mark.parametrize("frames", [24, 60])
+def test_parts_of_a_walk_add_up_to_a_random_walk(frames: int) -> None:
+    """Two places of a walk have the covariance of the earlier one's time."""
+    parts = walk(frames)
+    time = np.arange(frames) / (frames - 1)
+    assert parts @ parts.T == pytest.approx(np.minimum.outer(time, time), abs=0.05)
+
+
+def test_a_free_displacement_is_by_the_course_and_by_the_walk() -> None:
+    """Bead 5 goes along y by its course, and both along x by the first part of a walk."""
+    piece = Piece((2, 5), 1, False, (0.0, 0.5, -1.0, 0.0), (1.0, 0, 0, 2.0, 0, 0))
+    moved = piece.displacements(4, np.array([0, 0, 0, 0, 4.0, 0, 3.0, 0]))
+    quarter = (
+        3.0 * np.sqrt(2.0) * np.sin([0, np.pi / 6, np.pi / 3, np.pi / 2]) / (np.pi / 2)
+    )
+    assert moved[:, 0] == pytest.approx(np.outer(quarter, [1, 0, 0]))
+    expected = np.outer(quarter, [2, 0, 0]) + np.outer([0, 2.0, -4.0, 0], [0, 1, 0])
+    assert moved[:, 1] == pytest.approx(expected)

@@ -604,7 +604,8 @@ def _in_parts(
         return error(
             "frame_numbers",
             f"frames {part.start} to {part.stop - 1} by themselves fit the phantom, all of "
-            "them do not: frames are missing, or their numbers or angles are wrong",
+            "them do not: frames are missing, their numbers or angles are wrong, or beads move "
+            "against the others",
         )
     first, last = (ends[end][1].to_edge() for end in ("first", "last"))
     turn = (last["alpha"] - first["alpha"] + 180.0) % 360.0 - 180.0

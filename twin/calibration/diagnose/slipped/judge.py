@@ -50,8 +50,11 @@ def with_loose_beads(
         verdict = trial.judged(pieces)
         if best is None or verdict.odds > best.odds:
             best = verdict
-        if best.named:
+        if best.named and len(best.pieces) == 1:
+            # Several may be the parts of a course that follows no rule.
             return fit, best
+    if best is not None and best.named:
+        return fit, best
     if best is None or best.odds < LOG_CHANCE:
         return fit, None
     return _widened(plain, fit, best), None

@@ -13,7 +13,7 @@ from scipy.special import gammaln
 from flexdt.twin.calibration.diagnose.causes import Candidates, Choice, Known
 from flexdt.twin.calibration.diagnose.causes.columns import WAVES
 from flexdt.twin.calibration.diagnose.causes.explained import REPEATING_FRAMES
-from flexdt.twin.calibration.diagnose.slipped.piece import Model, Piece
+from flexdt.twin.calibration.diagnose.slipped.piece import Model, Piece, walk
 from flexdt.twin.calibration.diagnose.wobble import LEANS
 from flexdt.twin.calibration.fit.evidence import LOG_CHANCE
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -69,11 +69,17 @@ class Residuals:
         return Model(np.array(columns, np.intp), widths)
 
     def columns(self, piece: Piece) -> FloatArray:
-        """Return the columns of the displacements of a piece, (m, 3 beads) [1/mm]."""
+        """Return the columns of the displacements of a piece, (m, 3 beads) [1/mm]; behind them
+        those of a random walk along its way, where it moves freely.
+        """
         c = self.candidates
         course = piece.course(self.frames)[self.frame]
         at = [c.count + 3 * bead + axis for bead in piece.beads for axis in range(3)]
-        return np.asarray(c.rows[:, at] * course[:, None])
+        own = np.asarray(c.rows[:, at] * course[:, None])
+        if not piece.toward:
+            return own
+        along = c.rows[:, at] @ np.array(piece.toward)
+        return np.column_stack([own, along[:, None] * walk(self.frames)[self.frame]])
 
     def chance(self, piece: Piece) -> float:
         """Return the logarithm of the probability of a piece before the scan is seen: sets

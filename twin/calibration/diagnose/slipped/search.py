@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
+from flexdt.twin.calibration.diagnose.slipped.free import FreeCourses
+from flexdt.twin.calibration.diagnose.slipped.left import Left, Score
 from flexdt.twin.calibration.diagnose.slipped.piece import LEAST_SIDE, SHARES, Piece
 from flexdt.twin.calibration.diagnose.slipped.residuals import Residuals
 from flexdt.twin.geometry.conventions import FloatArray
@@ -17,22 +18,6 @@ COARSE_STEPS: Final = 12
 """Number of frames that are tried at first."""
 STARTS: Final = 4
 """Number of starts of the search for beads that move."""
-LEAST_SHARE: Final = 1e-12
-"""Part of a sum of squares that is rounding."""
-
-
-class Score(NamedTuple):
-    """What a piece explains.
-
-    Attributes:
-        gain: logarithm of its odds against none.
-        width: of the displacements [mm].
-        noise: standard deviation of the residuals that it leaves.
-    """
-
-    gain: float
-    width: float
-    noise: float
 
 
 class Search:
@@ -86,12 +71,13 @@ class Search:
         """Return the gain of a piece."""
         return self.score(piece).gain
 
-    def best(self, before: Sequence[Piece]) -> Piece:
+    def best(self, before: Sequence[Piece], free: bool) -> Piece:
         """Find the most likely piece, from `STARTS` sets of beads and ways to move, each with
         its best frame, by single changes.
 
         Args:
             before: pieces of the model, whose beads and frames are tried, too.
+            free: whether beads may move by no rule, too.
         """
         n = self._trial.frames
         even = np.linspace(LEAST_SIDE, n - LEAST_SIDE, min(COARSE_STEPS, n - 3))
@@ -105,7 +91,12 @@ class Search:
         for piece in sorted(some, key=self._gain, reverse=True):
             starts.setdefault((piece.beads, piece.slow), piece)
         likely = itertools.islice(starts.values(), STARTS)
-        return max(map(self._climbed, likely), key=self._gain)
+        ruled = max(map(self._climbed, likely), key=self._gain)
+        if not free:
+            return ruled
+        unruled = FreeCourses(self._trial, self._left).best(self._sets())
+        self._scores[unruled.piece] = unruled.score
+        return max(ruled, unruled.piece, key=self._gain)
 
     def _sets(self) -> set[tuple[int, ...]]:
         """List sets of beads: each alone, and those on either side of a plane across each
@@ -140,56 +131,3 @@ class Search:
             if best == piece:
                 return piece
             piece = best
-
-
-class Left:
-    """What a model leaves of the residuals.
-
-    Attributes:
-        values: (m,) residuals.
-        basis: (m, c) of what the model takes up, with its priors.
-        along: (c,) products of both.
-        noise: standard deviation of what is left.
-    """
-
-    def __init__(
-        self, rows: FloatArray, widths: FloatArray, values: FloatArray, noise: float
-    ) -> None:
-        """Project the residuals.
-
-        Args:
-            rows, widths: (m, c) columns of the model, and (c,) widths of their priors.
-            values: (m,) to be explained, priors of mean 0.
-            noise: standard deviation of the values.
-        """
-        weight = np.where(np.isinf(widths), 0.0, noise / widths)
-        size = np.sqrt(np.einsum("mc,mc->c", rows, rows) + weight**2)
-        size = np.where(size > 0, size, 1.0)
-        table = np.concatenate([rows / size, np.diag(weight / size)])
-        self.values = values
-        self.basis = np.linalg.qr(table)[0][: len(rows)]
-        self.along = self.basis.T @ values
-        square = float(values @ values)
-        total = square - float(self.along @ self.along)
-        self._total = max(total, LEAST_SHARE * square)
-        self.noise = math.sqrt(self._total / len(values))
-
-    def score(self, gram: FloatArray, push: FloatArray, width: float) -> Score:
-        """Judge further columns of a width.
-
-        Args:
-            gram: (q, q) products of the columns, less what the model takes up.
-            push: (q,) products with the residuals, likewise.
-            width: of their priors.
-        """
-        one = np.eye(len(push))
-        count = len(self.values)
-        noise = self.noise
-        for _ in range(2):
-            whole = gram + (noise / width) ** 2 * one
-            left = self._total - float(push @ np.linalg.solve(whole, push))
-            left = max(left, LEAST_SHARE * self._total)
-            noise = math.sqrt(left / count)
-        volume = float(np.linalg.slogdet(one + gram * (width / noise) ** 2)[1])
-        gain = -0.5 * (count * math.log(left / self._total) + volume)
-        return Score(gain, width, noise)

@@ -21,9 +21,10 @@ from flexdt.twin.calibration.diagnose.causes.every_cause import (
     PRIOR_FACTORS,
 )
 from flexdt.twin.calibration.diagnose.slipped.contest import Contest
+from flexdt.twin.calibration.diagnose.slipped.left import Left
 from flexdt.twin.calibration.diagnose.slipped.piece import SHARES, Model, Piece
 from flexdt.twin.calibration.diagnose.slipped.residuals import Residuals
-from flexdt.twin.calibration.diagnose.slipped.search import Left, Search
+from flexdt.twin.calibration.diagnose.slipped.search import Search
 from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, NAMED_LOG_ODDS, Judged
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -44,14 +45,14 @@ class Verdict:
         pieces: beads that move.
         odds: logarithm of the odds that they do.
         moved: the most likely model with them.
-        ways: (beads of all pieces, 3) their displacements [mm].
+        sizes: largest displacement of a bead of each piece [mm].
         rest: root mean square of the whitened residuals with them.
     """
 
     pieces: tuple[Piece, ...]
     odds: float
     moved: Judged
-    ways: FloatArray
+    sizes: tuple[float, ...]
     rest: float
 
     @property
@@ -65,12 +66,9 @@ class Verdict:
         Args:
             group: (n,) scan of each frame.
         """
-        ends = list(itertools.accumulate(len(piece.beads) for piece in self.pieces))
-        sizes = np.linalg.norm(self.ways, axis=1)
         parts = []
-        for piece, end in zip(self.pieces, ends, strict=True):
-            size = float(sizes[end - len(piece.beads) : end].max())
-            if size < LEAST_TOLD * sizes.max():
+        for piece, size in zip(self.pieces, self.sizes, strict=True):
+            if size < LEAST_TOLD * max(self.sizes):
                 continue
             scan = int(group[piece.frame])
             frame = piece.frame - int(np.flatnonzero(group == scan)[0])
@@ -78,9 +76,10 @@ class Verdict:
             one = len(piece.beads) == 1
             how = "slowly, beginning at" if piece.slow else "from"
             on = "" if piece.slow else " on"
+            when = "unevenly" if piece.free else f"{how} {place}{on}"
             parts.append(
                 f"bead{'s' * (not one)} {', '.join(map(str, piece.beads))} "
-                f"move{'s' * one} by {size:.2g} mm {how} {place}{on}"
+                f"move{'s' * one} by {size:.2g} mm {when}"
             )
         return error(
             "beads_moved",
@@ -95,25 +94,30 @@ class Trial(Residuals):
 
     def found(self) -> Iterator[tuple[Piece, ...]]:
         """Yield the pieces that explain most of what is left without causes, and with the
-        most likely ones, where they are likely at all; each once.
+        most likely ones, where they are likely at all; each once: at first those that move
+        by a rule, then with those that move freely.
         """
         before: list[tuple[Piece, ...]] = [()]
-        for base in (self.nothing, self.rival):
-            pieces = self._explaining(base)
+        for free, base in itertools.product((False, True), (self.nothing, self.rival)):
+            pieces = self._explaining(base, free)
             if pieces not in before:
                 yield pieces
             before.append(pieces)
 
-    def _explaining(self, base: Model) -> tuple[Piece, ...]:
+    def _explaining(self, base: Model, free: bool) -> tuple[Piece, ...]:
         """Find pieces that explain what a model leaves, step by step, `MOST_PIECES` at
         most, each further one beyond doubt; in the order of their frames.
+
+        Args:
+            base: the model.
+            free: whether beads may move by no rule, too.
         """
         rows, widths, values = self.rows_of(base)
         noise = self.candidates.noise
         out: list[Piece] = []
         while len(out) < MOST_PIECES:
             search = Search(self, Left(rows, widths, values, noise))
-            piece = search.best(out)
+            piece = search.best(out, free)
             gain, width, noise = search.score(piece)
             if gain < (NAMED_LOG_ODDS if out else 0.0) or piece in out:
                 break
@@ -131,7 +135,8 @@ class Trial(Residuals):
         """
         c = self.candidates
         motions = self.motions(pieces)
-        own = np.concatenate([self.columns(piece) for piece in pieces], axis=1)
+        each = [self.columns(piece) for piece in pieces]
+        own = np.concatenate(each, axis=1)
         first = c.rows.shape[1] + motions.shape[1]
         ways = range(first, first + own.shape[1])
         rows = np.concatenate([c.rows, motions, own], axis=1)
@@ -150,13 +155,20 @@ class Trial(Residuals):
         moved = contest.moved
         left = (c.values - rows[:, moved.columns] @ moved.mean) / self.share
         found = dict(zip(moved.columns.tolist(), moved.mean.tolist(), strict=True))
+        ends = list(itertools.accumulate(part.shape[1] for part in each))
+        parts = np.split(np.array([found[way] for way in ways]), ends[:-1])
         return Verdict(
             pieces,
             contest.odds,
             moved,
-            np.array([found[way] for way in ways]).reshape(-1, 3),
+            tuple(map(self._largest, pieces, parts)),
             float(np.sqrt(np.mean(left**2))),
         )
+
+    def _largest(self, piece: Piece, found: FloatArray) -> float:
+        """Return the largest displacement of a bead in any frame [mm]."""
+        moved = piece.displacements(self.frames, found)
+        return float(np.linalg.norm(moved, axis=2).max())
 
     def _rivals(self, moving: Sequence[int], motions: range) -> list[Model]:
         """List the rivals of beads that move: nothing, the most likely causes, these with wide
