@@ -15,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.refine import Refined, measure_beads
 from flexdt.twin.calibration.detect.smear import UNMEASURED, Smear, Step, solved
+from flexdt.twin.calibration.detect.smeared_spots import own_pixels, placed
 from flexdt.twin.calibration.detect.windows import Windows, plan_windows
 from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.causes.every_cause import _arc
@@ -106,6 +107,64 @@ def test_the_arc_of_an_exposure_is_told_and_shifts_no_position(share: float) -> 
 def test_a_smear_that_is_taken_for_round_blur_shifts_positions() -> None:
     result, middle = measured(0.5, told=False)
     assert float(np.sqrt(np.nanmean((result.tracks - middle) ** 2))) > 0.015
+
+
+def test_smeared_spots_in_noise_before_a_bent_wall_are_right_within_their_sigma() -> None:
+    images, plan = exposed(0.5, (0.6, 0.6))
+    at = np.arange(plan.side) - plan.side // 2
+    wall = 0.7 + 0.01 * at - 1e-4 * at**2
+    noise = 0.009 * np.random.default_rng(3).normal(size=images.shape)
+    model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
+    result = measure_beads(
+        (images + wall + noise).astype(np.float32),
+        plan,
+        turned(0.0),
+        model,
+        2.0 * RADIUS * MU,
+        turning=turned,
+    )
+    off = (result.tracks - plan.predicted).reshape(-1, 2)
+    assert np.isfinite(off).all()
+    pull = np.linalg.solve(result.covariances.reshape(-1, 2, 2), off[..., None])[..., 0]
+    assert 0.5 < 0.5 * float(np.einsum("mi,mi->m", off, pull).mean()) < 1.3
+    assert float(np.sqrt((off**2).mean())) < 0.01
+    assert result.smear.share == pytest.approx(0.5, rel=0.02)
+
+
+def smooth_spot(place: np.ndarray, contrast: float, side: int = 41) -> np.ndarray:
+    """Line integrals of a smooth spot, longer than wide."""
+    x, y = np.meshgrid(np.arange(side) - place[0], np.arange(side) - place[1])
+    return contrast * np.exp(-0.5 * ((x / 6.0) ** 2 + (y / 3.5) ** 2))
+
+
+def test_a_spot_is_placed_by_a_rendered_one_wherever_that_lies() -> None:
+    off, level = np.array([0.7, -0.4]), 0.3
+    at = np.arange(41.0)
+    seen = smooth_spot(20.0 + off, 1.32) + level + 0.004 * at - 0.003 * at[:, None]
+    drawn = smooth_spot(np.array([20.0, 20.0]), 1.2)
+    inner = np.zeros((1, 41, 41), np.bool_)
+    inner[:, 2:-2, 2:-2] = True
+    arrays = (a[None].astype(np.float32) for a in (seen, drawn))
+    found = placed(*arrays, inner, np.array([0]))
+    assert found.shift[0] == pytest.approx(off, abs=0.003)
+    assert found.contrast[0] == pytest.approx(1.1, rel=0.002)
+    assert found.misfit[0] < 0.01
+    assert found.share[0] == pytest.approx(1.0, abs=0.01)
+
+
+def test_pixels_on_the_path_of_another_bead_tell_nothing_of_a_spot() -> None:
+    model = BeadModel(np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]]), np.full(2, RADIUS))
+    plan = plan_windows(model, turned(0.0), SHAPE, 20.0)
+    way = np.zeros((FRAMES, 2, 2))
+    way[:, 1, 0] = 20.0
+    crossed = replace(plan, crowded=np.ones_like(plan.crowded))
+    (own,) = own_pixels(crossed, way, np.array([0]))[:1]
+    left, top = plan.corner[0, 0]
+    (x, y), reach = plan.predicted[0, 1], plan.radii[0, 1] + 3.0
+    for part, row in ((-10, 0.0), (0, 0.0), (-5, 0.8 * reach)):
+        assert not own[round(y + row) - top, round(x + part) - left]
+    (x, y) = plan.predicted[0, 0]
+    assert own[round(y) - top, round(x - plan.radii[0, 0]) - left]
 
 
 @pytest.mark.parametrize("blur", [(0.6, 0.6), (0.5, 1.1), (1.1, 0.5)])

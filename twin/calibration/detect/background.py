@@ -102,6 +102,14 @@ def survey(flat: Float32Array, alone: Float32Array) -> Background:
     return Background(ratio, enough & (ratio > limit), bend, plane, slope)
 
 
+def backdrop(behind: Background, side: int) -> Float32Array:
+    """Return the line integrals of smooth backgrounds, (m, side, side): planes and bend."""
+    at = (np.arange(side) - (side - 1) / 2).astype(np.float32)
+    value, right, down = behind.plane.astype(np.float32).T[:, :, None, None]
+    out = value + right * at + down * at[:, None]
+    return np.asarray(out if behind.bend is None else out + behind.bend)
+
+
 def levelled(
     flat: Float32Array, slope: FloatArray, which: npt.NDArray[np.bool_]
 ) -> Float32Array:

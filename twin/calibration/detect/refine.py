@@ -10,7 +10,6 @@ fitted, and no bead is missed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +17,12 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
-from flexdt.twin.calibration.detect.background import Background, levelled, survey
+from flexdt.twin.calibration.detect.background import (
+    Background,
+    backdrop,
+    levelled,
+    survey,
+)
 from flexdt.twin.calibration.detect.detection import BLUR_PX, MISFIT, covariances_of
 from flexdt.twin.calibration.detect.fading import evened, fading, more_behind
 from flexdt.twin.calibration.detect.patches import (
@@ -46,7 +50,6 @@ from flexdt.twin.calibration.detect.sharpness import (
     Sharp,
     balls_of,
     fine_rays,
-    hardened_balls,
     rendering_error,
     rest_of_blur,
     seen_sharpness,
@@ -58,9 +61,15 @@ from flexdt.twin.calibration.detect.smear import (
     UNMEASURED,
     Smear,
     Step,
-    small,
     solved,
     squared_step,
+)
+from flexdt.twin.calibration.detect.smeared_spots import (
+    Turning,
+    followed,
+    own_pixels,
+    placed,
+    results_of,
 )
 from flexdt.twin.calibration.detect.windows import (
     Balls,
@@ -106,10 +115,6 @@ SAMPLING_PX = 0.0005
 rendered spots: images of other rays a pixel, blur estimated (measured without noise)."""
 SHARP_SAMPLING_PX = 0.0001
 """The same where nothing is blurred, and the rendered rays are the images' own."""
-MOST_ROUNDS = 3
-"""Most measurements with an arc of an exposure, each with the arc that the last one found."""
-Turning = Callable[[float], ConeVec]
-"""Gives the geometry of all frames at a part of a step from the middle of each exposure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +163,6 @@ def measure_beads(
     known: Sharp | None = None,
     turning: Turning | None = None,
     smear: Smear = UNMEASURED,
-    rounds: int = MOST_ROUNDS,
 ) -> Refined:
     """Measure every bead in its window.
 
@@ -180,12 +184,11 @@ def measure_beads(
             None, or values that were not seen: they are estimated.
         turning: geometry within an exposure; None: the object is at rest.
         smear: the arc of an exposure that an earlier measurement of these images found.
-        rounds: most measurements, each with the arc that the last one found.
 
     Returns:
         Positions, nan where a spot fails the checks of `_accept`.
     """
-    if turning is not None:
+    if turning is not None and draft:
         windows = exposed(windows, model, turning, smear.share)
     n, k = windows.corner.shape[:2]
     side = windows.side
@@ -197,18 +200,25 @@ def measure_beads(
     sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
     first = centroids(patches, sample)
     patches = replace(patches, peaks=contrasts(first, patches))
-    if known is None or not known.seen:
-        as_fitted = sharpness(patches, sample, BLUR_PX)
-    else:
-        as_fitted = known
-    sharp = as_fitted
+    if known is None or not (known.seen or smear.told):
+        known = sharpness(patches, sample, BLUR_PX)
+    sharp = known
     if draft:
         plain = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
         balls: Balls = ((plain, None),)
-    elif windows.moments:
+    elif turning is not None and smear.told:
         # The profile of a round blur tells neither blur nor size of smeared spots.
-        sharp = replace(sharp, scale=1.0, size=1.0, seen=False, true=smear.blur)
-        balls = hardened_balls(sharp, patches, cone, model)[0]
+        sharp = replace(sharp, scale=1.0, size=1.0, seen=False)
+        smear, balls = followed(patches, sharp, cone, model, turning, smear)
+        if not smear.told:
+            still = measure_beads(
+                images, windows, cone, model, contrast, scene, known=known
+            )
+            return replace(still, smear=smear)
+        windows = exposed(windows, model, turning, smear.share)
+        sharp = replace(sharp, true=smear.blur)
+        peaks = np.tile(np.array(smear.contrast), n)
+        patches = replace(patches, windows=windows, peaks=peaks)
     else:
         sharp, balls = seen_sharpness(sharp, patches, sample, cone, model)
     if sharp.blur < BODY_BLUR_PX:
@@ -229,39 +239,79 @@ def measure_beads(
         alone = blurred_windows(beads, rest)
         # Fewer rays than the images' place a rim by where the lattice lies.
         if not draft and len(sample):
-            noise = ring_noise(first, sample)
             rough = rendering_error(
-                sharp, balls, patches, sample, cone, alone, fine, noise
+                sharp,
+                balls,
+                patches,
+                sample,
+                cone,
+                alone,
+                fine,
+                ring_noise(first, sample),
             )
         if body is not None:
-            # Blur acts on intensities, where body and bead multiply, and so do pixels: what the
-            # body adds to the line integral depends on the bead in front of it.
-            if not draft:
-                left = rest_of_blur(sharp.true, BLURRED_FINE)
-                seen = see_body(images, described, cone, model, windows, left, seen)
-            both = render_windows(seen.scene(described), cone, windows, fine, balls)
-            behind = blurred_windows(both, rest) - alone
-            if not draft:
-                seen, behind = adjusted(images, behind, cone, model, windows, seen)
+            seen, behind = _behind(
+                images, alone, described, cone, model, windows, fine, rest, balls,
+                None if draft else rest_of_blur(sharp.true, BLURRED_FINE), seen,
+            )  # fmt: skip
             data = images - behind
             patches = replace(patches, flat=data.reshape(n * k, side, side))
-    if turning is not None and alone is not None and not draft:
-        before = smear.share**2
-        smear = _smeared(patches, alone, sharp, balls, cone, model, turning, smear.share)
-        change = abs(smear.share**2 - before)
-        if rounds > 1 and not small(change, before, smear.sigma):
-            return measure_beads(
-                images, windows, cone, model, contrast, scene, known=as_fitted,
-                turning=turning, smear=smear, rounds=rounds - 1,
-            )  # fmt: skip
-    measured = _measured(patches, None if draft else alone, body, sharp)
+    if turning is not None and smear.told and alone is not None:
+        way = smear.share * ways(windows, model, turning)
+        measured = _measured_smeared(patches, alone, body, sharp, way)
+    else:
+        if turning is not None and alone is not None:
+            smear = _smeared(patches, alone, sharp, balls, cone, model, turning)
+            if smear.told:
+                return measure_beads(
+                    images, windows, cone, model, contrast, scene, known=known,
+                    turning=turning, smear=smear,
+                )  # fmt: skip
+        measured = _measured(patches, None if draft else alone, body, sharp)
     return replace(
         measured,
         body=seen,
-        as_fitted=as_fitted,
+        as_fitted=known,
         smear=smear,
         covariances=measured.covariances + rough**2 * np.eye(2),
     )
+
+
+def _behind(
+    images: Float32Array,
+    alone: Float32Array,
+    described: Scene,
+    cone: ConeVec,
+    model: BeadModel,
+    windows: Windows,
+    fine: int,
+    rest: float,
+    balls: Balls,
+    left: float | None,
+    seen: SeenBody,
+) -> tuple[SeenBody, Float32Array]:
+    """Render what the body adds to the line integrals.
+
+    Blur acts on intensities, where body and bead multiply, and so do pixels: it depends on the
+    bead in front of it.
+
+    Args:
+        images: (n, k, side, side) line integrals.
+        alone: of the beads.
+        described: the body's solids.
+        cone, model, windows: as of `measure_beads`.
+        fine, rest, balls: with which `alone` is rendered.
+        left: blur beside that of `BLURRED_FINE` rays, with which the body is estimated again;
+            None: it is taken as `seen`.
+        seen: the body, as estimated.
+    """
+    if left is not None:
+        seen = see_body(images, described, cone, model, windows, left, seen)
+    both = render_windows(seen.scene(described), cone, windows, fine, balls)
+    behind = blurred_windows(both, rest) - alone
+    if left is None:
+        return seen, behind
+    return adjusted(images, behind, cone, model, windows, seen)
 
 
 def _body(
@@ -322,7 +372,6 @@ def _smeared(
     cone: ConeVec,
     model: BeadModel,
     turning: Turning,
-    share: float,
 ) -> Smear:
     """Estimate the arc that the object turns in an exposure from `SMEAR_SAMPLE` complete spots.
 
@@ -331,12 +380,11 @@ def _smeared(
 
     Args:
         patches: the windows, less the body.
-        alone: beads rendered alone, (n, k, side, side) or (n k, side, side).
+        alone: beads at rest rendered alone, (n, k, side, side) or (n k, side, side).
         sharp, balls: with which they are.
         cone: geometry of the frames.
         model: the beads.
         turning: geometry within an exposure.
-        share: of a step, with which `alone` is rendered.
 
     Returns:
         The arc; `UNMEASURED` where the spots do not determine it.
@@ -363,10 +411,8 @@ def _smeared(
         return step
 
     drawn = alone.reshape(patches.flat.shape)[sample]
-    first = squared_step(seen, drawn, few, way, share)
-    if share > 0.0:
-        variance = max(variance + first.variance, BLURS[0] ** 2)
-    found = solved(share**2, first, step_at)
+    first = squared_step(seen, drawn, few, way, 0.0)
+    found = solved(0.0, first, step_at)
     return replace(found, blur=math.sqrt(variance)) if found.told else found
 
 
@@ -397,7 +443,8 @@ def _measured(
         behind = survey(patches.flat, alone)
         if behind.bend is not None:
             patches = replace(patches, flat=patches.flat - behind.bend)
-        patches, fainter = _evened(patches, behind, body, alone)
+        found = centroids(patches, patches.entire)
+        patches, fainter = _evened(patches, behind, body, alone, found)
         # A fit of a spot that is cut or touched knows a level alone.
         partial = ~windows.whole.ravel()
         patches = replace(patches, flat=levelled(patches.flat, behind.slope, partial))
@@ -452,11 +499,58 @@ def _measured(
     return replace(accepted, common=common.reshape(n, k, 2, -1))
 
 
+def _measured_smeared(
+    patches: Patches,
+    alone: Float32Array,
+    body: Float32Array | None,
+    sharp: Sharp,
+    way: FloatArray,
+) -> Refined:
+    """Measure smeared spots by rendered ones, once their backgrounds are removed.
+
+    Args:
+        patches: the windows.
+        alone: beads rendered alone, (n, k, side, side), as smeared as in the images.
+        body: line integrals of the body, or None.
+        sharp: blur and size.
+        way: (n, k, 2) of each bead's image in an exposure [px].
+    """
+    windows = patches.windows
+    n, k = windows.corner.shape[:2]
+    alone = alone.reshape(patches.flat.shape)
+    index = np.flatnonzero(windows.share > MIN_SHARE)
+    masks = own_pixels(windows, way, index)
+    behind = survey(patches.flat, alone)
+    level = backdrop(behind, windows.side)
+    found = placed(patches.flat - level, alone, masks, index)
+    results = results_of(found, patches)
+    seen = (
+        patches
+        if behind.bend is None
+        else replace(patches, flat=patches.flat - behind.bend)
+    )
+    evened, fainter = _evened(seen, behind, body, alone, results)
+    if evened is not seen:
+        found = placed(
+            evened.flat - (level - (patches.flat - seen.flat)), alone, masks, index
+        )
+        results = results_of(found, patches)
+    changed = placed(alone + fainter, alone, masks, index)
+    common = np.nan_to_num(changed.shift).reshape(n, k, 2, 1)
+    _discount(results, behind, patches.offsets)
+    results = results.reshape(n, k, -1)
+    lone = replace(windows, whole=np.zeros_like(windows.whole))
+    return replace(
+        _accept(results, lone, patches.peaks.reshape(n, k), sharp), common=common
+    )
+
+
 def _evened(
     patches: Patches,
     behind: Background,
     body: Float32Array | None,
     alone: Float32Array,
+    found: FloatArray,
 ) -> tuple[Patches, Float32Array]:
     """Return the windows with uniform contrast of each bead, by the fading found in them.
 
@@ -465,13 +559,14 @@ def _evened(
         behind: backgrounds.
         body: line integrals of the body, or None.
         alone: the beads alone, (m, side, side).
+        found: (m, RESULTS) of the complete spots.
 
     Returns:
         The windows, the same if no fading is found; and the change of their line integrals by
         one standard deviation of the fading.
     """
-    found = centroids(patches, patches.entire)
-    seen = found[:, kernels.OK] > 0
+    seen = np.zeros(len(found), np.bool_)
+    seen[patches.entire] = found[patches.entire, kernels.OK] > 0
     level = behind.plane[:, 0]
     thick = body
     if body is not None:

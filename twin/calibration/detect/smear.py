@@ -37,6 +37,8 @@ STILL_SHARE = 0.01
 """Change of the squared share, relative, from which it counts as still."""
 STILL_SIGMAS = 0.3
 """The same in standard deviations."""
+CONTRAST = 2
+"""Number of the contrast among the values of a spot."""
 LEAST_LIGHT = 1e-3
 """Added to the share of light in a pixel, against a division by none."""
 
@@ -50,12 +52,15 @@ class Smear:
         sigma: its standard deviation; inf: not measured.
         told: whether the spots were measured as smeared by it.
         blur: of the images beside it [px]; NaN where it is not told.
+        contrast: line integral through the middle of each bead, beside it; none where it is
+            not known.
     """
 
     squared: float = 0.0
     sigma: float = math.inf
     told: bool = False
     blur: float = math.nan
+    contrast: tuple[float, ...] = ()
 
     @property
     def measured(self) -> bool:
@@ -102,11 +107,13 @@ class Step(NamedTuple):
         square: of the share of a step.
         sigma: its standard deviation; inf: not determined.
         variance: of the round blur [px^2].
+        contrast: (m,) of each spot, relative; None: not determined.
     """
 
     square: float
     sigma: float
     variance: float = 0.0
+    contrast: FloatArray | None = None
 
 
 def small(change: float, square: float, sigma: float) -> bool:
@@ -170,6 +177,7 @@ def squared_step(
     windows: Windows,
     way: FloatArray,
     share: float,
+    ends: Float32Array | None = None,
 ) -> Step:
     """Estimate by how much the square of the share of a step is larger in the images than in
     rendered spots.
@@ -185,6 +193,8 @@ def squared_step(
         windows: m of one bead each.
         way: (m, 2) of each bead's image in a step [px].
         share: of a step with which the spots are rendered.
+        ends: as `drawn`, of the first and the last moment of each exposure alone; a longer
+            exposure has more of them. None: smear is told from its variance.
 
     Returns:
         The difference; not determined with fewer than `LEAST_SPOTS` spots, or where they do
@@ -193,7 +203,7 @@ def squared_step(
     count = len(seen)
     if count < LEAST_SPOTS:
         return Step(0.0, math.inf)
-    columns, left = _columns(seen, drawn, windows, way, share)
+    columns, left = _columns(seen, drawn, windows, way, share, ends)
     own = columns.shape[1] - 4
     gram = columns @ columns.transpose(0, 2, 1)
     push = np.einsum("mcp,mp->mc", columns, left)
@@ -223,7 +233,8 @@ def squared_step(
     off = weight[:, None] * (right - normal @ found)
     spread = inverse @ (off.T @ off) @ inverse * count / (count - 4.0)
     variance = 0.5 * float(found[1] + found[3])
-    return Step(float(found[0]), float(np.sqrt(spread[0, 0])), variance)
+    contrast = (taken @ found - alone)[:, CONTRAST]
+    return Step(float(found[0]), float(np.sqrt(spread[0, 0])), variance, contrast)
 
 
 def _columns(
@@ -232,12 +243,13 @@ def _columns(
     windows: Windows,
     way: FloatArray,
     share: float,
+    ends: Float32Array | None,
 ) -> tuple[Float32Array, Float32Array]:
     """Make the derivatives of the light in the pixels near each spot, and what rendered spots
     leave of it, over the root of the light.
 
     Args:
-        seen, drawn, windows, way, share: as of `squared_step`.
+        seen, drawn, windows, way, share, ends: as of `squared_step`.
 
     Returns:
         (m, columns, pixels): place (2), contrast, background (3), smear, blur (3); and
@@ -272,6 +284,9 @@ def _columns(
     y = (at - place[:, 1:]).astype(np.float32)[:, :, None]
     across, along = (way.T[..., None, None] / math.sqrt(24.0)).astype(np.float32)
     size = np.float32(1.0 / half)
+    longer = across**2 * xx + 2.0 * across * along * xy + along**2 * yy
+    if ends is not None:
+        longer = (np.exp(-ends)[:, part, part] - middle) / np.float32(2.0 * share**2)
     weight = np.where(use, 1.0 / np.sqrt(middle + LEAST_LIGHT), 0.0).astype(np.float32)
     terms = (
         0.5 * (right - back),
@@ -280,7 +295,7 @@ def _columns(
         middle,
         size * x * middle,
         size * y * middle,
-        across**2 * xx + 2.0 * across * along * xy + along**2 * yy,
+        longer,
         0.5 * xx,
         xy,
         0.5 * yy,

@@ -38,9 +38,10 @@ EVEN_STEPS = (0.7548776662466927, 0.5698402909980532)
 evenly over a square (powers of 1 / 1.3247..., the root of x^3 = x + 1)."""
 WIDEST_DEAD = 4
 """Pixels along the shorter side of a gap that is filled."""
-MOMENTS = (4, 24)
-"""Least and largest number of moments of an exposure; one for two pixels of a bead's longest
-way in between."""
+MOMENTS = (6, 24)
+"""Least and largest number of moments of an exposure."""
+MOMENT_PX = 1.5
+"""Part of a bead's longest way for each of them in between [px]: about two blurs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,7 +390,7 @@ def exposed(
         return replace(windows, moments=())
     way = float(np.linalg.norm(ways(windows, model, turning), axis=2).max()) * share
     least, most = MOMENTS
-    count = min(max(least, math.ceil(0.5 * way)), most)
+    count = min(max(least, math.ceil(way / MOMENT_PX)), most)
     # Their variance is that of an even exposure.
     parts = (np.arange(count) + 0.5 - 0.5 * count) / math.sqrt(count**2 - 1.0)
     return replace(windows, moments=tuple(turning(share * t) for t in parts.tolist()))
