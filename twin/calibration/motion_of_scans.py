@@ -118,7 +118,7 @@ def settle_motion(
     Returns:
         The state with wider sigmas but the same motion, and findings: warnings if something
         else moves than was asked for, if the tracks leave open what moves, and if it
-        changes by more than a sigma; an error if the fit is identifiable but an asked
+        changes by more than a sigma; an error if the fit is determined but an asked
         parameter with a unit is determined worse than `request.bound`.
     """
     held = state.motion
@@ -146,7 +146,7 @@ def settle_motion(
     wide = [
         f"{n} to {e.sigma:.2g} {e.unit}"
         for n, e in fit.certificate.estimates.items()
-        if fit.identifiable and e.asked and e.unit != "1" and e.sigma > request.bound
+        if fit.determined and e.asked and e.unit != "1" and e.sigma > request.bound
     ]
     if wide:
         out.append(

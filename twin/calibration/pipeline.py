@@ -178,7 +178,7 @@ def _detected(
 
 def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
     """Fit to the detected spots: with all six main parameters free if they are
-    identifiable, else with the requested ones.
+    determined, else with the requested ones.
 
     Adds the motion of single frames if requested, and findings on bead sizes if these are
     known and the fit is not singular.
@@ -192,7 +192,7 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
     """
     request = with_free(asked, SIX)
     fit = fit_scans(state, request)
-    if not fit.identifiable:
+    if not fit.determined:
         request = asked
         fit = fit_scans(state, request)
     if request.per_frame:

@@ -100,7 +100,7 @@ def explain_residuals(
     (`beads_moved`) are the only finding, and widen the sigmas where they are open.
 
     Args:
-        fit: to be judged; nothing is judged if it is not identifiable.
+        fit: to be judged; nothing is judged if it is not determined.
         known: statements on the phantom and the positions.
         refit: fits again with more parameters free.
         sigmas_known: the positions' sigmas were measured, and are no more than compared.
@@ -110,7 +110,7 @@ def explain_residuals(
         The fit to be reported (with the causes that explain the residuals) and the
         findings; only the factor's error, with the original fit, if that explains them.
     """
-    if not fit.identifiable:
+    if not fit.determined:
         return fit, []
     plain = fit
     fit, causes = explained_by_causes(fit, known, refit)
@@ -297,11 +297,11 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
 
 def _explained(better: FitResult, fit: FitResult) -> bool:
     """Check whether `better` explains the residuals of `fit`: they are halved and may be
-    chance, it is identifiable, and uses at least `MOST_USED` as many positions.
+    chance, it is determined, and uses at least `MOST_USED` as many positions.
     """
     rms = better.certificate.rms_px
     return (
-        better.identifiable
+        better.determined
         and rms < 0.5 * fit.certificate.rms_px
         and rms < largest_residual(better, MISFIT_CHANCE)
         and better.certificate.used.sum() >= MOST_USED * fit.certificate.used.sum()

@@ -56,10 +56,10 @@ def held_distance(free: FitResult, held: Mapping[str, float]) -> dict[str, float
     Returns:
         Parameter -> sigmas, and under "" those of all together (a chi2 distance of many,
         as the normal deviate that is as improbable): correlated ones may contradict the
-        data together where each by itself does not. Empty if the fit is not identifiable
+        data together where each by itself does not. Empty if the fit is not determined
         or determines none.
     """
-    if not free.identifiable:
+    if not free.determined:
         return {}
     names = list(free.certificate.estimates)
     some = [
@@ -147,9 +147,9 @@ def judge_exact(
     Returns:
         An error if the images contradict one of them by itself; a warning if sigmas grow
         more than `MIN_GROWTH` times with its usual prior, or the images narrow that prior
-        by less; else None, also where one of the two fits is not identifiable.
+        by less; else None, also where one of the two fits is not determined.
     """
-    if not (fit.identifiable and freed.identifiable):
+    if not (fit.determined and freed.determined):
         return None
     scores = held_distance(freed, exact)
     if max((score for name, score in scores.items() if name), default=0.0) > HELD_SIGMAS:
@@ -199,13 +199,13 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     Returns:
         Beyond `HELD_SIGMAS` an error and its likely causes; else a factor above 1 if the
         contradiction's chance is below `NARROW_CHANCE`. No finding and factor 1 without
-        priors, or if the fit is not identifiable.
+        priors, or if the fit is not determined.
     """
     c = loose.certificate
     known = [
         (i, n, e) for i, (n, e) in enumerate(c.estimates.items()) if e.prior is not None
     ]
-    if not loose.identifiable or not known or not np.isfinite(c.covariance).all():
+    if not loose.determined or not known or not np.isfinite(c.covariance).all():
         return PriorsJudged(None, 1.0)
     at, names, found = map(list, zip(*known, strict=True))
     width = np.array([e.prior for e in found])
@@ -322,11 +322,11 @@ def doubtful(
 
     Returns:
         The same values with wider intervals; `fit` itself without causes. Fits that are
-        not identifiable are ignored.
+        not determined are ignored.
     """
     for name in judged.causes:
         other = without(name)
-        if other.identifiable:
+        if other.determined:
             off = {n: other.values.get(n, v) - v for n, v in fit.values.items()}
             fit = replace(fit, certificate=widened(fit.certificate, off))
     return fit

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
 from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.foreseen import foreseen
+from flexdt.twin.calibration.fit.certificate import beyond_bound
 from flexdt.twin.calibration.fit.forecast import Forecast, forecast, visible_beads
 from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known, known_strain
 from flexdt.twin.calibration.fit.problem import (
@@ -62,7 +63,8 @@ class Prediction:
             `fit.fit`.
         covariance: (p, p) edge units.
         rank, condition: of the column-scaled Jacobian.
-        null, weak: directions not determined, or badly.
+        null, weak: directions not determined (also those that are foreseen to be stated
+            worse than the bound), or badly.
         visible: (n, k) beads entirely in view.
         suggestions: changes that help, best first; empty if nothing is weak.
         ranges: column or quantity of `image_sigmas` -> least and largest of the sigmas that
@@ -212,7 +214,7 @@ def identifiability(
         covariance=expected.covariance,
         rank=spec.rank,
         condition=spec.condition,
-        null=spec.null,
+        null=spec.null or beyond_bound(sigmas, bound),
         weak=spec.weak,
         visible=visible,
         suggestions=tuple(suggestions),

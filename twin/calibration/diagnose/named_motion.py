@@ -89,7 +89,7 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
     problem = fit.problem
     sizes = np.bincount(problem.group)
     names = [n for n in MOVING if n in fit.values or n + "@0" in fit.values]
-    if sizes.max() > MOST_FRAMES or not names or not fit.identifiable:
+    if sizes.max() > MOST_FRAMES or not names or not fit.determined:
         return None
     try:
         better, found = follow_motion(fit, names, refit)

@@ -53,7 +53,8 @@ def with_rival_pitch(
     rival = rival_pitch(fit, widths)
     if rival is None:
         return fit, None
-    certificate = widened(fit.certificate, rival.open_change)
+    open_change = rival.open_change
+    certificate = replace(widened(fit.certificate, open_change), of_units=open_change)
     fit = replace(fit, certificate=certificate, rival_pitch=rival)
     if rival.share < TOLD_SHARE:
         return fit, None
@@ -91,7 +92,7 @@ def rival_pitch(fit: FitResult, widths: Mapping[str, float]) -> RivalPitch | Non
     at = [i for i, name in enumerate(names) if _is_distance(name)]
     known = to_internal(DISTANCE, widths.get(DISTANCE, 0.0))
     free = [i for i in at if problem.prior_sigma[i] > known]
-    if not fit.identifiable or not free or not known > 0.0:
+    if not fit.determined or not free or not known > 0.0:
         return None
     judge = _Explanations(fit)
     near = judge.with_widths(free, known)

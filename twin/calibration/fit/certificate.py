@@ -84,6 +84,7 @@ class Conditioning:
         rank, condition: of the column-scaled Jacobian; condition is inf if rank-deficient.
         null: directions that are not determined.
         weak: directions that are determined badly.
+        bound: sigma [mm, deg] beyond which a direction counts as not determined.
     """
 
     names: tuple[str, ...]
@@ -92,6 +93,7 @@ class Conditioning:
     condition: float
     null: tuple[Direction, ...]
     weak: tuple[Direction, ...]
+    bound: float = BOUND
 
     @property
     def full(self) -> bool:
@@ -193,7 +195,26 @@ def spectrum(
         null.append(Direction(((names[worst], 1.0),), float(sigma[worst]), advice))
         rank -= 1
     return Conditioning(
-        tuple(names), covariance, rank, condition, tuple(null), tuple(weak)
+        tuple(names), covariance, rank, condition, tuple(null), tuple(weak), bound
+    )
+
+
+def beyond_bound(sigmas: Mapping[str, float], bound: float) -> tuple[Direction, ...]:
+    """List the columns that are stated worse than a bound, with advice.
+
+    Args:
+        sigmas: column -> stated standard deviation, edge units.
+        bound: see `spectrum`.
+    """
+    advice = (
+        f"worse than {bound:g} mm or deg, with what the residuals and open causes add: "
+        "add a placement at another SOD, frames or beads"
+    )
+    unusable = bound / TOLERANCE["mm"]
+    return tuple(
+        Direction(((name, 1.0),), sigma, advice)
+        for name, sigma in sigmas.items()
+        if sigma > unusable * tolerance_of(name)
     )
 
 
@@ -291,6 +312,8 @@ class Certificate:
         used: (n, k) positions in the fit.
         outliers: positions left out.
         held: parameters held by the gauge, with the reason.
+        of_units: column -> part of its sigma [edge unit] that comes of an unknown pixel pitch.
+            What images show is the same in other units, so it is no lack of information.
         rivals: explanations that the images leave open, of which `covariance` is the mean
             square about the estimates; empty for one alone.
     """
@@ -312,16 +335,46 @@ class Certificate:
     outliers: tuple[Outlier, ...]
     held: tuple[tuple[str, str], ...]
     rivals: tuple[Rival, ...] = ()
+    of_units: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def identifiable(self) -> bool:
-        """Whether the data determine every requested parameter."""
+    def determined(self) -> bool:
+        """Whether the data determine every requested parameter, if their errors are white
+        and no other cause is open; `identifiable` is judged on what is stated.
+        """
         return self.spectrum.full
 
     @property
+    def beyond(self) -> tuple[Direction, ...]:
+        """Requested parameters that are determined, but stated worse than the bound: what
+        the residuals show, and causes that are open, are in their sigmas. A pixel pitch
+        does not count (`of_units`).
+        """
+        if not self.determined:
+            return ()
+        asked = {
+            name: math.sqrt(max(e.sigma**2 - self.of_units.get(name, 0.0) ** 2, 0.0))
+            for name, e in self.estimates.items()
+            if e.asked
+        }
+        return beyond_bound(asked, self.spectrum.bound)
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the data determine every requested parameter, with stated sigmas within
+        the bound.
+        """
+        return self.determined and not self.beyond
+
+    @property
+    def open(self) -> tuple[Direction, ...]:
+        """Directions and parameters for which the fit is not identifiable."""
+        return (*self.spectrum.null, *self.beyond)
+
+    @property
     def weak(self) -> tuple[str, ...]:
-        """Null directions first, then weak ones, as text."""
-        return tuple(d.text for d in (*self.spectrum.null, *self.spectrum.weak))
+        """Open directions first, then weak ones, as text."""
+        return tuple(d.text for d in (*self.open, *self.spectrum.weak))
 
     @property
     def limited(self) -> dict[str, str]:

@@ -437,8 +437,15 @@ class FitResult:
         return self.certificate.covariance
 
     @property
+    def determined(self) -> bool:
+        """Every free parameter is determined, if nothing but white noise is in the data:
+        the other steps of a calibration can go on from the fit.
+        """
+        return self.certificate.determined
+
+    @property
     def identifiable(self) -> bool:
-        """Every free parameter is determined."""
+        """Every free parameter is determined, as it is stated."""
         return self.certificate.identifiable
 
     @property
@@ -623,8 +630,8 @@ def require_identifiable(result: FitResult) -> FitResult:
             parameters and directions.
     """
     spectrum = result.certificate.spectrum
-    if not spectrum.full:
-        directions = [d.text for d in spectrum.null]
+    if not result.identifiable:
+        directions = [d.text for d in result.certificate.open]
         raise NotIdentifiableError(
             f"not identifiable: {len(directions)} of {len(spectrum.names)} directions "
             "are open: " + "; ".join(directions),

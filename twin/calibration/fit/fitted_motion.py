@@ -173,7 +173,7 @@ def estimate_motion(
     count = problem.layout.parameter_count
     factor = edge_factors(problem.layout.names[:count])
     more = added[:count, :count] * np.outer(factor, factor)
-    if fit.identifiable:
+    if fit.determined:
         noise = max(LEAST_NOISE, fit.certificate.noise)
         unit_covariance = fit.certificate.spectrum.unit_covariance[:count, :count]
         more = more + (best.inflation - 1.0) * noise**2 * unit_covariance
@@ -286,10 +286,10 @@ def aware(fit: FitResult, held: MotionFit) -> FitResult:
         held: the motion.
 
     Returns:
-        A wider fit with its motions; as wide as before if it is not identifiable.
+        A wider fit with its motions; as wide as before if it is not determined.
     """
     fit = replace(fit, motions=held.motions)
-    if not fit.identifiable:
+    if not fit.determined:
         return fit
     more = estimate_motion(fit, held.asked, held, search=False).covariance
     more = more + _along_the_beam(fit, held)

@@ -56,7 +56,7 @@ def explained_by_causes(
 
     Returns:
         The new fit and the causes that were found; as `_undetermined` says if a fit with
-        them is not identifiable; `fit` with the odds, and `Found.beside_motion`, if the
+        them is not determined; `fit` with the odds, and `Found.beside_motion`, if the
         object moves and more than `MAX_REST_SHARE` of the residuals is left.
     """
     first = fit
@@ -80,7 +80,7 @@ def explained_by_causes(
         if not settled:
             applied = chosen
             better = refit(**options)
-            if not better.identifiable:
+            if not better.determined:
                 return _undetermined(first, better, candidates, choice, refit)
             fit = better
         alike = beside or fit.certificate.enlargement
@@ -130,13 +130,13 @@ def _stated(
         refit: as of `explained_by_causes`.
 
     Returns:
-        The fit with a wider certificate; not identifiable if beads that are so far off
+        The fit with a wider certificate; not determined if beads that are so far off
         determine too little.
     """
     whole = candidates.with_open_places(choice)
     if whole != choice:
         fit = refit(**_options(candidates, whole, borders))
-        if not fit.identifiable:
+        if not fit.determined:
             return fit
     return widened_by_causes(fit, candidates, choice)
 
@@ -237,7 +237,7 @@ def _undetermined(
 
     Args:
         first: fit without causes.
-        better: fit with those of `choice`, not identifiable.
+        better: fit with those of `choice`, not determined.
         candidates: all causes, judged.
         choice: the most likely one.
         refit: as of `explained_by_causes`.
