@@ -177,7 +177,7 @@ def stated(
         looks.append(FrameSpots(outlines, FrameState.USABLE))
     scan = Scan(SpotFrames(looks), plan.poses, index=index if known else None)
     result = calibrate([scan], plan.model, CalibrationRequest(second_look=False))
-    if result.errors or result.fit is None or not result.fit.determined:
+    if not result.identifiable or result.fit is None:
         return None
     (seen,) = image_quantities(result.fit)
     return result.fit.sigmas | {n: e.sigma for n, e in seen.items()}

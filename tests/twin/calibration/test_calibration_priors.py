@@ -17,6 +17,7 @@ from flexdt.twin.calibration import (
     identifiability,
 )
 from flexdt.twin.calibration.diagnose.fixed_parameters import judge_priors, loosened
+from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.fit.priors import ASSUMED, exact, prior_widths
 from flexdt.twin.calibration.pipeline import CalibrationRequest
@@ -168,6 +169,18 @@ def test_a_parameter_is_identifiable_by_the_sigma_that_is_stated() -> None:
         fit_geometry(seen, BEADS, poses(), shape=SHAPE)
     wide = estimate_geometry(seen, BEADS, poses(), shape=SHAPE, bound=10.0)
     assert wide.identifiable
+
+
+def test_a_parameter_that_open_causes_make_wide_is_told_and_offered() -> None:
+    """A right scan whose dO_x is stated to 8 mm, as a panel far aside is not excluded: nothing
+    told that it is beyond the bound of 5 mm. What the images show is as sharp as ever."""
+    fit = estimate_geometry(tracks(), BEADS, poses(), shape=SHAPE, priors=PRIORS)
+    assert not fit.certificate.weak
+    more = widened(fit.certificate, {"dO_x": 8.0, "dD_x": 15.0})
+    assert more.estimates["dO_x"].sigma > 8.0
+    assert more.identifiable
+    assert [d.names for d in more.wide] == [("dO_x",)]
+    assert "dO_x: sigma 8 mm: worse than 5 mm" in more.weak[0]
 
 
 def test_widths_come_from_profile_machine_and_request() -> None:

@@ -63,8 +63,7 @@ class Prediction:
             `fit.fit`.
         covariance: (p, p) edge units.
         rank, condition: of the column-scaled Jacobian.
-        null, weak: directions not determined (also those that are foreseen to be stated
-            worse than the bound), or badly.
+        null, weak: directions not determined, or badly, also because of open causes.
         visible: (n, k) beads entirely in view.
         suggestions: changes that help, best first; empty if nothing is weak.
         ranges: column or quantity of `image_sigmas` -> least and largest of the sigmas that
@@ -214,8 +213,8 @@ def identifiability(
         covariance=expected.covariance,
         rank=spec.rank,
         condition=spec.condition,
-        null=spec.null or beyond_bound(sigmas, bound),
-        weak=spec.weak,
+        null=spec.null,
+        weak=spec.weak if spec.null else (*beyond_bound(sigmas, bound), *spec.weak),
         visible=visible,
         suggestions=tuple(suggestions),
         ranges=expected.ranges,

@@ -53,8 +53,7 @@ def with_rival_pitch(
     rival = rival_pitch(fit, widths)
     if rival is None:
         return fit, None
-    open_change = rival.open_change
-    certificate = replace(widened(fit.certificate, open_change), of_units=open_change)
+    certificate = widened(fit.certificate, rival.open_change)
     fit = replace(fit, certificate=certificate, rival_pitch=rival)
     if rival.share < TOLD_SHARE:
         return fit, None

@@ -312,8 +312,8 @@ class Certificate:
         used: (n, k) positions in the fit.
         outliers: positions left out.
         held: parameters held by the gauge, with the reason.
-        of_units: column -> part of its sigma [edge unit] that comes of an unknown pixel pitch.
-            What images show is the same in other units, so it is no lack of information.
+        own: column -> standard deviation of the fit with what its residuals show [edge unit];
+            `estimates` state what causes leave open, too.
         rivals: explanations that the images leave open, of which `covariance` is the mean
             square about the estimates; empty for one alone.
     """
@@ -335,34 +335,41 @@ class Certificate:
     outliers: tuple[Outlier, ...]
     held: tuple[tuple[str, str], ...]
     rivals: tuple[Rival, ...] = ()
-    of_units: Mapping[str, float] = field(default_factory=dict)
+    own: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def determined(self) -> bool:
-        """Whether the data determine every requested parameter, if their errors are white
-        and no other cause is open; `identifiable` is judged on what is stated.
+        """Whether the data determine every requested parameter, if their errors are white;
+        `identifiable` counts what their residuals show, too.
         """
         return self.spectrum.full
 
     @property
     def beyond(self) -> tuple[Direction, ...]:
-        """Requested parameters that are determined, but stated worse than the bound: what
-        the residuals show, and causes that are open, are in their sigmas. A pixel pitch
-        does not count (`of_units`).
+        """Requested parameters that white noise would determine, but that the residuals
+        show to be known worse than the bound: they drift by more, for example.
         """
-        if not self.determined:
-            return ()
-        asked = {
-            name: math.sqrt(max(e.sigma**2 - self.of_units.get(name, 0.0) ** 2, 0.0))
-            for name, e in self.estimates.items()
-            if e.asked
+        own = {n: s for n, s in self.own.items() if self.estimates[n].asked}
+        return beyond_bound(own, self.spectrum.bound) if self.determined else ()
+
+    @property
+    def wide(self) -> tuple[Direction, ...]:
+        """Requested parameters that are stated worse than the bound only because of causes
+        that are open. Nothing that the images show is lacking, and such causes are open in one of
+        twenty right scans, so this is no reason not to use the fit.
+        """
+        known = {n for d in self.open for n in d.names}
+        stated = {
+            n: e.sigma
+            for n, e in self.estimates.items()
+            if e.asked and n not in known and math.isfinite(e.sigma)
         }
-        return beyond_bound(asked, self.spectrum.bound)
+        return beyond_bound(stated, self.spectrum.bound)
 
     @property
     def identifiable(self) -> bool:
-        """Whether the data determine every requested parameter, with stated sigmas within
-        the bound.
+        """Whether the data determine every requested parameter within the bound, with what
+        their residuals show.
         """
         return self.determined and not self.beyond
 
@@ -373,8 +380,8 @@ class Certificate:
 
     @property
     def weak(self) -> tuple[str, ...]:
-        """Open directions first, then weak ones, as text."""
-        return tuple(d.text for d in (*self.open, *self.spectrum.weak))
+        """Open directions first, then what is wide or weak, as text."""
+        return tuple(d.text for d in (*self.open, *self.wide, *self.spectrum.weak))
 
     @property
     def limited(self) -> dict[str, str]:
@@ -654,6 +661,7 @@ def certify(
         used=use,
         outliers=outliers,
         held=problem.layout.held,
+        own={name: e.sigma for name, e in estimates.items()},
     )
 
 

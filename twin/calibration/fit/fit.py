@@ -445,7 +445,7 @@ class FitResult:
 
     @property
     def identifiable(self) -> bool:
-        """Every free parameter is determined, as it is stated."""
+        """Every free parameter is determined, with what the residuals show."""
         return self.certificate.identifiable
 
     @property
