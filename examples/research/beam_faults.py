@@ -73,6 +73,7 @@ class Laboratory:
         dead: part of the pixels without a signal.
         drift: of the beam's brightness over the scan.
         ceiling: largest count as part of the open beam.
+        dark: by which the dark image is too bright, as part of the open beam.
         strain: (3, 3) of the phantom, by which its balls are displaced; none.
         arc: part of a step by which the object turns while a frame is exposed.
         shown: (n,) angles of the frames -> those that they show; none: their own.
@@ -92,6 +93,7 @@ class Laboratory:
     dead: float = 0.0
     drift: float = 0.0
     ceiling: float = math.inf
+    dark: float = 0.0
     strain: Array | None = None
     arc: float = 0.0
     shown: Callable[[Array, Rng], Array] | None = None
@@ -166,7 +168,9 @@ def radiographs(
         beam = lab.photons * (1.0 + lab.drift * i / len(angles))
         counts = np.minimum(rng.poisson(beam * lagging), lab.ceiling * lab.photons)
         counts = np.where(dead, 0.0, counts)
-        out.append((-np.log(np.maximum(counts, 0.5) / lab.photons)).astype(np.float32))
+        open_beam = lab.photons * (1.0 - lab.dark)
+        counts = np.maximum(counts - lab.dark * lab.photons, 0.5)
+        out.append((-np.log(counts / open_beam)).astype(np.float32))
     return out
 
 
@@ -342,6 +346,11 @@ KINDS: Final[Mapping[str, tuple[Change, str]]] = {
         lambda lab, rng: replace(lab, lag=rng.uniform(0.01, 0.1), **METAL), "",
     ),
     # Faults: to be named.
+    "dark_too_bright": (
+        lambda lab, rng: replace(
+            lab, radius_mm=1.5, cast_mm=1.5, dark=rng.uniform(0.007, 0.015), **METAL
+        ), "dark_too_bright",
+    ),
     "radial": (lambda lab, rng: replace(lab, shift=_radial(rng)), "panel_distorted"),
     "tiles_apart": (lambda lab, rng: replace(lab, shift=_tiles(rng)), "panel_distorted"),
     "radial_in_pmma": (

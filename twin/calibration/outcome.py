@@ -9,6 +9,7 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.camera_lag import Lag
+from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.diagnose import Finding
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -38,6 +39,7 @@ class Calibration:
         model: the phantom's beads.
         motion: that was found; None if it was not requested.
         lags: of the camera in each scan, removed from the measurements.
+        missing_light: in the images of each scan, given back in the measurements.
     """
 
     fit: FitResult | None
@@ -49,6 +51,7 @@ class Calibration:
     model: BeadModel
     motion: MotionFit | None = None
     lags: tuple[Lag, ...] = ()
+    missing_light: tuple[MissingLight, ...] = ()
 
     @property
     def motions(self) -> tuple[Motion, ...]:

@@ -24,8 +24,10 @@ from flexdt.twin.calibration.diagnose.data import judge_emptiness, judge_frames
 from flexdt.twin.calibration.diagnose.fitted import OF_RESIDUALS, judge_offsets
 from flexdt.twin.calibration.diagnose.frame_places import judge_places
 from flexdt.twin.calibration.diagnose.measured_spots import (
+    beside_missing_light,
     judge_body,
     judge_lag,
+    judge_missing_light,
     judge_smear,
 )
 from flexdt.twin.calibration.fit.fit import FitResult, with_start
@@ -92,9 +94,9 @@ def calibrate(
     """Calibrate from images: detect, identify, fit, measure again, fit again and
     diagnose.
 
-    Stops at the first stage with an error, at a fit that determines nothing (singular),
-    and at offsets that are implausible; the outcome then holds the fit so far and its
-    findings.
+    Stops at the first stage with an error, at a fit that determines nothing (singular), at
+    spots without light, and at offsets that are implausible; the outcome then holds the fit
+    so far and its findings.
 
     Args:
         scans: one or more scans of the same phantom.
@@ -132,8 +134,10 @@ def calibrate(
         return fitted.outcome  # Nothing that such a geometry predicts has a meaning.
     if asked.second_look:
         fitted = _second_fit(fitted, solids)
-        if not fitted.state.measured:
-            return fitted.outcome
+        if not fitted.state.measured or any(
+            light.seen and light.dark > 0.0 for light in fitted.state.missing_light
+        ):
+            return fitted.outcome  # Residuals tell no cause where spots lost their light.
     implausible = judge_offsets(fitted.fit)
     if implausible is not None:  # Nothing else that such a fit shows has a meaning.
         return fitted.with_findings(implausible).outcome
@@ -203,8 +207,8 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
 
 
 def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
-    """Measure the spots a second time, fit to them, and judge sizes (if known), body and
-    lag; with motion if it is requested.
+    """Measure the spots a second time, fit to them, and judge sizes (if known), body, lag and
+    missing light; with motion if it is requested.
 
     Args:
         fitted: the first fit.
@@ -223,6 +227,8 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
         state = state.with_findings(*judge_sizes(state, fit))
     state = state.with_findings(*listed(judge_body(state.measured)))
     state = state.with_findings(*(judge_lag(lag) for lag in state.lags if lag.seen))
+    missing = [light for light in state.missing_light if light.seen]
+    state = state.with_findings(*map(judge_missing_light, missing))
     for scan, measured in zip(state.scans, state.measured, strict=True):
         step = usual_step(scan.poses.angle)
         state = state.with_findings(*listed(judge_smear(measured.smear, step)))
@@ -235,7 +241,8 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
     """Explain the residuals, check the parameters that were not estimated, settle the
     motion if there is one, and add findings.
 
-    With motion, vibration is reported only if it forbids the fit.
+    With motion, vibration is reported only if it forbids the fit; where light is missing, it
+    is a rival of a phantom of another shape.
 
     Args:
         fitted: the last fit.
@@ -256,6 +263,8 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
         # A deviation in every frame takes up part of what its beads share, and the rest looks
         # shared, too: the sigmas stay wide, but nothing vibrates. What explains a misfit stays.
         explained = [f for f in explained if f.code != "vibration" or f.forbids]
+    if any(light.seen for light in state.missing_light):
+        explained = [beside_missing_light(f) for f in explained]
     fit = with_start(fit, asked.start, fitted.iterations)
     return replace(state, fit=fit).with_findings(*explained)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from flexdt.twin.calibration.camera_lag import lag_of, without_lag
 from flexdt.twin.calibration.detect.bead_contrast import seen_contrasts
+from flexdt.twin.calibration.detect.missing_light import missing_light, with_light
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, measure_beads
 from flexdt.twin.calibration.detect.smear import UNMEASURED
 from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows, ways
@@ -74,9 +75,9 @@ def measure_again(
 def _measured(
     state: Calibration, fit: FitResult, solids: Scene | None, draft: bool
 ) -> tuple[Calibration, list[Windows]]:
-    """Measure the beads of every scan at their fitted places; lag is estimated in the
-    first round only and removed in each, if seen, and blur and size only in drafts and in a
-    first round.
+    """Measure the beads of every scan at their fitted places; lag and missing light are
+    estimated in the first round only and undone in each, if seen, and blur and size only in
+    drafts and in a first round.
 
     Windows of frames that are not usable become NaN. Dead pixels are filled, see `mended`.
 
@@ -87,10 +88,11 @@ def _measured(
         draft: see `measure_beads`.
 
     Returns:
-        The state with measurements and lags, and the windows of each scan.
+        The state with measurements, lags and missing light, and the windows of each scan.
     """
     measured = []
     lags = []
+    missing = []
     plans = []
     model = replace(state.model, beads=fit.beads)
     for g, scan in enumerate(state.scans):
@@ -116,6 +118,12 @@ def _measured(
             images = without_lag(scan.frames, plan, lag)
         images[~usable] = np.nan
         images = mended(images, plan)
+        if state.missing_light:
+            light = state.missing_light[g]
+        else:
+            light = missing_light(images, plan, usable)
+        if light.seen:
+            images = with_light(images, light.part)
         measured.append(
             measure_beads(
                 images,
@@ -131,8 +139,15 @@ def _measured(
             )
         )
         lags.append(lag)
+        missing.append(light)
         plans.append(plan)
-    return replace(state, measured=tuple(measured), lags=tuple(lags)), plans
+    found = replace(
+        state,
+        measured=tuple(measured),
+        lags=tuple(lags),
+        missing_light=tuple(missing),
+    )
+    return found, plans
 
 
 def _turning(scan: Scan, parameters: Offsets) -> Callable[[float], ConeVec] | None:

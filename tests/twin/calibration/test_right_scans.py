@@ -150,6 +150,22 @@ def test_lag_is_taken_out_and_said(kind: str, seed: int) -> None:
     assert float(part[1]) / 100.0 == pytest.approx(true, rel=0.1)
 
 
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_dark_image_that_is_too_bright_is_no_arc_and_no_other_phantom(
+    seed: int,
+) -> None:
+    """It was told as an exposure's arc of 0.04 of a step, and a phantom less tall. What
+    hardening hides of it may remain, which is said."""
+    found = beam_faults.scored("dark_too_bright", seed)
+    assert found.offered
+    assert found.worst < 3.5
+    codes = [line.partition(":")[0] for line in found.said]
+    assert codes[0] == "dark_too_bright"
+    assert codes[1:] in ([], ["causes_open"])
+
+
 @pytest.mark.parametrize("kind", ["spectrum", "spectrum_aluminium"])
 @pytest.mark.slow
 @pytest.mark.campaign(1)

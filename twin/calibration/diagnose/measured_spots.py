@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flexdt.twin.calibration.camera_lag import Lag
+from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.detect.smear import Smear
 from flexdt.twin.calibration.diagnose import Finding, error, warning
@@ -146,6 +147,42 @@ def judge_lag(lag: Lag) -> Finding:
         "turn, but with the correction reconstruct takes it out, of scans with as long "
         "exposures "
         "and pauses",
+    )
+
+
+def judge_missing_light(light: MissingLight) -> Finding:
+    """Make the finding that light is missing in all images, with the part [%], whatever its
+    size: an error where some spots have no light left, since how much is missing there, and
+    with it their places, are not known.
+    """
+    said = (
+        f"light is missing in all images, {100 * light.part:.2g} % of the open beam at least, "
+        "as the light behind the beads shows: the dark image is too bright, or the detector "
+        "is not linear; "
+    )
+    code = "dark_too_bright"
+    if light.dark > 0.0:
+        lost = f"{100 * light.dark:.0f} % of the spots have no light left"
+        return error(code, f"{said}{lost}: take new dark images")
+    done = (
+        "it was given back in what was measured here, but in a volume thick parts are too"
+    )
+    return warning(code, f"{said}{done} dense: take new dark images")
+
+
+def beside_missing_light(finding: Finding) -> Finding:
+    """Return a finding beside light that is missing: what remains of it shifts spots towards
+    where the body is thinner, which looks like a phantom of another shape.
+
+    Args:
+        finding: of any code; others than `phantom_strained` are returned as they are.
+    """
+    if finding.code != "phantom_strained":
+        return finding
+    return warning(
+        "causes_open",
+        "the residuals have a cause that the images do not tell for certain: what remains of "
+        f"the light that is missing, or else {finding.text}",
     )
 
 
