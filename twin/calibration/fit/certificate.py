@@ -777,7 +777,7 @@ def _widened(
     Returns:
         The covariance; whether the beads of a frame err together; errors that repeat with
         the turn, in standard deviations of a position; and drifts, empty unless one is
-        `SIGNIFICANT`.
+        `SIGNIFICANT` and more than scatter.
     """
     reported = len(covariance)
     together = cluster_covariance(left)
@@ -806,11 +806,11 @@ def _widened(
             # first, or, of a drift that may not be one, the middle.
             steady = drift.score <= SIGNIFICANT and drift.step_at is None
             covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
-    if any(d.score > SIGNIFICANT for d in moving):
-        certain = moving
-    else:
-        certain = ()
-    return covariance, together is not None, size, certain
+    clear = [d for d in moving if d.score > SIGNIFICANT]
+    # The strongest tells: a drift of one parameter is scatter of another.
+    jitter = bool(clear) and max(clear, key=lambda d: d.score).jitter
+    certain = moving if clear and not jitter else ()
+    return covariance, together is not None or jitter, size, certain
 
 
 def widened_by_structure(left: Residuals, covariance: FloatArray) -> FloatArray:

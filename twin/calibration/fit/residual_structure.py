@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri, stdtr
 
 from flexdt.twin.calibration.fit.problem import FitProblem
 from flexdt.twin.geometry.conventions import FloatArray
@@ -27,6 +27,11 @@ SUSPECT_STEP = 3.5
 """The same for jumps, of which many are tried."""
 CLUSTER_SIGMAS = 3.2
 """The same for errors that the beads of a frame share."""
+FEWEST_CLUSTERS = 12
+"""Frames from which their shared errors have a covariance (a sandwich estimate by frames)."""
+JITTER_CHANCE = 1e-3
+"""Probability below which frames do not scatter so much, or do not drift so much for their
+scatter, by chance."""
 HARMONICS = 3
 """Number of harmonics of the turn in which errors of single beads are sought."""
 MIN_MOVING_FRAMES = 2
@@ -49,6 +54,7 @@ class Drift:
         score: its size in standard deviations.
         bias: (p,) its effect on the fitted values, edge units.
         scan: number of the group of frames that drifts.
+        jitter: the frames scatter so much that this is no drift, but a part of that.
     """
 
     column: str
@@ -57,6 +63,7 @@ class Drift:
     score: float
     bias: FloatArray
     scan: int = 0
+    jitter: bool = False
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -165,6 +172,14 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
             for at, among in ((suspect, suspects), (hint, found)):
                 if at is not None:
                     size = float(push[part][at] / power[part][at])
+                    taken = jacobian @ (unit_covariance @ absorbed[:, part][:, at])
+                    scatter = n < FEWEST_CLUSTERS and _scatters(
+                        left,
+                        np.where(inside, jacobian[:, c], 0.0),
+                        clean,
+                        (vectors[:, part][:, at] - taken) * size,
+                        len(score),
+                    )
                     bias = unit_covariance @ (absorbed[:, part][:, at] * size)
                     among.append(
                         Drift(
@@ -174,12 +189,46 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
                             float(each[at]),
                             bias,
                             int(group),
+                            scatter,
                         )
                     )
     if not any(d.score > SIGNIFICANT for d in found):
         return tuple(suspects)
     # Where one thing moves, hints of others count too.
     return tuple(sorted(found, key=lambda d: -d.score))
+
+
+def _scatters(
+    left: Residuals, slope: FloatArray, clean: FloatArray, drift: FloatArray, tried: int
+) -> bool:
+    """Check whether a parameter scatters from frame to frame, so that its drift may be chance.
+
+    Of few frames any scatter has a slope. The size of the drift is compared with the scatter
+    that it leaves, by Student's t with the degrees of freedom that the fit leaves the frames.
+
+    Args:
+        left: residuals.
+        slope: (m,) their change by a unit of the parameter; 0 in frames of other groups.
+        clean: (m,) residuals, less what the fit's columns take.
+        drift: (m,) their change by the drift, less that, too.
+        tried: number of drifts that were compared.
+    """
+    power = np.bincount(left.frame, slope**2)
+    there = power > 0
+    power = power[there]
+    each = left.frame[:, None] == np.flatnonzero(there)
+    absorbed = cross(left.jacobian, slope[:, None] * each)
+    taken = np.einsum("pf,pq,qf->f", absorbed, left.unit_covariance, absorbed)
+    freedom = float((1.0 - taken / power).sum()) - 1.0
+    if freedom < 1.0:
+        return False
+    rest = np.bincount(left.frame, slope * (clean - drift))[there] ** 2 / power
+    gone = np.bincount(left.frame, slope * drift)[there] ** 2 / power
+    square = float(rest.sum())
+    if chdtrc(freedom, square / left.noise**2) > JITTER_CHANCE:
+        return False
+    score = math.sqrt(float(gone.sum()) / (square / freedom))
+    return bool(2.0 * tried * stdtr(freedom, -score) > JITTER_CHANCE)
 
 
 def cluster_covariance(left: Residuals) -> FloatArray | None:
@@ -208,7 +257,7 @@ def cluster_covariance(left: Residuals) -> FloatArray | None:
     fitted = int(
         np.isinf(problem.prior_sigma).sum()
     )  # a prior leaves hardly a degree of freedom
-    if n < 12 or n < 2 * fitted or noise <= 0:
+    if n < FEWEST_CLUSTERS or n < 2 * fitted or noise <= 0:
         return None
     names = problem.layout.names
     alike = 0.0
