@@ -61,10 +61,10 @@ def with_loose_beads(
 
 
 def _widened(plain: FitResult, fit: FitResult, verdict: Verdict) -> FitResult:
-    """Widen the sigmas of a fit to those that it has where beads move, too; not of one that
-    is not identifiable.
+    """Widen the sigmas of a fit to those that it has where beads move, too; not of one
+    that is not determined.
     """
-    if not fit.identifiable:
+    if not fit.determined:
         return fit
     count = plain.problem.layout.parameter_count
     factor = edge_factors(plain.problem.layout.names[:count])
