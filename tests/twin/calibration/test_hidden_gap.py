@@ -29,19 +29,24 @@ FRAMES, ROWS, COLUMNS = 90, 16, 72
 
 
 def streaks(
-    rng: np.random.Generator, half_width: float, first: int, gap: float
+    rng: np.random.Generator,
+    half_width: float,
+    first: int,
+    gap: float,
+    shape: tuple[int, int] = (FRAMES, ROWS),
 ) -> list[np.ndarray]:
     """Frames of bodies that pass all columns, from column `first` on sampled `gap` further
-    on."""
+    on; `shape` is their number and that of their rows."""
+    frames, rows = shape
     at = np.arange(COLUMNS) + gap * (np.arange(COLUMNS) >= first)
     out = []
-    start = rng.uniform(0, 3 * COLUMNS, (ROWS, 9, 1))
-    speed = rng.uniform(1, 3, (ROWS, 9, 1)) * rng.choice([-1, 1], (ROWS, 9, 1))
-    for frame in range(FRAMES):
+    start = rng.uniform(0, 3 * COLUMNS, (rows, 9, 1))
+    speed = rng.uniform(1, 3, (rows, 9, 1)) * rng.choice([-1, 1], (rows, 9, 1))
+    for frame in range(frames):
         middle = (start + speed * frame) % (3 * COLUMNS) - COLUMNS
         edge = (np.abs(at - middle) - 3.0) / half_width
         image = (1.0 / (1.0 + np.exp(np.clip(edge, -40, 40)))).sum(axis=1)
-        out.append(image + rng.normal(0, 0.02, (ROWS, COLUMNS)))
+        out.append(image + rng.normal(0, 0.02, (rows, COLUMNS)))
     return out
 
 
@@ -55,11 +60,14 @@ def test_sharp_edges_tell_a_gap_or_exclude_it() -> None:
         assert found.likely is not None
         assert found.likely.column == first
         assert abs(found.likely.width - gap) < 3 * found.likely.sigma
-        without = hidden_gap(streaks(rng, 0.3, 0, 0.0), axis, None, 1.5)
-        assert without is not None
-        assert without.likely is None
-        assert not without.open
-        assert without.column_px < 0.1
+        few = hidden_gap(streaks(rng, 0.3, 0, 0.0), axis, None, 1.5)
+        many = hidden_gap(streaks(rng, 0.3, 0, 0.0, (180, 96)), axis, None, 1.5)
+        assert few is not None
+        assert many is not None
+        assert few.likely is many.likely is None
+        assert few.open
+        assert not many.open
+        assert many.column_px < 0.1
 
 
 def test_images_without_edges_leave_the_gap_in_the_sigma() -> None:
@@ -164,12 +172,21 @@ def test_outlines_at_both_sides_are_no_gap() -> None:
 @pytest.mark.campaign(1)
 @pytest.mark.parametrize(
     ("kind", "seed"),
-    [("bone", 802), ("bottle", 601), ("bottle", 700), ("foam", 802), ("printed", 601)],
+    [
+        ("bone", 802),
+        ("bottle", 601),
+        ("bottle", 700),
+        ("bottle", 900),
+        ("bottle", 906),
+        ("foam", 802),
+        ("printed", 601),
+    ],
 )
 def test_gaps_beside_the_axis_are_named_or_in_the_sigma(kind: str, seed: int) -> None:
     """A likely gap that both ends of rays do not bear out stays in the sigma (bone: another
     column was likelier, and 157 sigma off); one that nothing shows is not excluded (bottle
-    700, 0.3 px from the axis: 29 sigma off)."""
+    700, 0.3 px from the axis: 29 sigma off; 900 and 906: 27, excluded because gaps are
+    rare)."""
     told = natural_objects.tried(kind, seed, gap=False, near=True)
     assert "refused" not in told, told
     assert abs(told.get("pull", 0.0)) < natural_objects.SIGMAS, told

@@ -7,6 +7,7 @@ plane, and their uncertainty with a gap between tiles and steps of the images.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -23,6 +24,7 @@ from flexdt.twin.calibration.without_phantom.conjugate_rays import ConjugateRays
 from flexdt.twin.calibration.without_phantom.gaps.gap_evidence import (
     SIGMAS,
     GapFound,
+    contradicted,
     find_gap,
 )
 from flexdt.twin.calibration.without_phantom.gaps.hidden_gap import HiddenGap
@@ -189,10 +191,11 @@ def find_plane(
     """
     first = _first_column(scan, random)
     _require_one_column(scan, first)
-    gap, hidden, behind = _gap(scan, first, panel)
+    seen = _gap(scan, first, panel)
+    gap, hidden = seen.gap, seen.hidden
     whole = first
     if gap is not None:
-        first = _with_gap(first, gap, behind)
+        first = _with_gap(first, gap, seen.values)
     found = _fit(scan, first, gap)
     if gap is not None and _closes(found, gap):
         gap = None
@@ -201,7 +204,8 @@ def find_plane(
     if gap is not None:
         hidden = None
     _require_symmetric(found, first.preface)
-    plane = _plane(scan, first, found, GapFound(gap, hidden), panel)
+    judged = seen._replace(gap=gap, hidden=hidden)
+    plane = _plane(scan, first, found, judged, panel)
     _require_precise(plane, first.preface)
     return plane
 
@@ -447,13 +451,15 @@ def _plane(
     """
     turn = first.turn
     scales = first.scales
-    gap, hidden, _ = gap_found
+    gap, hidden = gap_found.gap, gap_found.hidden
     values = found.values.copy()
     covariance = found.covariance.copy()
+    unseen = hidden.column_px if hidden else 0.0
     if gap is not None and turn is not None:
-        if not gap.beside_axis:
-            sigma = float(np.sqrt(covariance[-1, -1]))
-            gap = gap._replace(width=float(values[-1]), sigma=sigma)
+        if gap.beside_axis:
+            unseen = gap.sigma / 2
+        else:
+            gap, unseen = _gap_of_fit(gap, found, gap_found.widths)
         values = values[:OF_TURN]
         covariance = covariance[:OF_TURN, :OF_TURN]
         scales = scales[:OF_TURN]
@@ -471,9 +477,6 @@ def _plane(
         step = turn.step_px
     opposite = _opposite_column(scan, first, values, covariance, gap)
     floor = opposite.floor_px if opposite else 0.0
-    unseen = hidden.column_px if hidden else 0.0
-    if gap is not None and gap.beside_axis:
-        unseen = gap.sigma / 2
     covariance[0, 0] += (math.hypot(floor, step[0] / 2, beside, unseen) * scales[0]) ** 2
     covariance[1, 1] += math.radians(FLOOR_DEG) ** 2 + (step[0] / scan.shape[0]) ** 2
     slopes = scan.slopes(values, scales)
@@ -492,6 +495,26 @@ def _plane(
         opposite,
         hidden,
     )
+
+
+def _gap_of_fit(
+    gap: Gap, found: Symmetry, widths: Sequence[tuple[float, float]]
+) -> tuple[Gap, float]:
+    """Give a gap the width that was fitted.
+
+    Args:
+        gap: as it was found.
+        found: the plane, with the gap's width as the last parameter [px].
+        widths: by other means, with their standard deviations [px].
+
+    Returns:
+        The gap, its sigma raised as far as the other widths contradict it, and what that
+        adds to the sigma of the axis column [px].
+    """
+    sigma = float(np.sqrt(found.covariance[-1, -1]))
+    fitted = gap._replace(width=float(found.values[-1]), sigma=sigma)
+    raised = contradicted(fitted, widths)
+    return raised, math.sqrt(raised.sigma**2 - sigma**2) / 2
 
 
 def _opposite_column(

@@ -62,11 +62,14 @@ class GapFound(NamedTuple):
             none is possible, or both ends of rays certify the gap.
         values: parameters of the plane of symmetry by both ends of rays, the gap closed;
             None without a gap.
+        widths: the gap's width and its standard deviation [px] by both ends of rays, and by
+            the steps of the mean where these tell the gap.
     """
 
     gap: Gap | None
     hidden: HiddenGap | None
     values: FloatArray | None = None
+    widths: tuple[tuple[float, float], ...] = ()
 
 
 def find_gap(
@@ -147,23 +150,26 @@ def find_gap(
     far_enough = abs(gap.column - 0.5 - axis) > 2.0 * border_room(rays.cols)
     in_mean = told and far_enough
     gap = gap._replace(beside_axis=not (in_mean or np.isfinite(inside.sigma)))
-    if told:
-        gap = _beside_mean(gap, of_mean.width(gap.column, about))
-    return GapFound(gap, None if likely is None else hidden, behind)
+    by_mean = [of_mean.width(gap.column, about)] if told else []
+    widths = ((gap.width, gap.sigma), *by_mean)
+    return GapFound(
+        contradicted(gap, by_mean), None if likely is None else hidden, behind, widths
+    )
 
 
-def _beside_mean(gap: Gap, of_mean: tuple[float, float]) -> Gap:
-    """Raise the sigma of a gap's width as far as the mean over the turn contradicts it.
+def contradicted(gap: Gap, widths: Sequence[tuple[float, float]]) -> Gap:
+    """Raise the sigma of a gap's width as far as other measurements contradict it.
 
-    Steps of few distances from the axis are less sure than they say.
+    Few distances from the axis, or few places of the mean, are less sure than they say.
 
     Args:
-        gap: by rays, or by frames.
-        of_mean: width and standard deviation by the mean [px].
+        gap: by rays, by frames or by the symmetry of the mean.
+        widths: each with its standard deviation [px].
     """
-    width, sigma = of_mean
-    apart = abs(gap.width - width) / math.hypot(gap.sigma, sigma)
-    return gap._replace(sigma=gap.sigma * max(apart, 1.0))
+    apart = [
+        abs(gap.width - width) / math.hypot(gap.sigma, sigma) for width, sigma in widths
+    ]
+    return gap._replace(sigma=gap.sigma * max([1.0, *apart]))
 
 
 def _by_mean(hidden: HiddenGap | None, of_mean: MirrorSteps) -> Gap | None:

@@ -80,7 +80,7 @@ class HiddenGap(NamedTuple):
         width_px: root mean square of its width, no gap included, and at least OPEN_SHARE of a
             usual gap's where it is not excluded [px].
         likely: the gap, where its odds exceed REPORTED_ODDS.
-        open: whether the images do not exclude it: in some stretch of these columns the
+        open: whether the images do not exclude it: in some stretch of these columns their
             odds against one are below REPORTED_ODDS.
     """
 
@@ -347,11 +347,11 @@ def _of_modes(columns: npt.NDArray[np.intp], steps: ModeSteps) -> FloatArray:
 
 
 def _is_excluded(effect: FloatArray, smoothing: float) -> bool:
-    """Check whether a gap has odds of `REPORTED_ODDS` against it in each stretch of as many
-    columns as rays hide about any axis.
+    """Check whether the images have odds of `REPORTED_ODDS` against a gap in each stretch of
+    as many columns as rays hide about any axis.
 
     Tiles may meet in any of them: many columns that exclude a gap say nothing about those
-    that do not.
+    that do not. How rare gaps are (`CHANCE`) says nothing about this panel.
 
     Args:
         effect: likelihood of a gap over none at each column, gaps weighted by how far they
@@ -360,8 +360,7 @@ def _is_excluded(effect: FloatArray, smoothing: float) -> bool:
     """
     stretch = min(1 + math.floor(2.0 * HIDDEN_SIGMAS * smoothing), len(effect))
     of_stretches = np.convolve(effect, np.full(stretch, 1.0 / stretch), mode="valid")
-    odds = CHANCE / (1.0 - CHANCE) * float(of_stretches.max())
-    return odds * REPORTED_ODDS < 1.0
+    return float(of_stretches.max()) * REPORTED_ODDS < 1.0
 
 
 def _beside_told(
