@@ -148,8 +148,8 @@ def find_gap(
     _require_one(gap, step)
     inside = profile.at(abs(gap.column - 0.5 - axis))
     far_enough = abs(gap.column - 0.5 - axis) > 2.0 * border_room(rays.cols)
-    in_mean = told and far_enough
-    gap = gap._replace(beside_axis=not (in_mean or np.isfinite(inside.sigma)))
+    fitted = far_enough and (told or np.isfinite(inside.sigma))
+    gap = gap._replace(beside_axis=not fitted)
     by_mean = [of_mean.width(gap.column, about)] if told else []
     widths = ((gap.width, gap.sigma), *by_mean)
     return GapFound(

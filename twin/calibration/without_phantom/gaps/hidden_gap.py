@@ -185,7 +185,7 @@ def hidden_gap(
         int(shown[-1]),
         total / (1.0 + total),
         math.sqrt(mean_square),
-        _gap_at(int(columns[best]), evidence.widths[:, best])
+        _gap_at(int(columns[best]), evidence.widths[:, best], doubted[:, best])
         if total > REPORTED_ODDS
         else None,
         open_gap,
@@ -248,16 +248,17 @@ def possible_gap(gap: Gap) -> HiddenGap:
     return HiddenGap(gap.column, gap.column, 0.5, gap.width, None, True)
 
 
-def _gap_at(column: int, share: FloatArray) -> Gap:
+def _gap_at(column: int, share: FloatArray, doubted: FloatArray) -> Gap:
     """Make the gap at a column: mean width and standard deviation, at least that of
     `local_sigma`.
 
     Args:
         column: first column beyond the gap.
-        share: probabilities of WIDTHS_PX, (w,).
+        share: probabilities of WIDTHS_PX by the images, (w,).
+        doubted: those of the standard deviation, (w,).
     """
     width = float(share @ WIDTHS_PX)
-    spread = math.sqrt(float(share @ np.square(WIDTHS_PX - width)))
+    spread = math.sqrt(float(doubted @ np.square(WIDTHS_PX - width)))
     return Gap(column, width, max(spread, float(local_sigma(width))))
 
 
