@@ -18,8 +18,10 @@ import numpy.typing as npt
 from scipy.special import fdtr, stdtrit
 
 from flexdt.twin.calibration.fit.curved_region import Bend, bend_of
+from flexdt.twin.calibration.fit.frame_jitter import frame_jitter, joined
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factors
 from flexdt.twin.calibration.fit.residual_structure import (
+    FEWEST_CLUSTERS,
     SIGNIFICANT,
     Drift,
     Residuals,
@@ -29,6 +31,7 @@ from flexdt.twin.calibration.fit.residual_structure import (
     drifts,
     larger,
     turning_errors,
+    with_lost_frames,
 )
 from flexdt.twin.calibration.fit.weak_directions import (
     BOUND,
@@ -618,7 +621,7 @@ def certify(
         )
         bend = partial(bend_of, left, x, factor, reported)
         covariance, shared, turning, moving = _widened(
-            left, predicted, covariance, prior, sampling_px
+            left, predicted, covariance, prior, sampling_px, _lost(left, x, use)
         )
     images = np.sqrt(np.maximum(np.diag(covariance) - np.diag(prior), 0.0))
     sigma = np.sqrt(np.diag(covariance))
@@ -754,12 +757,38 @@ def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, f
     return {n: math.sqrt(s) for n, s in ordered if s > 0.01 * sigma**2}
 
 
+def _lost(left: Residuals, x: FloatArray, use: npt.NDArray[np.bool_]) -> Residuals | None:
+    """Return residuals of the frames that were mostly left out of the fit.
+
+    Args:
+        left: residuals of the fit.
+        x: column values, internal units.
+        use: (n, k) positions that counted.
+
+    Returns:
+        Those that did not count; None without any, or of `FEWEST_CLUSTERS` frames or more.
+    """
+    problem = left.problem
+    more = with_lost_frames(problem.seen, use) & ~use
+    if len(use) >= FEWEST_CLUSTERS or not more.any():
+        return None
+    keep = np.repeat(more.ravel(), 2)
+    factor = edge_factors(problem.layout.names)
+    return replace(
+        left,
+        jacobian=problem.jacobian(x, more)[keep] / factor,
+        values=problem.whitened(x).ravel()[keep],
+        keep=keep,
+    )
+
+
 def _widened(
     left: Residuals,
     predicted: FloatArray,
     covariance: FloatArray,
     prior: FloatArray,
     sampling_px: float,
+    lost: Residuals | None = None,
 ) -> tuple[FloatArray, bool, float, tuple[Drift, ...]]:
     """Enlarge the covariance by the structure of the residuals beyond white noise: errors
     that beads share, places in the pixel grid, quantities that all frames share, errors that
@@ -773,6 +802,7 @@ def _widened(
         covariance: (p, p) nominal, edge units.
         prior: (p, p) part of it that comes from priors.
         sampling_px: see `certify`; 0 for none.
+        lost: residuals of few frames that were left out; see `frame_jitter`.
 
     Returns:
         The covariance; whether the beads of a frame err together; errors that repeat with
@@ -783,6 +813,24 @@ def _widened(
     together = cluster_covariance(left)
     if together is not None:
         covariance = larger(covariance, together[:reported, :reported] + prior)
+    everything = left if lost is None else joined(left, lost)
+    moving = drifts(everything)
+    # The strongest tells: a drift of one parameter is scatter of another.
+    strongest = max(moving, key=lambda d: d.score, default=None)
+    if strongest is not None and strongest.score <= SIGNIFICANT:
+        strongest = None
+    shared = together is not None
+    scattered = strongest is not None and strongest.jitter
+    if len(left.problem.group) < FEWEST_CLUSTERS:
+        shaken = frame_jitter(left, everything, strongest)
+        if shaken is not None:
+            white = (shaken.noise / left.noise) ** 2 * (covariance - prior)
+            jitter = shaken.covariance[:reported, :reported]
+            covariance = larger(covariance, prior + white + jitter)
+            shared = shaken.clear
+            scattered = strongest is not None and not shaken.drifts
+            if scattered:
+                moving = ()
     shifts = []
     if sampling_px > 0:
         shifts.append(sampling_px * _sampling_vectors(left.problem, predicted))
@@ -796,7 +844,6 @@ def _widened(
     if turning is not None:
         covariance = covariance + turning.covariance[:reported, :reported]
         size = turning.size
-    moving = drifts(left)
     for drift in moving:
         bias = drift.bias[:reported]
         covariance = covariance + np.outer(bias, bias)
@@ -806,11 +853,8 @@ def _widened(
             # first, or, of a drift that may not be one, the middle.
             steady = drift.score <= SIGNIFICANT and drift.step_at is None
             covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
-    clear = [d for d in moving if d.score > SIGNIFICANT]
-    # The strongest tells: a drift of one parameter is scatter of another.
-    jitter = bool(clear) and max(clear, key=lambda d: d.score).jitter
-    certain = moving if clear and not jitter else ()
-    return covariance, together is not None or jitter, size, certain
+    certain = moving if strongest is not None and not scattered else ()
+    return covariance, shared or scattered, size, certain
 
 
 def widened_by_structure(left: Residuals, covariance: FloatArray) -> FloatArray:

@@ -35,6 +35,7 @@ from flexdt.twin.calibration.fit.motion_model import (
 )
 from flexdt.twin.calibration.fit.motion_search import Likely, most_likely, moves
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factors, layout
+from flexdt.twin.calibration.fit.residual_structure import with_lost_frames
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.motion import MOVABLE, Motion, require_movable
@@ -347,13 +348,8 @@ def _along_the_beam(fit: FitResult, held: MotionFit) -> FloatArray:
 def counted(problem: FitProblem, fit: FitResult) -> npt.NDArray[np.bool_]:
     """Mark the used positions, and all seen ones of a frame whose positions were mostly
     left out, (n, k).
-
-    Single beads left out are outliers, all of them together are motion.
     """
-    use = fit.solution.use.copy()
-    lost = (problem.seen & ~use).sum(axis=1) > 0.5 * problem.seen.sum(axis=1)
-    use[lost] = problem.seen[lost]
-    return use
+    return with_lost_frames(problem.seen, fit.solution.use)
 
 
 def derivative(

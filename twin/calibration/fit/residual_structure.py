@@ -231,6 +231,20 @@ def _scatters(
     return bool(2.0 * tried * stdtr(freedom, -score) > JITTER_CHANCE)
 
 
+def with_lost_frames(
+    seen: npt.NDArray[np.bool_], use: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.bool_]:
+    """Mark the used positions, and all seen ones of a frame whose positions were mostly
+    left out, (n, k).
+
+    Single beads left out are outliers, all of them together are motion.
+    """
+    out = use.copy()
+    lost = (seen & ~use).sum(axis=1) > 0.5 * seen.sum(axis=1)
+    out[lost] = seen[lost]
+    return out
+
+
 def cluster_covariance(left: Residuals) -> FloatArray | None:
     """Compute the covariance that allows for errors all beads of a frame share (a
     sandwich estimate by frames).
