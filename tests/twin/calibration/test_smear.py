@@ -14,14 +14,21 @@ from scipy.ndimage import gaussian_filter
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.refine import Refined, measure_beads
+from flexdt.twin.calibration.detect.sharpness import balls_of
 from flexdt.twin.calibration.detect.smear import UNMEASURED, Smear, Step, solved
 from flexdt.twin.calibration.detect.smeared_spots import own_pixels, placed
-from flexdt.twin.calibration.detect.windows import Windows, plan_windows
+from flexdt.twin.calibration.detect.windows import (
+    Windows,
+    plan_windows,
+    render_windows,
+    window_intensities,
+)
 from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.causes.every_cause import _arc
 from flexdt.twin.calibration.diagnose.measured_spots import judge_smear
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.projection.analytic_solids import Scene
 
 SHAPE = (300, 360)
 PIXEL = 0.3
@@ -229,3 +236,19 @@ def test_a_scan_that_is_exposed_while_turning_is_told_as_that_and_nothing_false(
     assert told.codes == {"exposure_arc"}
     assert told.found == pytest.approx(told.share, rel=0.03)
     assert told.worst < 4.0
+
+
+@pytest.mark.parametrize("arc", [0.05, 1.5])
+def test_the_light_of_an_exposure_is_the_mean_of_its_moments_in_entire_windows(
+    arc: float,
+) -> None:
+    model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
+    plan = plan_windows(model, turned(0.0), SHAPE, 20.0)
+    balls = balls_of(model, np.array([0.5, 1.0, 2.0]))
+    moments = tuple(turned(arc * p) for p in (-0.5, -0.2, 0.1, 0.5))
+    groups = tuple((Scene((ball,)), None) for ball in balls.solids)
+    drawn = window_intensities(
+        Scene(()), turned(0.0), replace(plan, moments=moments), 1, groups
+    )
+    whole = [np.exp(-render_windows(balls, near, plan)) for near in moments]
+    assert np.abs(drawn - np.mean(whole, axis=0)).max() < 1e-5

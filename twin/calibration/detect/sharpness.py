@@ -28,6 +28,7 @@ from flexdt.twin.calibration.detect.windows import (
     blurred_light,
     blurred_windows,
     distances2,
+    exposed_light,
     rays_of,
     render_windows,
     window_rays,
@@ -318,13 +319,23 @@ def _profiles_of(
     slight = sharp.blur < SLIGHT_BLUR_PX
     sampled = sharp.blur < BODY_BLUR_PX
     fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
-    factors = -np.array(ATTENUATIONS, dtype=np.float32)[:, None, None, None]
-    light = np.zeros((len(ATTENUATIONS), len(spots), few.side, few.side), np.float32)
+    factors = -np.array(ATTENUATIONS, dtype=np.float32)[:, None, None, None, None]
     most = 0.0
-    for moment, place, weight in rays_of(cone[frames], few, 1 if sampled else fine):
-        rays = window_rays(ball, moment, few, place)[:, 0]
+
+    def light_of(near: ConeVec, some: Windows, place: FloatArray) -> Float32Array:
+        """Render what each term leaves of the light, (terms, m, 1, side, side)."""
+        nonlocal most
+        rays = window_rays(ball, near, some, place)
         most = max(most, float(rays.max()))
-        light += np.exp(factors * rays) * weight[:, :, None]
+        return np.asarray(np.exp(factors * rays))
+
+    rays = 1 if sampled else fine
+    if few.moments:
+        light = exposed_light([ball], few, rays, light_of, (len(ATTENUATIONS),))[:, :, 0]
+    else:
+        light = np.zeros((len(ATTENUATIONS), len(spots), few.side, few.side), np.float32)
+        for view, place, weight in rays_of(cone[frames], few, rays):
+            light += light_of(view, few, place)[:, :, 0] * weight[:, :, None]
     if slight:
         spread = (
             blurred_light(light, blur_kernel(UNIT_BLUR_PX)) - light

@@ -7,7 +7,7 @@ beads without processing entire images.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,6 +42,16 @@ MOMENTS = (6, 24)
 """Least and largest number of moments of an exposure."""
 MOMENT_PX = 1.5
 """Part of a bead's longest way for each of them in between [px]: about two blurs."""
+SHADOW_MARGIN = 1.1
+"""Factor on a shadow's major semi-axis, and 2 px, within which it lies about the image of a
+ball's middle."""
+PART_STEP = 8
+"""Sides of the rendered parts of windows are multiples of it [px]: those alike are rendered
+together."""
+PART_PIXELS = 400_000
+"""Pixels that are rendered together at most, about."""
+LightOf = Callable[["ConeVec", "Windows", FloatArray], Float32Array]
+"""Gives the light in windows of a geometry, for rays through one place of each pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +163,17 @@ def shadow_ellipses(
         and row; (1, 0) at the foot point) and major over minor axis, 1 at least, (n, k,
         3).
     """
+    minor, ratio = _semi_axes(model, cone)
+    away = predicted - cone.piercing_points(shape)[:, None]
+    length = np.linalg.norm(away, axis=2, keepdims=True)
+    direction = np.where(length > 1e-9, away / np.maximum(length, 1e-9), [1.0, 0.0])
+    return minor, np.concatenate([direction, ratio[..., None]], axis=2)
+
+
+def _semi_axes(model: BeadModel, cone: ConeVec) -> tuple[FloatArray, FloatArray]:
+    """Compute the minor semi-axes [px of columns] of the shadows of k beads in n frames, and
+    major over minor axis, each (n, k); see `shadow_ellipses`.
+    """
     ray = model.beads[None] - cone.source[:, None]
     distance = np.linalg.norm(ray, axis=2)
     cos_t = np.einsum("nkj,nj->nk", ray, cone.normal) / distance
@@ -160,11 +181,7 @@ def shadow_ellipses(
     root = np.sqrt(np.maximum(cos_t**2 - sin_b**2, 1e-6))
     pitch = np.linalg.norm(cone.u, axis=1)
     minor = (cone.source_detector_distance / pitch)[:, None] * sin_b / root
-    away = predicted - cone.piercing_points(shape)[:, None]
-    length = np.linalg.norm(away, axis=2, keepdims=True)
-    direction = np.where(length > 1e-9, away / np.maximum(length, 1e-9), [1.0, 0.0])
-    ratio = np.sqrt(1.0 - sin_b**2) / root
-    return minor, np.concatenate([direction, np.maximum(ratio, 1.0)[..., None]], axis=2)
+    return minor, np.maximum(np.sqrt(1.0 - sin_b**2) / root, 1.0)
 
 
 def _disc_share(t: FloatArray) -> FloatArray:
@@ -344,6 +361,15 @@ def window_intensities(
     Returns:
         (n, k, side, side), from 0 to 1.
     """
+    if windows.moments and not scene.solids:
+        return exposed_light(
+            [ball for ball, _ in balls],
+            windows,
+            fine,
+            lambda near, few, place: np.exp(
+                -_hardened_rays(scene, near, few, place, balls)
+            ),
+        )
     n, k = windows.corner.shape[:2]
     total = np.zeros((n, k, windows.side, windows.side), dtype=np.float32)
     for near, place, weight in rays_of(cone, windows, fine):
@@ -373,6 +399,116 @@ def rays_of(
         for m, near in enumerate(moments)
         for place, weight in spread_lattice(windows, fine, m)
     ]
+
+
+def exposed_light(
+    scenes: Sequence[Scene],
+    windows: Windows,
+    fine: int,
+    light_of: LightOf,
+    terms: tuple[int, ...] = (),
+) -> Float32Array:
+    """Render the light behind beads in exposures, at each moment only where shadows reach.
+
+    Args:
+        scenes: of all beads that `light_of` renders, and nothing else.
+        windows: k windows in n frames, with moments.
+        fine: rays along each side of a pixel, see `rays_of`.
+        light_of: gives the light, (*terms, m, 1, size, size), of rays through one place of
+            each pixel in m windows of one bead each.
+        terms: shape of what is rendered at once.
+
+    Returns:
+        (*terms, n, k, side, side), the mean of the moments; 1 where there is no shadow.
+    """
+    n, k = windows.corner.shape[:2]
+    still = replace(windows, moments=())
+    cones = _together(windows.moments)
+    first, size = reached(scenes, cones, windows)
+    places, weights = _rays_of_moments(windows, fine)
+    out = np.ones((*terms, n, k, windows.side, windows.side), np.float32)
+    for side in np.unique(size[size > 0]).tolist():
+        every = np.argwhere(size == side)
+        count = math.ceil(len(every) * side**2 / PART_PIXELS)
+        for some in np.array_split(every, count):
+            moment, frame, bead = some.T
+            corner = windows.corner[frame, bead] + first[moment, frame, bead]
+            few = replace(still.pick(frame, bead), corner=corner[:, None], side=side)
+            near = cones[moment * n + frame]
+            dark = np.zeros((*terms, len(some), side, side), np.float32)
+            for place, weight in zip(places, weights, strict=True):
+                light = light_of(near, few, place[moment, frame, bead][:, None])
+                dark += weight[moment, frame, bead, None, None] * (
+                    1.0 - light[..., 0, :, :]
+                )
+            left, top = first[moment, frame, bead].T.tolist()
+            for i, (f, b) in enumerate(some[:, 1:].tolist()):
+                rows = slice(top[i], top[i] + side)
+                out[..., f, b, rows, left[i] : left[i] + side] -= dark[..., i, :, :]
+    return out
+
+
+def _together(cones: Sequence[ConeVec]) -> ConeVec:
+    """Put views one after another."""
+    return ConeVec.from_vectors(
+        np.concatenate([cone.source for cone in cones]),
+        np.concatenate([cone.detector for cone in cones]),
+        np.concatenate([cone.u for cone in cones]),
+        np.concatenate([cone.v for cone in cones]),
+    )
+
+
+def reached(
+    scenes: Sequence[Scene], cone: ConeVec, windows: Windows
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Find the square part of each window that shadows of balls reach.
+
+    Args:
+        scenes: of spheres.
+        cone: n views; or those of several moments, one after another.
+        windows: k windows in each of the n.
+
+    Returns:
+        Column and row of its first pixel in the window, (moments, n, k, 2), and its side
+        (moments, n, k), a multiple of `PART_STEP` or that of the window; 0: no shadow.
+    """
+    spheres = [s.shape for scene in scenes for s in scene.solids]
+    places = np.array([s.center for s in spheres if isinstance(s, Sphere)])
+    radii = np.array([s.radius for s in spheres if isinstance(s, Sphere)])
+    model = BeadModel(places, radii)
+    moments = len(cone) // len(windows.corner)
+    middle = cone.project_points(model.beads, windows.shape)
+    minor, ratio = _semi_axes(model, cone)
+    reach = (SHADOW_MARGIN * minor * ratio + 2.0)[:, None, :, None]
+    at = middle[:, None] - np.tile(windows.corner, (moments, 1, 1))[:, :, None]
+    # A bead that is nowhere may be anywhere.
+    low = np.nan_to_num(np.floor(at - reach), nan=0.0).clip(0, windows.side)
+    high = np.nan_to_num(np.ceil(at + reach) + 1, nan=windows.side).clip(0, windows.side)
+    there = (low < high).all(axis=3, keepdims=True)
+    begin = np.where(there, low, windows.side).min(axis=2)
+    end = np.where(there, high, 0.0).max(axis=2)
+    width = np.maximum(end - begin, 0.0).max(axis=2)
+    side = np.minimum(PART_STEP * np.ceil(width / PART_STEP), windows.side)
+    first = np.minimum(begin, windows.side - side[..., None])
+    shape = (moments, *windows.corner.shape[:2])
+    return (
+        first.reshape(*shape, 2).astype(np.int64),
+        side.reshape(shape).astype(np.int64),
+    )
+
+
+def _rays_of_moments(windows: Windows, fine: int) -> tuple[FloatArray, Float32Array]:
+    """Return places (rays, moments, n, k, 2) and weights (rays, moments, n, k) of the rays
+    of `rays_of`.
+    """
+    shape = (1, len(windows.moments), *windows.corner.shape[:2])
+    share = np.float32(1.0 / len(windows.moments))
+    if fine == 1:
+        return np.zeros((*shape, 2)), np.full(shape, share)
+    rays = [spread_lattice(windows, fine, m) for m in range(len(windows.moments))]
+    places = np.array([[place for place, _ in moment] for moment in rays])
+    weights = np.array([[weight for _, weight in moment] for moment in rays])
+    return places.swapaxes(0, 1), share * weights.swapaxes(0, 1)
 
 
 def exposed(
