@@ -15,16 +15,21 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.diagnose import Finding, listed
 from flexdt.twin.calibration.diagnose.data import (
+    GOOD_RMS_PX,
+    GOOD_SHARE,
     WIDE_GATE_PX,
     convincing,
     explain_identification,
 )
 from flexdt.twin.calibration.diagnose.fitted import OF_MOTION
 from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers, frame_numbers
+from flexdt.twin.calibration.diagnose.measured_spots import shadows_drawn_out
+from flexdt.twin.calibration.fit.problem import usual_step
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, nothing
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
+from flexdt.twin.calibration.second_measurement import seen_arc
 from flexdt.twin.geometry.offsets import Offsets
 
 MAX_BEAD_SHARE: Final = 0.6
@@ -91,6 +96,14 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         finding = explain_identification(
             found, detections, state.model, scan.poses, scan.name, request.start
         )
+        if found is not None and finding is not None and finding.code == "wrong_phantom":
+            finding = _of_exposure(found, state.model, scan) or finding
+            if (
+                finding.code == "exposure_arc"
+                and request.second_look
+                and _agreeing(found)
+            ):
+                finding = None
         if request.per_frame and finding is not None and finding.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
             found = seek(search=replace(search, gate_px=WIDE_GATE_PX)) or found
@@ -104,6 +117,31 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         findings = [f for f in findings if f.code != "extra_spots"]
     found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
     return found_so_far.with_findings(*findings)
+
+
+def _of_exposure(found: Identification, model: BeadModel, scan: Scan) -> Finding | None:
+    """Make the error that shadows are drawn out by an exposure's arc; None if they are not.
+
+    Args:
+        found: an identification that says where the beads are.
+        model: the beads.
+        scan: its images.
+    """
+    arc = seen_arc(scan, model, found.parameters)
+    if arc is None:
+        return None
+    return shadows_drawn_out(
+        scan.name, arc.share, usual_step(scan.poses.angle), found.found
+    )
+
+
+def _agreeing(found: Identification) -> bool:
+    """Check whether the spots that there are fit the phantom in one way, however few beads
+    have one.
+    """
+    if found.ambiguous:
+        return False
+    return found.explained >= GOOD_SHARE and found.rms_px < GOOD_RMS_PX
 
 
 def _stated_turn(scan: Scan, request: CalibrationRequest) -> float:

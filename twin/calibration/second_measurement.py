@@ -7,13 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.camera_lag import lag_of, without_lag
 from flexdt.twin.calibration.detect.bead_contrast import seen_contrasts
+from flexdt.twin.calibration.detect.drawn_out import DrawnOut, drawn_out
 from flexdt.twin.calibration.detect.missing_light import missing_light, with_light
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, measure_beads
 from flexdt.twin.calibration.detect.smear import UNMEASURED
 from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows, ways
 from flexdt.twin.calibration.diagnose import Finding, error
+from flexdt.twin.calibration.diagnose.data import GOOD_SHARE
+from flexdt.twin.calibration.diagnose.measured_spots import shadows_drawn_out
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import usual_step
 from flexdt.twin.calibration.fits_of_scans import fit_scans
@@ -29,6 +33,8 @@ CLOSE_PX = 0.02
 FAR_PX = 0.5
 """The same for a draft."""
 MOST_ROUNDS = 4
+MOST_STEPS_EXPOSED = 2.0
+"""Longest exposure that is looked for where few beads look round, in steps of the stage."""
 LEAST_CONFIRMED = 0.25
 """Least share of the first measurement's spots that the second must find."""
 
@@ -79,6 +85,9 @@ def _measured(
     estimated in the first round only and undone in each, if seen, and blur and size only in
     drafts and in a first round.
 
+    Where few beads have a round shadow, the arc that draws them out is taken from `seen_arc`
+    to begin with; an error says so if the spots do not tell it.
+
     Windows of frames that are not usable become NaN. Dead pixels are filled, see `mended`.
 
     Args:
@@ -94,11 +103,17 @@ def _measured(
     lags = []
     missing = []
     plans = []
+    failed = []
     model = replace(state.model, beads=fit.beads)
     for g, scan in enumerate(state.scans):
         cone = scan.poses.cone_vec(fit.group_parameters[g])
-        turning = _turning(scan, fit.group_parameters[g])
+        turning = turning_of(scan, fit.group_parameters[g])
         smear = state.measured[g].smear if state.measured else UNMEASURED
+        round_share = state.identifications[g].found
+        few = round_share < GOOD_SHARE
+        if few and not state.measured:
+            arc = seen_arc(scan, model, fit.group_parameters[g])
+            smear = UNMEASURED if arc is None else arc.smear
         plan = plan_windows(model, cone, scan.frames.shape)
         if smear.told and turning is not None:
             way = np.linalg.norm(ways(plan, model, turning), axis=2)
@@ -138,6 +153,9 @@ def _measured(
                 smear=smear,
             )
         )
+        if few and smear.told and not measured[-1].smear.told:
+            step = usual_step(scan.poses.angle)
+            failed.append(shadows_drawn_out(scan.name, smear.share, step, round_share))
         lags.append(lag)
         missing.append(light)
         plans.append(plan)
@@ -147,10 +165,29 @@ def _measured(
         lags=tuple(lags),
         missing_light=tuple(missing),
     )
-    return found, plans
+    return found.with_findings(*failed), plans
 
 
-def _turning(scan: Scan, parameters: Offsets) -> Callable[[float], ConeVec] | None:
+def seen_arc(scan: Scan, model: BeadModel, parameters: Offsets) -> DrawnOut | None:
+    """Estimate the arc of an exposure that draws shadows out; None if none is certain.
+
+    Args:
+        scan: gives the poses and images.
+        model: the beads.
+        parameters: offsets that say where they are.
+    """
+    turning = turning_of(scan, parameters)
+    if turning is None:
+        return None
+    cone = turning(0.0)
+    plan = plan_windows(model, cone, scan.frames.shape)
+    way = np.linalg.norm(ways(plan, model, turning), axis=2)
+    plan = plan_windows(model, cone, scan.frames.shape, MOST_STEPS_EXPOSED * way)
+    arc = drawn_out(scan.frames.windows(plan), plan, model, turning)
+    return arc if arc.certain else None
+
+
+def turning_of(scan: Scan, parameters: Offsets) -> Callable[[float], ConeVec] | None:
     """Make the function from a part of a step to the geometry of all frames so much later;
     None where the stage is at rest in an exposure, as is stated, or never turns.
 

@@ -13,6 +13,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.drawn_out import drawn_out
 from flexdt.twin.calibration.detect.refine import Refined, measure_beads
 from flexdt.twin.calibration.detect.sharpness import balls_of
 from flexdt.twin.calibration.detect.smear import UNMEASURED, Smear, Step, solved
@@ -25,7 +26,7 @@ from flexdt.twin.calibration.detect.windows import (
 )
 from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.causes.every_cause import _arc
-from flexdt.twin.calibration.diagnose.measured_spots import judge_smear
+from flexdt.twin.calibration.diagnose.measured_spots import judge_smear, shadows_drawn_out
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
@@ -252,3 +253,29 @@ def test_the_light_of_an_exposure_is_the_mean_of_its_moments_in_entire_windows(
     )
     whole = [np.exp(-render_windows(balls, near, plan)) for near in moments]
     assert np.abs(drawn - np.mean(whole, axis=0)).max() < 1e-5
+
+
+@pytest.mark.parametrize(("share", "about"), [(1.4, 0.2), (0.9, 0.2)])
+def test_shadows_that_are_drawn_out_tell_the_arc_without_a_spot(
+    share: float, about: float
+) -> None:
+    images, plan = exposed(share, (0.6, 0.6))
+    model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
+    arc = drawn_out(images, plan, model, turned)
+    assert arc.certain
+    assert arc.share == pytest.approx(share, abs=about)
+
+
+def test_round_shadows_are_not_drawn_out_wherever_they_are_sought() -> None:
+    images, plan = exposed(0.0, (0.6, 0.6))
+    model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
+    assert not drawn_out(images, plan, model, turned).certain
+    aside = np.roll(images, (4, -3), (2, 3))
+    assert not drawn_out(aside, plan, model, turned).certain
+
+
+def test_the_error_of_drawn_out_shadows_names_the_arc_and_what_to_do() -> None:
+    told = shadows_drawn_out("scan", 1.43, STEP, 0.48)
+    assert told.forbids
+    for words in ("21 deg, 1.4 of a step", "48 %", "stop the stage", "more frames"):
+        assert words in told.text

@@ -219,3 +219,21 @@ def exposure_arc(arc_deg: float, share: float, done: str) -> Finding:
         f"step: {done}; volumes are blurred along the turn, and angles are those of the "
         "middle of each exposure",
     )
+
+
+def shadows_drawn_out(name: str, share: float, step_rad: float, found: float) -> Finding:
+    """Make the error that exposures draw shadows out so much that beads are not recognised.
+
+    Args:
+        name: of the scan.
+        share: of a step that an exposure lasts.
+        step_rad: of the stage, from frame to frame.
+        found: share of the beads in view with a round shadow.
+    """
+    return error(
+        "exposure_arc",
+        f"{name}: the object turns while a frame is exposed, by about "
+        f"{share * math.degrees(step_rad):.2g} deg, {share:.1f} of a step: shadows are drawn "
+        f"out along the turn, and {100 * found:.0f} % of the beads in view have a round one; "
+        "stop the stage for each frame, or turn more slowly, with more frames",
+    )

@@ -1,0 +1,100 @@
+"""Shadows that an exposure draws out along the paths of their beads, so that few look round.
+
+Told without a measured spot, from the second moments of the light in windows where the beads
+are expected: along its path a shadow's variance is larger than across by that of the path.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.detect.detection import BLUR_PX
+from flexdt.twin.calibration.detect.smear import LEAST_SPOTS, Smear
+from flexdt.twin.calibration.detect.smeared_spots import Turning
+from flexdt.twin.calibration.detect.windows import Windows, ways
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+LEAST_DARK = 0.1
+"""Light that a pixel of a shadow lacks at least, as a share of the darkest's: above noise."""
+CERTAIN_SIGMAS = 5.0
+"""Standard deviations of the mean from which an arc is certain."""
+
+
+@dataclass(frozen=True)
+class DrawnOut:
+    """An arc by which shadows are drawn out.
+
+    Attributes:
+        squared: square of the share of a step that an exposure lasts.
+        sigma: its standard deviation, by the scatter of the shadows; inf: not determined.
+    """
+
+    squared: float
+    sigma: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether the shadows are longer along their paths beyond doubt."""
+        return self.squared > CERTAIN_SIGMAS * self.sigma
+
+    @property
+    def share(self) -> float:
+        """Share of a step that an exposure lasts."""
+        return math.sqrt(max(self.squared, 0.0))
+
+    @property
+    def smear(self) -> Smear:
+        """The smear from which spots are followed, of images with a usual blur."""
+        return Smear(self.squared, self.sigma, True, BLUR_PX)
+
+
+def drawn_out(
+    images: Float32Array, windows: Windows, model: BeadModel, turning: Turning
+) -> DrawnOut:
+    """Estimate the arc of an exposure from the second moments of free, complete shadows.
+
+    The median of the shadows whose bead moves by its radius or more in a step.
+
+    Args:
+        images: (n, k, side, side) line integrals.
+        windows: their places.
+        model: the beads.
+        turning: geometry within an exposure.
+    """
+    way = ways(windows, model, turning)
+    length = np.linalg.norm(way, axis=2)
+    told = windows.whole & (length > windows.radii)
+    told &= np.isfinite(images).all(axis=(2, 3))
+    squares = [
+        12.0 * _longer(images[f, k], way[f, k] / length[f, k]) / length[f, k] ** 2
+        for f, k in np.argwhere(told).tolist()
+    ]
+    if len(squares) < LEAST_SPOTS:
+        return DrawnOut(0.0, math.inf)
+    middle = float(np.median(squares))
+    scatter = 1.4826 * float(np.median(np.abs(np.array(squares) - middle)))
+    return DrawnOut(middle, scatter * math.sqrt(0.5 * math.pi / len(squares)))
+
+
+def _longer(image: Float32Array, along: FloatArray) -> float:
+    """Compute by how much the variance of a shadow is larger along a direction than across
+    it [px^2]; 0 without a shadow.
+    """
+    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    dark = 1.0 - np.exp(np.median(border) - image)
+    weight = np.maximum(dark - LEAST_DARK * dark.max(), 0.0)
+    if not weight.any():
+        return 0.0
+    y, x = np.mgrid[: len(image), : len(image)]
+    one = along[0] * x + along[1] * y
+    other = along[0] * y - along[1] * x
+    means = (np.average(part, weights=weight) for part in (one, other))
+    first, second = (
+        np.average((part - mean) ** 2, weights=weight)
+        for part, mean in zip((one, other), means, strict=True)
+    )
+    return float(first - second)
