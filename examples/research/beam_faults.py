@@ -77,6 +77,14 @@ class Laboratory:
         strain: (3, 3) of the phantom, by which its balls are displaced; none.
         arc: part of a step by which the object turns while a frame is exposed.
         shown: (n,) angles of the frames -> those that they show; none: their own.
+        rows: part of a step by which the object turns from the first row's reading to the
+            last's.
+        flat: by which the flat image's beam is stronger at the right edge, and at the lower
+            one, than at the panel's middle, as parts of it.
+        loose: [mm] from its place, by which the first ball is displaced.
+        sharpened: standard deviation [px] and strength of the camera's unsharp mask.
+        veil: standard deviation [px] and part of the light that the detector spreads so far.
+        wall_mm: thickness of a tube in place of the full cylinder; 0 is full.
     """
 
     ball: str = "steel"
@@ -97,6 +105,12 @@ class Laboratory:
     strain: Array | None = None
     arc: float = 0.0
     shown: Callable[[Array, Rng], Array] | None = None
+    rows: float = 0.0
+    flat: tuple[float, float] = (0.0, 0.0)
+    loose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sharpened: tuple[float, float] = (1.0, 0.0)
+    veil: tuple[float, float] = (1.0, 0.0)
+    wall_mm: float = 0.0
 
 
 def rays(truth: Mapping[str, float], step: int = 1) -> Array:
@@ -148,7 +162,9 @@ def radiographs(
     """
     if lab.strain is not None:
         beads = beads + beads @ lab.strain.T
+    beads = beads + np.array(lab.loose) * (np.arange(len(beads)) == 0)[:, None]
     step = angles[1] - angles[0]
+    flat = _ramp(lab.flat)
     if lab.shown is not None:
         angles = lab.shown(angles, rng)
     straight = rays(truth)
@@ -158,20 +174,33 @@ def radiographs(
     for i, angle in enumerate(angles.tolist()):
         some = angle + lab.arc * step * parts
         shown = np.mean(
-            [light(lab, beads, float(a), truth, straight) for a in some], axis=0
+            [light(lab, beads, float(a), truth, straight, lab.rows * step) for a in some],
+            axis=0,
         )
         if lab.shift is not None:
             shown = _shifted(shown, lab.shift)
         shown = _blurred(shown, lab.blur_px) + lab.scatter
+        wide, part = lab.veil
+        shown = (1.0 - part) * shown + part * cv2.GaussianBlur(shown, (0, 0), wide)
         lagging = shown if before is None else (1 - lab.lag) * shown + lab.lag * before
         before = shown
         beam = lab.photons * (1.0 + lab.drift * i / len(angles))
         counts = np.minimum(rng.poisson(beam * lagging), lab.ceiling * lab.photons)
+        wide, part = lab.sharpened
+        counts = counts + part * (counts - cv2.GaussianBlur(counts, (0, 0), wide))
         counts = np.where(dead, 0.0, counts)
         open_beam = lab.photons * (1.0 - lab.dark)
         counts = np.maximum(counts - lab.dark * lab.photons, 0.5)
-        out.append((-np.log(counts / open_beam)).astype(np.float32))
+        out.append((-np.log(counts / (open_beam * flat))).astype(np.float32))
     return out
+
+
+def _ramp(most: tuple[float, float]) -> Array:
+    """Compute a beam, (rows, cols), that grows in a line from 1 in the panel's middle, to the
+    right and down by `most` at the edges.
+    """
+    row, column = (np.linspace(-1.0, 1.0, n) for n in own.SHAPE)
+    return np.asarray(1.0 + most[0] * column + most[1] * row[:, None])
 
 
 def light(
@@ -180,6 +209,7 @@ def light(
     angle: float,
     truth: Mapping[str, float],
     straight: Array,
+    rows_turn: float = 0.0,
 ) -> Array:
     """Compute the transmitted share of the beam at one angle, (rows, cols), through the
     balls and their holder.
@@ -190,6 +220,8 @@ def light(
         angle: of the stage [deg].
         truth: offsets [mm, deg].
         straight: unit vectors of `rays`.
+        rows_turn: the object turns by so much from the first row's reading to the last's
+            [deg], and has the angle at the middle row's.
     """
     ends = np.array([[0.0, 0.0, -30.0], [0.0, 0.0, 30.0]])
     turn = np.array([angle])
@@ -202,16 +234,52 @@ def light(
     inside = (
         cylinder(straight, *at[-2:], lab.body_mm) if lab.body != "air" else 0.0 * shown
     )
+    if lab.wall_mm > 0.0:
+        inside = inside - cylinder(straight, *at[-2:], lab.body_mm - lab.wall_mm)
     through = [np.zeros(own.SHAPE) for _ in energies]
-    for place, centre in zip(
-        at[:-2], own.pixels(beads, turn, own.SOD, truth)[0], strict=True
-    ):
+    centres = own.pixels(beads, turn, own.SOD, truth)[0]
+    for k, centre in enumerate(centres):
+        place = at[k]
         where, passed = own.shadow(place, centre, panel, lab.cast_mm, own.SOD)
+        if rows_turn:
+            where, passed = read_by_rows(lab, beads[k], angle, rows_turn, truth)
         for e in range(len(energies)):  # a ball takes its place in the body
             through[e][where] -= np.log(passed(ball[e] - body[e]))
     for e, weight in enumerate(parts):
         shown += weight * np.exp(-body[e] * inside - through[e])
     return shown
+
+
+def read_by_rows(
+    lab: Laboratory, bead: Array, angle: float, turn: float, truth: Mapping[str, float]
+) -> tuple[tuple[Array, ...], Callable[[float], Array]]:
+    """Find the pixels about a ball's image whose rows are read one after another, and the part
+    of light that passes there, as `prior_coverage.shadow` does.
+
+    Args:
+        lab: gives the ball's true radius.
+        bead: (3,) of the object [mm].
+        angle: of the middle row [deg].
+        turn: from the first row to the last [deg].
+        truth: offsets [mm, deg].
+    """
+    times = np.linspace(-0.5, 0.5, 5)
+    tracks = own.pixels(bead[None], angle + turn * times, own.SOD, truth)[:, 0]
+    seen = (
+        tracks[:, 1] / (own.SHAPE[0] - 1) - 0.5 - times
+    )  # falls through 0 when it is read
+    when = float(np.interp(0.0, seen[::-1], times[::-1]))
+    half = lab.cast_mm * own.SDD / (0.7 * own.SOD) / own.PIXEL * 1.3 / own.SHAPE[0]
+    ends = angle + turn * (when + half * np.array([-1.0, 0.0, 1.0]))
+    at, panel = own.places(bead[None], ends, own.SOD, truth)
+    (centre,) = own.pixels(bead[None], ends[1:2], own.SOD, truth)[0]
+    speed = (at[2, 0] - at[0, 0]) / (2.0 * half)
+    row = (own.SHAPE[0] - 1) * (when + 0.5)
+
+    def place(rows: Array) -> Array:
+        return np.asarray(at[1, 0] + (rows - row)[..., None] / (own.SHAPE[0] - 1) * speed)
+
+    return own.shadow(at[1, 0], centre, panel, lab.cast_mm, own.SOD, place)
 
 
 def _blurred(image: Array, blur: tuple[float, float, float]) -> Array:
@@ -284,6 +352,11 @@ def _strained(i: int, j: int) -> Change:
     return change
 
 
+def _either(rng: Rng, least: float, most: float) -> float:
+    """Draw a size, and its sign."""
+    return float(rng.choice([-1, 1]) * rng.uniform(least, most))
+
+
 def _as_assumed(lab: Laboratory, rng: Rng) -> Laboratory:
     return replace(lab, mono=True, strain=1e-3 * rng.normal(size=(3, 3)))
 
@@ -342,6 +415,13 @@ KINDS: Final[Mapping[str, tuple[Change, str]]] = {
     "dead_pixels": (lambda lab, rng: replace(lab, dead=rng.uniform(1e-4, 3e-3)), ""),
     "saturated": (lambda lab, rng: replace(lab, **BODY, ceiling=rng.uniform(0.3, 0.9)), ""),
     "lag": (lambda lab, rng: replace(lab, lag=rng.uniform(0.01, 0.1)), ""),
+    "hazed_tube": (
+        lambda lab, rng: replace(
+            lab, body="glass", body_mm=20.0, wall_mm=2.0, scatter=rng.uniform(0.05, 0.3),
+            blur_px=((b := rng.uniform(1, 3)), b, 0.0),
+            veil=(rng.uniform(15, 60), rng.uniform(0.1, 0.4)),
+        ), "",
+    ),
     "lag_in_aluminium": (
         lambda lab, rng: replace(lab, lag=rng.uniform(0.01, 0.1), **METAL), "",
     ),
@@ -367,6 +447,21 @@ KINDS: Final[Mapping[str, tuple[Change, str]]] = {
     "strain_z": (_strained(2, 2), SHAPED),
     "strain_shear": (_strained(0, 1), SHAPED),
     "strain_lean": (_strained(0, 2), SHAPED),
+    "rows_in_turn": (
+        lambda lab, rng: replace(lab, mono=True, rows=_either(rng, 0.1, 1.0)), "rows_in_turn",
+    ),
+    "rows_under_other_flat": (
+        lambda lab, rng: replace(
+            lab, mono=True, rows=_either(rng, 0.1, 1.0),
+            flat=(_either(rng, 0.02, 0.1), _either(rng, 0.02, 0.1)),
+        ), "rows_in_turn",
+    ),
+    "bead_loose_sharpened": (
+        lambda lab, rng: replace(
+            lab, mono=True, loose=tuple(rng.normal(0.0, 0.3, size=3).tolist()),
+            sharpened=(rng.uniform(0.8, 2.0), rng.uniform(0.5, 1.5)),
+        ), "bead_displaced|bead_tolerance",
+    ),
     "exposed_long": (
         lambda lab, rng: replace(lab, mono=True, arc=rng.uniform(0.1, 1.0)),
         f"exposure_arc|{SHAPED}",

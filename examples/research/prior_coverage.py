@@ -150,7 +150,12 @@ def radiographs(
 
 
 def shadow(
-    ball: Array, centre: Array, panel: Array, radius: float, sod: float
+    ball: Array,
+    centre: Array,
+    panel: Array,
+    radius: float,
+    sod: float,
+    read: Callable[[Array], Array] | None = None,
 ) -> tuple[tuple[Array, ...], Callable[[float], Array]]:
     """Find the pixels about a ball's image, and the part of light that passes there.
 
@@ -160,6 +165,7 @@ def shadow(
         panel: as of `places`.
         radius: [mm].
         sod: of the axis [mm].
+        read: rows (n,) -> the ball's centres when they are read (n, 3) [mm]; none: it rests.
 
     Returns:
         The pixels as an index of an image, and a function of an attenuation [1/mm] that
@@ -174,7 +180,10 @@ def shadow(
     b = (row + fine - (SHAPE[0] - 1) / 2)[:, None, None]
     ray = middle + a * across + b * down
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-    chord = 2 * np.sqrt(np.maximum(radius**2 - ball @ ball + (ray @ ball) ** 2, 0.0))
+    here = ball[None] if read is None else read(np.rint(row + fine))
+    along = (ray * here[:, None]).sum(axis=2)
+    square = (here**2).sum(axis=1)[:, None]
+    chord = 2 * np.sqrt(np.maximum(radius**2 - square + along**2, 0.0))
     columns, rows = (c - reach + np.arange(n) for c in (column, row))
     ok = (
         ((rows >= 0) & (rows < SHAPE[0])).nonzero()[0],

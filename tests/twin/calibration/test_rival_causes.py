@@ -23,7 +23,7 @@ from flexdt.twin.calibration.diagnose.tiles import alike_places, likely_border
 from flexdt.twin.calibration.fit.evidence import Table
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.problem import STRAINS, build_problem
-from flexdt.twin.geometry.panel import Border
+from flexdt.twin.geometry.panel import Border, PanelModel
 from flexdt.twin.geometry.poses import Poses
 
 BEADS = np.array([[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]])
@@ -89,10 +89,13 @@ def test_the_mean_of_an_arc_is_that_of_its_positions(frames: int) -> None:
     )
 
 
-@pytest.mark.parametrize("share", [0.2, -0.2])
-def test_each_position_is_that_of_the_time_at_which_its_row_is_read(share: float) -> None:
+@pytest.mark.parametrize(
+    ("frames", "share"), [(60, 0.2), (60, -0.2), (24, 0.7), (24, -0.7)]
+)
+def test_each_position_is_that_of_the_time_at_which_its_row_is_read(
+    frames: int, share: float
+) -> None:
     """Against the place and the time of each bead, found in turn."""
-    frames = 60
     when = np.zeros((frames, len(BEADS)))
     for _ in range(8):
         seen = np.stack(
@@ -109,9 +112,42 @@ def test_each_position_is_that_of_the_time_at_which_its_row_is_read(share: float
     problem = build_problem(seen, model, poses, free=("dO_x",), shape=SHAPE, rows=True)
     x = problem.start
     x[problem.layout.rows_column] = share
-    # What is left grows with the square of the arc: of 0.6 deg at most.
-    assert problem.residuals(x)[0] == pytest.approx(seen, abs=0.01)
+    # What is left grows with the fourth power of the arc: of 5 deg at most.
+    assert problem.residuals(x)[0] == pytest.approx(seen, abs=1e-3)
     assert np.abs(problem.residuals(problem.start)[0] - seen).max() > 0.5
+
+
+def test_rows_that_are_read_over_a_long_turn_are_no_other_phantom() -> None:
+    """Of 8.7 deg from the first row to the last, paths bend by .4 px."""
+    seen = scored("rows_in_turn", 2)
+    assert seen.verdict == "right"
+    assert [one.partition(":")[0] for one in seen.said] == ["rows_in_turn"]
+
+
+@pytest.mark.parametrize("strained", [False, True])
+def test_slopes_of_rows_are_those_of_positions(strained: bool) -> None:
+    """Against differences of the predicted positions, beside all other columns."""
+    frames = 24
+    poses, model = upright(frames), BeadModel(BEADS, np.ones(5))
+    tracks = poses.cone_vec().project_points(BEADS, SHAPE)
+    problem = build_problem(
+        tracks, model, poses, free=("dO_x", "alpha"), shape=SHAPE, rows=True, arc=True,
+        strain=(1e-3, 1e-3) if strained else (0.0, 0.0), free_beads=strained,
+        panel=PanelModel(1.0, SHAPE),
+    )  # fmt: skip
+    x = problem.start
+    x[problem.layout.rows_column] = 0.6
+    slopes = problem.jacobian(x)
+    assert slopes.shape == (2 * tracks[..., 0].size, len(x))
+    step = 1e-4
+    for i in range(len(x)):
+        ahead, behind = x.copy(), x.copy()
+        ahead[i] += step
+        behind[i] -= step
+        moved = problem.residuals(ahead)[0] - problem.residuals(behind)[0]
+        assert slopes[:, i] == pytest.approx(
+            moved.ravel() / (2 * step), abs=1e-3, rel=1e-4
+        )
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -60,6 +60,10 @@ from flexdt.twin.geometry.panel import Panel, PanelModel
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.signatures import with_arguments_of
 
+PATH_SIGMAS = 0.1
+"""Change of a position [standard deviation] that other paths of the beads may make."""
+PATH_ROUNDS = 4
+"""Solutions with the paths of the one before, at most."""
 RAYLEIGH_MEDIAN = 1.1774100225154747
 """Median length of a 2-vector with independent unit normal parts."""
 LEAST_PIVOT = 1e-15
@@ -575,7 +579,7 @@ def estimate_geometry(
         raise TwinError(
             "no bead was seen in any frame: there is nothing to fit", {"seen": 0}
         )
-    solution, noise = _solved(problem, solver)
+    problem, solution, noise = _followed(problem, solver)
     certificate = certify(problem, solution.x, solution.use, noise, sampling_px, bound)
     groups_at = problem.parameters(solution.x)
     return FitResult(
@@ -662,6 +666,34 @@ def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
     begun = problem.with_base(base)
     cost = cost_at(begun, begun.start, result.solution.use)
     return replace(result, start_cost=cost, iterations=iterations)
+
+
+def _followed(
+    problem: FitProblem, solver: Solver | None
+) -> tuple[FitProblem, Solution, float]:
+    """Solve a problem; where the object turns while rows are read, again with the paths of
+    the solution, until they move no position by more than `PATH_SIGMAS` or for
+    `PATH_ROUNDS`.
+
+    Args:
+        problem: data, columns and priors.
+        solver: settings; the default is robust.
+
+    Returns:
+        The problem that was solved last, and what `_solved` returns.
+    """
+    solution, noise = _solved(problem, solver)
+    if problem.layout.rows_column < 0:
+        return problem, solution, noise
+    for _ in range(PATH_ROUNDS):
+        x = solution.x
+        moved = problem.with_paths_at(x)
+        change = (moved.whitened(x) - problem.whitened(x))[solution.use]
+        if np.abs(change).max(initial=0.0) <= PATH_SIGMAS * noise:
+            break
+        problem = moved
+        solution, noise = _weighted(problem, solver, x, noise)
+    return problem, solution, noise
 
 
 def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:

@@ -49,8 +49,10 @@ ARC_PRIOR = 0.5
 ROWS_PRIOR = 0.5
 """Standard deviation of the share of a step by which the last row of a frame is read later
 than the first; it is -1 to 1."""
+ROWS_POWERS = 3
+"""Powers of the turn between two rows by which the path of a bead is followed."""
 ARC_ANGLE_RAD = 0.02
-"""Of the differences that give the curvature and the slope of the beads' paths."""
+"""Between the positions that give the derivatives of the beads' paths."""
 
 GAUGES = (("dS_x", "dO_x", "dD_x"), ("dS_y", "dO_y", "dD_y"))
 """Parameters whose common shift changes no image: the first is fixed when all three are
@@ -298,8 +300,8 @@ class FitProblem:
             prior.
         panel: terms of the panel's distortion; None: no distortion.
         turning: (n, k, 2, m) shifts of the positions by an exposure of a full step, and by
-            rows that are read over one, as far as they have columns (`turning_shifts`);
-            None: each frame is an instant.
+            each power of the share of a step over which rows are read, as far as they have
+            columns (`turning_shifts`); None: each frame is an instant.
         expected_spread: of the whitened residuals, expected before they are seen; 0: nothing is
             expected.
         common: (n, k, 2, c) shifts of the positions [px] by one standard deviation of each of c
@@ -378,11 +380,29 @@ class FitProblem:
             out[:, "xyz".index(term[0]), i] = beads[:, "xyz".index(term[1])]
         return out.reshape(-1, len(STRAINS))
 
+    def _columns_of_kernel(self, x: FloatArray) -> FloatArray | None:
+        """Compute the matrix (kernel's columns, columns) by which the kernel's columns change
+        with those of the layout at `x`; None where they are the same.
+
+        With strain the kernel's columns have the beads' coordinates, with rows that are
+        read one after another each power of their share.
+        """
+        still = self._columns_without_rows
+        if self.layout.rows_column < 0:
+            return still
+        if still is None:
+            still = np.eye(len(self.layout.names))
+        powers = np.arange(ROWS_POWERS)
+        slopes = np.zeros((ROWS_POWERS, still.shape[1]))
+        share = x[self.layout.rows_column]
+        slopes[:, self.layout.rows_column] = (powers + 1) * share**powers
+        before = len(still) - (still.shape[1] - self.layout.rows_column)
+        return np.concatenate([still[:before], slopes, still[before + 1 :]])
+
     @cached_property
-    def _columns_of_kernel(self) -> FloatArray | None:
-        """Matrix (kernel's columns, columns) by which the kernel's columns, which always
-        have the beads' coordinates, follow from those of the layout; None where they are
-        the same (without strain).
+    def _columns_without_rows(self) -> FloatArray | None:
+        """Matrix (columns of the kernel, columns) with a single column of the rows' share;
+        None without strain.
         """
         if self.layout.strain_column < 0:
             return None
@@ -396,6 +416,17 @@ class FitProblem:
         out[count : count + own, self.layout.strain_columns] = self.strain_basis
         out[count + own :, self.layout.shift_column :] = np.eye(shifts)
         return out
+
+    def _shift_coefficients(self, x: FloatArray) -> FloatArray:
+        """Return the coefficients of `shift_terms`: the layout's, and all powers of the share
+        of a step over which rows are read.
+        """
+        first = self.layout.shift_column
+        rows = self.layout.rows_column
+        if rows < 0:
+            return np.array(x[first:])
+        powers = x[rows] ** np.arange(1, ROWS_POWERS + 1)
+        return np.concatenate([x[first:rows], powers, x[rows + 1 :]])
 
     def spread(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Compute parameter sets and beads for the values `x` of the columns.
@@ -423,7 +454,8 @@ class FitProblem:
     @cached_property
     def shift_terms(self) -> FloatArray:
         """(n, k, 2, m) shifts of the positions by a coefficient of 1 of the exposure's
-        arc and of the rows' turn, if there are any, and each of the panel's terms [px].
+        arc and of each power of the rows' turn, if there are any, and each of the panel's
+        terms [px].
         """
         if self.turning is None:
             return self.panel_terms
@@ -521,7 +553,7 @@ class FitProblem:
         """
         x = np.asarray(x, dtype=np.float64)
         params, beads = self.spread(x)
-        table = self._columns_of_kernel
+        table = self._columns_of_kernel(x)
         size = len(x) if table is None else len(table)
         written = (
             np.zeros((*use.shape, 2)),
@@ -530,7 +562,7 @@ class FitProblem:
             np.zeros((size, size)),
             np.zeros(size),
         )
-        shifts = np.array(x[self.layout.shift_column :])
+        shifts = self._shift_coefficients(x)
         cost = kernels.evaluate(
             self.data, params, beads, shifts, use, huber, want, *written
         )
@@ -563,6 +595,24 @@ class FitProblem:
         Priors are absolute, and the residuals only known up to their spread s: s^2 / sigma^2.
         """
         return np.asarray((noise / self.prior_sigma) ** 2)
+
+    def with_paths_at(self, x: FloatArray) -> FitProblem:
+        """Return the problem with the paths of the beads, along which they turn while a frame
+        is exposed or read, at the geometry of column values `x`.
+        """
+        params, beads = self.spread(x)
+        paths = turning_shifts(
+            self.poses,
+            beads,
+            params,
+            self.group,
+            self.reading,
+            panel_heights(self.measured, self.origin),
+        )
+        columns = self.layout
+        return replace(
+            self, turning=_with_columns(paths, columns.arc_column, columns.rows_column)
+        )
 
     def with_base(self, base: FloatArray) -> FitProblem:
         """Return the problem with other starts, one row of seventeen values for each group."""
@@ -677,9 +727,9 @@ def build_problem(
             raise TwinError.of_shape("common shifts", shared.shape[:-1], t.shape)
     turning = None
     if arc or rows:
-        places = measured[..., 1] / (2.0 * origin[:, None, 1] + 1.0)
-        turning = turning_shifts(poses, model, base, group, reading, places)
-        turning = turning[..., [arc, rows]]
+        places = panel_heights(measured, origin)
+        paths = turning_shifts(poses, model.beads, base, group, reading, places)
+        turning = _with_columns(paths, columns.arc_column, columns.rows_column)
     mean = [centres[NAMES.index(n)] for n in bases]
     sigma = [widths.get(n, math.inf) for n in bases]
     return FitProblem(
@@ -729,9 +779,24 @@ def usual_step(angle: FloatArray) -> float:
     return float(np.median(np.abs(np.diff(angle)))) if len(angle) > 1 else 0.0
 
 
+def panel_heights(measured: FloatArray, origin: FloatArray) -> FloatArray:
+    """Compute the row of each position, from the panel's middle, in panel heights, (n, k).
+
+    Args:
+        measured: (n, k, 2) pixels from the panel's centre.
+        origin: (n, 2) pixel coordinates of that centre.
+    """
+    return np.asarray(measured[..., 1] / (2.0 * origin[:, None, 1] + 1.0))
+
+
+def _with_columns(paths: FloatArray, arc_column: int, rows_column: int) -> FloatArray:
+    """Take those of `turning_shifts` that have columns; -1: none."""
+    return paths[..., [arc_column >= 0, *[rows_column >= 0] * ROWS_POWERS]]
+
+
 def turning_shifts(
     poses: Poses,
-    model: BeadModel,
+    beads: FloatArray,
     base: FloatArray,
     group: npt.NDArray[np.int64],
     reading: Reading,
@@ -741,21 +806,23 @@ def turning_shifts(
     of the frame's group: while a frame is exposed, and while its rows are read.
 
     A path p of the angle has the mean p + p'' arc^2 / 24 over an arc about it, to the
-    fourth power of the arc: 2e-4 px of 100 px for a step of 15 deg. What a row shows that
-    is read by a share of a step later is further on its path by p' of that share.
+    fourth power of the arc: 2e-4 px of 100 px for a step of 15 deg. A row that is read when
+    the stage has turned on by t shows p + p' t + p'' t^2 / 2 + p''' t^3 / 6, to the fourth
+    power of t: 5e-4 px of 100 px for 6 deg.
 
     Args:
         poses: nominal geometry of the n frames.
-        model: the k beads.
+        beads: (k, 3) centres [mm].
         base: (groups, 17) offsets, internal units, in the reading.
         group: (n,) of each frame.
         reading: of eq. 5.4.
         places: (n, k) row of each position, from the panel's middle, in panel heights.
 
     Returns:
-        (n, k, 2, 2) [px], of the exposure and of the rows; 0 in groups of one frame.
+        (n, k, 2, 1 + ROWS_POWERS) [px], of the exposure and of the powers of the rows' share
+        of a step; 0 in groups of one frame.
     """
-    out = np.zeros((len(poses), len(model), 2, 2))
+    out = np.zeros((len(poses), len(beads), 2, 1 + ROWS_POWERS))
     for g, row in enumerate(base):
         mine = group == g
         some = poses[np.flatnonzero(mine)]
@@ -763,19 +830,36 @@ def turning_shifts(
             continue
         step = usual_step(some.angle)
         offsets = to_printed_reading(Offsets(*row), reading)
-        turned = (
-            replace(some, angle=some.angle + turn).cone_vec(offsets)
-            for turn in (ARC_ANGLE_RAD, 0.0, -ARC_ANGLE_RAD)
-        )
-        ahead, here, behind = (
-            cone.project_points(model.beads, (1, 1)) for cone in turned
-        )
-        bent = (ahead - 2.0 * here + behind) / ARC_ANGLE_RAD**2
+        slope, bent, twisted = _path_derivatives(some, offsets, beads)
         out[mine, ..., 0] = bent * step**2 / 24.0
-        slope = (ahead - behind) / (2.0 * ARC_ANGLE_RAD)
         way = float(np.sign(np.median(np.diff(some.angle))))
-        out[mine, ..., 1] = slope * (way * step * places[mine])[..., None]
+        late = (way * step * places[mine])[..., None]
+        out[mine, ..., 1] = slope * late
+        out[mine, ..., 2] = bent * late**2 / 2.0
+        out[mine, ..., 3] = twisted * late**3 / 6.0
     return out
+
+
+def _path_derivatives(
+    poses: Poses, offsets: Offsets, beads: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Compute the first three derivatives of the beads' positions by the stage's angle, each
+    (n, k, 2) [px/rad, px/rad^2, px/rad^3], from positions at five angles.
+    """
+    h = ARC_ANGLE_RAD
+    before, behind, here, ahead, beyond = (
+        replace(poses, angle=poses.angle + i * h)
+        .cone_vec(offsets)
+        .project_points(beads, (1, 1))
+        for i in (-2, -1, 0, 1, 2)
+    )
+    odd, far_odd = ahead - behind, beyond - before
+    even, far_even = ahead + behind, beyond + before
+    return (
+        (8.0 * odd - far_odd) / (12.0 * h),
+        (16.0 * even - far_even - 30.0 * here) / (12.0 * h**2),
+        (far_odd - 2.0 * odd) / (2.0 * h**3),
+    )
 
 
 def frame_shapes(shape: Shape, frames: int) -> FloatArray:

@@ -17,6 +17,7 @@ from flexdt.twin.calibration.fit.problem import (
     STRAINS,
     ColumnLayout,
     FitProblem,
+    panel_heights,
     turning_shifts,
 )
 from flexdt.twin.calibration.fit.residual_structure import (
@@ -211,15 +212,15 @@ def with_every_column(
         old.active,
         old.held,
     )
-    base = problem.spread(x)[0]
-    rows = problem.measured[..., 1] / (2.0 * problem.origin[:, None, 1] + 1.0)
+    base, beads = problem.spread(x)
+    rows = panel_heights(problem.measured, problem.origin)
     whole = replace(
         problem,
         layout=layout,
         panel=panel,
         base=base,
         turning=turning_shifts(
-            problem.poses, problem.model, base, problem.group, problem.reading, rows
+            problem.poses, beads, base, problem.group, problem.reading, rows
         ),
     )
     there = whole.start
