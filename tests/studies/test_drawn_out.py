@@ -6,6 +6,8 @@ import arcs_drawn
 import pytest
 
 
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_an_exposure_of_more_than_a_step_is_followed_where_half_the_shadows_are_long() -> (
     None
 ):

@@ -88,6 +88,8 @@ def calibrated(kind: str, seed: int) -> tuple[Calibration, dict[str, float]]:
     return calibrate([scan], BeadModel(beads, np.full(k, RADIUS_MM)), request), truth
 
 
+@pytest.mark.daily(1)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_repeats_with_the_turn_is_no_panel_and_in_the_sigmas(kind: str) -> None:
     for seed in range(8):

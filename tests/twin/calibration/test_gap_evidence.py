@@ -56,6 +56,8 @@ RIGHT_SEEDS = {"bottle": (1002, 1008), "bricks": (1005, 1006), "printed": (1010,
 with what the scan itself shows; 31 and 32 for the other objects."""
 
 
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_a_step_of_rays_that_no_frame_shows_is_left_open() -> None:
     """Distances between both ends of its rays change smoothly by half a pixel; it was told
     a gap of 0.46 +- 0.075 px."""

@@ -116,6 +116,8 @@ def test_a_renumbered_frame_of_a_helix_shows_another_height_too(
     assert found.verdict == "right", found
 
 
+@pytest.mark.daily(2)
+@pytest.mark.campaign(2)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -141,6 +143,8 @@ def test_a_refusal_names_what_is_there(kind: str, seed: int) -> None:
     assert not found.offered or not found.wrong
 
 
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [("drift_across+tiles_apart", 8022), ("jump_across+four_tiles", 97643)],

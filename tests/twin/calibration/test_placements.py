@@ -60,6 +60,8 @@ def test_a_motion_belongs_to_one_scan() -> None:
     assert np.abs(between[0, :, 1]).max() == np.abs(between[1, :, 0]).max() == 0.0
 
 
+@pytest.mark.daily(2)
+@pytest.mark.campaign(2)
 @pytest.mark.parametrize(
     ("kind", "seed", "said"),
     [

@@ -47,6 +47,8 @@ def test_an_unasked_jump_of_the_source_is_named_with_its_frame() -> None:
     assert "dS_x follows it" in said.text
 
 
+@pytest.mark.daily(2)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize(
     ("kind", "seed", "asked", "moves"),
     [
@@ -131,6 +133,8 @@ def test_the_column_of_a_scan_with_motion_is_that_of_its_mean() -> None:
     assert column.value == pytest.approx(scan.image["axis_column"], abs=4 * column.sigma)
 
 
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_a_misfit_named_a_vibration_is_not_dropped_with_a_motion(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

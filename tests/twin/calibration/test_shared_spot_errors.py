@@ -138,6 +138,8 @@ def drawn(rng: np.random.Generator) -> Drawn:
     return Drawn(rows, cone, BeadModel(beads, np.full(3, radius)), (centre, size), scene)
 
 
+@pytest.mark.daily(1)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize("seed", range(4))
 def test_what_keeps_its_place_in_the_pixels_shifts_no_spot_alike_in_all_frames(
     seed: int,

@@ -33,6 +33,9 @@ SIZES: Final = 2.0 ** np.arange(-2.0, 11.0, 0.5)
 """Standard deviations of a jitter in those of a frame's noise; equally likely in advance."""
 LEAST_TOLD: Final = 1e-3
 """Part of what the best told frame tells that another tells to count."""
+FEWEST_TOLD: Final = 3
+"""Deviates of a parameter that residuals must tell: the errors that fewer leave, Student's of
+one or two degrees of freedom, have no variance."""
 ROUNDING: Final = 1e-9
 """Part of what frames would tell alone that the fit leaves, below which it is rounding."""
 LEAST_SHARE: Final = 1e-12
@@ -237,7 +240,7 @@ def _shaken(shown: Residuals, fitted: Residuals, some: Sequence[str]) -> _Likely
     each other in what the residuals tell of them; arguments as `_all_likely`.
 
     Returns:
-        The likelihoods; None if the residuals tell nothing.
+        The likelihoods; None if the residuals tell fewer than `FEWEST_TOLD` deviates of each.
     """
     frame = shown.frame
     frames = np.arange(len(shown.problem.group))
@@ -251,7 +254,7 @@ def _shaken(shown: Residuals, fitted: Residuals, some: Sequence[str]) -> _Likely
         return None
     rows /= size
     each = np.concatenate([rows[:, [q]] * within for q in range(len(some))], axis=1)
-    found = _likelihoods(shown, each)
+    found = _likelihoods(shown, each, FEWEST_TOLD * len(some))
     if found is None:
         return None
     original = [fitted.jacobian[:, own].sum(axis=1) for own in columns]
@@ -263,25 +266,26 @@ def _shaken(shown: Residuals, fitted: Residuals, some: Sequence[str]) -> _Likely
 
 
 def _likelihoods(
-    shown: Residuals, each: FloatArray
+    shown: Residuals, each: FloatArray, fewest: int = 1
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Compute the likelihood of the widths of normal deviates in the residuals.
 
     Args:
         shown: residuals.
         each: (m, f) changes of the residuals with each deviate.
+        fewest: deviates that the residuals must tell.
 
     Returns:
         (w,) each: logarithms of the likelihoods against those without deviates, the
         variances of the deviates over the noise's, and the variances of the noise; None if
-        the residuals tell nothing of them.
+        the residuals tell fewer deviates.
     """
     unit = shown.unit_covariance
     absorbed = cross(shown.jacobian, each)
     whole = cross(each, each)
     values, vectors = np.linalg.eigh(whole - absorbed.T @ unit @ absorbed)
     told = values > max(LEAST_TOLD * float(values[-1]), ROUNDING * float(np.trace(whole)))
-    if not told.any():
+    if told.sum() < fewest:
         return None
     values = values[told]
     residual = shown.values
