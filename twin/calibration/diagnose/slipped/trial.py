@@ -108,6 +108,8 @@ class Trial(Residuals):
         """Find pieces that explain what a model leaves, step by step, `MOST_PIECES` at
         most, each further one beyond doubt; in the order of their frames.
 
+        One that moves freely takes up nearly anything, so none is added to it.
+
         Args:
             base: the model.
             free: whether beads may move by no rule, too.
@@ -122,6 +124,8 @@ class Trial(Residuals):
             if gain < (NAMED_LOG_ODDS if out else 0.0) or piece in out:
                 break
             out.append(piece)
+            if piece.free:
+                break
             more = self.columns(piece)
             rows = np.concatenate([rows, more], axis=1)
             widths = np.append(widths, np.full(more.shape[1], width))
