@@ -97,13 +97,10 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             found, detections, state.model, scan.poses, scan.name, request.start
         )
         if found is not None and finding is not None and finding.code == "wrong_phantom":
-            finding = _of_exposure(found, state.model, scan) or finding
-            if (
-                finding.code == "exposure_arc"
-                and request.second_look
-                and _agreeing(found)
-            ):
-                finding = None
+            drawn_out = _of_exposure(found, state.model, scan)
+            if drawn_out is not None:
+                followed = request.second_look and _agreeing(found)
+                finding = None if followed else drawn_out
         if request.per_frame and finding is not None and finding.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
             found = seek(search=replace(search, gate_px=WIDE_GATE_PX)) or found

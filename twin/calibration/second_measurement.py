@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,13 @@ from flexdt.twin.calibration.detect.drawn_out import DrawnOut, drawn_out
 from flexdt.twin.calibration.detect.missing_light import missing_light, with_light
 from flexdt.twin.calibration.detect.refine import FEW_WINDOWS, measure_beads
 from flexdt.twin.calibration.detect.smear import UNMEASURED
-from flexdt.twin.calibration.detect.windows import Windows, mended, plan_windows, ways
+from flexdt.twin.calibration.detect.windows import (
+    Turning,
+    Windows,
+    mended,
+    plan_windows,
+    ways,
+)
 from flexdt.twin.calibration.diagnose import Finding, error
 from flexdt.twin.calibration.diagnose.data import GOOD_SHARE
 from flexdt.twin.calibration.diagnose.measured_spots import shadows_drawn_out
@@ -24,7 +30,6 @@ from flexdt.twin.calibration.fits_of_scans import fit_scans
 from flexdt.twin.calibration.frame_source import FrameState, Scan
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
-from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection.analytic_solids import Scene
 
@@ -187,7 +192,7 @@ def seen_arc(scan: Scan, model: BeadModel, parameters: Offsets) -> DrawnOut | No
     return arc if arc.certain else None
 
 
-def turning_of(scan: Scan, parameters: Offsets) -> Callable[[float], ConeVec] | None:
+def turning_of(scan: Scan, parameters: Offsets) -> Turning | None:
     """Make the function from a part of a step to the geometry of all frames so much later;
     None where the stage is at rest in an exposure, as is stated, or never turns.
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.detect import spot_kernels as kernels
+from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
@@ -237,7 +238,7 @@ def _candidates(
     )
     small = coarse - wide
     sample = small[::3, ::3].ravel()
-    noise = 1.4826 * _middle(np.abs(sample - _middle(sample))) + 1e-4
+    noise = ROBUST * _middle(np.abs(sample - _middle(sample))) + 1e-4
     top = float(small.max())
     floor = max(8.0 * noise, how.faintest * top)
     inside: list[_Candidate] = []

@@ -14,8 +14,8 @@ import numpy as np
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import BLUR_PX
 from flexdt.twin.calibration.detect.smear import LEAST_SPOTS, Smear
-from flexdt.twin.calibration.detect.smeared_spots import Turning
-from flexdt.twin.calibration.detect.windows import Windows, ways
+from flexdt.twin.calibration.detect.windows import Turning, Windows, ways
+from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 LEAST_DARK = 0.1
@@ -76,7 +76,7 @@ def drawn_out(
     if len(squares) < LEAST_SPOTS:
         return DrawnOut(0.0, math.inf)
     middle = float(np.median(squares))
-    scatter = 1.4826 * float(np.median(np.abs(np.array(squares) - middle)))
+    scatter = ROBUST * float(np.median(np.abs(np.array(squares) - middle)))
     return DrawnOut(middle, scatter * math.sqrt(0.5 * math.pi / len(squares)))
 
 

@@ -65,7 +65,6 @@ from flexdt.twin.calibration.detect.smear import (
     squared_step,
 )
 from flexdt.twin.calibration.detect.smeared_spots import (
-    Turning,
     followed,
     own_pixels,
     placed,
@@ -73,6 +72,7 @@ from flexdt.twin.calibration.detect.smeared_spots import (
 )
 from flexdt.twin.calibration.detect.windows import (
     Balls,
+    Turning,
     Windows,
     blurred_windows,
     edged,
@@ -521,19 +521,14 @@ def _measured_smeared(
     index = np.flatnonzero(windows.share > MIN_SHARE)
     masks = own_pixels(windows, way, index)
     behind = survey(patches.flat, alone)
-    level = backdrop(behind, windows.side)
-    found = placed(patches.flat - level, alone, masks, index)
+    plane = backdrop(replace(behind, bend=None), windows.side)
+    if behind.bend is not None:
+        patches = replace(patches, flat=patches.flat - behind.bend)
+    found = placed(patches.flat - plane, alone, masks, index)
     results = results_of(found, patches)
-    seen = (
-        patches
-        if behind.bend is None
-        else replace(patches, flat=patches.flat - behind.bend)
-    )
-    evened, fainter = _evened(seen, behind, body, alone, results)
-    if evened is not seen:
-        found = placed(
-            evened.flat - (level - (patches.flat - seen.flat)), alone, masks, index
-        )
+    evened, fainter = _evened(patches, behind, body, alone, results)
+    if evened is not patches:
+        found = placed(evened.flat - plane, alone, masks, index)
         results = results_of(found, patches)
     changed = placed(alone + fainter, alone, masks, index)
     common = np.nan_to_num(changed.shift).reshape(n, k, 2, 1)

@@ -8,7 +8,6 @@ So spots are compared with rendered ones of the same smear, all pixels at once.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -44,6 +43,7 @@ from flexdt.twin.calibration.detect.smear import (
 )
 from flexdt.twin.calibration.detect.windows import (
     Balls,
+    Turning,
     Windows,
     blurred_windows,
     exposed,
@@ -71,8 +71,6 @@ RIM_PX = 6.5
 """Pixels about a spot's rim that tell its background."""
 LEAST_PIXELS = 40
 """Least number of usable pixels of a spot."""
-Turning = Callable[[float], ConeVec]
-"""Gives the geometry of all frames at a part of a step from the middle of each exposure."""
 
 
 def followed(

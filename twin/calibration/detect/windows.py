@@ -50,6 +50,8 @@ PART_STEP = 8
 together."""
 PART_PIXELS = 400_000
 """Pixels that are rendered together at most, about."""
+Turning = Callable[[float], ConeVec]
+"""Gives the geometry of all frames at a part of a step from the middle of each exposure."""
 LightOf = Callable[["ConeVec", "Windows", FloatArray], Float32Array]
 """Gives the light in windows of a geometry, for rays through one place of each pixel."""
 
@@ -423,7 +425,7 @@ def exposed_light(
     """
     n, k = windows.corner.shape[:2]
     still = replace(windows, moments=())
-    cones = _together(windows.moments)
+    cones = ConeVec.concatenate(windows.moments)
     first, size = reached(scenes, cones, windows)
     places, weights = _rays_of_moments(windows, fine)
     out = np.ones((*terms, n, k, windows.side, windows.side), np.float32)
@@ -446,16 +448,6 @@ def exposed_light(
                 rows = slice(top[i], top[i] + side)
                 out[..., f, b, rows, left[i] : left[i] + side] -= dark[..., i, :, :]
     return out
-
-
-def _together(cones: Sequence[ConeVec]) -> ConeVec:
-    """Put views one after another."""
-    return ConeVec.from_vectors(
-        np.concatenate([cone.source for cone in cones]),
-        np.concatenate([cone.detector for cone in cones]),
-        np.concatenate([cone.u for cone in cones]),
-        np.concatenate([cone.v for cone in cones]),
-    )
 
 
 def reached(
@@ -512,7 +504,7 @@ def _rays_of_moments(windows: Windows, fine: int) -> tuple[FloatArray, Float32Ar
 
 
 def exposed(
-    windows: Windows, model: BeadModel, turning: Callable[[float], ConeVec], share: float
+    windows: Windows, model: BeadModel, turning: Turning, share: float
 ) -> Windows:
     """Return windows of frames that are exposed over a share of a step; 0: of instants.
 
@@ -532,9 +524,7 @@ def exposed(
     return replace(windows, moments=tuple(turning(share * t) for t in parts.tolist()))
 
 
-def ways(
-    windows: Windows, model: BeadModel, turning: Callable[[float], ConeVec]
-) -> FloatArray:
+def ways(windows: Windows, model: BeadModel, turning: Turning) -> FloatArray:
     """Compute the way of each bead's image in a step of the stage, (n, k, 2) [px]."""
     before, after = (
         turning(part).project_points(model.beads, windows.shape) for part in (-0.5, 0.5)

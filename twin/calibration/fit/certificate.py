@@ -768,9 +768,11 @@ def _lost(left: Residuals, x: FloatArray, use: npt.NDArray[np.bool_]) -> Residua
     Returns:
         Those that did not count; None without any, or of `FEWEST_CLUSTERS` frames or more.
     """
+    if len(use) >= FEWEST_CLUSTERS:
+        return None
     problem = left.problem
     more = with_lost_frames(problem.seen, use) & ~use
-    if len(use) >= FEWEST_CLUSTERS or not more.any():
+    if not more.any():
         return None
     keep = np.repeat(more.ravel(), 2)
     factor = edge_factors(problem.layout.names)

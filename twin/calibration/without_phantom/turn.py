@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
-from flexdt.twin.calibration.repeated_frames import find_repeated
+from flexdt.twin.calibration.repeated_frames import ROBUST, find_repeated
 from flexdt.twin.calibration.without_phantom.tile_gap import FRAMES, averaged_rows
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import NotIdentifiableError
@@ -330,7 +330,7 @@ def _step(
     valid = np.all([np.roll(even, by) for by in (-1, 0, 1, 2)], axis=0)
     if valid.sum() < MIN_DIRECTIONS // 2:
         return (0.0, 0.0), 0
-    spread = 1.4826 * np.median(np.abs(shifts[valid]), axis=0) + 1e-6
+    spread = ROBUST * np.median(np.abs(shifts[valid]), axis=0) + 1e-6
     score = np.where(valid, np.abs(shifts / spread).max(axis=1), 0.0)
     worst = int(score.argmax())
     others = np.where(_far(n, worst), score, 0.0)

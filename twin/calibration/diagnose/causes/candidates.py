@@ -20,6 +20,7 @@ from flexdt.twin.calibration.diagnose.causes.cause import (
     with_pick,
 )
 from flexdt.twin.calibration.diagnose.causes.columns import (
+    coordinates,
     image_shape,
     motion_columns,
     panel_of,
@@ -206,7 +207,7 @@ class Candidates:
         at = next(i for i, cause in enumerate(self.causes) if cause.name == "beads")
         size = float(np.ptp(self.problem.model.beads, axis=0).max())
         every = self.causes[at].columns
-        own = [every[3 * bead + axis] for bead in beads for axis in range(3)]
+        own = [every[i] for i in coordinates(beads).tolist()]
         still = with_pick(choice, at, 0.0)
         columns, widths = self.columns_of(still)
         free = dict(zip(columns, widths.tolist(), strict=True)) | dict.fromkeys(own, size)

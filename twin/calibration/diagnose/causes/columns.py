@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -32,6 +32,11 @@ LEAST_VISIBLE: Final = 1e-3
 """Part of a motion that the geometry must leave, for it to be told."""
 WAVES: Final = 8
 """Number of shapes of a motion here: a ramp, and half waves in a scan."""
+
+
+def coordinates(beads: Iterable[int]) -> npt.NDArray[np.intp]:
+    """Return the numbers of the coordinates of beads, (3 beads,), among those of all."""
+    return np.array([3 * bead + axis for bead in beads for axis in range(3)], np.intp)
 
 
 def motion_columns(

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from flexdt.twin.calibration.diagnose.causes.columns import coordinates
 from flexdt.twin.calibration.diagnose.slipped.left import Left, Score
 from flexdt.twin.calibration.diagnose.slipped.piece import SHARES, Piece, walk
 from flexdt.twin.calibration.diagnose.slipped.residuals import Residuals
@@ -91,7 +91,7 @@ class FreeCourses:
         q = self._walk.shape[1]
         out = []
         for beads in (*((bead,) for bead in range(k)), tuple(range(k))):
-            at = _coordinates(beads)
+            at = coordinates(beads)
             gram = self._gram[at][:, :, at].reshape(len(at) * q, -1)
             push = self._push[at].ravel()
             widths = [share * self._residuals.size for share in SHARES]
@@ -112,7 +112,7 @@ class FreeCourses:
         Returns:
             The most likely course of these beads so far.
         """
-        at = _coordinates(beads)
+        at = coordinates(beads)
         gram = self._gram[at][:, :, at]
         push = self._push[at]
         noise = self._left.noise
@@ -152,8 +152,3 @@ class FreeCourses:
 def _gain(scored: Scored) -> float:
     """Return the logarithm of the odds of a piece against none."""
     return scored.score.gain
-
-
-def _coordinates(beads: Iterable[int]) -> npt.NDArray[np.intp]:
-    """Return the columns of the coordinates of beads, (3 beads,)."""
-    return np.array([3 * bead + axis for bead in beads for axis in range(3)], np.intp)

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 
 from flexdt.twin.calibration.diagnose.causes import Candidates, Choice, Known
-from flexdt.twin.calibration.diagnose.causes.columns import WAVES
+from flexdt.twin.calibration.diagnose.causes.columns import WAVES, coordinates
 from flexdt.twin.calibration.diagnose.causes.explained import REPEATING_FRAMES
 from flexdt.twin.calibration.diagnose.slipped.piece import Model, Piece, walk
 from flexdt.twin.calibration.diagnose.wobble import LEANS
@@ -74,7 +74,7 @@ class Residuals:
         """
         c = self.candidates
         course = piece.course(self.frames)[self.frame]
-        at = [c.count + 3 * bead + axis for bead in piece.beads for axis in range(3)]
+        at = c.count + coordinates(piece.beads)
         own = np.asarray(c.rows[:, at] * course[:, None])
         if not piece.toward:
             return own

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from flexdt.twin.calibration.diagnose.causes.columns import coordinates
 from flexdt.twin.calibration.diagnose.slipped.free import FreeCourses
 from flexdt.twin.calibration.diagnose.slipped.left import Left, Score
 from flexdt.twin.calibration.diagnose.slipped.piece import LEAST_SIDE, SHARES, Piece
@@ -54,7 +55,7 @@ class Search:
         """Judge a piece, once (cached), with the width that its displacements have."""
         if piece not in self._scores:
             gram, push = self._of_all_beads(piece.frame, piece.slow)
-            at = [3 * bead + axis for bead in piece.beads for axis in range(3)]
+            at = coordinates(piece.beads)
             gram = gram[np.ix_(at, at)]
             push = push[at]
             size = self._trial.size

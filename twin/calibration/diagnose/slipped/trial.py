@@ -15,7 +15,7 @@ from flexdt.twin.calibration.diagnose import Finding, error
 from flexdt.twin.calibration.diagnose.causes.cause import (
     REPEATING,
 )
-from flexdt.twin.calibration.diagnose.causes.columns import LEAST_VISIBLE
+from flexdt.twin.calibration.diagnose.causes.columns import LEAST_VISIBLE, coordinates
 from flexdt.twin.calibration.diagnose.causes.every_cause import (
     MOTION_WIDTHS,
     PRIOR_FACTORS,
@@ -35,6 +35,9 @@ LEAST_TOLD: Final = 0.05
 SLOW_ERRORS: Final = tuple(itertools.product((0.7, 0.9, 0.97), (1.0, 3.0, 10.0, 30.0)))
 """Correlations of slow errors of spots from frame to frame, and their sizes in units of errors
 that are not correlated."""
+
+Searches = dict[tuple[Piece, ...], Search]
+"""Searches by the pieces that are there already."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +101,16 @@ class Trial(Residuals):
         by a rule, then with those that move freely.
         """
         before: list[tuple[Piece, ...]] = [()]
-        for free, base in itertools.product((False, True), (self.nothing, self.rival)):
-            pieces = self._explaining(base, free)
+        bases: tuple[tuple[Model, Searches], ...] = ((self.nothing, {}), (self.rival, {}))
+        for free, (base, searches) in itertools.product((False, True), bases):
+            pieces = self._explaining(base, searches, free)
             if pieces not in before:
                 yield pieces
             before.append(pieces)
 
-    def _explaining(self, base: Model, free: bool) -> tuple[Piece, ...]:
+    def _explaining(
+        self, base: Model, searches: Searches, free: bool
+    ) -> tuple[Piece, ...]:
         """Find pieces that explain what a model leaves, step by step, `MOST_PIECES` at
         most, each further one beyond doubt; in the order of their frames.
 
@@ -112,13 +118,17 @@ class Trial(Residuals):
 
         Args:
             base: the model.
+            searches: beside that model and pieces; those that are not there are added.
             free: whether beads may move by no rule, too.
         """
         rows, widths, values = self.rows_of(base)
         noise = self.candidates.noise
         out: list[Piece] = []
         while len(out) < MOST_PIECES:
-            search = Search(self, Left(rows, widths, values, noise))
+            beside = tuple(out)
+            if beside not in searches:
+                searches[beside] = Search(self, Left(rows, widths, values, noise))
+            search = searches[beside]
             piece = search.best(out, free)
             gain, width, noise = search.score(piece)
             if gain < (NAMED_LOG_ODDS if out else 0.0) or piece in out:
@@ -185,7 +195,7 @@ class Trial(Residuals):
         for cause in c.causes:
             if cause.name == REPEATING:
                 out += [likely.beside(cause.columns, width) for width in cause.widths]
-        own = [c.count + 3 * bead + axis for bead in moving for axis in range(3)]
+        own = (c.count + coordinates(moving)).tolist()
         out += [likely.beside(own, share * self.size) for share in SHARES]
         out += [likely.beside(motions, width * c.noise) for width in MOTION_WIDTHS]
         return out
