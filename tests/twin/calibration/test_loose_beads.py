@@ -98,6 +98,15 @@ def test_slow_errors_and_motion_of_everything_are_no_beads_that_move(
     assert found.verdict == "right", found.said
 
 
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+def test_four_tiles_are_no_beads_that_move() -> None:
+    """A free course with steps beside it has an answer to any remainder."""
+    found = scored("four_tiles", 99_000)
+    assert (found.verdict, found.offered) == ("right", True), found
+    assert found.worst < 4.0
+
+
 def test_what_is_open_is_in_the_sigmas(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is named here, as where the images show less of the same slip."""
     scan = drawn("part_slips", 2)

@@ -255,19 +255,26 @@ def test_the_light_of_an_exposure_is_the_mean_of_its_moments_in_entire_windows(
     assert np.abs(drawn - np.mean(whole, axis=0)).max() < 1e-5
 
 
-@pytest.mark.parametrize(("share", "about"), [(1.4, 0.2), (0.9, 0.2)])
+@pytest.mark.parametrize(
+    ("share", "about", "blur"),
+    [(1.4, 0.2, (0.6, 0.6)), (0.9, 0.2, (0.6, 0.6)), (0.9, 0.2, (3.0, 0.6))],
+)
 def test_shadows_that_are_drawn_out_tell_the_arc_without_a_spot(
-    share: float, about: float
+    share: float, about: float, blur: tuple[float, float]
 ) -> None:
-    images, plan = exposed(share, (0.6, 0.6))
+    images, plan = exposed(share, blur)
     model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
     arc = drawn_out(images, plan, model, turned)
     assert arc.certain
     assert arc.share == pytest.approx(share, abs=about)
 
 
-def test_round_shadows_are_not_drawn_out_wherever_they_are_sought() -> None:
-    images, plan = exposed(0.0, (0.6, 0.6))
+@pytest.mark.parametrize("blur", [(0.6, 0.6), (0.6, 1.5)])
+def test_shadows_at_rest_are_not_drawn_out_wherever_they_are_sought(
+    blur: tuple[float, float],
+) -> None:
+    """A detector that blurs more along rows was told an arc of a quarter of a step."""
+    images, plan = exposed(0.0, blur)
     model = BeadModel(BEADS, np.full(len(BEADS), RADIUS))
     assert not drawn_out(images, plan, model, turned).certain
     aside = np.roll(images, (4, -3), (2, 3))

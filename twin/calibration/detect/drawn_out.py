@@ -1,7 +1,8 @@
 """Shadows that an exposure draws out along the paths of their beads, so that few look round.
 
 Told without a measured spot, from the second moments of the light in windows where the beads
-are expected: along its path a shadow's variance is larger than across by that of the path.
+are expected: along its path a shadow's variance is larger than across by that of the path. A
+detector that blurs more along rows than along columns draws shadows out, too, but all alike.
 """
 
 from __future__ import annotations
@@ -20,6 +21,12 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 LEAST_DARK = 0.1
 """Light that a pixel of a shadow lacks at least, as a share of the darkest's: above noise."""
+ROUNDS = 30
+"""Steps to the least sum of absolute residuals."""
+LEAST_LEFT = 1e-4
+"""Residual, as a share of the largest, below which its weight does not grow."""
+MOST_CONDITION = 1e6
+"""Condition number of the normal equations from which paths do not tell the arc from blur."""
 CERTAIN_SIGMAS = 5.0
 """Standard deviations of the mean from which an arc is certain."""
 
@@ -57,7 +64,7 @@ def drawn_out(
 ) -> DrawnOut:
     """Estimate the arc of an exposure from the second moments of free, complete shadows.
 
-    The median of the shadows whose bead moves by its radius or more in a step.
+    Shadows are longer by the square of their paths, and by a blur that is not round.
 
     Args:
         images: (n, k, side, side) line integrals.
@@ -66,18 +73,40 @@ def drawn_out(
         turning: geometry within an exposure.
     """
     way = ways(windows, model, turning)
-    length = np.linalg.norm(way, axis=2)
-    told = windows.whole & (length > windows.radii)
-    told &= np.isfinite(images).all(axis=(2, 3))
-    squares = [
-        12.0 * _longer(images[f, k], way[f, k] / length[f, k]) / length[f, k] ** 2
-        for f, k in np.argwhere(told).tolist()
-    ]
-    if len(squares) < LEAST_SPOTS:
+    told = windows.whole & np.isfinite(images).all(axis=(2, 3))
+    told &= np.linalg.norm(way, axis=2) > 0.0
+    if told.sum() < LEAST_SPOTS:
         return DrawnOut(0.0, math.inf)
-    middle = float(np.median(squares))
-    scatter = ROBUST * float(np.median(np.abs(np.array(squares) - middle)))
-    return DrawnOut(middle, scatter * math.sqrt(0.5 * math.pi / len(squares)))
+    paths = way[told]
+    square = np.square(paths).sum(axis=1)
+    along = paths / np.sqrt(square)[:, None]
+    longer = [_longer(one, to) for one, to in zip(images[told], along, strict=True)]
+    x, y = along.T
+    columns = np.column_stack([square / 12.0, x**2 - y**2, 2.0 * x * y])
+    return _robust(columns, np.array(longer))
+
+
+def _robust(columns: FloatArray, values: FloatArray) -> DrawnOut:
+    """Fit columns to values with the least sum of absolute residuals.
+
+    Args:
+        columns: (m, 3), that of the squared share of a step first.
+        values: (m,).
+    """
+    gram = columns.T @ columns
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    if np.linalg.cond(gram / np.outer(scale, scale)) > MOST_CONDITION:
+        return DrawnOut(0.0, math.inf)
+    weight = np.ones(len(values))
+    for _ in range(ROUNDS):
+        found = np.linalg.solve(
+            (columns.T * weight) @ columns, columns.T @ (weight * values)
+        )
+        left = np.abs(values - columns @ found)
+        weight = 1.0 / np.maximum(left, LEAST_LEFT * max(float(left.max()), 1e-12))
+    scatter = ROBUST * float(np.median(left))
+    unit = float(np.linalg.inv(gram)[0, 0])
+    return DrawnOut(float(found[0]), scatter * math.sqrt(0.5 * math.pi * unit))
 
 
 def _longer(image: Float32Array, along: FloatArray) -> float:
