@@ -42,6 +42,9 @@ LOOSE_FACTOR = 15.0
 WIDE_PX = (120.0, 60.0, 40.0)
 NARROW_PX = (25.0, 15.0, 10.0)
 """Gates of the rounds from all start angles, and of those from the promising ones."""
+SETTLED_PX = 1e-3
+"""Change of the residuals' rms below which a hypothesis is settled: a hundredth of the usual
+error of a spot. The fit of the geometry goes on from there."""
 MAX_FINALISTS = 4
 """Number of hypotheses finished on all frames."""
 MAX_RIVAL_EXCESS = 25.0
@@ -617,7 +620,7 @@ def _finish(
     while gates[-1] > max(20.0, how.gate_px):
         gates.append(max(0.5 * gates[-1], how.gate_px))
     gates += [how.gate_px] * (12 - len(gates))
-    solver = Solver(max_iterations=15)
+    solver = Solver(max_iterations=15, tolerance=SETTLED_PX)
     return _followed(problem, shadows, x, gates, solver, how.gate_px, give_up=False)
 
 

@@ -11,7 +11,7 @@ import pytest
 from calibration_scenarios import scenario
 from scipy import linalg
 
-from flexdt.twin.calibration.fit.motion_model import Course, MotionModel
+from flexdt.twin.calibration.fit.motion_model import Course, MotionModel, Waves
 from flexdt.twin.calibration.pipeline import CalibrationRequest
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.motion import MOVABLE, Motion
@@ -129,10 +129,10 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
         )
 
     choices = [
-        ((1.0, 1.0), (0.1, 4.0)),
-        ((10.0, 4.0), (0.3, math.inf)),
-        ((3.0, 16.0), (30.0, 4.0)),
-        (Course((0,), 10.0), (3.0, 4.0)),
+        (Waves(1.0, 1.0), Waves(0.1, 4.0)),
+        (Waves(10.0, 4.0), Waves(0.3, math.inf)),
+        (Waves(3.0, 16.0), Waves(30.0, 4.0)),
+        (Course((0,), 10.0), Waves(3.0, 4.0)),
         (Course((1, 3), 100.0), Course((1,), 3.0)),
     ]
     ours = [model.likelihood(choice) for choice in choices]
@@ -148,7 +148,7 @@ def test_bands_and_means_equal_a_dense_model(seed: int) -> None:
         np.testing.assert_allclose(added + plain, covariance[:g, :g], atol=1e-8)
         np.testing.assert_allclose(moved, found[:g], atol=1e-8)
     shapes = range(model.courses.shape[1])
-    for beside in (None, (3.0, 4.0), Course((4,), 10.0)):
+    for beside in (None, Waves(3.0, 4.0), Course((4,), 10.0)):
         tried = [(Course((s,), w), beside) for s in shapes for w in (1.0, 30.0)]
         found = model.best_course((None, beside), 0, (1.0, 30.0))
         assert found == max(tried, key=model.likelihood)[0]

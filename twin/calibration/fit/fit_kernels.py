@@ -16,9 +16,11 @@ the projection of its centre: spot = a + bias * (r / depth)^2 (a - foot), bias 1
 outline's centre, 0.8 for the chord-weighted centroid, 0 for points (calibration.md,
 "Images").
 
-All of a frame is in a matrix from beads to columns, rows and depths. Its derivatives are
-imaginary parts: where a parameter has the imaginary part h, a smooth real function has h times
-its slope, exact to rounding (Squire and Trapp, SIAM Review 40 (1998) 110).
+All of a frame is in a matrix from beads to columns, rows and depths: the product of three
+rows, which know the panel and the source, and four columns, which know the object. Derivatives
+by turns of the detector are imaginary parts: where a parameter has the imaginary part h, a
+smooth real function has h times its slope, exact to rounding (Squire and Trapp, SIAM Review 40
+(1998) 110). All others are written out: they are a few products each.
 """
 
 from __future__ import annotations
@@ -84,25 +86,23 @@ def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
 
 
 @linked
-def frame_matrix(p, geo, pivot, matrix, foot):  # type: ignore[no-untyped-def]
-    """Compute the projection matrix of a frame.
+def panel_rows(p, geo, rows, steps):  # type: ignore[no-untyped-def]
+    """Compute the rows of a frame, which take a place, from the source, to column, row and 1,
+    times its depth [mm].
 
     Angles are [rad], lengths [mm]; complex numbers serve for derivatives.
 
     Args:
         p: (17,) complex parameters.
         geo: (18,) complex, see `Data`.
-        pivot: 1.0 or 0.0, see the module.
-        matrix: (3, 4) from a bead (x, y, z, 1) to column, row and 1, times its depth
-            [mm]; written.
-        foot: (3,) column, row and 1 of the perpendicular's foot; written. Pixels are from
-            the detector's centre.
+        rows: (3, 3) written; the last is the panel's unit normal.
+        steps: (2, 3) the steps of a pixel to the right and down, over the pixel's area [1/mm];
+            written.
     """
-    s = geo[SOURCE] + p[DS_X], geo[SOURCE + 1], geo[SOURCE + 2] + p[DS_Y]
     g = (
-        geo[DETECTOR] + p[DD_X] - s[0],
-        geo[DETECTOR + 1] + p[DD_Z] - s[1],
-        geo[DETECTOR + 2] + p[DD_Y] - s[2],
+        geo[DETECTOR] + p[DD_X] - geo[SOURCE] - p[DS_X],
+        geo[DETECTOR + 1] + p[DD_Z] - geo[SOURCE + 1],
+        geo[DETECTOR + 2] + p[DD_Y] - geo[SOURCE + 2] - p[DS_Y],
     )
     # As `conventions.turn_detector` has it.
     v = geo[V], geo[V + 1], geo[V + 2]
@@ -113,25 +113,133 @@ def frame_matrix(p, geo, pivot, matrix, foot):  # type: ignore[no-untyped-def]
         n = _cross(u, v)
         u, v = _turned(u, n, p[ROLL]), _turned(v, n, p[ROLL])
     n = _cross(u, v)
-    # T = Ry(axis_tilt_z) Rx(axis_tilt_x), and R clockwise from above: columns of T, and of T R.
-    cx, sx = _wave(p[TILT_X])
-    cz, sz = _wave(p[TILT_Z])
-    ca, sa = _wave(p[ALPHA] + p[ANGLE_SCALE] * geo[ANGLE])
+    scale = 1.0 / cmath.sqrt(_dot(n, n))
+    for r, row in enumerate((_cross(v, g), _cross(g, u), n)):
+        for c in range(3):
+            rows[r, c] = row[c] * scale
+    for r, step in enumerate((u, v)):
+        for c in range(3):
+            steps[r, c] = step[c] * scale
+
+
+@linked
+def object_columns(p, geo, pivot, columns):  # type: ignore[no-untyped-def]
+    """Compute the columns of a frame: a bead (x, y, z, 1) is at the sum of their products,
+    from the source [mm].
+
+    Args:
+        p: (17,) parameters.
+        geo: (18,) see `Data`.
+        pivot: 1.0 or 0.0, see the module.
+        columns: (4, 3) written.
+    """
+    # T = Ry(axis_tilt_z) Rx(axis_tilt_x), and R clockwise from above: columns of T R.
+    cx, sx = math.cos(p[TILT_X]), math.sin(p[TILT_X])
+    cz, sz = math.cos(p[TILT_Z]), math.sin(p[TILT_Z])
+    angle = p[ALPHA] + p[ANGLE_SCALE] * geo[ANGLE]
+    ca, sa = math.cos(angle), math.sin(angle)
     x = ca * cz - sa * sz * sx, -sa * cx, -ca * sz - sa * cz * sx
     y = sa * cz + ca * sz * sx, ca * cx, -sa * sz + ca * cz * sx
     z = sz * cx, -sx, cz * cx
     bx, by = geo[MOUNT] - p[TAU_X], geo[MOUNT + 1] - p[TAU_Z]
     still = (
-        x[0] * bx + y[0] * by + geo[AXIS] + p[DO_X] + pivot * p[TAU_X] - s[0],
-        x[1] * bx + y[1] * by + geo[AXIS + 1] + p[DO_Z] + pivot * p[TAU_Z] - s[1],
-        x[2] * bx + y[2] * by + geo[AXIS + 2] + p[DO_Y] - s[2],
-    )
-    scale = 1.0 / cmath.sqrt(_dot(n, n))
-    away = n[0] * scale, n[1] * scale, n[2] * scale
-    for r, row in enumerate((_cross(v, g), _cross(g, u), n)):
-        for c, column in enumerate((x, y, z, still)):
-            matrix[r, c] = _dot(row, column) * scale
-        foot[r] = _dot(row, away) * scale
+        x[0] * bx + y[0] * by + geo[AXIS] + p[DO_X] + pivot * p[TAU_X]
+        - geo[SOURCE] - p[DS_X],
+        x[1] * bx + y[1] * by + geo[AXIS + 1] + p[DO_Z] + pivot * p[TAU_Z]
+        - geo[SOURCE + 1],
+        x[2] * bx + y[2] * by + geo[AXIS + 2] + p[DO_Y] - geo[SOURCE + 2] - p[DS_Y],
+    )  # fmt: skip
+    for c, column in enumerate((x, y, z, still)):
+        for a in range(3):
+            columns[c, a] = column[a]
+
+
+@linked
+def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped-def]
+    """Compute the derivatives of a frame's columns by a parameter.
+
+    Args:
+        i: number of the parameter.
+        p, geo, pivot: see `object_columns`.
+        columns: (4, 3) of it.
+        slopes: (4, 3) written.
+    """
+    slopes[:] = 0.0
+    x, y, z = columns[0], columns[1], columns[2]
+    bx, by = geo[MOUNT] - p[TAU_X], geo[MOUNT + 1] - p[TAU_Z]
+    if i == DO_X:
+        slopes[3, 0] = 1.0
+    elif i == DO_Z:
+        slopes[3, 1] = 1.0
+    elif i == DO_Y:
+        slopes[3, 2] = 1.0
+    elif i == DS_X:
+        slopes[3, 0] = -1.0
+    elif i == DS_Y:
+        slopes[3, 2] = -1.0
+    elif i == TAU_X:
+        slopes[3] = -x
+        slopes[3, 0] += pivot
+    elif i == TAU_Z:
+        slopes[3] = -y
+        slopes[3, 1] += pivot
+    elif i in (ALPHA, ANGLE_SCALE):
+        amount = 1.0
+        if i == ANGLE_SCALE:
+            amount = geo[ANGLE]
+        for a in range(3):
+            slopes[0, a] = -amount * y[a]
+            slopes[1, a] = amount * x[a]
+            slopes[3, a] = slopes[0, a] * bx + slopes[1, a] * by
+    elif i == TILT_X:
+        angle = p[ALPHA] + p[ANGLE_SCALE] * geo[ANGLE]
+        ca, sa = math.cos(angle), math.sin(angle)
+        for a in range(3):
+            slopes[0, a] = -sa * z[a]
+            slopes[1, a] = ca * z[a]
+            slopes[2, a] = sa * x[a] - ca * y[a]
+            slopes[3, a] = slopes[0, a] * bx + slopes[1, a] * by
+    elif i == TILT_Z:
+        for c in range(3):
+            slopes[c, 0] = columns[c, 2]
+            slopes[c, 2] = -columns[c, 0]
+        for a in range(3):
+            slopes[3, a] = slopes[0, a] * bx + slopes[1, a] * by
+
+
+@linked
+def panel_slopes(i, p, geo, steps, rows, slopes):  # type: ignore[no-untyped-def]
+    """Compute the derivatives of a frame's rows by a parameter.
+
+    Args:
+        i: number of the parameter.
+        p, geo: as of `panel_rows`.
+        steps: (2, 3) of it, real.
+        rows: (3, 3) complex, for intermediate results.
+        slopes: (3, 3) written.
+    """
+    slopes[:] = 0.0
+    away = 0.0, 0.0, 0.0  # how the panel's centre moves from the source
+    if i == DD_X:
+        away = 1.0, 0.0, 0.0
+    elif i == DD_Z:
+        away = 0.0, 1.0, 0.0
+    elif i == DD_Y:
+        away = 0.0, 0.0, 1.0
+    elif i == DS_X:
+        away = -1.0, 0.0, 0.0
+    elif i == DS_Y:
+        away = 0.0, 0.0, -1.0
+    elif i in (ROLL, PITCH, YAW):
+        turned = p.copy()
+        turned[i] += IMAGINARY_STEP * 1j
+        panel_rows(turned, geo, rows, np.empty((2, 3), np.complex128))
+        slopes[:] = rows.imag / IMAGINARY_STEP
+        return
+    across, along = _cross(steps[1], away), _cross(away, steps[0])
+    for c in range(3):
+        slopes[0, c] = across[c]
+        slopes[1, c] = along[c]
 
 
 class Data(NamedTuple):
@@ -186,8 +294,7 @@ def evaluate(  # type: ignore[no-untyped-def]
         predicted: (n, k, 2) out, pixels from the detector's centre.
         norms: (n, k) out: length of the whitened residual; -1 where not used.
         jac: (2 n k, columns) out when want = 2 (rows of unused observations stay zero).
-        hess: (columns, columns), grad: (columns,): set to 0; out when want = 1, upper
-            triangle.
+        hess: (columns, columns), grad: (columns,): set to 0; out when want = 1.
 
     Returns:
         The cost; inf if a bead is not in front of the source.
@@ -207,7 +314,13 @@ def evaluate(  # type: ignore[no-untyped-def]
     ) = data
     n_frames, n_beads = use.shape
     most = len(active) + 3
-    matrix, foot = np.zeros((3, 4), np.complex128), np.zeros(3, np.complex128)
+    rows, rows_slope = np.zeros((3, 3)), np.zeros((3, 3))
+    columns, columns_slope = np.zeros((4, 3)), np.zeros((4, 3))
+    steps = np.zeros((2, 3))
+    turned, turned_steps = (
+        np.zeros((3, 3), np.complex128),
+        np.zeros((2, 3), np.complex128),
+    )
     now, at = np.zeros((3, 4)), np.zeros(3)
     slope, slide = np.zeros((most, 3, 4)), np.zeros((most, 3))
     cols = np.empty(most + len(panel), np.int64)
@@ -216,20 +329,31 @@ def evaluate(  # type: ignore[no-untyped-def]
     hess[:] = 0.0
     grad[:] = 0.0
     for f in range(n_frames):
-        values = params[group[f]].astype(np.complex128)
-        geo = geometry[f].astype(np.complex128)
-        frame_matrix(values, geo, pivot, matrix, foot)
-        now[:], at[:] = matrix.real, foot.real
+        values, geo = params[group[f]], geometry[f]
+        complex_values, complex_geo = (
+            values.astype(np.complex128),
+            geo.astype(np.complex128),
+        )
+        panel_rows(complex_values, complex_geo, turned, turned_steps)
+        rows[:], steps[:] = turned.real, turned_steps.real
+        object_columns(values, geo, pivot, columns)
+        for r in range(3):
+            at[r] = _dot(rows[r], rows[2])
+            for c in range(4):
+                now[r, c] = _dot(rows[r], columns[c])
         own = 0
         for i in active:
             if want > 0 and colmap[group[f], i] >= 0:
-                values[i] += IMAGINARY_STEP * 1j
-                frame_matrix(values, geo, pivot, matrix, foot)
-                values[i] = values[i].real
-                slope[own], slide[own] = (
-                    matrix.imag / IMAGINARY_STEP,
-                    foot.imag / IMAGINARY_STEP,
-                )
+                object_slopes(i, values, geo, pivot, columns, columns_slope)
+                panel_slopes(i, complex_values, complex_geo, steps, turned, rows_slope)
+                for r in range(3):
+                    slide[own, r] = _dot(rows_slope[r], rows[2]) + _dot(
+                        rows[r], rows_slope[2]
+                    )
+                    for c in range(4):
+                        slope[own, r, c] = _dot(rows_slope[r], columns[c]) + _dot(
+                            rows[r], columns_slope[c]
+                        )
                 cols[own] = colmap[group[f], i]
                 own += 1
         if bead_col >= 0:
@@ -302,4 +426,7 @@ def evaluate(  # type: ignore[no-untyped-def]
                 grad[cj] += va * r0 + vb * r1
                 for i in range(j + 1):
                     hess[min(cj, cols[i]), max(cj, cols[i])] += va * da[i] + vb * db[i]
+    for i in range(len(grad)):
+        for j in range(i):
+            hess[i, j] = hess[j, i]
     return total

@@ -159,10 +159,13 @@ class MotionModel:
         self.total = float(np.sum(residual**2) + np.sum(weight * off**2))
         self.freedom = max(len(residual) + int((weight > 0).sum()) - g, 1)
         self.courses = _courses(sizes)
+        self._one_frame = 1.0 / np.maximum(np.einsum("nii->i", self.pairs) / n, 1e-300)
+        self._centred: dict[int, FloatArray] = {}
+        self._precisions: dict[float, _Precision] = {}
 
     def one_frame(self, i: int) -> float:
         """Compute the variance of a parameter's deviation from one frame."""
-        return 1.0 / max(float(self.pairs[:, i, i].mean()), 1e-300)
+        return float(self._one_frame[i])
 
     def course(self, i: int, shapes: Sequence[int]) -> FloatArray:
         """Compute the deviations of a parameter that follow courses, from their mean, (n,
@@ -172,11 +175,17 @@ class MotionModel:
             i: number of the parameter.
             shapes: numbers of courses.
         """
-        out = self.courses[:, list(shapes)]
-        own = self.column[:, i]
-        for label in np.unique(own):
-            out[own == label] -= out[own == label].mean(axis=0)
-        return np.asarray(out * math.sqrt(self.one_frame(i)))
+        return self._every_course(i)[:, list(shapes)]
+
+    def _every_course(self, i: int) -> FloatArray:
+        """Compute the deviations of a parameter that follow each course, once; see `course`."""
+        if i not in self._centred:
+            out = self.courses.copy()
+            own = self.column[:, i]
+            for label in np.unique(own):
+                out[own == label] -= out[own == label].mean(axis=0)
+            self._centred[i] = np.asarray(out * math.sqrt(self.one_frame(i)))
+        return self._centred[i]
 
     def spectrum(self, i: int, pick: Waves) -> list[FloatArray]:
         """Compute the variance of the amplitude of each scan's cosines, for deviations
@@ -190,37 +199,28 @@ class MotionModel:
             For each scan (frames,), by the number of half waves, falling; the mean from
             one half wave on is the squared width.
         """
-        width, waves = pick
-        one_frame = self.one_frame(i)
-        out = []
-        for size in self.sizes:
-            bends = (2.0 * np.sin(0.5 * math.pi * np.arange(size) / size)) ** 2
-            shares = 1.0 / (1.0 + (bends / _stiffness(size, waves)) ** 2)
-            out.append(width**2 * one_frame * shares * (size - 1) / shares[1:].sum())
-        return out
+        variance = pick.width**2 * self.one_frame(i)
+        return [variance * shares for shares in _shares(self.sizes, pick.waves)]
+
+    def _of_one(self, waves: float) -> _Precision:
+        """Return the prior precision of deviations of unit width, made once."""
+        if waves not in self._precisions:
+            self._precisions[waves] = _precision(self.sizes, waves)
+        return self._precisions[waves]
 
     def _diagonals(self, i: int, pick: Waves) -> FloatArray:
-        """Compute the prior precision of a parameter's deviations, a banded matrix: (1 +
-        D'D / stiffness^2) / variance of each scan.
+        """Compute the prior precision of a parameter's deviations, (3, n); see `_Precision`.
 
         Args:
             i: number of the parameter.
             pick: width and smoothness of its motion.
-
-        Returns:
-            (3, n) the main diagonal and the two below it, for n frames; scans are not
-            connected.
         """
-        parts = []
-        for size, variance in zip(self.sizes, self.spectrum(i, pick), strict=True):
-            inner = np.ones(size - 2)  # frames with a second difference [1, -2, 1]
-            diagonal = np.convolve(inner, [1.0, 4.0, 1.0])
-            beside = np.r_[np.convolve(inner, [-2.0, -2.0]), 0.0]
-            squared = np.stack([diagonal, beside, np.r_[inner, 0.0, 0.0]])
-            squared /= _stiffness(size, pick[1]) ** 2
-            squared[0] += 1.0
-            parts.append(squared / variance[0])
-        return np.concatenate(parts, axis=1)
+        return self._of_one(pick.waves).diagonals / (pick.width**2 * self.one_frame(i))
+
+    def _logarithm_of_prior(self, i: int, pick: Waves) -> float:
+        """Compute the logarithm of the determinant of the same."""
+        variance = pick.width**2 * self.one_frame(i)
+        return self._of_one(pick.waves).logarithm - len(self.pull) * math.log(variance)
 
     def _factor(self, moving: Sequence[int], choice: MotionChoice) -> FloatArray:
         """Factorise the deviations' normal equations, frame by frame (banded Cholesky);
@@ -357,8 +357,7 @@ class MotionModel:
             if isinstance(pick, Course):
                 volume += 2.0 * len(pick.shapes) * math.log(pick.width)
             elif pick is not None:
-                alone = linalg.cholesky_banded(self._diagonals(i, pick), lower=True)
-                volume -= 2.0 * float(np.log(alone[0]).sum())
+                volume -= self._logarithm_of_prior(i, pick)
         return float(-0.5 * (volume + self.freedom * math.log(rest)))
 
     def best_course(
@@ -588,6 +587,52 @@ def _averages(
     each = np.zeros((n * p, len(kinds)))
     each[np.arange(n * p), mean_of] = 1.0 / size[mean_of]
     return own.ravel()[first], mean_of, each
+
+
+class _Precision(NamedTuple):
+    """The prior precision of n deviations, a banded matrix: (1 + D'D / stiffness^2) /
+    variance of each scan. Scans are not connected.
+
+    Attributes:
+        diagonals: (3, n) the main diagonal and the two below it.
+        logarithm: of its determinant.
+    """
+
+    diagonals: FloatArray
+    logarithm: float
+
+
+def _precision(sizes: Sequence[int], waves: float) -> _Precision:
+    """Compute the prior precision of deviations of unit width.
+
+    Args:
+        sizes: frames of each scan.
+        waves: half waves in a scan above which amplitudes fall.
+    """
+    parts = []
+    for size, shares in zip(sizes, _shares(sizes, waves), strict=True):
+        inner = np.ones(size - 2)  # frames with a second difference [1, -2, 1]
+        diagonal = np.convolve(inner, [1.0, 4.0, 1.0])
+        beside = np.r_[np.convolve(inner, [-2.0, -2.0]), 0.0]
+        squared = np.stack([diagonal, beside, np.r_[inner, 0.0, 0.0]])
+        squared /= _stiffness(size, waves) ** 2
+        squared[0] += 1.0
+        parts.append(squared / shares[0])
+    whole = np.concatenate(parts, axis=1)
+    lower = linalg.cholesky_banded(whole, lower=True)
+    return _Precision(whole, 2.0 * float(np.log(lower[0]).sum()))
+
+
+def _shares(sizes: Sequence[int], waves: float) -> list[FloatArray]:
+    """Compute the variances of the amplitudes of each scan's cosines, falling, by the number
+    of half waves; the mean from one half wave on is 1.
+    """
+    out = []
+    for size in sizes:
+        bends = (2.0 * np.sin(0.5 * math.pi * np.arange(size) / size)) ** 2
+        shares = 1.0 / (1.0 + (bends / _stiffness(size, waves)) ** 2)
+        out.append(shares * (size - 1) / shares[1:].sum())
+    return out
 
 
 def _stiffness(size: int, waves: float) -> float:

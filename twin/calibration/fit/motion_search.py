@@ -316,13 +316,19 @@ class _Search:
             if not isinstance(best, Waves):
                 continue
             top = self.likelihood(choice)
-            fair = [
+            wider = (
+                Waves(*pair) for pair in product(WIDTHS, WAVES) if pair[0] >= best.width
+            )
+            by_room = sorted(
+                wider,
+                key=lambda p, i=i: (self._model.spectrum(i, p)[0][ONE_PERIOD], p),  # type: ignore[misc]
+                reverse=True,
+            )
+            wide = next(
                 pick
-                for pick in (Waves(*pair) for pair in product(WIDTHS, WAVES))
-                if pick.width >= best.width
-                and self.likelihood(_with(choice, i, pick)) >= top - MAX_LIKELIHOOD_LOSS
-            ]
-            wide = max((self._model.spectrum(i, p)[0][ONE_PERIOD], p) for p in fair)[1]
+                for pick in by_room
+                if self.likelihood(_with(choice, i, pick)) >= top - MAX_LIKELIHOOD_LOSS
+            )
             choice = _with(choice, i, wide)
         return choice
 

@@ -569,15 +569,14 @@ class FitProblem:
         if want == 0:
             return float(cost), *written
         predicted, norms, jac, hess, grad = written
-        whole = hess + np.triu(hess, 1).T
         if table is None:
-            return float(cost), predicted, norms, jac, whole, grad
+            return float(cost), predicted, norms, jac, hess, grad
         return (
             float(cost),
             predicted,
             norms,
             jac @ table,
-            table.T @ whole @ table,
+            table.T @ hess @ table,
             grad @ table,
         )
 
