@@ -42,6 +42,8 @@ LOOSE_FACTOR = 15.0
 WIDE_PX = (120.0, 60.0, 40.0)
 NARROW_PX = (25.0, 15.0, 10.0)
 """Gates of the rounds from all start angles, and of those from the promising ones."""
+LEAST_GAIN = 0.01
+"""Share of its loss that a hypothesis has to lose in a round to go on with the same gate."""
 SETTLED_PX = 1e-3
 """Change of the residuals' rms below which a hypothesis is settled: a hundredth of the usual
 error of a spot. The fit of the geometry goes on from there."""
@@ -380,19 +382,33 @@ def assign(
     """
     from scipy.optimize import linear_sum_assignment
 
-    out = np.full(predicted.shape[:2], -1, dtype=np.int64)
     with np.errstate(invalid="ignore", over="ignore"):
-        d2 = np.sum((predicted[:, :, None, :] - points[:, None, :, :]) ** 2, axis=3)
+        across, along = np.moveaxis(
+            predicted[:, :, None, :] - points[:, None, :, :], 3, 0
+        )
+        d2 = across**2 + along**2
     far = gate * gate
     d2 = np.where(d2 < far, d2, far)
-    for f in range(len(out)):
-        m = int(counts[f])
-        if m == 0:
-            continue
-        rows, cols = linear_sum_assignment(d2[f, :, :m])
+    # Where no two beads have the same nearest spot, these are the assignment.
+    out = np.asarray(d2.argmin(axis=2), dtype=np.int64)
+    out[d2.min(axis=2) >= far] = -1
+    for f in _shared(out).tolist():
+        rows, cols = linear_sum_assignment(d2[f, :, : int(counts[f])])
         near = d2[f, rows, cols] < far
+        out[f] = -1
         out[f, rows[near]] = cols[near]
     return out
+
+
+def _shared(index: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
+    """List the frames in which two beads have the same spot.
+
+    Args:
+        index: (n, k) spot of each bead, -1 without one.
+    """
+    ordered = np.sort(index, axis=1)
+    same = (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)
+    return np.flatnonzero(same.any(axis=1))
 
 
 def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
@@ -450,8 +466,8 @@ def _followed(
     cap: float,
     give_up: bool,
 ) -> _Hypothesis:
-    """Assign and fit with each gate in turn, until a gate equal to the last one changes
-    no assignment.
+    """Assign and fit with each gate in turn, until with a gate equal to the last one no
+    assignment changes, or the loss falls by less than `LEAST_GAIN`.
 
     Args:
         problem: of the fit.
@@ -467,6 +483,7 @@ def _followed(
     """
     used = math.nan
     before = np.zeros(0, np.int64)
+    loss = math.inf
     try:
         predicted = _predicted(problem, x)
         for gate in gates:
@@ -475,7 +492,10 @@ def _followed(
                 if give_up:
                     return _Hypothesis(x, math.inf, 0)
                 break
-            if gate == used and np.array_equal(index, before):
+            enough = (1.0 - LEAST_GAIN) * loss
+            loss = _loss_of(index, predicted, shadows, gate)
+            settled = np.array_equal(index, before) or loss > enough
+            if gate == used and settled:
                 break
             x = solve(_with_tracks(problem, shadows, index), solver, x=x).x
             predicted = _predicted(problem, x)
@@ -532,14 +552,24 @@ def _loss(predicted: FloatArray, shadows: _Shadows, cap: float) -> tuple[float, 
         and the number of explained spots.
     """
     index = assign(predicted, shadows.points, shadows.counts, cap)
+    matches = int(np.count_nonzero(index >= 0))
+    return _loss_of(index, predicted, shadows, cap), matches
+
+
+def _loss_of(
+    index: npt.NDArray[np.int64], predicted: FloatArray, shadows: _Shadows, cap: float
+) -> float:
+    """Compute the loss of an assignment [px^2]; see `_loss`.
+
+    Args:
+        index: (n, k) spot of each bead, -1 without one.
+        predicted, shadows, cap: see `_loss`.
+    """
     frames, beads = np.nonzero(index >= 0)
-    d2 = np.sum(
-        (predicted[frames, beads] - shadows.points[frames, index[frames, beads]]) ** 2,
-        axis=1,
-    )
-    possible = np.minimum(shadows.counts, predicted.shape[1]).sum()
-    missing = int(possible) - len(d2)
-    return float((d2.sum() + missing * cap * cap) / max(int(possible), 1)), len(d2)
+    spots = shadows.points[frames, index[frames, beads]]
+    d2 = np.sum((predicted[frames, beads] - spots) ** 2, axis=1)
+    possible = max(int(np.minimum(shadows.counts, predicted.shape[1]).sum()), 1)
+    return float((d2.sum() + (possible - len(d2)) * cap * cap) / possible)
 
 
 def _with_tracks(

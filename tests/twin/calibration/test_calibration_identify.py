@@ -3,6 +3,7 @@ matching."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -95,6 +96,34 @@ def test_no_shadow_at_all_is_an_error() -> None:
     empty = shadows(np.full((2, 3, 2), -100.0), 0)
     with pytest.raises(TwinError, match="no bead shadow"):
         identify(empty, model, poses)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_an_assignment_has_the_least_sum_of_all(seed: int) -> None:
+    """Of all ways to pair beads and spots, an unpaired one counting as a pair at the gate."""
+    rng = np.random.default_rng(seed)
+    beads, spots = rng.integers(1, 5, 2).tolist()
+    predicted = rng.uniform(0.0, 10.0, (3, beads, 2))
+    points = rng.uniform(0.0, 10.0, (3, spots, 2))
+    counts = rng.integers(0, spots + 1, 3)
+    points[np.arange(spots) >= counts[:, None]] = np.inf
+    gate = rng.uniform(1.0, 12.0)
+    for f, index in enumerate(assign(predicted, points, counts, gate)):
+        d2 = np.sum((predicted[f, :, None] - points[f, None, : counts[f]]) ** 2, axis=2)
+        pairs = [(bead, spot) for bead, spot in enumerate(index.tolist()) if spot >= 0]
+        assert len({spot for _, spot in pairs}) == len(pairs)
+        assert all(d2[pair] < gate**2 for pair in pairs)
+        ours = sum(d2[pair] - gate**2 for pair in pairs)
+        places = [*range(counts[f]), *[-1] * beads]
+        least = min(
+            sum(
+                min(d2[bead, spot] - gate**2, 0.0)
+                for bead, spot in enumerate(way)
+                if spot >= 0
+            )
+            for way in itertools.permutations(places, beads)
+        )
+        assert ours == pytest.approx(least, abs=1e-9)
 
 
 def test_assignment_is_one_to_one_and_gated() -> None:
