@@ -1,19 +1,29 @@
-"""Processor time that each test file took: `durations.py [--over 10] [FILE.xml ...]`.
+"""Processor time that each test file took: `durations.py [--over 10] [--write] [FILE.xml ...]`.
 
 `make test`, `test-extensions`, `studies` and `page` write what each test took to
 build/durations/: processor time, which other work on the machine does not change, of the test,
 its fixtures and the processes that ended in it. The files that took more than `--over` seconds,
 the budget of a file in `make test`, are listed, the longest first, with their longest test.
+
+`--write` keeps the means of tests whose cases take a second or more together, for
+`tests/support/suite.py`, which leaves in `make test` what its budget allows.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import re
+import statistics
 import xml.etree.ElementTree as ElementTree
 from collections import defaultdict
 from pathlib import Path
 
-FOLDER = Path(__file__).parents[2] / "build" / "durations"
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "build" / "durations"
+MEASURED = ROOT / "tests" / "support" / "processor_s.json"
+LEAST_S = 1.0
+"""Processor time of all cases of a test from which their mean is kept."""
 
 
 def seconds(report: Path) -> dict[str, dict[str, float]]:
@@ -27,6 +37,22 @@ def seconds(report: Path) -> dict[str, dict[str, float]]:
     return found
 
 
+def means(reports: list[Path]) -> dict[str, float]:
+    """Mean processor time of the cases of each test that takes long [s], by its path and
+    name; where several reports have a test, the last one counts."""
+    found: dict[str, float] = {}
+    for report in reports:
+        for place, tests in seconds(report).items():
+            cases: dict[str, list[float]] = defaultdict(list)
+            for case, spent in tests.items():
+                cases[re.sub(r"\[.*", "", case)].append(spent)
+            for name, each in cases.items():
+                if sum(each) >= LEAST_S:
+                    path = place.replace(".", "/")
+                    found[f"{path}.py::{name}"] = round(statistics.fmean(each), 2)
+    return found
+
+
 def main() -> None:
     """Print the sum of each report, and the files above a limit with their longest test."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -36,7 +62,13 @@ def main() -> None:
     parser.add_argument(
         "--over", type=float, default=10.0, help="list files above so many seconds"
     )
+    parser.add_argument(
+        "--write", action="store_true", help="keep the means for the next runs"
+    )
     chosen = parser.parse_args()
+    if chosen.write:
+        kept = means(chosen.reports)
+        MEASURED.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
     for report in chosen.reports:
         files = {name: (sum(t.values()), t) for name, t in seconds(report).items()}
         print(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,26 +36,60 @@ settings.register_profile(
 settings.load_profile("same")
 
 
+ROOT = Path(__file__).parents[2]
+MEASURED = Path(__file__).with_name("processor_s.json")
+"""Test -> mean processor time of its cases [s], of those that take long together; written by
+`tests/studies/durations.py --write`."""
+BUDGET_S = 1.5
+"""Processor time that the cases of one test may take together in `make test`; the others are
+slow."""
+
+
 def spread_out(items: list[pytest.Item]) -> None:
     """Mark the cases of a test by when they run.
 
-    `daily(n)` leaves n cases in `make test` and marks the others `slow`. `campaign(n)` leaves n
-    cases in CI and marks the other slow ones, and the page's, `night`. The n cases are spread
-    evenly over the table, so that each kind of case is met.
+    `daily(n)` leaves n cases in `make test` and marks the others `slow`, and so does
+    BUDGET_S. `campaign(n)` leaves n cases in CI and marks the other slow ones, and the
+    page's, `night`. The n cases are spread evenly over the table, so that each kind of case
+    is met.
     """
+    mean_s = json.loads(MEASURED.read_text(encoding="utf-8"))
     cases: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
-        if {"daily", "campaign"} & {mark.name for mark in item.iter_markers()}:
-            name = getattr(item, "originalname", None) or item.name
-            cases.setdefault((item.path, name), []).append(item)
-    for every in cases.values():
-        daily, campaign = (_kept(every, name) for name in ("daily", "campaign"))
-        for number, item in enumerate(every):
-            if daily is not None and number not in daily:
-                item.add_marker(pytest.mark.slow)
-            slow = {"slow", "browser"} & {mark.name for mark in item.iter_markers()}
-            if slow and campaign is not None and number not in campaign:
-                item.add_marker(pytest.mark.night)
+        name = getattr(item, "originalname", None) or item.name
+        cases.setdefault((item.path, name), []).append(item)
+    for (path, name), every in cases.items():
+        daily, campaign = (_kept(every, mark) for mark in ("daily", "campaign"))
+        _leave(every, daily, "slow")
+        quick = [item for item in every if not _is_slow(item)]
+        place = path.as_posix().removeprefix(f"{ROOT.as_posix()}/")
+        spent = mean_s.get(f"{place}::{name}", 0.0)
+        if spent * len(quick) > BUDGET_S:
+            _leave(quick, _spread(len(quick), int(BUDGET_S // spent)), "slow")
+        _leave(every, campaign, "night", _is_slow)
+
+
+def _is_slow(item: pytest.Item) -> bool:
+    """Whether `make test` leaves a case out."""
+    return any(item.get_closest_marker(name) for name in ("slow", "browser"))
+
+
+def _leave(
+    every: list[pytest.Item],
+    kept: set[int] | None,
+    mark: str,
+    of: Callable[[pytest.Item], bool] = lambda _: True,
+) -> None:
+    """Mark all cases but those that are kept, of those that `of` is true of; none without
+    numbers to keep."""
+    for number, item in enumerate(every):
+        if kept is not None and number not in kept and of(item):
+            item.add_marker(mark)
+
+
+def _spread(cases: int, count: int) -> set[int]:
+    """Numbers of some cases, evenly spread."""
+    return {cases * i // count for i in range(count)}
 
 
 def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
@@ -62,8 +97,7 @@ def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
     mark = every[0].get_closest_marker(name)
     if mark is None:
         return None
-    count = mark.args[0] if mark.args else 0
-    return {len(every) * i // count for i in range(count)}
+    return _spread(len(every), mark.args[0] if mark.args else 0)
 
 
 @pytest.hookimpl(tryfirst=True)
