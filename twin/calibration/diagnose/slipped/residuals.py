@@ -104,24 +104,35 @@ class Residuals:
         unit length: a ramp, half waves of the scan, waves of the turn, and the courses of
         the pieces.
         """
-        problem = self.candidates.problem
         place = (np.arange(self.frames) + 0.5) / self.frames
         shapes = [place - 0.5]
         shapes += [np.cos(math.pi * wave * place) for wave in range(1, WAVES)]
         for harmonic in range(1, HARMONICS + 1):
-            turn = harmonic * np.asarray(problem.poses.angle)
+            turn = harmonic * np.asarray(self.candidates.problem.poses.angle)
             shapes += [np.cos(turn), np.sin(turn)]
         courses = {piece[1:]: piece.course(self.frames) for piece in pieces}
         shapes += courses.values()
         table = np.stack(shapes, axis=1)[self.frame]
+        every = np.einsum("mp,mc->mpc", self._slopes(), table).reshape(len(table), -1)
+        return np.asarray(every / np.maximum(np.linalg.norm(every, axis=0), 1e-300))
+
+    def walks(self) -> FloatArray:
+        """Return the shifts by random walks of object, source, panel and axis, (m, parameters,
+        parts of a walk), of which the first part is of unit length.
+        """
+        parts = walk(self.frames)[self.frame]
+        every = np.einsum("mp,mc->mpc", self._slopes(), parts)
+        first = np.linalg.norm(every[:, :, :1], axis=0)
+        return np.asarray(every / np.maximum(first, 1e-300))
+
+    def _slopes(self) -> FloatArray:
+        """Compute the shifts by a unit of each parameter that may move, (m, parameters)."""
+        problem = self.candidates.problem
         kept = np.repeat(problem.seen.ravel(), 2)
         x = self.candidates.x
-        out = []
-        for name in (*MOVABLE, *LEANS):
-            slope = derivative(problem, x, name, problem.seen)[kept] * self.share
-            out.append(slope[:, None] * table)
-        every = np.concatenate(out, axis=1)
-        return np.asarray(every / np.maximum(np.linalg.norm(every, axis=0), 1e-300))
+        names = (*MOVABLE, *LEANS)
+        slopes = [derivative(problem, x, name, problem.seen)[kept] for name in names]
+        return np.stack(slopes, axis=1) * self.share[:, None]
 
     def uncorrelated(
         self, rows: FloatArray, part: float, size: float, beads: Sequence[int]

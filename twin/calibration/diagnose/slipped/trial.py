@@ -151,15 +151,19 @@ class Trial(Residuals):
         motions = self.motions(pieces)
         each = [self.columns(piece) for piece in pieces]
         own = np.concatenate(each, axis=1)
-        first = c.rows.shape[1] + motions.shape[1]
+        behind = c.rows.shape[1] + motions.shape[1]
+        walks = self.walks()
+        first = behind + walks[0].size
         ways = range(first, first + own.shape[1])
-        rows = np.concatenate([c.rows, motions, own], axis=1)
+        every = [c.rows, motions, walks.reshape(len(walks), -1), own]
+        rows = np.concatenate(every, axis=1)
         contest = Contest(self, rows, ways, pieces)
         moving = sorted({bead for piece in pieces for bead in piece.beads})
-        rivals = self._rivals(moving, range(c.rows.shape[1], first))
-        rivals += [
-            self._moving_as_one(base, motions) for base in (self.nothing, self.rival)
-        ]
+        rivals = self._rivals(moving, range(c.rows.shape[1], behind))
+        bases = self.nothing, self.rival
+        rivals += [self._moving_as_one(base, motions) for base in bases]
+        if any(piece.free for piece in pieces):
+            rivals += [self._moving_freely(base, walks, behind) for base in bases]
         contest.compare(rivals)
         if contest.odds > LOG_CHANCE:
             likely = [rivals[i] for i in contest.likely()]
@@ -227,4 +231,41 @@ class Trial(Residuals):
             out = out.beside([first + best], width, chance)
             rows = np.concatenate([rows, motions[:, best : best + 1]], axis=1)
             widths = np.append(widths, width)
+        return out
+
+    def _moving_freely(self, base: Model, walks: FloatArray, first: int) -> Model:
+        """Add random walks of everything to a model, that of the parameter which explains
+        most after the other, as long as that is more likely, `MOST_PIECES` at most.
+
+        Args:
+            base: the model.
+            walks: (m, parameters, parts of a walk).
+            first: number of their first column.
+        """
+        m, count, q = walks.shape
+        rows, widths, values = self.rows_of(base)
+        chance = LOG_CHANCE - math.log(count * len(MOTION_WIDTHS))
+        noise = self.candidates.noise
+        out = base
+        for _ in range(MOST_PIECES):
+            left = Left(rows, widths, values, noise)
+            every = walks.reshape(m, -1)
+            taken = (left.basis.T @ every).reshape(-1, count, q)
+            push = (every.T @ left.values).reshape(count, q)
+            push -= np.einsum("cpq,c->pq", taken, left.along)
+            gram = np.einsum("mpq,mpr->pqr", walks, walks)
+            gram -= np.einsum("cpq,cpr->pqr", taken, taken)
+            scores = {
+                (i, width): left.score(gram[i], push[i], width * left.noise)
+                for i in range(count)
+                for width in MOTION_WIDTHS
+            }
+            (best, _), score = max(scores.items(), key=lambda one: one[1].gain)
+            if score.gain + chance < 0.0:
+                break
+            noise = score.noise
+            own = range(first + best * q, first + (best + 1) * q)
+            out = out.beside(own, score.width, chance)
+            rows = np.concatenate([rows, walks[:, best]], axis=1)
+            widths = np.append(widths, np.full(q, score.width))
         return out
