@@ -47,14 +47,16 @@ def runs(every: list[Any]) -> str:
     [
         (0.0, (), "tttttt"),
         (0.2, (), "tttttt"),
-        (0.5, (), "tststs"),
-        (1.4, (), "tsssss"),
-        (9.0, (), "ssssss"),
+        (0.4, (), "tststs"),
+        (1.4, (), "tnnsnn"),
+        (1.6, (), "snnnnn"),
+        (9.0, (), "snnnnn"),
         (0.0, (pytest.mark.daily(2),), "tsstss"),
-        (1.0, (pytest.mark.daily(2),), "tsssss"),
+        (0.9, (pytest.mark.daily(2),), "tnsnsn"),
         (0.0, (pytest.mark.daily(2), pytest.mark.campaign(3)), "tnstsn"),
-        (9.0, (pytest.mark.campaign(2),), "snnsnn"),
+        (9.0, (pytest.mark.campaign(2),), "snnnnn"),
         (0.0, (pytest.mark.slow, pytest.mark.campaign), "nnnnnn"),
+        (9.0, (pytest.mark.slow, pytest.mark.campaign), "nnnnnn"),
     ],
 )
 def test_a_test_has_as_many_cases_as_its_budget_allows(

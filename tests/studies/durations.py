@@ -47,9 +47,9 @@ def means(reports: list[Path]) -> dict[str, float]:
             for case, spent in tests.items():
                 cases[re.sub(r"\[.*", "", case)].append(spent)
             for name, each in cases.items():
-                if sum(each) >= LEAST_S:
-                    path = place.replace(".", "/")
-                    found[f"{path}.py::{name}"] = round(statistics.fmean(each), 2)
+                path = place.replace(".", "/") + ".py"
+                if sum(each) >= LEAST_S and (ROOT / path).is_file():
+                    found[f"{path}::{name}"] = round(statistics.fmean(each), 2)
     return found
 
 

@@ -43,6 +43,8 @@ MEASURED = Path(__file__).with_name("processor_s.json")
 BUDGET_S = 1.5
 """Processor time that the cases of one test may take together in `make test`; the others are
 slow."""
+CI_BUDGET_S = 3.0
+"""The same in CI, where one case is always run; the others are `night`."""
 
 
 def spread_out(items: list[pytest.Item]) -> None:
@@ -50,8 +52,8 @@ def spread_out(items: list[pytest.Item]) -> None:
 
     `daily(n)` leaves n cases in `make test` and marks the others `slow`, and so does
     BUDGET_S. `campaign(n)` leaves n cases in CI and marks the other slow ones, and the
-    page's, `night`. The n cases are spread evenly over the table, so that each kind of case
-    is met.
+    page's, `night`, and so does CI_BUDGET_S. The n cases are spread evenly over the table, so
+    that each kind of case is met.
     """
     mean_s = json.loads(MEASURED.read_text(encoding="utf-8"))
     cases: dict[tuple[Path, str], list[pytest.Item]] = {}
@@ -67,6 +69,10 @@ def spread_out(items: list[pytest.Item]) -> None:
         if spent * len(quick) > BUDGET_S:
             _leave(quick, _spread(len(quick), int(BUDGET_S // spent)), "slow")
         _leave(every, campaign, "night", _is_slow)
+        in_ci = [item for item in every if item.get_closest_marker("night") is None]
+        if spent * len(in_ci) > CI_BUDGET_S:
+            count = max(1, int(CI_BUDGET_S // spent))
+            _leave(in_ci, _spread(len(in_ci), count), "night", _is_slow)
 
 
 def _is_slow(item: pytest.Item) -> bool:
