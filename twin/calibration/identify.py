@@ -568,8 +568,9 @@ def _loss_of(
     frames, beads = np.nonzero(index >= 0)
     spots = shadows.points[frames, index[frames, beads]]
     d2 = np.sum((predicted[frames, beads] - spots) ** 2, axis=1)
-    possible = max(int(np.minimum(shadows.counts, predicted.shape[1]).sum()), 1)
-    return float((d2.sum() + (possible - len(d2)) * cap * cap) / possible)
+    possible = int(np.minimum(shadows.counts, predicted.shape[1]).sum())
+    missing = possible - len(d2)
+    return float((d2.sum() + missing * cap * cap) / max(possible, 1))
 
 
 def _with_tracks(

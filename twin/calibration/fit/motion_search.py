@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Sequence
+from functools import partial
 from itertools import product
 from typing import Final, NamedTuple
 
@@ -316,14 +317,10 @@ class _Search:
             if not isinstance(best, Waves):
                 continue
             top = self.likelihood(choice)
-            wider = (
+            wider = [
                 Waves(*pair) for pair in product(WIDTHS, WAVES) if pair[0] >= best.width
-            )
-            by_room = sorted(
-                wider,
-                key=lambda p, i=i: (self._model.spectrum(i, p)[0][ONE_PERIOD], p),  # type: ignore[misc]
-                reverse=True,
-            )
+            ]
+            by_room = sorted(wider, key=partial(self._room, i), reverse=True)
             wide = next(
                 pick
                 for pick in by_room
@@ -331,6 +328,10 @@ class _Search:
             )
             choice = _with(choice, i, wide)
         return choice
+
+    def _room(self, i: int, pick: Waves) -> tuple[float, Waves]:
+        """Return the variance that a prior leaves to motions that turn once with the table."""
+        return float(self._model.spectrum(i, pick)[0][ONE_PERIOD]), pick
 
 
 def _taken_over(choice: MotionChoice, pick: Course) -> Iterator[MotionChoice]:
