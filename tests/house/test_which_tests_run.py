@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import durations
 import pytest
 import suite
 
@@ -72,16 +73,32 @@ def test_a_test_has_as_many_cases_as_its_budget_allows(
     assert runs(cases(6, *marks)) == wanted
 
 
+def report(path: Path, **spent: list[float]) -> Path:
+    """A report of a run, with the processor time of each case of tests of this file."""
+    place = Path(__file__).relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+    lines = [
+        f'<testcase classname="{place}" name="{name}[{number}]"><properties>'
+        f'<property name="processor_s" value="{one}"/></properties></testcase>'
+        for name, each in spent.items()
+        for number, one in enumerate(each)
+    ]
+    path.write_text(f"<testsuites>{''.join(lines)}</testsuites>")
+    return path
+
+
+def test_what_no_report_has_is_kept_and_what_is_gone_is_not(tmp_path: Path) -> None:
+    """A test that is slow is in no report of `make test`: without its mean it came back."""
+    here = Path(__file__).relative_to(ROOT).as_posix() + "::"
+    slow, fast, gone = "report", "runs", "test_of_another_name"
+    first = report(tmp_path / "1.xml", **{slow: [2.0, 4.0], fast: [1.0, 1.0]})
+    known = durations.merged({here + gone: 5.0}, durations.means([first]))
+    assert known == {here + slow: 3.0, here + fast: 1.0}
+    second = report(tmp_path / "2.xml", **{fast: [0.2, 0.4], gone: [3.0]})
+    assert durations.merged(known, durations.means([second])) == {here + slow: 3.0}
+
+
 def test_measured_tests_exist() -> None:
-    """A test with another name runs all its cases until it is measured again."""
+    """A renamed test runs all its cases until it is measured: `durations.py --write`."""
     known = json.loads(suite.MEASURED.read_text())
     assert len(known) > 100
-    texts = {
-        path: (ROOT / path).read_text() for path in {n.partition("::")[0] for n in known}
-    }
-    gone = [
-        name
-        for name in known
-        if f"def {name.partition('::')[2]}(" not in texts[name.partition("::")[0]]
-    ]
-    assert gone == []
+    assert [test for test in known if not durations.is_there(test)] == []

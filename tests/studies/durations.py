@@ -2,11 +2,12 @@
 
 `make test`, `test-extensions`, `studies` and `page` write what each test took to
 build/durations/: processor time, which other work on the machine does not change, of the test,
-its fixtures and the processes that ended in it. The files that took more than `--over` seconds,
-the budget of a file in `make test`, are listed, the longest first, with their longest test.
+its fixtures and the processes that ended in it. The files that took more than `--over` seconds
+are listed, the longest first, with their longest test.
 
 `--write` keeps the means of tests whose cases take a second or more together, for
-`tests/support/suite.py`, which leaves in `make test` what its budget allows.
+`tests/support/suite.py`, which leaves in `make test` what its budget allows. Tests that are in no
+report keep theirs, and those that are gone lose it.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ def seconds(report: Path) -> dict[str, dict[str, float]]:
 
 
 def means(reports: list[Path]) -> dict[str, float]:
-    """Mean processor time of the cases of each test that takes long [s], by its path and
-    name; where several reports have a test, the last one counts."""
+    """Mean processor time of the cases of each test [s], by its path and name: of the last
+    report in which they take LEAST_S together, or 0 without one."""
     found: dict[str, float] = {}
     for report in reports:
         for place, tests in seconds(report).items():
@@ -47,10 +48,25 @@ def means(reports: list[Path]) -> dict[str, float]:
             for case, spent in tests.items():
                 cases[re.sub(r"\[.*", "", case)].append(spent)
             for name, each in cases.items():
-                path = place.replace(".", "/") + ".py"
-                if sum(each) >= LEAST_S and (ROOT / path).is_file():
-                    found[f"{path}::{name}"] = round(statistics.fmean(each), 2)
+                test = f"{place.replace('.', '/')}.py::{name}"
+                if sum(each) >= LEAST_S:
+                    found[test] = round(statistics.fmean(each), 2)
+                else:
+                    found.setdefault(test, 0.0)
     return found
+
+
+def is_there(test: str) -> bool:
+    """Whether a module has a function for a test."""
+    path, _, name = test.partition("::")
+    module = ROOT / path
+    return module.is_file() and f"def {name}(" in module.read_text(encoding="utf-8")
+
+
+def merged(known: dict[str, float], fresh: dict[str, float]) -> dict[str, float]:
+    """Means with fresh ones in their places, of tests that exist and take long."""
+    every = known | fresh
+    return {test: mean for test, mean in every.items() if mean > 0.0 and is_there(test)}
 
 
 def main() -> None:
@@ -67,7 +83,8 @@ def main() -> None:
     )
     chosen = parser.parse_args()
     if chosen.write:
-        kept = means(chosen.reports)
+        known = json.loads(MEASURED.read_text(encoding="utf-8"))
+        kept = merged(known, means(chosen.reports))
         MEASURED.write_text(json.dumps(kept, indent=1, sort_keys=True) + "\n")
     for report in chosen.reports:
         files = {name: (sum(t.values()), t) for name, t in seconds(report).items()}

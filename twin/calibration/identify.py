@@ -45,8 +45,8 @@ NARROW_PX = (25.0, 15.0, 10.0)
 LEAST_GAIN = 0.01
 """Share of its loss that a hypothesis has to lose in a round to go on with the same gate."""
 SETTLED_PX = 1e-3
-"""Change of the residuals' rms below which a hypothesis is settled: a hundredth of the usual
-error of a spot. The fit of the geometry goes on from there."""
+"""Change of the residuals' rms below which a hypothesis is settled, well below the error of a
+spot. The fit of the geometry goes on from there."""
 MAX_FINALISTS = 4
 """Number of hypotheses finished on all frames."""
 MAX_RIVAL_EXCESS = 25.0

@@ -218,8 +218,8 @@ def _spread(norms: FloatArray, columns: int, floor: float) -> float:
 
 
 def _median(values: FloatArray) -> float:
-    """Compute the median of (m,) values, one at least: of some hundred by a tenth of the
-    time of `numpy.median`, which fits call several times a step.
+    """Compute the median of (m,) values, one at least, in a fifth of the time of
+    `numpy.median` for some hundred: fits need it several times a step.
     """
     ordered = np.sort(values)
     middle = len(ordered) // 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -113,7 +114,7 @@ class Residuals:
         courses = {piece[1:]: piece.course(self.frames) for piece in pieces}
         shapes += courses.values()
         table = np.stack(shapes, axis=1)[self.frame]
-        every = np.einsum("mp,mc->mpc", self._slopes(), table).reshape(len(table), -1)
+        every = np.einsum("mp,mc->mpc", self._slopes, table).reshape(len(table), -1)
         return np.asarray(every / np.maximum(np.linalg.norm(every, axis=0), 1e-300))
 
     def walks(self) -> FloatArray:
@@ -121,12 +122,13 @@ class Residuals:
         parts of a walk), of which the first part is of unit length.
         """
         parts = walk(self.frames)[self.frame]
-        every = np.einsum("mp,mc->mpc", self._slopes(), parts)
+        every = np.einsum("mp,mc->mpc", self._slopes, parts)
         first = np.linalg.norm(every[:, :, :1], axis=0)
         return np.asarray(every / np.maximum(first, 1e-300))
 
+    @cached_property
     def _slopes(self) -> FloatArray:
-        """Compute the shifts by a unit of each parameter that may move, (m, parameters)."""
+        """(m, parameters) shifts by a unit of each parameter that may move."""
         problem = self.candidates.problem
         kept = np.repeat(problem.seen.ravel(), 2)
         x = self.candidates.x

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,7 +21,7 @@ from flexdt.twin.calibration.diagnose.causes.every_cause import (
     PRIOR_FACTORS,
 )
 from flexdt.twin.calibration.diagnose.slipped.contest import Contest
-from flexdt.twin.calibration.diagnose.slipped.left import Left
+from flexdt.twin.calibration.diagnose.slipped.left import Left, Score
 from flexdt.twin.calibration.diagnose.slipped.piece import SHARES, Model, Piece
 from flexdt.twin.calibration.diagnose.slipped.residuals import Residuals
 from flexdt.twin.calibration.diagnose.slipped.search import Search
@@ -151,19 +151,25 @@ class Trial(Residuals):
         motions = self.motions(pieces)
         each = [self.columns(piece) for piece in pieces]
         own = np.concatenate(each, axis=1)
-        behind = c.rows.shape[1] + motions.shape[1]
-        walks = self.walks()
-        first = behind + walks[0].size
+        walks = self.walks() if any(piece.free for piece in pieces) else None
+        every = [c.rows, motions]
+        if walks is not None:
+            every.append(walks.reshape(len(walks), -1))
+        first = sum(part.shape[1] for part in every)
         ways = range(first, first + own.shape[1])
-        every = [c.rows, motions, walks.reshape(len(walks), -1), own]
-        rows = np.concatenate(every, axis=1)
+        rows = np.concatenate([*every, own], axis=1)
         contest = Contest(self, rows, ways, pieces)
         moving = sorted({bead for piece in pieces for bead in piece.beads})
-        rivals = self._rivals(moving, range(c.rows.shape[1], behind))
+        begin = c.rows.shape[1]
+        behind = begin + motions.shape[1]
+        rivals = self._rivals(moving, range(begin, behind))
         bases = self.nothing, self.rival
-        rivals += [self._moving_as_one(base, motions) for base in bases]
-        if any(piece.free for piece in pieces):
-            rivals += [self._moving_freely(base, walks, behind) for base in bases]
+        single = motions[:, :, None]
+        rivals += [self._step_by_step(base, single, begin, _largest) for base in bases]
+        if walks is not None:
+            rivals += [
+                self._step_by_step(base, walks, behind, _likeliest) for base in bases
+            ]
         contest.compare(rivals)
         if contest.odds > LOG_CHANCE:
             likely = [rivals[i] for i in contest.likely()]
@@ -204,68 +210,64 @@ class Trial(Residuals):
         out += [likely.beside(motions, width * c.noise) for width in MOTION_WIDTHS]
         return out
 
-    def _moving_as_one(self, base: Model, motions: FloatArray) -> Model:
-        """Add single motions of everything to a model, the one that explains most after the
-        other, as long as that is more likely, `MOST_PIECES` at most.
+    def _step_by_step(
+        self, base: Model, motions: FloatArray, first: int, chosen: Chooser
+    ) -> Model:
+        """Add motions of everything to a model, the one that explains most after the other,
+        as long as that is more likely, `MOST_PIECES` at most.
 
         Args:
             base: the model.
-            motions: (m, columns) behind those of the causes.
+            motions: (m, count, q) columns of each.
+            first: number of the first of them.
+            chosen: finds the motion that explains most, and its width.
         """
-        first = self.candidates.rows.shape[1]
+        m, count, q = motions.shape
+        every = motions.reshape(m, -1)
+        products = np.einsum("mpq,mpr->pqr", motions, motions)
         rows, widths, values = self.rows_of(base)
-        chance = LOG_CHANCE - math.log(motions.shape[1])
         noise = self.candidates.noise
         out = base
         for _ in range(MOST_PIECES):
             left = Left(rows, widths, values, noise)
-            push = motions.T @ left.values - (left.basis.T @ motions).T @ left.along
-            power = 1.0 - np.square(left.basis.T @ motions).sum(axis=0)
-            power = np.maximum(power, LEAST_VISIBLE**2)
-            best = int(np.argmax(push**2 / power))
-            width = max(abs(float(push[best] / power[best])), left.noise)
-            score = left.score(power[best : best + 1, None], push[best : best + 1], width)
-            if score.gain + chance < 0.0:
-                break
-            noise = score.noise
-            out = out.beside([first + best], width, chance)
-            rows = np.concatenate([rows, motions[:, best : best + 1]], axis=1)
-            widths = np.append(widths, width)
-        return out
-
-    def _moving_freely(self, base: Model, walks: FloatArray, first: int) -> Model:
-        """Add random walks of everything to a model, that of the parameter which explains
-        most after the other, as long as that is more likely, `MOST_PIECES` at most.
-
-        Args:
-            base: the model.
-            walks: (m, parameters, parts of a walk).
-            first: number of their first column.
-        """
-        m, count, q = walks.shape
-        rows, widths, values = self.rows_of(base)
-        chance = LOG_CHANCE - math.log(count * len(MOTION_WIDTHS))
-        noise = self.candidates.noise
-        out = base
-        for _ in range(MOST_PIECES):
-            left = Left(rows, widths, values, noise)
-            every = walks.reshape(m, -1)
             taken = (left.basis.T @ every).reshape(-1, count, q)
             push = (every.T @ left.values).reshape(count, q)
             push -= np.einsum("cpq,c->pq", taken, left.along)
-            gram = np.einsum("mpq,mpr->pqr", walks, walks)
-            gram -= np.einsum("cpq,cpr->pqr", taken, taken)
-            scores = {
-                (i, width): left.score(gram[i], push[i], width * left.noise)
-                for i in range(count)
-                for width in MOTION_WIDTHS
-            }
-            (best, _), score = max(scores.items(), key=lambda one: one[1].gain)
+            gram = products - np.einsum("cpq,cpr->pqr", taken, taken)
+            power = np.einsum("pqq->pq", gram)
+            np.maximum(power, LEAST_VISIBLE**2, out=power)
+            best, score, choices = chosen(left, gram, push)
+            chance = LOG_CHANCE - math.log(choices)
             if score.gain + chance < 0.0:
                 break
             noise = score.noise
             own = range(first + best * q, first + (best + 1) * q)
             out = out.beside(own, score.width, chance)
-            rows = np.concatenate([rows, walks[:, best]], axis=1)
+            rows = np.concatenate([rows, motions[:, best]], axis=1)
             widths = np.append(widths, np.full(q, score.width))
         return out
+
+
+Chooser = Callable[[Left, FloatArray, FloatArray], tuple[int, Score, int]]
+"""Finds one of some motions from what a model leaves and their products, (count, q, q), and with
+the residuals, (count, q). Returns its number, what it explains, and among how many it was
+chosen."""
+
+
+def _largest(left: Left, gram: FloatArray, push: FloatArray) -> tuple[int, Score, int]:
+    """Find the motion of one column that explains most; its width is its size."""
+    power = gram[:, 0, 0]
+    best = int(np.argmax(push[:, 0] ** 2 / power))
+    width = max(abs(float(push[best, 0] / power[best])), left.noise)
+    return best, left.score(gram[best], push[best], width), len(push)
+
+
+def _likeliest(left: Left, gram: FloatArray, push: FloatArray) -> tuple[int, Score, int]:
+    """Find the motion that is most likely with one of MOTION_WIDTHS."""
+    scores = [
+        (i, left.score(gram[i], push[i], width * left.noise))
+        for i in range(len(push))
+        for width in MOTION_WIDTHS
+    ]
+    best, score = max(scores, key=lambda one: one[1].gain)
+    return best, score, len(scores)
