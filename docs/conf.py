@@ -41,7 +41,6 @@ exclude_patterns = [
     "_build",
     "_ext",
     "_static",
-    "history",
     "tools",
     "**/.ipynb_checkpoints",
 ]

@@ -3,7 +3,7 @@
     python docs/tools/page_words.py [--pages]
 
 A page's words are those of its Markdown, code and tables included. The evidence shelf's figures
-are data (`docs/evidence/*.json`) and are counted by themselves, as is the changelog's history.
+are data (`docs/evidence/*.json`) and are counted by themselves.
 Pages that are generated from code are not counted.
 """
 
@@ -40,8 +40,7 @@ def contents(page: Path) -> Iterator[Path]:
 
 def shelves() -> dict[str, list[Path]]:
     """Return the pages of each shelf, a page in the first shelf that lists it, and under
-    `other` those of none, sorted; generated pages and the changelog's history are left
-    out.
+    `other` those of none, sorted; generated pages are left out.
     """
     pages_of: dict[str, list[Path]] = {}
     placed: set[Path] = set()
@@ -52,8 +51,7 @@ def shelves() -> dict[str, list[Path]]:
         placed |= {*pages_of[shelf]}
     rest = {path.resolve() for path in DOCS.rglob("*.md")} - placed
     generated = {path for path in rest if path.relative_to(DOCS).parts[0].startswith("_")}
-    history = {path for path in rest if path.parent.name == "history"}
-    pages_of["other"] = sorted(rest - generated - history)
+    pages_of["other"] = sorted(rest - generated)
     return pages_of
 
 
@@ -90,11 +88,7 @@ def main() -> None:
                 print(f"  {name:40s} {words(path):6d} words {pictures(path):3d} pictures")
     print(f"{'all':12s} {total:7d} words")
     data = sum(words(path) for path in DOCS.glob("evidence/*.json"))
-    history = sum(words(path) for path in DOCS.glob("history/*.md"))
-    print(
-        f"{'besides':12s} {data:7d} words of evidence as JSON, {history} of the "
-        "changelog's history"
-    )
+    print(f"{'besides':12s} {data:7d} words of evidence as JSON")
 
 
 if __name__ == "__main__":

@@ -15,13 +15,12 @@ import flexdt as fx
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (
     "flexdt/library", "protocol", "twin", "phantoms", "runtime", "server", "clients", "examples",
-    "tests", "docker", "docs", ".ci", ".github", "extensions", "changes",
+    "tests", "docker", "docs", ".ci", ".github", "extensions",
 )  # fmt: skip
-# The changelog and its history name what there was at the time.
+# The changelog names what there was at the time.
 PROSE = sorted(
     {*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md"), *ROOT.glob("protocol/*.md")}
     - {ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("_*/**/*.md")}
-    - {*(ROOT / "docs" / "history").glob("*.md")}
 )
 EVIDENCE = evidence()
 # Not files of the repository: a secret that its reader makes, and what `make docs` makes.
