@@ -22,6 +22,7 @@ from typing import Final
 
 from flexdt.twin.following.mirror import MAX_WAITING, Alarm, Heard, Mirror, Waiting
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
+from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.executed_log import MotorReply, log_line, motor_reply, reply_bytes
@@ -31,7 +32,7 @@ from flexdt.twin.script.planning.plan_values import PlanStep, SampleSize
 from flexdt.twin.script.planning.planner import plan_script, simulated
 from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
-from flexdt.twin.script.problems import Severity
+from flexdt.twin.script.problems import ScriptProblem, Severity
 
 NEAR_LIMIT_DISTANCE: Final = 0.5
 """Distance of a target from a limit below which a warning is given [mm or deg]."""
@@ -169,38 +170,53 @@ class Follower:
         if mirror.ends is False:
             mirror = self._end_overdue(mirror, "", now)
         for waiting in mirror.waiting.values():
-            took = now - waiting.sent_s
+            mirror = self._overdue_or_silent(mirror, waiting, now)
             quiet = now - waiting.told_s
-            about = waiting.heard.words[0]
-            expected = waiting.predicted_s is not None and not waiting.superseded
-            overdue = took > waiting.most_s + SLACK_S
-            if expected and overdue and mirror.ends is not False:
-                mirror = self._outside(mirror, waiting, took, now)
-                mirror = replace(mirror, ends=mirror.ends or False)
-            if (
-                expected
-                and not overdue
-                and quiet > MAX_SILENCE_S
-                and mirror.speaks is not False
-            ):
-                message = (
-                    f"{waiting.heard.text!r} is under way and has said nothing "
-                    f"for {quiet:.1f} s"
-                )
-                mirror = _alarm(mirror, now, "warning", "silent", about, message)
-                mirror = replace(mirror, speaks=mirror.speaks or False)
             if quiet > max(FORGOTTEN_AFTER_S, waiting.most_s):
                 mirror = _rests(mirror.finished(waiting.heard), waiting)
-        for name, axis in mirror.axes.items() if mirror.ends is False else ():
-            heard_s = axis.heard_s or 0.0
-            path = axis.path
-            if path is not None and path.end < heard_s < now - axis.delay_s - SLACK_S:
-                mirror = self._arrival(mirror, name, axis.position, path.target, now)
+        if mirror.ends is False:
+            mirror = self._arrivals(mirror, now)
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             due = f"{self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
             mirror = _alarm(
                 mirror, now, "error", "late", "script", f"the script is late: {due}"
             )
+        return mirror
+
+    def _overdue_or_silent(self, mirror: Mirror, waiting: Waiting, now: float) -> Mirror:
+        """Return the mirror, with a warning if a command under way is overdue, or silent
+        before that.
+
+        A command without a prediction, or superseded, is neither. Each of the two is only
+        judged while the server is not known to keep ends, or its progress, to itself.
+        """
+        if waiting.predicted_s is None or waiting.superseded:
+            return mirror
+        took = now - waiting.sent_s
+        if took > waiting.most_s + SLACK_S:
+            if mirror.ends is False:
+                return mirror
+            mirror = self._outside(mirror, waiting, took, now)
+            return replace(mirror, ends=mirror.ends or False)
+        quiet = now - waiting.told_s
+        if quiet <= MAX_SILENCE_S or mirror.speaks is False:
+            return mirror
+        message = (
+            f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
+        )
+        about = waiting.heard.words[0]
+        mirror = _alarm(mirror, now, "warning", "silent", about, message)
+        return replace(mirror, speaks=mirror.speaks or False)
+
+    def _arrivals(self, mirror: Mirror, now: float) -> Mirror:
+        """Judge the arrival of each motor whose path is over and whose last reading is
+        from after its end (`_arrival`).
+        """
+        for name, axis in mirror.axes.items():
+            heard_s = axis.heard_s or 0.0
+            path = axis.path
+            if path is not None and path.end < heard_s < now - axis.delay_s - SLACK_S:
+                mirror = self._arrival(mirror, name, axis.position, path.target, now)
         return mirror
 
     def linked(
@@ -383,45 +399,16 @@ class Follower:
             The mirror, with the predicted paths of its axes, and the command with its
             expected duration and bounds [s] and, for a move, the targets of its motors.
         """
-        if isinstance(command, c.MoveAbsolute):
-            command = replace(command, trigger=None)
-        paths = {n: a.path for n, a in mirror.axes.items() if a.path is not None}
-        moving = {n: p for n, p in paths.items() if p.end - mirror.axes[n].begun_s > now}
-        arrived = {n: p.target for n, p in paths.items() if n not in moving}
-        start = replace(mirror.start, positions={**mirror.positions, **arrived})
-        sim = Simulation(self.machine, start)
-        sim.now = now
-        sim.tube.ready_at = mirror.ready_s
-        for name, path in moving.items():
-            sim.motors.all[name].moves.append((path.start, path))
-        sim.run((replace(command, wait=c.Wait.ACK),))
-        step = sim.steps[0]
-        moved = tuple(
-            n for n, m in sim.motors.all.items() if m.moves and m.moves[-1][0] == now
-        )
+        sim = self._simulated(mirror, command, now)
         about = getattr(command, "component", "") or waiting.heard.words[0]
         if isinstance(command, c.MoveAbsolute):
             mirror = mirror.cleared(about, *_KINDS_OF_A_MOVE)
-        for p in sim.findings.problems:
-            if p.code in _KIND_OF_PROBLEM and not (
-                mirror.xrays_on is None and "xray" in p.code
-            ):
-                kind = _KIND_OF_PROBLEM[p.code]
-                mirror = _alarm(mirror, now, p.severity, kind, about, p.message)
+        mirror = _with_problems(mirror, sim.findings.problems, about, now)
+        step = sim.steps[0]
         low, high = _bounds(step, self.machine)
         delay = max(0.0, high - step.computed_s)
-        for name in moved:
-            path = sim.motors.all[name].moves[-1][1]
-            rests = mirror.axes[name].at_rest
-            axis = replace(
-                rests,
-                begun_s=waiting.heard.late_s,
-                delay_s=delay,
-                path=path,
-                target=path.target,
-                mover=waiting.heard.identity,
-            )
-            mirror = replace(mirror, axes={**mirror.axes, name: axis})
+        for name, path in sim.motors.begun(now).items():
+            mirror = mirror.sent_on(name, path, waiting.heard, delay)
             mirror = self._near_limit(mirror, name, path.target, now)
         known = waiting.heard.words[0] in (*self.machine.axes, *self.machine.virtual_axes)
         motors = (
@@ -433,6 +420,21 @@ class Follower:
         return mirror, replace(
             waiting, predicted_s=step.holds_s, least_s=low, most_s=high, targets=targets
         )
+
+    def _simulated(self, mirror: Mirror, command: c.Command, now: float) -> Simulation:
+        """Simulate one command from the machine as it is at `now`, motors under way on
+        their predicted paths; its trigger and wait are ignored.
+        """
+        if isinstance(command, c.MoveAbsolute):
+            command = replace(command, trigger=None)
+        paths = {n: a.path for n, a in mirror.axes.items() if a.path is not None}
+        moving = {n: p for n, p in paths.items() if p.end - mirror.axes[n].begun_s > now}
+        arrived = {n: p.target for n, p in paths.items() if n not in moving}
+        start = replace(mirror.start, positions={**mirror.positions, **arrived})
+        sim = Simulation(self.machine, start, now=now, ready_at=mirror.ready_s)
+        sim.motors.go_on(moving)
+        sim.run((replace(command, wait=c.Wait.ACK),))
+        return sim
 
     def _near_limit(self, mirror: Mirror, name: str, target: float, now: float) -> Mirror:
         """Return the mirror, with a warning `limit_near` if a target is less than
@@ -590,8 +592,7 @@ class Follower:
             now: moment [s].
         """
         axis = waiting.heard.words[0]
-        motor = motor_reply(reply_bytes(heard.reply))
-        at = motor.position if motor is not None else _number(heard.reply)
+        at, motor = _read(heard)
         motors = [n for n in waiting.targets if _stays(mirror, n, waiting)]
         mirror = _rests(mirror, waiting)
         for name in motors:
@@ -667,15 +668,10 @@ class Follower:
     def _compare_reading(
         self, mirror: Mirror, heard: Heard, waiting: Waiting | None, now: float
     ) -> Mirror:
-        """Compare a reading of a motor's position with its predicted path.
+        """Compare a reading of a motor's position with its predicted path, or with the
+        place where it stood.
 
-        A reading of a motor without a path is its position; if it was elsewhere before
-        and no move explains it, that is an alarm `moved`. A path's delay is now less the
-        time at which the path passes the reading: more than the motor's `delay_s` and
-        `SLACK_S`, or growing by more than `MAX_DRIFT_S`, is `slow`; a lead of that size
-        `fast`; a position nowhere on it `off_path`. Positions within `TARGET_TOLERANCE`
-        of start or target are never off. A motor's full reply also has its limits and
-        rates compared (`_compare_limits`).
+        A motor's full reply also has its limits and rates compared (`_compare_limits`).
 
         Args:
             mirror: the machine.
@@ -688,70 +684,26 @@ class Follower:
             position, a repeated or old reading, and one of a move that another has
             replaced change nothing.
         """
+        at, reply = _read(heard)
         asks = heard.asks or (waiting.heard.asks if waiting is not None else "")
-        axis = heard.words[0]
-        motor = motor_reply(reply_bytes(heard.reply))
-        at = motor.position if motor is not None else _number(heard.reply)
         moves = waiting is not None and bool(waiting.targets)
-        known = self.machine.has(axis) and (
-            moves or asks == "position" or motor is not None
-        )
-        if at is None or not known:
+        is_position = moves or asks == "position" or reply is not None
+        axis = heard.words[0]
+        if at is None or not is_position or not self.machine.has(axis):
             return mirror
         name, x = self._motor(axis, at)
         if waiting is not None and moves and not _stays(mirror, name, waiting):
             return mirror
-        if motor is not None:
-            mirror = self._compare_limits(mirror, name, motor, now)
-        seen = mirror.axes[name]
+        if reply is not None:
+            mirror = self._compare_limits(mirror, name, reply, now)
+        reading = _Reading(
+            name, x, self.machine.axes[name].unit, moves, heard.late_s, now
+        )
         path = mirror.axes[name].path
-        unit = self.machine.axes[name].unit
-        if path is None:
-            mirror = mirror.with_axis(name, position=x, target=x, heard_s=now)
-            moved = waiting is None and heard.words[1].startswith("move")
-            if (
-                seen.heard_s is not None
-                and abs(x - seen.position) > TARGET_TOLERANCE
-                and not moved
-            ):
-                stood = f"not at {seen.position:.6g}, and no move of it was heard"
-                message = f"{name} stands at {x:.6g} {unit}, {stood}"
-                mirror = _alarm(mirror, now, "error", "moved", name, message)
-            return mirror
-        arrived = abs(x - path.target) <= TARGET_TOLERANCE
-        passes = path.end if arrived else path.time_at(x)
-        here = mirror.with_axis(name, position=x, heard_s=now)
-        if (
-            moves and passes is not None and passes < seen.passed_s
-        ):  # old, if not the last
-            last = mirror.ends is False and now > path.end > seen.passed_s
-            return here if last else mirror
-        if (
-            moves
-            and passes == seen.passed_s
-            and now - (seen.heard_s or now) < MAX_SILENCE_S
-        ):
-            return mirror  # a repeated reading
-        if arrived or abs(x - path.pieces[0].position) <= TARGET_TOLERANCE:
-            if passes is None:
-                return here
-            return here.with_axis(name, passed_s=passes)
-        if passes is None:
-            message = f"{name} is at {x:.6g} {unit}, on no way to {path.target:.6g}"
-            return _alarm(here, now, "error", "off_path", name, message)
-        least = now - heard.late_s - passes
-        most = now - passes
-        first = seen.behind_s or (least, most)
-        if least > seen.delay_s + SLACK_S or least - first[1] > MAX_DRIFT_S:
-            message = f"{name} is slow: {least:.2f} s behind the predicted path at {x:.6g} {unit}"
-            here = _alarm(here, now, "error", "slow", name, message)
-        elif most + seen.begun_s < -SLACK_S or (
-            most < 0.0 and first[0] - most > MAX_DRIFT_S
-        ):
-            message = f"{name} is fast: {-most:.2f} s ahead of the predicted path at {x:.6g} {unit}"
-            here = _alarm(here, now, "error", "fast", name, message)
-        promptest = min(first, (least, most), key=lambda behind: behind[1])
-        return here.with_axis(name, behind_s=promptest, passed_s=passes)
+        if path is not None:
+            return _compare_on_path(mirror, reading, path)
+        explained = waiting is None and heard.words[1].startswith("move")
+        return _compare_at_rest(mirror, reading, explained)
 
     def _motor(self, axis: str, at: float) -> tuple[str, float]:
         """Return the motor that a reading of `axis` is of, and that motor's position.
@@ -779,6 +731,132 @@ class Follower:
             f"{bounds}"
         )
         return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], message)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A position of a motor in its own sign and unit.
+
+    Attributes:
+        motor: its name.
+        x: position [unit].
+        unit: mm or deg.
+        of_move: whether it was told by a move under way, not asked for.
+        late_s: by how much earlier it may have come than it was read [s].
+        now: when it was read [s].
+    """
+
+    motor: str
+    x: float
+    unit: str
+    of_move: bool
+    late_s: float
+    now: float
+
+
+def _read(heard: Heard) -> tuple[float | None, MotorReply | None]:
+    """Read a reply: its position [mm, deg], None if it has none, and the motor's full
+    reply, None if it is no more than a number.
+    """
+    reply = motor_reply(reply_bytes(heard.reply))
+    if reply is None:
+        return _number(heard.reply), None
+    return reply.position, reply
+
+
+def _compare_at_rest(mirror: Mirror, reading: _Reading, explained: bool) -> Mirror:
+    """Take a reading of a motor without a path as its position.
+
+    If the motor was heard elsewhere before, and the reading does not come with a move of
+    which no begin was heard (`explained`), that is an error alarm `moved`.
+    """
+    name = reading.motor
+    seen = mirror.axes[name]
+    mirror = mirror.with_axis(
+        name, position=reading.x, target=reading.x, heard_s=reading.now
+    )
+    stays = abs(reading.x - seen.position) <= TARGET_TOLERANCE
+    if seen.heard_s is None or stays or explained:
+        return mirror
+    stood = f"not at {seen.position:.6g}, and no move of it was heard"
+    message = f"{name} stands at {reading.x:.6g} {reading.unit}, {stood}"
+    return _alarm(mirror, reading.now, "error", "moved", name, message)
+
+
+def _compare_on_path(mirror: Mirror, reading: _Reading, path: Trajectory) -> Mirror:
+    """Compare a reading with the predicted path of its motor.
+
+    A position nowhere on the path is an error alarm `off_path`; one within
+    `TARGET_TOLERANCE` of start or target never is, nor is its delay judged. A repeated
+    reading, and an old one, change nothing.
+    """
+    name = reading.motor
+    arrived = abs(reading.x - path.target) <= TARGET_TOLERANCE
+    at_start = abs(reading.x - path.pieces[0].position) <= TARGET_TOLERANCE
+    passes = path.end if arrived else path.time_at(reading.x)
+    here = mirror.with_axis(name, position=reading.x, heard_s=reading.now)
+    if passes is None:
+        if at_start:
+            return here
+        message = (
+            f"{name} is at {reading.x:.6g} {reading.unit}, on no way to {path.target:.6g}"
+        )
+        return _alarm(here, reading.now, "error", "off_path", name, message)
+    seen = mirror.axes[name]
+    if reading.of_move and passes < seen.passed_s:
+        # Feedback can be overtaken by later feedback: then it is no news. It counts where
+        # it is the last after the path's end, and the server reports no ends: `_arrivals`
+        # has nothing else to judge.
+        last = mirror.ends is False and reading.now > path.end > seen.passed_s
+        return here if last else mirror
+    since = reading.now - (seen.heard_s or reading.now)
+    if reading.of_move and passes == seen.passed_s and since < MAX_SILENCE_S:
+        return mirror
+    if arrived or at_start:
+        return here.with_axis(name, passed_s=passes)
+    return _compare_delay(here, reading, passes)
+
+
+def _compare_delay(mirror: Mirror, reading: _Reading, passes: float) -> Mirror:
+    """Compare the delay of a reading behind its motor's path with the motor's own, and
+    with the promptest so far.
+
+    The delay is now less the time `passes` [s] at which the path passes the reading: more
+    than the motor's `delay_s` and `SLACK_S`, or growing by more than `MAX_DRIFT_S`, is an
+    error alarm `slow`; a lead of that size `fast`.
+    """
+    name = reading.motor
+    axis = mirror.axes[name]
+    # The reading may be older than it seems by its lateness: the delay is between the two,
+    # and each alarm takes the end that is better for the machine.
+    least = reading.now - reading.late_s - passes
+    most = reading.now - passes
+    first = axis.behind_s or (least, most)
+    at = f"the predicted path at {reading.x:.6g} {reading.unit}"
+    if least > axis.delay_s + SLACK_S or least - first[1] > MAX_DRIFT_S:
+        message = f"{name} is slow: {least:.2f} s behind {at}"
+        mirror = _alarm(mirror, reading.now, "error", "slow", name, message)
+    elif most + axis.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > MAX_DRIFT_S):
+        message = f"{name} is fast: {-most:.2f} s ahead of {at}"
+        mirror = _alarm(mirror, reading.now, "error", "fast", name, message)
+    promptest = min(first, (least, most), key=lambda behind: behind[1])
+    return mirror.with_axis(name, behind_s=promptest, passed_s=passes)
+
+
+def _with_problems(
+    mirror: Mirror, problems: Iterable[ScriptProblem], about: str, now: float
+) -> Mirror:
+    """Return the mirror with alarms for the problems of one command's plan.
+
+    Only those of `_KIND_OF_PROBLEM` count; those about X-rays are left out while it is
+    unknown whether they are on.
+    """
+    for p in problems:
+        unsure = mirror.xrays_on is None and "xray" in p.code
+        if p.code in _KIND_OF_PROBLEM and not unsure:
+            kind = _KIND_OF_PROBLEM[p.code]
+            mirror = _alarm(mirror, now, p.severity, kind, about, p.message)
+    return mirror
 
 
 def _alarm(

@@ -291,6 +291,27 @@ class Mirror:
         axes = {**self.axes, name: replace(self.axes[name], **changes)}  # type: ignore[arg-type]
         return replace(self, axes=axes)
 
+    def sent_on(
+        self, name: str, path: Trajectory, mover: Heard, delay_s: float
+    ) -> Mirror:
+        """Return the mirror with a motor that a command has sent on a path.
+
+        Args:
+            name: of the motor.
+            path: predicted motion, in the listener's time.
+            mover: the command.
+            delay_s: the most that a move takes beyond its motion [s].
+        """
+        axis = replace(
+            self.axes[name].at_rest,
+            begun_s=mover.late_s,
+            delay_s=delay_s,
+            path=path,
+            target=path.target,
+            mover=mover.identity,
+        )
+        return replace(self, axes={**self.axes, name: axis})
+
     def alarmed(self, alarm: Alarm) -> Mirror:
         """Add an alarm, unless one of its kind and subject is active already; it is
         active from then on.

@@ -6,6 +6,7 @@ results are frozen values of `plan`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -140,6 +141,16 @@ class Motors:
     def moving(self, time: float) -> list[str]:
         """List the motors still under way at `time`."""
         return [n for n, m in self.all.items() if m.end > time]
+
+    def go_on(self, paths: Mapping[str, Trajectory]) -> None:
+        """Put motors on paths that they are on already, before the plan's first command."""
+        for name, path in paths.items():
+            self.all[name].moves.append((path.start, path))
+
+    def begun(self, time: float) -> dict[str, Trajectory]:
+        """Return motor -> path of those whose last move began at `time`."""
+        last = {n: m.moves[-1] for n, m in self.all.items() if m.moves}
+        return {n: path for n, (began, path) in last.items() if began == time}
 
     @property
     def end(self) -> float:

@@ -73,21 +73,29 @@ class Simulation:
         machine: whose axes, limits, camera and timing these are.
         start: the scanner before the script.
         averages: inferred in a first run, or None.
+        now: time of the start [s].
+        ready_at: when X-rays that were switched on before are ready [s].
     """
 
     def __init__(
-        self, machine: Machine, start: StartState, averages: int | None = None
+        self,
+        machine: Machine,
+        start: StartState,
+        averages: int | None = None,
+        *,
+        now: float = 0.0,
+        ready_at: float = 0.0,
     ) -> None:
-        """Begin at 0 s with motors, tube and camera as `start` has them, and no steps.
+        """Begin at `now` with motors, tube and camera as `start` has them, and no steps.
 
         `averages` is the number of averages assumed where the script sets none.
         """
         self.machine = machine
-        self.now = 0.0
+        self.now = now
         self.motors = planned.Motors(machine, start)
         on = start.xrays_on
         self.tube = planned.PlannedTube(
-            start.kV, start.power_W, on is True, on is not None
+            start.kV, start.power_W, on is True, on is not None, ready_at
         )
         self.camera = planned.PlannedCamera(start.camera)
         self.findings = Findings()
