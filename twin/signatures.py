@@ -458,55 +458,94 @@ def kind_of(annotation: Any) -> Kind | None:
         (('a number', 'None'), False)
     """
     origin = typing.get_origin(annotation)
-    parts = typing.get_args(annotation)
-    plain = origin not in (Annotated, Literal, Callable)
-    inner = [kind_of(part) for part in parts if plain and part is not ...]
-    if origin is Annotated:  # a value, which its owner also makes of its JSON
-        return Kind(
-            (_type_words(parts[0]),), lambda v: isinstance(v, (parts[0], Mapping))
-        )
-    if origin in (typing.Union, types.UnionType):
-        kinds = [kind for kind in inner if kind is not None]
-        words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))
-        if None not in inner:
-            return Kind(words, lambda v: any(k.holds(v) for k in kinds))
-        return None
-    if origin is Literal:
-        return Kind(
-            tuple(map(repr, parts)),
-            lambda v: v in [p for p in parts if type(p) is type(v)],
-        )
+    form = _FORMS.get(origin)
+    if form is not None:
+        return form(typing.get_args(annotation))
     if annotation is Array or getattr(origin, "__name__", "") == "ndarray":
         return Kind(("an array of numbers",), _is_numbers)
-    if origin is tuple and ... not in parts:
-        members = [
-            "anything" if kind is None else " or ".join(kind.words) for kind in inner
-        ]
-        return Kind((f"({', '.join(members)})",), lambda v: _is_list(v, inner))
-    if origin in (tuple, list, Sequence):
-        member = "anything"
-        if inner[0] is not None:
-            member = " or ".join(inner[0].words)
-        return Kind(
-            (f"a list ({member}, ...)",), lambda v: _is_list(v, inner, several=True)
-        )
-    if origin is Mapping:
-        return Kind(("a dictionary",), lambda v: isinstance(v, Mapping))
-    if origin is Callable:
-        return Kind(("a function",), callable)
     wanted = origin or annotation
-    if wanted in (*PLAIN, Any, object, inspect.Parameter.empty) or not isinstance(
-        wanted, type
-    ):
+    anything = (Any, object, inspect.Parameter.empty)
+    if wanted in (*PLAIN, *anything) or not isinstance(wanted, type):
         return PLAIN.get(wanted)
     if getattr(wanted, "_is_protocol", False):
-        methods = [
-            n
-            for n, m in vars(wanted).items()
-            if inspect.isfunction(m) and n != "__init__"
-        ]
-        return Kind((_type_words(wanted),), lambda v: all(hasattr(v, n) for n in methods))
+        return _kind_of_protocol(wanted)
     return Kind((_type_words(wanted),), lambda v: isinstance(v, wanted))
+
+
+def _kind_of_protocol(protocol: type) -> Kind:
+    """Make the kind of values that have all methods of a protocol, `__init__` aside."""
+    members = vars(protocol).items()
+    methods = [n for n, m in members if inspect.isfunction(m) and n != "__init__"]
+    return Kind((_type_words(protocol),), lambda v: all(hasattr(v, n) for n in methods))
+
+
+def _kind_of_annotated(parts: Sequence[Any]) -> Kind:
+    """Make the kind of an annotated type, which its owner also makes of its JSON."""
+    wanted = parts[0]
+    return Kind((_type_words(wanted),), lambda v: isinstance(v, (wanted, Mapping)))
+
+
+def _kind_of_union(parts: Sequence[Any]) -> Kind | None:
+    """Make the kind of values that one of the members allows; None if one allows anything."""
+    inner = [kind_of(part) for part in parts]
+    kinds = [kind for kind in inner if kind is not None]
+    if len(kinds) < len(inner):
+        return None
+    words = tuple(dict.fromkeys(word for kind in kinds for word in kind.words))
+    return Kind(words, lambda v: any(k.holds(v) for k in kinds))
+
+
+def _kind_of_literal(parts: Sequence[Any]) -> Kind:
+    """Make the kind of these values, each of its own type: True is not 1."""
+    words = tuple(map(repr, parts))
+    return Kind(words, lambda v: v in [p for p in parts if type(p) is type(v)])
+
+
+def _kind_of_tuple(parts: Sequence[Any]) -> Kind:
+    """Make the kind of a tuple: a list of members in order, or any number of one kind
+    where `...` follows it.
+    """
+    if ... in parts:
+        return _kind_of_list(parts)
+    inner = [kind_of(part) for part in parts]
+    members = ", ".join(map(_member_words, inner))
+    return Kind((f"({members})",), lambda v: _is_list(v, inner))
+
+
+def _kind_of_list(parts: Sequence[Any]) -> Kind:
+    """Make the kind of a list of any length, whose members are of the kind of the first part."""
+    inner = [kind_of(parts[0])]
+    words = f"a list ({_member_words(inner[0])}, ...)"
+    return Kind((words,), lambda v: _is_list(v, inner, several=True))
+
+
+def _member_words(kind: Kind | None) -> str:
+    """Return the words of a kind of members, joined by "or"; "anything" for None."""
+    return "anything" if kind is None else " or ".join(kind.words)
+
+
+def _kind_of_mapping(_parts: Sequence[Any]) -> Kind:
+    """Make the kind of a mapping; its keys and values may be anything."""
+    return Kind(("a dictionary",), lambda v: isinstance(v, Mapping))
+
+
+def _kind_of_callable(_parts: Sequence[Any]) -> Kind:
+    """Make the kind of a function; its arguments and result may be anything."""
+    return Kind(("a function",), callable)
+
+
+_FORMS: Final[Mapping[Any, Callable[[Sequence[Any]], Kind | None]]] = {
+    Annotated: _kind_of_annotated,
+    typing.Union: _kind_of_union,
+    types.UnionType: _kind_of_union,
+    Literal: _kind_of_literal,
+    tuple: _kind_of_tuple,
+    list: _kind_of_list,
+    Sequence: _kind_of_list,
+    Mapping: _kind_of_mapping,
+    Callable: _kind_of_callable,
+}
+"""Origin of an annotation with members -> function that makes its kind of the members."""
 
 
 def _is_number(value: Any) -> bool:
