@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from flexdt.twin.errors import LimitError
-from flexdt.twin.machine.description import Machine, parse_machine
+from flexdt.twin.machine.description import Component, Machine, parse_machine
 from flexdt.twin.machine.fitted_machine import Range
 
 _HOUSING_MARGIN_MM = 60.0
@@ -91,49 +91,120 @@ def new_machine_text(answers: Answers) -> str:
         _lines({"base": answers.base, "name": answers.name}), "the new machine"
     )
     panel = next((part for part in base.components if part.role == "panel"), None)
-    fixed: dict[str, float] = {}
-    rail: dict[str, object] = {}
-    without = list(answers.without)
-    limits = dict(answers.limits)
-    for quantity, distance_name, distance in (
-        ("object_y", "SOD", answers.sod_mm),
-        ("detector_y", "SDD", answers.sdd_mm),
-    ):
-        if distance is None:
-            continue
-        motors = base.geometry.get(quantity, {})
-        if distance[0] == distance[1]:
-            fixed[quantity] = distance[0]
-            without += [motor for motor in motors if motor not in without]
-        elif motors:
-            (motor, factor), *_ = motors.items()
-            if motor in limits:
-                raise LimitError(
-                    f"the {distance_name} and the travel of {motor} are both said, and "
-                    f"{motor} sets the {distance_name}; say one",
-                    {"asked": list(limits[motor]), "axis": motor},
-                )
-            ends = sorted((d - base.fixed.get(quantity, 0.0)) / factor for d in distance)
-            limits[motor] = (ends[0], ends[1])
-        elif quantity == "detector_y" and panel is not None and panel.axis is None:
-            # A cabinet whose panel runs on a rail: the fixed distance is a motor's reading now.
-            fixed[quantity] = 0.0
-            home = min(max(base.fixed.get(quantity, 0.0), distance[0]), distance[1])
-            rail = {
-                "lower": distance[0],
-                "upper": distance[1],
-                "home": home,
-                **_RAIL_VALUES,
-            }
+    differences = _Differences(
+        answers.base, base, dict(answers.limits), list(answers.without)
+    )
+    if answers.sod_mm is not None:
+        differences.set_distance("object_y", "SOD", answers.sod_mm)
+    if answers.sdd_mm is not None:
+        if _takes_rail(answers.sdd_mm, base, panel):
+            differences.set_rail(answers.sdd_mm)
         else:
+            differences.set_distance("detector_y", "SDD", answers.sdd_mm)
+    detector = _detector(answers, base)
+    text = (
+        f"# Made by `flexdt machine new`. What is not said here is as in {answers.base}: times,\n"
+        "# rates, bodies and filters too, so compare them with your scanner.\n"
+        + _lines(_head(answers, differences.without))
+    )
+    tables = {
+        "detector": detector,
+        "tube": _tube(answers, base),
+        "fixed": differences.fixed,
+        **differences.axis_tables(),
+    }
+    for title, values in tables.items():
+        if any(value is not None for value in values.values()):
+            text += f"\n[{title}]\n{_lines(values)}"
+    if panel is not None:
+        body = _panel_body(panel, base, detector, on_rail=bool(differences.rail))
+        if body:
+            text += f"\n[[components]]\n{_lines(body)}"
+    parse_machine(text, "the new machine")
+    return text
+
+
+@dataclass
+class _Differences:
+    """Axes and distances that differ from the base, while the file is made.
+
+    Attributes:
+        base_name: of the machine that ships.
+        base: that machine.
+        limits: axis -> travel [mm, deg].
+        without: axes and components that there are not.
+        fixed: quantity -> its constant part [mm].
+        rail: values of the motor `_RAIL_AXIS`; {} without one.
+    """
+
+    base_name: str
+    base: Machine
+    limits: dict[str, Range]
+    without: list[str]
+    fixed: dict[str, object] = field(default_factory=dict)
+    rail: dict[str, object] = field(default_factory=dict)
+
+    def set_distance(self, quantity: str, name: str, distance: Range) -> None:
+        """Set SOD or SDD: two equal ends are a fixed distance without its motors, a range
+        the travel of the first motor that drives it.
+
+        Raises:
+            LimitError: there is no motor for the range, or its travel is said as well.
+        """
+        motors = self.base.geometry.get(quantity, {})
+        if distance[0] == distance[1]:
+            self.fixed[quantity] = distance[0]
+            self.without += [motor for motor in motors if motor not in self.without]
+            return
+        if not motors:
             raise LimitError(
-                f"{answers.base} has no motor along the {distance_name}, so it is one number; for "
-                "a range "
+                f"{self.base_name} has no motor along the {name}, so it is one number; for a range "
                 "begin with another machine (flexdt machine list)",
-                {"asked": list(distance), "base": answers.base},
+                {"asked": list(distance), "base": self.base_name},
             )
+        (motor, factor), *_ = motors.items()
+        if motor in self.limits:
+            raise LimitError(
+                f"the {name} and the travel of {motor} are both said, and {motor} sets the "
+                f"{name}; say one",
+                {"asked": list(self.limits[motor]), "axis": motor},
+            )
+        start = self.base.fixed.get(quantity, 0.0)
+        ends = sorted((d - start) / factor for d in distance)
+        self.limits[motor] = (ends[0], ends[1])
+
+    def set_rail(self, distance: Range) -> None:
+        """Put the panel of a cabinet on a rail: its distance becomes a motor's reading,
+        and the fixed part 0.
+        """
+        lower, upper = distance
+        home = min(max(self.base.fixed.get("detector_y", 0.0), lower), upper)
+        self.fixed["detector_y"] = 0.0
+        self.rail = {"lower": lower, "upper": upper, "home": home, **_RAIL_VALUES}
+
+    def axis_tables(self) -> dict[str, dict[str, object]]:
+        """Make the tables of the rail's motor and of changed travels, homes moved into them."""
+        tables: dict[str, dict[str, object]] = {}
+        if self.rail:
+            tables["geometry.detector_y"] = {_RAIL_AXIS: 1.0}
+            tables[f"axes.{_RAIL_AXIS}"] = self.rail
+        for name, (lower, upper) in self.limits.items():
+            home = min(max(self.base.axis(name).home, lower), upper)
+            tables[f"axes.{name}"] = {"lower": lower, "upper": upper, "home": home}
+        return tables
+
+
+def _takes_rail(sdd_mm: Range, base: Machine, panel: Component | None) -> bool:
+    """Return whether a range of SDD needs a rail for a panel that nothing moves in the base."""
+    carried = panel is None or panel.axis is not None
+    driven = base.geometry.get("detector_y", {})
+    return sdd_mm[0] != sdd_mm[1] and not driven and not carried
+
+
+def _head(answers: Answers, without: list[str]) -> dict[str, object]:
+    """Collect the values before the first table."""
     scanner = answers.scanner or answers.name
-    head = {
+    return {
         "base": answers.base,
         "without": without or None,
         "name": answers.name,
@@ -141,49 +212,42 @@ def new_machine_text(answers: Answers) -> str:
         "scanner_type": scanner,
         "description": f"{scanner}, described with flexdt machine new; begins with {answers.base}.",
     }
-    tables: dict[str, dict[str, object]] = {
-        "detector": _detector(answers, base),
-        "tube": {
-            "min_kV": answers.min_kV,
-            "max_kV": answers.max_kV,
-            "max_W": answers.max_W,
-            "kV": answers.max_kV
-            and min(max(base.tube.kV, answers.min_kV or 0.0), answers.max_kV),
-            "power_W": answers.max_W and min(base.tube.power_W, answers.max_W),
-        },
-        "fixed": dict(fixed),
+
+
+def _tube(answers: Answers, base: Machine) -> dict[str, object]:
+    """Collect the values of `[tube]`, by key; None for those that stay.
+
+    Initial voltage and power are moved into new limits.
+    """
+    least_kV = answers.min_kV or 0.0
+    return {
+        "min_kV": answers.min_kV,
+        "max_kV": answers.max_kV,
+        "max_W": answers.max_W,
+        "kV": answers.max_kV and min(max(base.tube.kV, least_kV), answers.max_kV),
+        "power_W": answers.max_W and min(base.tube.power_W, answers.max_W),
     }
-    if rail:
-        tables |= {"geometry.detector_y": {_RAIL_AXIS: 1.0}, f"axes.{_RAIL_AXIS}": rail}
-    for name, (lower, upper) in limits.items():
-        home = min(max(base.axis(name).home, lower), upper)
-        tables[f"axes.{name}"] = {"lower": lower, "upper": upper, "home": home}
-    text = (
-        f"# Made by `flexdt machine new`. What is not said here is as in {answers.base}: "
-        "times,\n"
-        "# rates, bodies and filters too, so compare them with your scanner.\n"
-        + _lines(head)
-    )
-    for title, values in tables.items():
-        if any(value is not None for value in values.values()):
-            text += f"\n[{title}]\n{_lines(values)}"
-    seen = {key: value for key, value in tables["detector"].items() if value is not None}
-    if panel is not None and (rail or seen.keys() & {"columns", "rows", "pitch_mm"}):
-        part: dict[str, object] = {
-            "name": panel.name,
-            "axis": _RAIL_AXIS if rail else None,
-        }
-        across, up = base.detector.model_copy(update=seen).pixels.size_mm
-        if (across, up) != base.detector.pixels.size_mm:
-            sides = (
-                across + _HOUSING_MARGIN_MM,
-                panel.size_mm[1],
-                up + _HOUSING_MARGIN_MM,
-            )
-            part |= {"size_mm": [round(side, 1) for side in sides], "source": "assumed"}
-        text += f"\n[[components]]\n{_lines(part)}"
-    parse_machine(text, "the new machine")
-    return text
+
+
+def _panel_body(
+    panel: Component, base: Machine, detector: Mapping[str, object], *, on_rail: bool
+) -> dict[str, object]:
+    """Collect the values of the panel's component: its rail, and for another active area
+    a body wider than that by `_HOUSING_MARGIN_MM`; {} if it is the base's.
+    """
+    seen = {key: value for key, value in detector.items() if value is not None}
+    if not on_rail and not seen.keys() & {"columns", "rows", "pitch_mm"}:
+        return {}
+    part: dict[str, object] = {
+        "name": panel.name,
+        "axis": _RAIL_AXIS if on_rail else None,
+    }
+    across, up = base.detector.model_copy(update=seen).pixels.size_mm
+    if (across, up) == base.detector.pixels.size_mm:
+        return part
+    sides = (across + _HOUSING_MARGIN_MM, panel.size_mm[1], up + _HOUSING_MARGIN_MM)
+    size_mm = [round(side, 1) for side in sides]
+    return part | {"size_mm": size_mm, "source": "assumed"}
 
 
 def _detector(answers: Answers, base: Machine) -> dict[str, object]:
