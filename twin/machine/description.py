@@ -736,60 +736,65 @@ class Machine(_Frozen):
         """
         names = [c.name for c in self.components]
         for component in self.components:
-            where = f"components.{component.name}"
-            if names.count(component.name) > 1:
-                raise _refused(
-                    f"{where}.name", component.name, "a name that is used once"
-                )
-            if component.name == SAMPLE:
-                raise _refused(
-                    f"{where}.name", SAMPLE, "another name: it is the sample's"
-                )
-            if component.parent is not None:
-                # Parents come first, so that a chain can never be a circle.
-                earlier = names[: names.index(component.name)]
-                _require(
-                    [component.parent], earlier, f"{where}.parent", "earlier component"
-                )
-            if component.axis is not None:
-                _require([component.axis], self.axes, f"{where}.axis", "axis")
+            self._check_links(component, names)
         for component in self.components:
+            where = f"components.{component.name}"
+            self._check_anchor(component, where)
+            self._check_turntable(component, where)
             chain = self.chain(component)
-            driving = self._motors_of(component.anchor)
-            message = f"motor of anchor {component.anchor!r}"
-            _require(chain, driving, f"components.{component.name}.axis", message)
-            carrier = next(
-                (c for c in self.components if c.name == component.parent), None
-            )
-            if (
-                carrier is not None
-                and self.chain(carrier)
-                and carrier.anchor != component.anchor
-            ):
-                allowed = f"{carrier.anchor!r}, as that of the part that carries it, {carrier.name}"
-                raise _refused(
-                    f"components.{component.name}.anchor", component.anchor, allowed
-                )
-            turns = self.geometry.get("angle", {})
-            centring = [i for i, motor in enumerate(chain) if self._on_turntable(motor)]
-            turning = [chain.index(motor) if motor in chain else -1 for motor in turns]
-            if (
-                component.anchor == "object"
-                and centring
-                and min(turning, default=-1) < centring[-1]
-            ):
-                allowed = (
-                    f"carried by the turntable ({', '.join(turns)}), as mount_x and "
-                    "mount_y are"
-                )
-                raise _refused(
-                    f"components.{component.name}.axis", component.axis, allowed
-                )
             twice = next((motor for motor in chain if chain.count(motor) > 1), None)
             allowed = "a motor that no part which carries this one has already"
-            _refuse_if(
-                twice is not None, f"components.{component.name}.axis", twice, allowed
-            )
+            _refuse_if(twice is not None, f"{where}.axis", twice, allowed)
+
+    def _check_links(self, component: Component, names: list[str]) -> None:
+        """Check that a component's name is used once, its parent stands earlier in
+        `names`, and its axis is a motor of the machine.
+        """
+        name = component.name
+        where = f"components.{name}"
+        _refuse_if(
+            names.count(name) > 1, f"{where}.name", name, "a name that is used once"
+        )
+        allowed = "another name: it is the sample's"
+        _refuse_if(name == SAMPLE, f"{where}.name", name, allowed)
+        if component.parent is not None:
+            # Parents come first, so that a chain can never be a circle.
+            earlier = names[: names.index(name)]
+            _require([component.parent], earlier, f"{where}.parent", "earlier component")
+        if component.axis is not None:
+            _require([component.axis], self.axes, f"{where}.axis", "axis")
+
+    def _check_anchor(self, component: Component, where: str) -> None:
+        """Check that all motors of a component's chain drive its anchor, and that a
+        moved carrier has the same anchor.
+        """
+        driving = self._motors_of(component.anchor)
+        message = f"motor of anchor {component.anchor!r}"
+        _require(self.chain(component), driving, f"{where}.axis", message)
+        carrier = next((c for c in self.components if c.name == component.parent), None)
+        if carrier is None or not self.chain(carrier):
+            return
+        allowed = (
+            f"{carrier.anchor!r}, as that of the part that carries it, {carrier.name}"
+        )
+        differs = carrier.anchor != component.anchor
+        _refuse_if(differs, f"{where}.anchor", component.anchor, allowed)
+
+    def _check_turntable(self, component: Component, where: str) -> None:
+        """Check that a stage on the turntable (mount_x, mount_y) is carried by all motors
+        of the angle.
+        """
+        chain = self.chain(component)
+        centring = [i for i, motor in enumerate(chain) if self._on_turntable(motor)]
+        if component.anchor != "object" or not centring:
+            return
+        turns = self.geometry.get("angle", {})
+        turning = [chain.index(motor) if motor in chain else -1 for motor in turns]
+        allowed = (
+            f"carried by the turntable ({', '.join(turns)}), as mount_x and mount_y are"
+        )
+        outside = min(turning, default=-1) < centring[-1]
+        _refuse_if(outside, f"{where}.axis", component.axis, allowed)
 
     def _check_roles(self) -> None:
         """Check that focal spot, active area, holder and mount are where the X-ray
@@ -1223,16 +1228,29 @@ def _drop(base: Raw, name: object) -> None:
         entry["moves"].pop(name, None)
         if entry["of"] == name:
             del axes[1][virtual]
-    removed = next((c for c in parts if c["name"] == name), {})
-    for part in parts:
-        if part.get("axis") == name:
-            del part["axis"]
-        if "parent" in part and part["parent"] == name:
-            part.pop("parent")
-            part.update({k: removed[k] for k in ("parent",) if k in removed})
-    base["components"] = [c for c in parts if c["name"] != name]
+    base["components"] = _without_part(parts, name)
     pairs = base.get("allowed_contacts", [])
     base["allowed_contacts"] = [pair for pair in pairs if name not in pair]
+
+
+def _without_part(parts: list[Raw], name: object) -> list[Raw]:
+    """Return the components less one of that name; its parts go to its parent, and parts
+    on an axis of that name are mounted rigidly.
+    """
+    removed = next((c for c in parts if c["name"] == name), {})
+    parent = {key: removed[key] for key in ("parent",) if key in removed}
+    left = []
+    for part in parts:
+        if part["name"] == name:
+            continue
+        changed = dict(part)
+        if changed.get("axis") == name:
+            del changed["axis"]
+        if changed.get("parent") == name:
+            del changed["parent"]
+            changed |= parent
+        left.append(changed)
+    return left
 
 
 def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
