@@ -204,51 +204,15 @@ def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
     """
     scan = copied(NODES)
     values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
-    data = np.nan_to_num(values)
     nodes = UniformNodes.of(values, scan.rim)
-    found = nodes.found
-    causes: dict[str, FloatArray] = {}
-    bias = Bias(scan.grid.like(found), nodes.even, nodes.inside, causes)
+    bias = Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, {})
     comparison = compared(scan)
     if comparison is not None:
-        seen = comparison.contradiction()
-        if seen is not None and seen.by_misfit_alone:
-            finer = copied(FINE_NODES)
-            if finer.binned != scan.binned and not still_misfits(finer):
-                seen = None
+        seen = _confirmed(comparison.contradiction(), scan, copied)
         if seen is not None:
             return replace(bias, contradiction=seen)
         bias = replace(bias, widening=comparison.widening)
-
-    def add(cause: str, share: float, change: Float32Array) -> None:
-        causes[cause] = causes.get(cause, 0.0) + share * _about(change, nodes.even)
-
-    if scan.sparse:
-        # Streaks come from edges, and do not cancel about a node.
-        wide = (max(scan.ends),) * 2
-        best, ours = (
-            scan.seen(nodes.sharp, scan.parallel("", wide, t))
-            for t in (None, scan.angles)
-        )
-        add("angles", SAFETY_FACTOR, np.abs(ours - best))
-    rungs = [(rung.flaw, scan.seen(found, rung)) for rung in scan.ladder()]
-    for (_, before), (flaw, after) in pairwise(rungs):
-        add(flaw, SAFETY_FACTOR, after - before)
-    truncation = scan.truncation
-    if truncation is not None and truncation.cut_off.any():
-        ways = [(truncation.otherwise, SAFETY_FACTOR)]
-        if (
-            truncation.explained
-        ):  # but the prisms' residual at the edges is as unknown as ever
-            ways = [
-                (truncation.otherwise, PRISM_ERROR_SHARE),
-                (truncation.later, SAFETY_FACTOR),
-            ]
-        for way, share in ways:
-            other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
-            add("beyond", share, other - data)
-    else:
-        add("drift", 1.0, np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec)))
+    bias = replace(bias, causes=_causes(scan, nodes, np.nan_to_num(values)))
     accuracy = bias.accuracy(bias.found)
     if accuracy is None or accuracy.cut_off:
         return bias
@@ -265,6 +229,66 @@ def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
             closer = comparison.finer(undecided, fine)
             undecided = closer.undecided(accuracy.most, sides_known=sides_known)
     return replace(bias, contradiction=undecided)
+
+
+def _confirmed(
+    seen: Contradiction | None, scan: CoarseScan, copied: Callable[[int], CoarseScan]
+) -> Contradiction | None:
+    """Return a contradiction of a coarse copy; None if there is none, or if a misfit
+    alone tells it and a finer copy has none.
+    """
+    if seen is None or not seen.by_misfit_alone:
+        return seen
+    finer = copied(FINE_NODES)
+    if finer.binned != scan.binned and not still_misfits(finer):
+        return None
+    return seen
+
+
+def _causes(
+    scan: CoarseScan, nodes: UniformNodes, data: Float32Array
+) -> dict[str, FloatArray]:
+    """Bound the errors of a coarse volume, by cause (`_bias_of`).
+
+    Args:
+        scan: the coarse copy.
+        nodes: of its volume.
+        data: that volume, its unreconstructed voxels 0, (nz, ny, nx).
+
+    Returns:
+        Cause -> largest error of each node, (nz, ny, nx) [1/mm].
+    """
+    causes: dict[str, FloatArray] = {}
+
+    def add(cause: str, share: float, change: Float32Array) -> None:
+        causes[cause] = causes.get(cause, 0.0) + share * _about(change, nodes.even)
+
+    if scan.sparse:
+        # Streaks come from edges, and do not cancel about a node.
+        wide = (max(scan.ends),) * 2
+        best, ours = (
+            scan.seen(nodes.sharp, scan.parallel("", wide, t))
+            for t in (None, scan.angles)
+        )
+        add("angles", SAFETY_FACTOR, np.abs(ours - best))
+    rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in scan.ladder()]
+    for (_, before), (flaw, after) in pairwise(rungs):
+        add(flaw, SAFETY_FACTOR, after - before)
+    truncation = scan.truncation
+    if truncation is None or not truncation.cut_off.any():
+        add("drift", 1.0, np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec)))
+        return causes
+    ways = [(truncation.otherwise, SAFETY_FACTOR)]
+    if truncation.explained:
+        # Prisms explain the rows, but their residual at the edges is as unknown as ever.
+        ways = [
+            (truncation.otherwise, PRISM_ERROR_SHARE),
+            (truncation.later, SAFETY_FACTOR),
+        ]
+    for way, share in ways:
+        other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
+        add("beyond", share, other - data)
+    return causes
 
 
 def _drift(images: Float32Array) -> Float32Array:

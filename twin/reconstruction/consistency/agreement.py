@@ -427,22 +427,8 @@ class Comparison:
             None where the best is clearly better than the stated geometry of a doubtful
             scan.
         """
-        trial = self._trial
-        covered = _covered(claimed)
-        best_of_all = self._best()
-        rivals = [
-            one
-            for one in self._tried
-            if one.evidence < self._least_evidence_against(one)
-            and not (sides_known and one.suspect.kind in SIDES)
-            and (one.suspect.shifts is None or one is best_of_all)
-            and one.change > (MIN_CHANGE if self._fits_better(one) else covered)
-            and (
-                one.evidence < -MIN_EVIDENCE_SIGMAS
-                or trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
-            )
-        ]
-        if not trial.whole or not rivals:
+        rivals = self._rivals(_covered(claimed), sides_known)
+        if not self._trial.whole or not rivals:
             return None
         best = min(rivals, key=lambda one: one.score)
         as_good = [one for one in self._as_good_as(best) if one in rivals]
@@ -457,6 +443,40 @@ class Comparison:
             change = max(one.change for one in as_good)
         named = self._named(as_good, best.score, change)
         return replace(named, fits_better=change is not None and self._fits_better(best))
+
+    def _rivals(self, covered: float, sides_known: bool) -> list[Tried]:
+        """List the explanations of `undecided`: not excluded, as good as the stated
+        geometry, and with a change that matters.
+
+        Args:
+            covered: change of a volume that the claim covers.
+            sides_known: leaves out the kinds of `SIDES`.
+        """
+        best_of_all = self._best()
+
+        def allowed(one: Tried) -> bool:
+            """Return whether nothing excludes an explanation; movement is only taken
+            where no other is better.
+            """
+            if sides_known and one.suspect.kind in SIDES:
+                return False
+            if one.suspect.shifts is not None and one is not best_of_all:
+                return False
+            return one.evidence < self._least_evidence_against(one)
+
+        def fits(one: Tried) -> bool:
+            """Return whether it fits as well as the stated geometry, or clearly better."""
+            if one.evidence < -MIN_EVIDENCE_SIGMAS:
+                return True
+            return self._trial.fits_as_well(one, EQUAL_MISFIT_RATIO)
+
+        return [
+            one
+            for one in self._tried
+            if allowed(one)
+            and one.change > (MIN_CHANGE if self._fits_better(one) else covered)
+            and fits(one)
+        ]
 
     @property
     def _clear_score(self) -> float:
