@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from flexdt.twin.machine.description import (
@@ -29,9 +29,8 @@ _NO_FLAT: Final = (
     "reconstructed"
 )
 _NO_PATH: Final = (
-    "no free path takes the sample out of the beam for the flat image; give `flat` a "
-    "pose where it "
-    "is outside, or false to leave the flat image out"
+    "no free path takes the sample out of the beam for the flat image; give `flat` a pose "
+    "where it is outside, or false to leave the flat image out"
 )
 
 
@@ -85,49 +84,30 @@ def plan_poses(
     for axis in (name for pose in (*poses, asked) for name in pose):
         if not machine.has(axis):
             raise unknown_axis(axis, machine)
-    if start is None:
-        begin = StartState.of(machine)
-    else:
-        begin = start
-    camera = begin.camera
-    if exposure_ms is None:
-        exposure = camera.exposure_ms
-    else:
-        exposure = exposure_ms
-    commands: list[c.Command] = [
-        c.SetMode(mode=camera.mode),
-        c.SetRoi(roi=camera.roi),
-        c.SetExposure(exposure_ms=exposure),
-        c.SetFrames(frames=1),
-        c.SetVoltage(kV=begin.kV),
-        c.SetPower(power_W=begin.power_W),
-    ]
+    begin = StartState.of(machine) if start is None else start
     problems: list[ScriptProblem] = []
     back: Sequence[Pose] = ()
+    commands = _settings(begin, exposure_ms)
     references = [*_image("di000000.tif"), c.XrayOn(), c.WaitXrayReady()]
     if flat is False or not poses:
         problems = [ScriptProblem("warning", "no_flat", 0, 1, _NO_FLAT)]
     else:
         first = _arrival(begin.positions, poses[0], machine, begin)
         if flat is True:
-            radius = 0.0
-            if sample is not None:
-                radius = sample.diameter_mm / 2
-            sides = beside_beam(machine, profile, camera, first, radius)
+            radius = 0.0 if sample is None else sample.diameter_mm / 2
+            sides = beside_beam(machine, profile, begin.camera, first, radius)
             places = [{**first, **side} for side in sides]
         else:
             places = [_arrival(begin.positions, asked, machine, begin)]
-        ways = ((place, _legs(begin.positions, place, route)) for place in places)
-        place, out = next((way for way in ways if way[1] is not None), (places[0], None))
-        if out is None:
+        way = _way_to_flat(begin.positions, places, first, route)
+        if not way.free:
             problems = [ScriptProblem("warning", "flat_path", 0, 1, _NO_PATH)]
-            out = _legs(begin.positions, place) or ()
-        back = _legs(place, first, route) or _legs(place, first) or ()
-        for leg in (*out, asked):
+        back = way.back
+        for leg in (*way.out, asked):
             commands += _moves(leg)
         references += _image("io000000.tif")
     commands += [c.XrayOff(), c.SetAverages(averages=REFERENCES), *references]
-    commands.append(c.SetAverages(averages=camera.averages))
+    commands.append(c.SetAverages(averages=begin.camera.averages))
     for i, pose in enumerate(poses):
         line = i + 1
         for leg in (*back, pose) if i == 0 else (pose,):
@@ -140,6 +120,49 @@ def plan_poses(
         c.Script.of(commands), machine, profile, start=begin, sample=sample
     )
     return replace(plan, problems=in_order((*problems, *plan.problems)))
+
+
+def _settings(begin: StartState, exposure_ms: float | None) -> list[c.Command]:
+    """Make the commands that state the settings: those in force, and an exposure, the
+    camera's own if None.
+    """
+    camera = begin.camera
+    exposure = camera.exposure_ms if exposure_ms is None else exposure_ms
+    return [
+        c.SetMode(mode=camera.mode),
+        c.SetRoi(roi=camera.roi),
+        c.SetExposure(exposure_ms=exposure),
+        c.SetFrames(frames=1),
+        c.SetVoltage(kV=begin.kV),
+        c.SetPower(power_W=begin.power_W),
+    ]
+
+
+@dataclass(frozen=True)
+class _FlatWay:
+    """Moves to the place of the flat image, `out`, and from there to the first pose,
+    `back`; `free` is False where no free path leads out.
+    """
+
+    out: Sequence[Pose]
+    back: Sequence[Pose]
+    free: bool
+
+
+def _way_to_flat(
+    start: Pose, places: Sequence[Pose], first: Pose, route: Route | None
+) -> _FlatWay:
+    """Choose the first of the places with a free path, and the moves there and back.
+
+    Where none has, the way leads to the first place, all motors at once; so does the way
+    back where the route finds none.
+    """
+    ways = ((place, _legs(start, place, route)) for place in places)
+    place, out = next((way for way in ways if way[1] is not None), (places[0], None))
+    back = _legs(place, first, route) or _legs(place, first) or ()
+    if out is None:
+        return _FlatWay(_legs(start, place) or (), back, free=False)
+    return _FlatWay(out, back, free=True)
 
 
 def _image(file: str, line: int = 0) -> list[c.Command]:
