@@ -41,6 +41,9 @@ def bias_factor(ratio, power):  # type: ignore[no-untyped-def]
     c = min(max(ratio, 1e-3), 1.0)
     c2 = c * c
     p = power
+    # chord^p up to the cap is a sum over levels t <= c with the weight p t^(p-1). Where a
+    # ball's chord exceeds t, its outline's area and displacement both go with 1 - t^2: the
+    # mean displacement is the integral of (1 - t^2)^2 over that of 1 - t^2, each over p c^p.
     above = 1.0 / p - 2.0 * c2 / (p + 2.0) + c2 * c2 / (p + 4.0)
     return above / (1.0 / p - c2 / (p + 2.0))
 
@@ -136,6 +139,8 @@ def median(values, n):  # type: ignore[no-untyped-def]
             break
     if n % 2 == 1:
         return values[middle]
+    # The selection has left the lower half, whose largest is the other one in the middle,
+    # before it.
     below = values[0]
     for i in range(1, middle):
         below = max(below, values[i])
@@ -301,6 +306,8 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
         reach = 1.12 * radius + 1.5
         if x - reach < 0 or y - reach < 0 or x + reach > cols - 1 or y + reach > rows - 1:
             return
+        # The ring is the dearest part: it is taken anew only where the spot has moved by a
+        # third of a pixel, and late rounds keep it, so that they settle.
         moved = (x - centre_x) ** 2 + (y - centre_y) ** 2 > 0.1
         if turn == 0 or (turn < 4 and moved):
             noise = background(image, x, y, reach + 1.0, 1.55 * radius + 4.0, plane)
@@ -317,6 +324,8 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
                     value = (
                         plane[0] + plane[1] * (j - centre_x) + plane[2] * (i - centre_y)
                     )
+                    # Each pixel near the middle tells the peak: its own chord is known from
+                    # its place.
                     core[n] = (image[i, j] - value) / math.sqrt(part)
                     n += 1
         if n == 0:
@@ -350,6 +359,8 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
             return
         mx, my = sx / s, sy / s
         factor = bias_factor(limit / peak if peak > limit else 1.0, power)
+        # A disc of radius r has the mean square distance r^2 / 2. Averaged over the outlines
+        # of the weight's levels, r^2 / R^2 is the bias factor: spread = factor R^2 / 2.
         spread = (sxx + syy) / s - mx * mx - my * my
         x += mx
         y += my
@@ -411,6 +422,8 @@ def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, resu
             dx, dy = j - x, i - y
             value = image[i, j] - plane[0] - plane[1] * (j - cx) - plane[2] * (i - cy)
             if dx * dx + dy * dy <= reach * reach and value < limit:
+                # Slope of the weight, p value^(p-1), times the noise; squared, that grows as
+                # exp(value).
                 v = noise * power * abs(raised(value, power) / max(abs(value), 1e-9))
                 v = v * v * math.exp(max(value, 0.0))
                 vx += v * dx * dx
@@ -494,6 +507,7 @@ def ball_table(radius, peak, blur, veil, table, slope):  # type: ignore[no-untyp
     for k in range(n):
         value = 0.0
         for i in range(-half, half + 1):
+            # The profile is even: before the middle it is what it is behind it.
             value += kernel[i + half] * through[abs(k + i)]
         slope[k] = value / total
     for k in range(n):
@@ -624,6 +638,8 @@ def fit_ball(  # type: ignore[no-untyped-def]
                 expected = math.exp(-value - base)
                 seen = image[row, col] - plane[1] * (col - x0) - plane[2] * (row - y0)
                 seen = math.exp(-min(max(seen, -1.0), 20.0))
+                # A count's variance is its mean: over the root, all pixels have the same
+                # noise.
                 root = math.sqrt(expected + 1e-6)
                 r = (seen - expected) / root
                 count += 1
@@ -632,6 +648,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
                 power += (seen - clear) ** 2
                 if d < radius:
                     used += 1
+                # In the very middle the gradient has no direction.
                 if d < 1e-6:
                     continue
                 # d(expected)/dp = -expected dL/dp; dL/dx = -rise dx/d; the residual is seen
@@ -647,12 +664,17 @@ def fit_ball(  # type: ignore[no-untyped-def]
         if count < 20 or used < 0.15 * math.pi * radius * radius:
             return
         if not free_radius:
+            # A radius that is held has a row of the unit matrix, and its step is 0.
             h[3, 3] = 1.0
+        # Where all of the rim that is seen points one way, the place across it is open: the
+        # determinant of both coordinates is then small against its diagonal's.
         minor = h[0, 0] * h[1, 1] - h[0, 1] ** 2
         if h[2, 2] <= 0 or h[3, 3] <= 0 or minor < 1e-6 * h[0, 0] * h[1, 1] or minor <= 0:
             return
         solve(h, g, step)
         length = math.sqrt(step[0] ** 2 + step[1] ** 2)
+        # Slopes are those of the rim: a step of more than a third of the radius leaves where
+        # they hold. A rise of the misfit cannot be taken back, but shortens what follows.
         damp = min(1.0, 0.35 * radius / (length + 1e-12))
         if total > before * 1.2:
             damp *= 0.3
@@ -665,6 +687,8 @@ def fit_ball(  # type: ignore[no-untyped-def]
             return
         if length < 1e-4:
             break
+    # Covariance of the place alone: level and radius are estimated too, so the whole matrix
+    # is inverted, of which two rows are needed.
     inverse, unit = (
         np.zeros((2, 4)),
         np.zeros((2, 4)),

@@ -107,6 +107,7 @@ def panel_rows(p, geo, rows, steps):  # type: ignore[no-untyped-def]
     # As `conventions.turn_detector` has it.
     v = geo[V], geo[V + 1], geo[V + 2]
     u = geo[U], geo[U + 1], geo[U + 2]
+    # Complex numbers: an angle of 0 with a step for its derivative is not 0, and turns.
     if p[YAW] != 0.0 or p[PITCH] != 0.0 or p[ROLL] != 0.0:
         u = _turned(u, v, p[YAW])
         v = _turned(v, u, p[PITCH])
@@ -187,6 +188,7 @@ def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped
         amount = 1.0
         if i == ANGLE_SCALE:
             amount = geo[ANGLE]
+        # R turns x towards -y: the slope of its column x is -y, that of y is x.
         for a in range(3):
             slopes[0, a] = -amount * y[a]
             slopes[1, a] = amount * x[a]
@@ -201,6 +203,7 @@ def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped
             slopes[3, a] = slopes[0, a] * bx + slopes[1, a] * by
     elif i == TILT_Z:
         for c in range(3):
+            # The outermost turn, about the world's y: it turns all columns alike.
             slopes[c, 0] = columns[c, 2]
             slopes[c, 2] = -columns[c, 0]
         for a in range(3):
@@ -280,8 +283,8 @@ def evaluate(  # type: ignore[no-untyped-def]
 ):
     """Evaluate all observations in one pass.
 
-    Derivatives are by complex steps. A bead at or behind the source ends the evaluation
-    at once; the arrays are then incomplete.
+    Derivatives are exact (see the module). A bead at or behind the source ends the
+    evaluation at once; the arrays are then incomplete.
 
     Args:
         data: see `Data`.
@@ -338,6 +341,8 @@ def evaluate(  # type: ignore[no-untyped-def]
         rows[:], steps[:] = turned.real, turned_steps.real
         object_columns(values, geo, pivot, columns)
         for r in range(3):
+            # The foot of the source's perpendicular, away from which a ball's spot is
+            # displaced: where a ray along the unit normal, rows[2], meets the panel.
             at[r] = _dot(rows[r], rows[2])
             for c in range(4):
                 now[r, c] = _dot(rows[r], columns[c])
@@ -360,6 +365,8 @@ def evaluate(  # type: ignore[no-untyped-def]
             slope[own : own + 3] = 0.0
             slide[own : own + 3] = 0.0
             for i in range(3):
+                # A bead's x changes its place by the column of x, wherever it is: a slope of
+                # the constant.
                 slope[own + i, :, 3] = now[:, i]
         for k in range(n_beads):
             x, y, z = beads[k]
@@ -401,6 +408,8 @@ def evaluate(  # type: ignore[no-untyped-def]
                 m += 3
             for j in range(m):
                 d = slope[j]
+                # Quotient rule: `inward` is the relative change of depth; `stretch` goes with
+                # its square, over the foot that moves by `slide`.
                 inward = (d[2, 0] * x + d[2, 1] * y + d[2, 2] * z + d[2, 3]) / depth
                 va = (
                     d[0, 0] * x + d[0, 1] * y + d[0, 2] * z + d[0, 3]
@@ -425,6 +434,7 @@ def evaluate(  # type: ignore[no-untyped-def]
                 va, vb = weight * da[j], weight * db[j]
                 grad[cj] += va * r0 + vb * r1
                 for i in range(j + 1):
+                    # Columns of a frame do not ascend: sets of parameters may share some.
                     hess[min(cj, cols[i]), max(cj, cols[i])] += va * da[i] + vb * db[i]
     for i in range(len(grad)):
         for j in range(i):

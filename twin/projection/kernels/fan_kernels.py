@@ -75,6 +75,7 @@ def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
             c = np.int64(collected.column[q])
             if not transposed:
                 buffer[at] = walk_ray(box, g, r, c, ZERO, False)
+            # Single rays are dear, and a pixel of 0 adds nothing.
             elif buffer[at] != ZERO:
                 walk_ray(box, g, r, c, buffer[at], True)
         return
@@ -280,6 +281,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                     before = count
                     turn = turn + 1
                     continue
+                # Units of one turn have no voxel column in common, but do with those of the
+                # turn before.
                 if turn > 0:
                     wait_until(done, turn - 1, before)
                 at = item - first_item

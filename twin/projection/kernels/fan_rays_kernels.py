@@ -133,6 +133,7 @@ def columns_of(lines, first, last, cols, starts, ends):
     b = lines[last]
     width = 1
     for r in range(starts.size):
+        # Up to the next line, but without it: each pixel belongs to one fan.
         starts[r] = min(max(math.ceil(a[0] + a[1] * r), 0), cols)
         ends[r] = min(max(math.ceil(b[0] + b[1] * r), 0), cols)
         width = max(width, ends[r] - starts[r])
@@ -188,6 +189,7 @@ def collect(collected, grid, g, lines, line, starts, width, shadow):
                 n += 1
     t = grid.axis
     el = 1 - grid.axis
+    # Directions as the mirrored box has them.
     t0 = grid.sign_t * g[3 + t]
     tc = grid.sign_t * g[6 + t]
     tr = grid.sign_t * g[9 + t]
@@ -352,12 +354,15 @@ def start(grid, fan, rays, work, n):
         m = slope[q]
         up = rise[q]
         inverse = 1.0 / m
+        # The numbers of the walk's three corrections, in single precision as its sums are.
         weight[q] = np.float32(inverse)
         tilt[q] = np.float32(m - m0)
         ratio[q] = np.float32(m0 * inverse - 1.0)
         length[q] = np.float32(
             math.sqrt(m * m * square_l + square_t + up * up * square_z)
         )
+        # A ray that is still below or above the box is in the level next to it: it enters
+        # from there.
         k = min(max(np.floor(sz + up * reach), -1.0), nz)
         plane = k + 1.0 if up > 0.0 else k
         every = 1.0 / up
@@ -368,7 +373,10 @@ def start(grid, fan, rays, work, n):
         level[q] = np.uint32(np.int32(k) + 1)
         acc[q] = ZERO
     if not fan.spread:
+        # Rays of one line have the same slope; what is left of the ratio is rounding.
         ratio[:] = ZERO
+    # A list for each slab, linked through the rays: crossings are met in the order of slabs
+    # without being sorted.
     head = work.head
     following = rays.following
     for j in range(fan.j0, fan.j1):

@@ -286,6 +286,8 @@ def slab_kernel(transposed):
         dz = direction(views, view, r, c, 2)
         sa, da, na, hop_a = views[view, 0], dx, nx, hop_x
         sb, db, nb, hop_b = views[view, 1], dy, ny, hop_y
+        # Axis a is the faster of x and y. All axes are mirrored so that the ray moves up
+        # them; the mirrors are in `base` and in the signs of the hops.
         if abs(dy) > abs(dx):
             sa, da, na, hop_a, sb, db, nb, hop_b = sb, db, nb, hop_b, sa, da, na, hop_a
         sz, hop_z = views[view, 2], 1
@@ -336,6 +338,8 @@ def slab_kernel(transposed):
             )
             inner = narrow(min(max(quick - begin, k), end))
             outer = narrow(min(max(slow - begin, inner), end))
+            # Whole groups for the unrolled loop; what is left of the middle goes to the
+            # checked one.
             outer = narrow(inner + ((outer - inner) & -UNROLLED_SLABS))
             b, _ = crossing(np.float32(k), slope_b, distance_b, steps_b)
             z, _ = crossing(np.float32(k), slope_z, distance_z, steps_z)
@@ -350,6 +354,8 @@ def slab_kernel(transposed):
                     l = l if next_z != z else ZERO  # noqa: E741
                     mid_b, mid_z = (next_b, z) if h >= l else (b, next_z)
                     h, l = max(h, l), min(h, l)  # noqa: E741
+                    # Voxels before both crossings, between them, and after both; either comes
+                    # first.
                     p = narrow(origin + k * hop_a)
                     in_b, in_z = 0 <= b + plane_b < nb, 0 <= z + plane_z < nz
                     out_b, out_z = 0 <= next_b + plane_b < nb, 0 <= next_z + plane_z < nz
@@ -496,6 +502,7 @@ def column_kernel(transposed):
             last = min(int(math.floor(leave + MARGIN_SLABS)) + 1, na)  # noqa: RUF046
             quick = int(math.ceil(enter + MARGIN_SLABS))  # noqa: RUF046
             slow = int(math.floor(leave - MARGIN_SLABS))  # noqa: RUF046
+        # Rays of one detector column have axis a in common, so the last slab needs no limit.
         first, last = least(narrow(first)), most(narrow(last))
         quick, slow = most(narrow(quick)), least(narrow(slow))
         hop_a, hop_b, hop_z = narrow(hop_a), narrow(hop_b), narrow(hop_z)
@@ -510,14 +517,19 @@ def column_kernel(transposed):
         while begin < last:
             plane_b, distance_b = anchor(at_b, rate_b, begin)
             plane_z, distance_z = anchor(at_z, rate_z, begin)
+            # Each lane works out one slab's crossing of b for all lanes, whose rays are one
+            # line in x and y: 32 slabs cost one evaluation.
             b, _ = crossing(np.float32(lane), slope_b, distance_b, steps_b)
             next_b, h = crossing(np.float32(lane + 1), slope_b, distance_b, steps_b)
             here, there = narrow(b + plane_b), narrow(next_b + plane_b)
+            # None may write before all have read the last 32 slabs, nor read before all have
+            # written.
             meet_lanes()
             pairs[mine] = packed(
                 narrow((there - here) * hop_b), h if next_b != b else ZERO
             )
             places[mine] = narrow(base + (begin + lane) * hop_a + here * hop_b)
+            # Bit 0: the voxel before the crossing is in the box; bit 1: the one behind it.
             inside[mine] = (1 if 0 <= here < nb else 0) + (2 if 0 <= there < nb else 0)
             meet_lanes()
             k, end = (
@@ -534,6 +546,9 @@ def column_kernel(transposed):
                     y = fused(np.float32(k), slope_z, distance_z)
                     floor, z = floor_bits(y)
                     z = narrow(low_z + (z + plane_z) * hop_z)
+                    # Rays rise by a quarter voxel a slab at most: the next plane of z is
+                    # known slabs before, by its distance from the anchor, and each slab asks
+                    # only whether it has come.
                     ahead = (
                         (floor + ONE) - distance_z
                     ) * steps_z  # exact where it is near
@@ -541,6 +556,7 @@ def column_kernel(transposed):
                 while k < stop:
                     jump, h = unpacked(pairs[place(own + k)])
                     t += ONE
+                    # Above 0 in one slab for each plane, the one in which the ray passes it.
                     l = clamped(t - ahead)  # noqa: E741
                     up = narrow(0)
                     if l > ZERO:

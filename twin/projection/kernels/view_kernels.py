@@ -66,10 +66,13 @@ def prepare(row, frame, rows, cols, least_sine, clearance, rise, table):
         rays[6 + a] = row[6 + a] / voxel[a]
         rays[9 + a] = row[9 + a] / voxel[a]
     rays[12] = 0.0
+    # The tests of `gpu` for many views: alone, a view must get the same walk.
     steepest = _steepest(rays, rows, cols)
     slabs = steepest <= 1.0 and _is_clear(rays, frame[4], clearance)
     mx = rays[3] + (cols - 1) / 2 * rays[6] + (rows - 1) / 2 * rays[9]
     my = rays[4] + (cols - 1) / 2 * rays[7] + (rows - 1) / 2 * rays[10]
+    # Lanes go along the step that moves less across the middle ray, seen along z: they read
+    # the same voxel columns. On a panel that lies on its side that is u.
     lying = abs(rays[9] * my - rays[10] * mx) > abs(rays[6] * my - rays[7] * mx)
     if lying:
         for a in range(3):
@@ -100,6 +103,7 @@ def _spreads_behind(row, frame, least_sine):
     x = uy * vz - uz * vy
     y = uz * vx - ux * vz
     z = ux * vy - uy * vx
+    # Not `<=`: a view with NaN is unfit, too.
     if not _length(x, y, z) > least_sine * area:
         return False
     depth = x * bx + y * by + z * bz
@@ -110,6 +114,7 @@ def _spreads_behind(row, frame, least_sine):
     middle = (
         x * (centre[0] - row[0]) + y * (centre[1] - row[1]) + z * (centre[2] - row[2])
     )
+    # How far the box's farthest corner is beyond its centre, along the normal.
     beyond = abs(x) * half[0] + abs(y) * half[1] + abs(z) * half[2]
     if depth < 0.0:
         middle = -middle
@@ -123,6 +128,9 @@ def _steepest(rays, rows, cols):
     different ways."""
     mx = 2.0 * rays[3] + (cols - 1) * rays[6] + (rows - 1) * rays[9]
     my = 2.0 * rays[4] + (cols - 1) * rays[7] + (rows - 1) * rays[10]
+    # A ray gains along its faster axis at least its part along any of the five ways (axes;
+    # the middle ray over root 2). |z| over that part is greatest at a corner of the panel,
+    # and the least of five bounds is one.
     diagonal = np.sqrt(2.0 * (mx * mx + my * my))
     best = np.inf
     for way in range(5):
@@ -155,6 +163,8 @@ def _is_clear(rays, counts, clearance):
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         normal = rays[6 + b] * rays[9 + c] - rays[6 + c] * rays[9 + b]
+        # A box's extent along a normal is a sum over its axes: each adds its lower or upper
+        # end.
         nearest += min(normal * counts[a], 0.0) - rays[a] * normal
         farthest += max(normal * counts[a], 0.0) - rays[a] * normal
         depth += rays[3 + a] * normal

@@ -392,6 +392,8 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
         np.float32(size[1] - 1),
     )
     for k in range(at.size):
+        # c(k) - c = step turn / depth(k) exactly, as both numbers are linear in k:
+        # differences from one voxel are small enough for float32, places are not.
         step = np.float32(k - zero)
         far = depth + step * slope
         inverse = np.float32(1.0) / far
@@ -404,6 +406,7 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
         weight[k] = part if line <= lowest + edge else none
         column, line = min(max(column, first), last), min(max(line, none), lowest)
         i = np.int32(column)
+        # An integer is cut towards 0, but columns left of `base` are negative.
         i = min(i - np.int32(column < np.float32(i)), np.int32(size[0] - 2 - base))
         j = min(np.int32(line), np.int32(size[1] - 2))
         across[k], down[k] = column - np.float32(i), line - np.float32(j)
@@ -457,6 +460,7 @@ def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
     n, cols = len(acc), len(image)
     y -= g[1]
     slope = dx * g[3]
+    # Where that one is behind the source, all are.
     zero = n - 1 if slope > 0.0 else 0  # the farthest one
     x += zero * dx - g[0]
     depth = x * g[3] + y * g[4]
@@ -521,6 +525,7 @@ def _add_tile(
     ny, nx = volume.shape[:2]
     few = images.shape[2] == rows
     last_x = min(nx, first_x + (WIDE if few else TILE))
+    # Views outside, voxels inside: the tile stays in the cache while all views pass.
     for view in range(len(images)):
         g, share = views[view], shares[view]
         for iy in range(first_y, min(ny, first_y + TILE)):
@@ -578,6 +583,8 @@ def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
         tiles = tiles_x * ((ny + TILE - 1) // TILE)
         counter = np.zeros(1, np.int64)
         for _ in prange(workers):
+            # Each thread has room of its own, and takes the next tile when it is free: a view
+            # costs a tile the more, the more of it the view sees.
             line = np.zeros(rows + 2 + MARGIN, np.float32)
             at, parts = np.empty(WIDE, np.int32), np.empty((3, WIDE), np.float32)
             tile = fetch_next(counter)
@@ -646,6 +653,8 @@ def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
     # Between what a wide object's filtered rows fall with (depth^2) and a small one's (depth).
     weight *= inverse * math.sqrt(inverse)
     if lowest <= highest:
+        # Only where the weight begins and ends: a view costs two additions, however many
+        # voxels it sees.
         seen[lowest] += weight
         seen[highest + 1] -= weight
     return weight, angle

@@ -251,6 +251,7 @@ def filter_rows(
     length, wide, rows = response.size, factors.shape[1], out.shape[2]
     r = 2 * cuda.blockIdx.x
     second = min(r + 1, rows - 1)
+    # Until the rows are there, `real` is room for the partial sums of their edges.
     for part in range(thread, SIDES, THREADS):
         which = part // 32
         row = second if which >= 2 else r
@@ -278,6 +279,8 @@ def filter_rows(
         rests[which] = total * cut[row] / np.float32(max(edge, 1))
     cuda.syncthreads()
     for c in range(thread, length, THREADS):
+        # The filter is real and even: two rows go through it as the real and the imaginary
+        # part of one signal without mixing.
         a, b = np.float32(0), np.float32(0)
         if c < wide:
             a = weighted_pixel(
@@ -315,6 +318,8 @@ def filter_rows(
                 1,
             )
         real[c], imaginary[c] = a, b
+    # Decimation in frequency takes the natural order to that of reversed bits, in which the
+    # response is; decimation in time takes it back. So nothing is ever permuted.
     half, step = narrow(length // 2), narrow(1)
     while half > 0:
         cuda.syncthreads()
@@ -331,6 +336,7 @@ def filter_rows(
     for c in range(thread, length, THREADS):
         real[c] *= response[c]
         imaginary[c] *= response[c]
+    # With sines of the other sign: the inverse, whose 1 / length is in the response.
     half, step = narrow(1), narrow(length // 2)
     while half < length:
         cuda.syncthreads()
@@ -387,6 +393,7 @@ def backproject(images, cols, rows, views, first, size, volume):
     for base in range(0, n, BLOCK[0]):
         view = base + lane
         cuda.syncthreads()
+        # No voxel, unless the view is found to see the column.
         highest[warp, lane] = -1
         lowest[warp, lane] = 0
         if view < n and ix < nx:
@@ -416,6 +423,8 @@ def backproject(images, cols, rows, views, first, size, volume):
                     columns[warp, lane] = i
                     parts[warp, lane] = c - i
                     weights[warp, lane] = inverse * inverse
+                    # Counted from the lowest voxel that is seen: its row is on the panel, so
+                    # that fixed point holds it, and adding steps rounds nothing.
                     starts[warp, lane] = int((start + low * step) * FIXED)
                     steps[warp, lane] = int(max(step, -STEEP) * FIXED)
         cuda.syncthreads()
@@ -433,9 +442,11 @@ def backproject(images, cols, rows, views, first, size, volume):
             for m in range(RUN):
                 k = begin + m * BLOCK[0]
                 if low <= k <= high:
+                    # `EDGE_ROWS` and rounding may put a place just before the first row.
                     held = max(at, 0)
                     j = min(narrow(held >> BITS), rows - 1)
                     after = place(min(j + 1, rows - 1))
+                    # As 32 bits without a sign it is what stands behind the point.
                     down = np.float32(place(held)) * UNIT
                     up = images[left + place(j)]
                     up += across * (images[right + place(j)] - up)

@@ -43,6 +43,9 @@ def _chord(prism, source_x, source_y, x, y):
         x: horizontal direction of the ray, of any length.
         y: likewise.
     """
+    # In the frame where the ellipse is the unit disc, a ray p + t d is inside for 2
+    # sqrt(|d|^2 - (p x d)^2) / |d|^2 of t. The cross product there is the one here times the
+    # map's determinant.
     start_x = source_x - prism[0]
     start_y = source_y - prism[1]
     along_x = prism[2] * x
@@ -77,8 +80,11 @@ def _edge_mean(line, before, first, last, lower, upper, share, across, high):
     total = 0.0
     for c in range(first, last):
         at = before + c
+        # The prisms are upright: all rays above one another are inside for the same t, and
+        # the whole length of a ray, its rise included, makes that a path.
         model = lower[at] + share * (upper[at] - lower[at])
         total += line[c] - model * math.sqrt(across[at] + high)
+    # An edge of no columns leaves no rest, rather than 0 / 0.
     return total / max(last - first, 1)
 
 
@@ -110,6 +116,8 @@ def _continue_side(
             model = lower[c] + share * (upper[c] - lower[c])
             out[c] = np.float32(model * math.sqrt(across[c] + high) + rest * fade[c])
         return
+    # The weight is a factor over the ray's length, and a path has that length as a factor:
+    # both cancel, and only columns with a rest need a root.
     part = np.float32(share)
     for c in range(len(out)):
         out[c] = (lower[c] + part * (upper[c] - lower[c])) * factors[c]
@@ -158,6 +166,7 @@ def prism_lengths(before, cols, edge, plane, prisms, out):
         k = job % bands
         g = plane[view]
         for c in range(wide):
+            # On the panel only the columns whose rest is averaged need a path.
             length = 0.0
             if prisms[k, 5] > 0.0 and (c < before + edge or c >= after - edge):
                 length = _chord(prisms[k], g[0], g[1], g[2] + c * g[4], g[3] + c * g[5])
@@ -194,6 +203,7 @@ def continue_rows(
     cols = images.shape[2]
     after = before + cols
     bands = lengths.shape[1]
+    # The rest fades alike in all rows: columns where nothing is left of it are found once.
     begin = 0
     while begin < before and fade[begin] == 0.0:
         begin += 1
@@ -286,6 +296,8 @@ def _cost(x, source, rays, length, seen, scale):
         seen: (n, k) line integrals in the plane.
         scale: deviation from which on rays count less.
     """
+    # Both axes and the attenuation are fitted as logarithms, so that every step leaves them
+    # above 0.
     e = math.exp(x[2])
     f = math.exp(x[3])
     attenuation = math.exp(x[5])
@@ -302,6 +314,7 @@ def _cost(x, source, rays, length, seen, scale):
             inside = max(squared - apart * apart, 0.0)
             value = 2.0 * attenuation * length[i, j] * math.sqrt(inside) / squared
             rest = (value - seen[i, j]) / scale
+            # Cauchy's: rays that see more than a prism must not pull without end.
             total += math.log1p(rest * rest)
     return 0.5 * total
 
@@ -346,7 +359,10 @@ def _normal_equations(x, source, rays, length, seen, scale, slope, matrix, gradi
             unit = 2.0 * attenuation * length[i, j] / scale
             value = unit * root / squared
             rest = value - seen[i, j] / scale
+            # Cauchy's loss as a weighted square: its slope over that of the square.
             pull = 1.0 / (1.0 + rest * rest)
+            # value = unit sqrt(inside) / squared, inside = squared - apart^2. Of its slopes,
+            # `steep` goes with half the change of `inside`, `flat` with that of `squared`.
             steep = unit / (squared * math.sqrt(max(inside, MIN_CHORD_SHARE * squared)))
             flat = value / squared
             slope[0] = steep * apart * e * f * dy
@@ -383,8 +399,12 @@ def _solved(matrix, gradient, free, damping, factor, step):
     for a in range(PARAMETERS):
         step[a] = -gradient[a] if free[a] else 0.0
         for b in range(a + 1):
+            # A parameter that is held has a row of the unit matrix: its step is 0, and the
+            # others' are as if it were not there.
             value = matrix[a, b] if free[a] and free[b] else 0.0
             if a == b:
+                # Marquardt's damping, relative to each curvature, serves parameters of all
+                # units.
                 value = value * (1.0 + damping) + 1e-12 if free[a] else 1.0
             for k in range(b):
                 value -= factor[a, k] * factor[b, k]
@@ -445,6 +465,8 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
             )
             fresh = True
         for a in range(PARAMETERS):
+            # Held for this step alone: else it would be solved for a way that it cannot go,
+            # and the others would follow.
             outward = (x[a] <= least[a] and gradient[a] > 0.0) or (
                 x[a] >= most[a] and gradient[a] < 0.0
             )
@@ -459,6 +481,8 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
             x[:] = trial
             cost = other
             fresh = False
+            # Towards Gauss and Newton's step after a fall, towards a short one down the slope
+            # after a rise; there the equations are still those of x.
             damping = max(0.2 * damping, LEAST_DAMPING)
             if gain <= MIN_GAIN * cost:
                 break
