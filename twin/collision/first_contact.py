@@ -128,15 +128,19 @@ class PathSearch:
         looks = 0
         first: tuple[float, int, PairResult] | None = None
         for k, bound in enumerate(self.bounds):
+            # Bounds ascend: from here on no pair can touch, nor lower the best if that is
+            # asked for.
             if bound > limits.margin + limits.tolerance and (
                 only_contacts or bound >= best
             ):
                 break
             motion = self.motion(k)
             until = math.inf if first is None else first[0]
+            # It stands until after the contact that was found.
             if motion.time(START) > until:
                 continue
             separate = self.scene.separation(self.pairs[k])
+            # Only an earlier contact counts: no pair is swept beyond the first one so far.
             result = sweep_pair(motion, separate, limits, until=until)
             looks += result.looks
             if result.contact is not None and motion.time(result.contact) < until:
@@ -166,6 +170,7 @@ class PathSearch:
         nearest = guess.nearest
         looks = guess.looks
         for k, bound in enumerate(self.bounds):
+            # Bounds ascend: no later pair can lower the best by more than the accuracy.
             if bound >= best - self.scene.limits.slack(best):
                 break
             separate = self.scene.separation(self.pairs[k])
@@ -244,6 +249,8 @@ def bodies_touching(scene: CollisionScene, q: FloatArray) -> list[tuple[Pair, fl
     """
     stack = scene.candidates(q, q)
     limit = scene.limits.margin + scene.limits.tolerance
+    # Bounds of boxes are never above the gap: only pairs that they leave open cost a
+    # distance.
     near = np.flatnonzero(stack.clearances(q, q) <= limit).tolist()
     gaps = [(stack.pairs[k], separation_at(scene, stack.pairs[k], q)) for k in near]
     return [(pair, gap) for pair, gap in gaps if gap <= limit]
@@ -268,6 +275,7 @@ def clearance_trace(
     if len(times) == 0:
         return ()
     q = path.vectors(np.asarray(times, dtype=np.float64))
+    # Candidates of the box of all moments: chosen once, not once a moment.
     stack = scene.candidates(q.min(axis=0), q.max(axis=0))
     bounds = stack.clearances(q, q)
     nearest = [
@@ -292,6 +300,7 @@ def _nearest(
     """
     best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
+        # Bounds ascend in this order, and gaps are above theirs.
         if bounds[k] >= best.mm:
             break
         gap = separation_at(scene, pairs[k], q)

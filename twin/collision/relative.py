@@ -260,6 +260,7 @@ class _Bound:
             The moment; None if the bound stays above `level`.
         """
         lengths = lengths[at.segment :].copy()
+        # From the moment on: the first segment is shorter, and its rate has grown.
         lengths[0] -= at.dt
         rate = self.rate[at.segment :].copy()
         growth = self.growth[at.segment :]
@@ -300,6 +301,8 @@ def _fall_time(above: float, rate: float, growth: float, length: float) -> float
     if square < 0.0:
         return None
     root = math.sqrt(square)
+    # The first root in the form 2 c / (root - b): where the bound falls nothing cancels, and
+    # a growth of 0 needs no case of its own.
     if root > rate:
         dt = 2.0 * above / (root - rate)
     else:
@@ -396,6 +399,8 @@ class _Turn:
         turn = self.body.turn_until(
             self.side * normal @ orientation, allowance, self.sense
         )
+        # The chord is no better than the bound that holds for any turn, and which needs no
+        # new look at the end of this one.
         if turn * crude <= allowance:
             return crude, math.inf
         return allowance / turn, turn
@@ -460,6 +465,7 @@ class RelativeMotion:
         [(_, turn)] = self._turning
         moving = self._velocity.any(axis=1) | self._acceleration.any(axis=1)
         rate = np.where(moving | (turn.acceleration != 0.0), 0.0, np.abs(turn.rate))
+        # One whole turn passes every pose that the others would.
         again = np.maximum(np.floor(rate * self.lengths / (2.0 * math.pi)) - 1.0, 0.0)
         self.lengths -= 2.0 * math.pi * again / np.where(again > 0.0, rate, 1.0)
 
@@ -516,9 +522,13 @@ class RelativeMotion:
         for i, turn in self._turning:
             orientation = look.turns[i]
             assert orientation is not None
+            # Approaches by turning add up: of two bodies that turn, each may use half of the
+            # gap.
             allowance = (look.gap - level) / len(self._turning)
             lever, horizon = turn.lever(look.normal, orientation, allowance)
             bound = bound.less(turn.nearing, lever)
+            # A chord bounds the approach within its turn only: where that is used up, the
+            # pair is looked at again.
             if math.isfinite(horizon):
                 horizons.append(turn.left.first_fall(look.at, self.lengths, horizon, 0.0))
         moments = [bound.first_fall(look.at, self.lengths, look.gap, level), *horizons]
@@ -649,11 +659,14 @@ def sweep_pair(
         look = motion.look(at, separate)
         looks += 1
         least = min(least, look.gap)
+        # Near from the start, and allowed to leave: it keeps the floor of the gap that it
+        # has.
         if looks == 1 and 0.0 < look.gap <= near:
             level = max(0.0, floor(look.gap, limits.margin))
             near = level + 0.5 * ROUNDING_MM
             clear = level + ROUNDING_MM
         elif look.gap <= near:
+            # An overlap at the start; there was no free moment.
             if before is None:
                 return PairResult(look.gap, at, None, looks)
             # The bound that led here holds as well as the look.
@@ -695,6 +708,8 @@ def refine_pair(
         look = motion.look(at, separate)
         looks += 1
         best = min(best, look.gap)
+        # What cannot fall to this level before the next look cannot lower the best by more
+        # than is allowed; so the search advances from level to level, not from gap to gap.
         level = best - limits.slack(best)
         if level <= 0.0:
             break

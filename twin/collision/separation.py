@@ -79,6 +79,7 @@ def separation_of(
             object_b = fcl.CollisionObject(shape_b, fcl.Transform(rb, rb @ shift_b))
         result = fcl.DistanceResult()
         distance = fcl.distance(object_a, object_b, request, result)
+        # Not `<=`: whatever else fcl may return, nan too, counts as a touch.
         if not distance > 0.0:
             return _TOUCHING
         on_a, on_b = result.nearest_points

@@ -292,6 +292,8 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
             shorter = longest * (rate - 0.5 * roughly * longest)
             ahead = min(ahead, max(shorter, MIN_CELL_S))
         slowing = min(state.slowing(rate, ahead) for state in states)
+        # `ahead` is programme time, which is to the rate what way is to velocity: its square
+        # falls by twice the slowing times the way.
         left = rate * rate - 2.0 * slowing * ahead
         ends = left < MIN_TIME_RATE * MIN_TIME_RATE
         following = 0.0 if ends else math.sqrt(left)

@@ -284,6 +284,8 @@ class Lookahead:
         speed = max(planned.top_speed, motion.MIN_RATE)
         acceleration = max(planned.acceleration(self.now), motion.MIN_RATE)
         way = current.redirected(contact.last_free[name], speed, acceleration, self.now)
+        # Swept although it ends where the path is free: a motor that cannot stop before it
+        # passes the place, and comes back.
         halted = {name: way}
         if self.contact(halted) is None:
             return halted
@@ -342,6 +344,8 @@ class Lookahead:
 
         def free(at: float) -> bool:
             """Return whether that is free of contacts."""
+            # Until it brakes, the motors do what was asked for, which is free up to its
+            # contact.
             return self.contact(halted(at), since=at) is None
 
         at = self._latest(free, contact, SWEPT_HALVINGS)
@@ -436,6 +440,8 @@ class Lookahead:
         slowed = {name: self.drives[name].following(t) for name, t in along.items()}
         for share in QUICKER_STOP_SHARES:
             at = self.now + share * duration
+            # After some of the stop, each motor goes on from there and not from its
+            # programme.
             drives = slowed if share else self.drives
             stops = braked_apart(self.machine, drives, at, strongest)
             if (
@@ -508,6 +514,8 @@ class Lookahead:
         )
         if halted is not None:
             return halted
+        # Neither is certified by what was swept: the first may rest behind the contact, and
+        # the second leaves the path.
         for trajectories in (
             braked_along(self.drives, self.now, self.hardest),
             braked_apart(self.machine, self.drives, self.now, self.hardest),
@@ -564,6 +572,7 @@ class UnsweptProgramme:
 
         Without a guard nothing is swept, and the programme counts as free.
         """
+        # Motors without a programme are part of what may be hit.
         standing = {name: motion.at_rest(x, 0.0) for name, x in self.start.items()}
         legs = {name: motion.joined(legs) for name, legs in self.legs.items()}
         contact = None

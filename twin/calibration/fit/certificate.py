@@ -145,6 +145,8 @@ def spectrum(
     judged = p if reported is None else reported
     factor = edge_factors(names)
     j = jacobian / factor
+    # Columns of length 1: rank and condition must not depend on whether a column is in mm or
+    # a scale.
     norm = np.linalg.norm(j, axis=0)
     scale = np.where(norm > 0, norm, 1.0)
     s, vt = _singular(j / scale)
@@ -155,6 +157,8 @@ def spectrum(
     inverse = np.where(zero, 0.0, 1.0 / np.where(zero, 1.0, s))
     v = vt.T * inverse
     covariance = (v @ v.T) / np.outer(scale, scale)
+    # A column that takes part in an open direction has no sigma, however well the others are
+    # known.
     touched = (np.abs(basis) > 1e-5).any(axis=1)
     covariance[touched, :] = np.nan
     covariance[:, touched] = np.nan
@@ -172,10 +176,12 @@ def spectrum(
         condition = top / float(s[-1])
     else:
         condition = 1.0
+    # From the worst direction on; the first that is good ends the list.
     for i in range(rank - 1, -1, -1):
         direction = weak_direction(vt[i], scale, names, noise / s[i], beads)
         size = direction.sigma / tolerance_of(direction.names[0])
         lead = names.index(direction.names[0])
+        # Nobody asked for what leads it.
         if lead >= judged:
             continue
         if size > unusable:
@@ -189,8 +195,10 @@ def spectrum(
             weak.append(direction)
         else:
             break
+    # Several directions, each good enough, may add up to a column that is not.
     hopeless = np.isfinite(sigma) & (sigma > unusable * tolerance)
     hopeless[judged:] = False
+    # Directions that are open altogether are missing from the rank already.
     rank -= sum(1 for d in null if math.isfinite(d.sigma))
     if hopeless.any() and not null:
         worst = int(np.argmax(np.where(hopeless, sigma / tolerance, 0.0)))
@@ -233,9 +241,12 @@ def _singular(j: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     p = j.shape[1]
     if len(j) >= p:
+        # Squares of singular values: down to 1e-9 of the largest they keep seven digits, and
+        # cost a fraction of a QR of all rows.
         values, vectors = np.linalg.eigh(cross(j, j))
         if p and values[0] > 1e-9 * values[-1]:
             return np.sqrt(values[::-1]), vectors.T[::-1]
+    # The triangle has the singular values and right vectors of all rows.
     r = np.linalg.qr(j, mode="r") if len(j) >= p else j
     _, s, vt = np.linalg.svd(r, full_matrices=True)
     return np.concatenate([s, np.zeros(p - len(s))]), vt
@@ -463,10 +474,13 @@ class Certificate:
             covariance = rival.covariance[np.ix_(at, at)]
             distance2 = bend.distance2(off - rival.off[at], at, covariance)
             size = np.sqrt(np.diag(covariance))
+            # Determinant in two parts: of mm and scales together it would be lost to
+            # rounding.
             volume = 2.0 * np.log(size).sum()
             volume += np.linalg.slogdet(covariance / np.outer(size, size))[1]
             levels.append(float(fdtr(p, self.dof, distance2 / p)))
             likely.append(math.log(rival.weight) - 0.5 * (distance2 + float(volume)))
+        # Against the likeliest: far from all rivals, each alone would be 0.
         weights = np.exp(np.array(likely) - max(likely))
         return float(weights @ np.array(levels) / weights.sum())
 
@@ -560,6 +574,7 @@ def certify(
     jac = problem.jacobian(x, use)
     keep = np.repeat(use.ravel(), 2)
     weight = problem.prior_weight(prior_noise)
+    # A prior is one more residual, of its column alone.
     rows = np.concatenate([jac[keep], np.diag(np.sqrt(weight))[weight > 0]])
     beads = int(problem.seen.any(axis=0).sum())
     noise, dof = spread_of_residuals(problem, x, use, prior_noise)
@@ -601,6 +616,9 @@ def certify(
         shares = np.where(weight > 0, weight / factor**2, 0.0)
         widths = np.where(weight > 0, problem.prior_sigma * factor, 0.0)
         pull = spec.unit_covariance[:reported] * shares * widths
+    # noise^2 U counts the priors as if they scattered like the images. That part, gain gain',
+    # is taken out before the rest is enlarged, and each prior counts with its own width: pull
+    # pull'.
     gain = pull * (noise / prior_noise)
     prior = cross(pull.T, pull.T)
     covariance = prior + enlargement * (
@@ -627,6 +645,8 @@ def certify(
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = covariance / np.outer(sigma, sigma)
+    # The spread is estimated from as many residuals as are left: few make the interval
+    # longer.
     t = float(stdtrit(effective, 0.975))
     estimates = {}
     for i, name in enumerate(names[:reported]):
@@ -727,6 +747,7 @@ def _determined(told: FloatArray, weight: FloatArray) -> float:
     """
     whole = told + np.diag(weight)
     diagonal = np.diag(whole)
+    # Scaled, so that one bound of rounding serves columns of all units.
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
     some = values > ROUNDING_OF_COLUMNS
@@ -826,6 +847,7 @@ def _widened(
     if len(left.problem.group) < FEWEST_CLUSTERS:
         shaken = frame_jitter(left, everything, strongest)
         if shaken is not None:
+            # With the frames' own shifts taken out, less of the residuals is white noise.
             white = (shaken.noise / left.noise) ** 2 * (covariance - prior)
             jitter = shaken.covariance[:reported, :reported]
             covariance = larger(covariance, prior + white + jitter)
@@ -839,6 +861,8 @@ def _widened(
     if left.problem.common is not None:
         shifts.append(_whitened_shifts(left.problem, left.problem.common))
     for shift in shifts:
+        # An error that all frames have in common moves the estimates as a whole: no number of
+        # frames averages it out.
         gain = left.unit_covariance[:reported] @ cross(left.jacobian, shift[left.keep])
         covariance = covariance + gain @ gain.T
     turning = turning_errors(left)
@@ -847,6 +871,7 @@ def _widened(
         covariance = covariance + turning.covariance[:reported, :reported]
         size = turning.size
     for drift in moving:
+        # The fit takes a part of the drift up, also in columns that do not drift.
         bias = drift.bias[:reported]
         covariance = covariance + np.outer(bias, bias)
         i = left.problem.layout.names.index(drift.column)
@@ -898,6 +923,8 @@ def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:
         (2 n k, 4 k).
     """
     n, k = problem.seen.shape
+    # Beads that stay in one place of the grid keep the same error, those that wander have all
+    # phases: the two vectors say which.
     phase = 2.0 * math.pi * predicted
     w = problem.whiten
     out = np.zeros((n, k, 2, k, 4))

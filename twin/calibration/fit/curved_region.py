@@ -72,6 +72,7 @@ class Bend:
         lengths = np.minimum(lengths, 1.0)
         directions = root @ (along * lengths) @ turn
         second = np.einsum("ki,lj,klp->ijp", shorter, shorter, self.second[:, :, at])
+        # What the covariance holds beside the directions, which may be almost nothing.
         rest = np.eye(len(off)) - (along * lengths**2) @ along.T
         values, vectors = np.linalg.eigh(rest)
         values = np.maximum(values, ROUNDING)
@@ -123,6 +124,8 @@ def bend_of(left: Residuals, x: FloatArray, factor: FloatArray, reported: int) -
     second = np.zeros((len(steps), len(steps), reported))
     for i, step in enumerate(steps):
         for j in range(i + 1):
+            # A mixed difference over one sigma of each: the bend within the region that is
+            # stated, rather than a derivative at its middle.
             both = problem.whitened(x + step + steps[j]).ravel()[keep]
             bend = gain @ (both - moved[i] - moved[j] + left.values)
             second[i, j] = bend
