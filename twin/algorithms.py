@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, assert_never
 
 __all__ = ["ALGORITHMS", "DEFAULT", "PLAIN", "WINDOWS", "Algorithm", "having"]
 
@@ -44,7 +44,13 @@ class Algorithm:
     @property
     def direct(self) -> bool:
         """Whether it goes through the views once."""
-        return self.kind == "direct"
+        match self.kind:
+            case "direct":
+                return True
+            case "iterative":
+                return False
+            case _:
+                assert_never(self.kind)
 
     def load(self) -> Callable[..., Any]:
         """Import the algorithm's module and return its function."""

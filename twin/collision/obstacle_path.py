@@ -14,6 +14,7 @@ import heapq
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import assert_never
 
 from flexdt.twin.collision.collision_scene import CollisionScene
 from flexdt.twin.collision.first_contact import first_contact, touching
@@ -173,13 +174,14 @@ class _Planner:
         for axis in dict.fromkeys([*goal, *movable]):
             a = self.machine.axes[axis]
             here = self.at(axis)
-            aside = [a.lower, a.upper, a.home, 0.5 * (a.lower + a.upper)]
-            if a.kind == "rotation":
-                aside = [
-                    x
-                    for x in (here - ASIDE_TURN_DEG, here + ASIDE_TURN_DEG)
-                    if a.lower <= x <= a.upper
-                ]
+            match a.kind:
+                case "linear":
+                    aside = [a.lower, a.upper, a.home, 0.5 * (a.lower + a.upper)]
+                case "rotation":
+                    turns = (here - ASIDE_TURN_DEG, here + ASIDE_TURN_DEG)
+                    aside = [x for x in turns if a.lower <= x <= a.upper]
+                case _:
+                    assert_never(a.kind)
             out[axis] = list(dict.fromkeys([here, goal.get(axis, here), *aside]))
         return out
 

@@ -19,6 +19,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import assert_never
 
 import numpy as np
 
@@ -360,12 +361,15 @@ def _solid(part: Component, profile: Profile, p: Offsets) -> UprightCylinder | P
 
     A panel that is no cylinder is turned by the profile's roll and the offsets' tilts.
     """
-    if part.shape == "cylinder":
-        return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
-    if part.points_mm:
-        solid = hull(part.points_mm)
-    else:
-        solid = box(part.size_mm, part.center_mm)
+    match part.shape:
+        case "cylinder":
+            return UprightCylinder(part.center_mm, 0.5 * part.size_mm[0], part.size_mm[2])
+        case "hull":
+            solid = hull(part.points_mm)
+        case "box":
+            solid = box(part.size_mm, part.center_mm)
+        case _:
+            assert_never(part.shape)
     turned = profile.det_roll_deg or p.det_yaw or p.det_pitch or p.det_roll
     if part.role == "panel" and turned:
         return Polytope(solid.vertices @ _panel_turn(profile, p).T, solid.faces)

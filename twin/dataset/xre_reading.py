@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, assert_never
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import XRE_SETTINGS
@@ -68,15 +68,18 @@ class XreSettings:
         succeeded = self.text("Scan info", "Succeeded")
         values: dict[str, Any] = {}
         for field, entry in ENTRIES.items():
-            if entry.xre is not None and entry.kind == "text":
-                values[field] = self.text(*entry.xre)
-            elif entry.xre is not None:
-                number = self.number(*entry.xre)
-                whole = entry.kind == "count"
-                if whole and number is not None:
-                    values[field] = round(number)
-                else:
-                    values[field] = number
+            if entry.xre is None:
+                continue
+            match entry.kind:
+                case "text":
+                    values[field] = self.text(*entry.xre)
+                case "count":
+                    number = self.number(*entry.xre)
+                    values[field] = None if number is None else round(number)
+                case "number" | "mm" | "minutes" | "whole minutes" | "roi":
+                    values[field] = self.number(*entry.xre)
+                case _:
+                    assert_never(entry.kind)
         smooth = (
             self.text("Acquisition settings", "Rotation mode") or ""
         ).lower() == "smooth"

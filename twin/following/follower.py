@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, assert_never
 
 from flexdt.twin.following.mirror import MAX_WAITING, Alarm, Heard, Mirror, Waiting
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
@@ -142,12 +142,16 @@ class Follower:
             ) in mirror.active and now - waiting.told_s > MAX_SILENCE_S:
                 mirror = replace(mirror, speaks=False)
             mirror = mirror.with_waiting(waiting, told_s=now).cleared(about, "silent")
-        if heard.what == "FDB":
-            mirror = replace(mirror, speaks=mirror.speaks is not False)
-            return self._compare_reading(mirror, heard, waiting, now)
-        if heard.what == "RCV":
-            return mirror
-        return self._end_command(mirror, heard, waiting, now)
+        match heard.what:
+            case "FDB":
+                mirror = replace(mirror, speaks=mirror.speaks is not False)
+                return self._compare_reading(mirror, heard, waiting, now)
+            case "RCV":
+                return mirror
+            case "ACK" | "ERR":
+                return self._end_command(mirror, heard, waiting, now)
+            case _:
+                assert_never(heard.what)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
         """Update the mirror after time without a message: raise alarms for overdue and

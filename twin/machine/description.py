@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from itertools import product
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar, assert_never
 
 from pydantic import (
     AfterValidator,
@@ -152,7 +152,13 @@ class Axis(_Frozen):
     @property
     def unit(self) -> str:
         """Unit of its positions at the edge: mm or deg."""
-        return "deg" if self.kind == "rotation" else "mm"
+        match self.kind:
+            case "linear":
+                return "mm"
+            case "rotation":
+                return "deg"
+            case _:
+                assert_never(self.kind)
 
     @model_validator(mode="after")
     def _ordered(self) -> Axis:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, assert_never
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine
@@ -42,7 +42,15 @@ class Arrival:
 
     def is_clamped(self, machine: Machine) -> bool:
         """Return whether a script's line continues with `motors`; otherwise it is an error."""
-        return self.beyond is None or machine.on_limit == "clamp"
+        if self.beyond is None:
+            return True
+        match machine.on_limit:
+            case "clamp":
+                return True
+            case "reject":
+                return False
+            case _:
+                assert_never(machine.on_limit)
 
 
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
@@ -98,12 +106,16 @@ def rate(machine: Machine, axis: str, what: Rate, value: float) -> Arrival:
     for motor, share in machine.moves(axis).items():
         a = machine.axes[motor]
         requested = value * abs(share)
-        if what == "speed":
-            limit = a.max_speed
-        else:
-            limit = a.max_acceleration
+        match what:
+            case "speed":
+                limit = a.max_speed
+                unit = f"{a.unit}/s"
+            case "acceleration":
+                limit = a.max_acceleration
+                unit = f"{a.unit}/s2"
+            case _:
+                assert_never(what)
         if not requested <= limit * (1.0 + POSITION_ROUNDING):  # as one that is no number
-            unit = f"{a.unit}/{'s' if what == 'speed' else 's2'}"
             messages.append(
                 f"{motor} {what} {requested:g} {unit} is above {limit:g} {unit}"
             )

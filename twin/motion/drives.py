@@ -16,6 +16,7 @@ from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import assert_never
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Axis, Machine
@@ -354,8 +355,17 @@ def _shortest(axis: Axis, position: float, target: float) -> float:
     `target` unchanged for a linear axis, or if the nearest equivalent angle and those a
     turn beside it are outside travel.
     """
-    if axis.kind != "rotation":
-        return target
+    match axis.kind:
+        case "linear":
+            return target
+        case "rotation":
+            return _shortest_turn(axis, position, target)
+        case _:
+            assert_never(axis.kind)
+
+
+def _shortest_turn(axis: Axis, position: float, target: float) -> float:
+    """Find that angle for a rotation axis (`_shortest`)."""
     turns = round((position - target) / 360.0)
     # The nearest may be past the travel's end: then the next one inwards is the shortest
     # allowed.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, assert_never
 
 import numpy as np
 import numpy.typing as npt
@@ -148,10 +148,24 @@ def open_beam_of(
     Returns:
         The open beam; None where mono or poly have no spectrum for the voltage.
     """
-    if physics == "ideal":
-        model = ideal.ideal_response(machine)
-        counts = ideal.open_beam(model, exposure)
-        return OpenBeam(counts, model.full_scale - model.dark_counts)
+    match physics:
+        case "ideal":
+            model = ideal.ideal_response(machine)
+            counts = ideal.open_beam(model, exposure)
+            return OpenBeam(counts, model.full_scale - model.dark_counts)
+        case "mono" | "poly":
+            return _open_beam_of_a_spectrum(machine, camera, exposure, view)
+        case _:
+            assert_never(physics)
+
+
+def _open_beam_of_a_spectrum(
+    machine: Machine,
+    camera: CameraSettings,
+    exposure: ExposureSettings,
+    view: npt.ArrayLike,
+) -> OpenBeam | None:
+    """Predict the open beam with the tube's spectrum; None without one for the voltage."""
     panel = detector_of(machine.detector)
     brightest = float(flux_of(view, camera.shape).max())
     try:

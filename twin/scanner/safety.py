@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, assert_never
 
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.motion.profiles import Trajectory
@@ -114,9 +114,16 @@ def require_ready(safety: Safety, what: str) -> None:
         SafetyError: E-stopped, or blocked without a contact; the message says that a
             reset is needed.
     """
-    if safety.state == "estopped" or (
-        safety.state == "blocked" and safety.contact is None
-    ):
+    match safety.state:
+        case "ready":
+            refused = False
+        case "blocked":
+            refused = safety.contact is None
+        case "estopped":
+            refused = True
+        case _:
+            assert_never(safety.state)
+    if refused:
         raise SafetyError(
             f"{what} is refused: {safety.reason}; a reset is needed",
             {

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Unpack
+from typing import Unpack, assert_never
 
 import numpy.typing as npt
 
@@ -426,16 +426,19 @@ class ScannerTwin:
         ahead = self._lookahead(now)
         if now < self._coasts_until:
             return self.stop(now)
-        if self.machine.estop.category == 0:
-            trajectories = coasting(
-                self.machine, self._drives, now, self.machine.estop.coasting
-            )
-            hit = None
-            if trajectories:
-                hit = ahead.contact(trajectories)
-            self._coasts_until = max((t.end for t in trajectories.values()), default=now)
-            return self._stopped(StopMotion.of(trajectories, "coasting", now, hit))
-        return self._stopped(ahead.stopped(ahead.hardest))
+        match self.machine.estop.category:
+            case 0:
+                trajectories = coasting(
+                    self.machine, self._drives, now, self.machine.estop.coasting
+                )
+                hit = ahead.contact(trajectories) if trajectories else None
+                ends = (t.end for t in trajectories.values())
+                self._coasts_until = max(ends, default=now)
+                return self._stopped(StopMotion.of(trajectories, "coasting", now, hit))
+            case 1:
+                return self._stopped(ahead.stopped(ahead.hardest))
+            case _:
+                assert_never(self.machine.estop.category)
 
     def reset(self, now: float, stop: int | None = None) -> None:
         """Leave E-stop or blocked; no motion starts, and a contact remains one.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import assert_never
 
 import numpy as np
 import numpy.typing as npt
@@ -124,14 +125,21 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
     warnings: list[ScriptProblem] = []
     for view in views(plan):
         outside = view.outside
-        if view.kind == "projection" and outside.any():
-            warnings.append(
-                _aggregate(view, outside, "sample_out_of_beam", _outside_text(view))
-            )
-        if view.kind == "flat" and not outside.all():
-            warnings.append(
-                _aggregate(view, ~outside, "sample_in_flat", _inside_text(view))
-            )
+        match view.kind:
+            case "projection":
+                bad = outside
+                code = "sample_out_of_beam"
+                text = _outside_text
+            case "flat":
+                bad = ~outside
+                code = "sample_in_flat"
+                text = _inside_text
+            case "dark" | "preview":
+                continue
+            case _:
+                assert_never(view.kind)
+        if bad.any():
+            warnings.append(_aggregate(view, bad, code, text(view)))
     return tuple(warnings)
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, assert_never
 
 import numpy as np
 
@@ -537,12 +537,18 @@ class ImageCollector:
             )
         self.names.update(draft.files)
         self._warn_of_defaults(draft)
-        if draft.kind == "dark" and draft.xrays_on:
-            self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
-        if draft.kind != "dark" and not draft.xrays_on:
-            message = "projections are"
-            if draft.kind == "flat":
+        match draft.kind:
+            case "dark":
+                if draft.xrays_on:
+                    self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
+                return
+            case "flat":
                 message = "a flat image is"
+            case "projection" | "preview":
+                message = "projections are"
+            case _:
+                assert_never(draft.kind)
+        if not draft.xrays_on:
             self.findings.warn("xrays_off", f"{message} taken with X-rays off")
 
     def _warn_of_defaults(self, draft: ExposureGroup) -> None:

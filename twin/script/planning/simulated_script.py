@@ -13,7 +13,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, assert_never
 
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine, unknown_axis
@@ -159,11 +159,15 @@ class Simulation:
         With ACK it is the end of the command; with POS the passing of its trigger, if it
         has one; else at once. It is never before now.
         """
-        if command.wait is c.Wait.ACK:
-            return max(self.now, span.end)
-        if command.wait is c.Wait.POS and span.release is not None:
-            return max(self.now, span.release)
-        return self.now
+        match command.wait:
+            case c.Wait.ACK:
+                return max(self.now, span.end)
+            case c.Wait.POS:
+                return max(self.now, self.now if span.release is None else span.release)
+            case c.Wait.NO_WAIT | c.Wait.RCV:
+                return self.now
+            case _:
+                assert_never(command.wait)
 
     def timed(self, kind: str, length: float = 0.0, note: str = "") -> planned.Span:
         """Make the span of a command that starts now: its length and the machine's time
