@@ -60,8 +60,8 @@ def check_home(machine: Machine, profile: Profile, file: str) -> None:
     if pairs:
         message = f"at home {_pairs(pairs)}; the safety margin is {machine.safety_margin_mm:g} mm"
         more = (
-            "another home, other sizes or places; or say in allowed_contacts that they "
-            "are mounted"
+            "another home, other sizes or places; or say in allowed_contacts "
+            "that they are mounted"
         )
         raise wrong(
             f"{message} ({more} on each other)", pairs=[list(pair) for pair, _ in pairs]

@@ -708,8 +708,8 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
         ) from None
     if isinstance(content, dict) and content.get("schema") != SCHEMA:
         raise DatasetFormatError(
-            f"{file}: schema is {str(content.get('schema'))[:40]!r}; this version reads "
-            f"{SCHEMA}",
+            f"{file}: schema is {str(content.get('schema'))[:40]!r}; "
+            f"this version reads {SCHEMA}",
             {"path": file, "asked": repr(content.get("schema"))[:40], "allowed": SCHEMA},
         )
     return _validated(DatasetDocument, content, file)

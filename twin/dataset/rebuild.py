@@ -194,9 +194,8 @@ def physical(settings: ScanSettings, file: str) -> tuple[ScanSettings, list[str]
     if sdd is not None and cor is not None and hc is not None:
         cor = hc + (cor - hc) * (sdd + far) / sdd
     note = (
-        f"mag_det_phys is {real.value:g} mm, mag_det {read.value:g} mm: the detector is "
-        "taken to "
-        f"be {far:+g} mm from where SDD has it"
+        f"mag_det_phys is {real.value:g} mm, mag_det {read.value:g} mm: the detector "
+        f"is taken to be {far:+g} mm from where SDD has it"
     )
     motors = {**settings.motors, "mag_det": real}
     return replace(

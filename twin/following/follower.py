@@ -731,8 +731,8 @@ class Follower:
             longer = "more"
         bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
         message = (
-            f"{waiting.heard.text} has taken {took:.2f} s, {longer} than its range of "
-            f"{bounds}"
+            f"{waiting.heard.text} has taken {took:.2f} s, "
+            f"{longer} than its range of {bounds}"
         )
         return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], message)
 

@@ -628,8 +628,8 @@ class ConeVec:
             given = check_shape(shape)
         if given is not None and own is not None and given != own:
             raise GeometryError(
-                f"detector shape {given}; this geometry is of a detector of {own} (rows, "
-                "columns)",
+                f"detector shape {given}; this geometry is of a detector of "
+                f"{own} (rows, columns)",
                 {"asked": list(given), "allowed": list(own)},
             )
         known = own if given is None else given
@@ -1059,8 +1059,8 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
         if bad.any():
             i = int(np.flatnonzero(bad)[0])
             raise GeometryError(
-                f"cone_vec row {i}: {name} is {length[i]:.9g} mm, the binned pixel pitch is "
-                f"{pitch:.9g} mm",
+                f"cone_vec row {i}: {name} is {length[i]:.9g} mm, the binned pixel "
+                f"pitch is {pitch:.9g} mm",
                 {"row": i, "check": "pitch", "asked": float(length[i]), "allowed": pitch},
             )
     cosine = np.einsum("ni,ni->n", u, v) / (lengths["|u|"] * lengths["|v|"])
@@ -1075,9 +1075,8 @@ def check_cone_vec(cone_vec: ConeVec, pixel_mm: float | tuple[float, float]) -> 
     if (distance <= 0).any():
         i = int(np.argmin(distance))
         raise GeometryError(
-            f"cone_vec row {i}: the source-detector distance is {distance[i]:.6g} mm; it "
-            "must be "
-            "positive",
+            f"cone_vec row {i}: the source-detector distance is {distance[i]:.6g} "
+            "mm; it must be positive",
             {"row": i, "check": "sdd", "asked": float(distance[i]), "allowed": "> 0"},
         )
     return cone_vec

@@ -95,8 +95,8 @@ def as_numbers(
     except (TypeError, ValueError):
         kind = type(value).__name__
         raise GeometryError(
-            f"{what}: {'an' if kind[0] in 'aeiou' else 'a'} {kind}; allowed: an array of "
-            "numbers",
+            f"{what}: {'an' if kind[0] in 'aeiou' else 'a'} {kind}; "
+            "allowed: an array of numbers",
             {"asked": kind, "allowed": "numbers"},
         ) from None
 

@@ -229,8 +229,7 @@ def check_roi(roi: Roi, grid: PixelGrid, binning: int) -> Roi:
     if roi.right - roi.left + 1 < binning or roi.bottom - roi.top + 1 < binning:
         raise LimitError(
             f"ROI {roi} holds no pixel at binning {binning}: right and bottom are "
-            "inclusive and "
-            "must exceed left and top",
+            "inclusive and must exceed left and top",
             {"asked": str(roi), "binning": binning},
         )
     return roi

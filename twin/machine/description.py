@@ -829,8 +829,8 @@ class Machine(_Frozen):
             parts = [part for part in self.components if part.role == role]
             if self.components and len(parts) != 1 and role != "sample_mount":
                 allowed = (
-                    f"one component with role = {role!r}; or no components and no check "
-                    "at all"
+                    f"one component with role = {role!r}; "
+                    "or no components and no check at all"
                 )
                 raise _refused("components", [part.name for part in parts], allowed)
             for part in parts:
@@ -843,11 +843,9 @@ class Machine(_Frozen):
                 left = [motor for motor in self._motors_of(anchor) if motor not in chain]
                 if left:
                     allowed = (
-                        f"carried by every motor that [geometry] gives the {anchor}, so "
-                        "that it "
-                        f"goes where the X-ray geometry goes: say axis = {left[0]!r} of "
-                        "it or of "
-                        "a part that carries it"
+                        f"carried by every motor that [geometry] gives the {anchor}, "
+                        "so that it goes where the X-ray geometry goes: say axis = "
+                        f"{left[0]!r} of it or of a part that carries it"
                     )
                     raise _refused(f"{where}.axis", part.axis, allowed)
                 slack = 1e-6

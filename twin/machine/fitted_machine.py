@@ -43,8 +43,8 @@ def fitted_text(
     new_text = _replaced(text, {**blocks, "timing": _timing_table(machine.timing)})
     if parse(new_text, "fitted machine") != machine:
         message = (
-            "the base machine's file must write axes as tables [axes.NAME] and times as "
-            "[timing]"
+            "the base machine's file must write axes as tables [axes.NAME] "
+            "and times as [timing]"
         )
         raise MachineFileError(message, {"allowed": ["[axes.NAME]", "[timing]"]})
     return new_text

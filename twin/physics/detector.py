@@ -231,8 +231,8 @@ class Detector:
         pitch = pixels.pitch_mm
         if self.pixel_mm is not None and abs(self.pixel_mm - pitch) > 1e-6 * pitch:
             message = (
-                f"the detector's pixel_mm is {self.pixel_mm:g} mm, the geometry's "
-                f"{pitch:g} mm"
+                f"the detector's pixel_mm is {self.pixel_mm:g} mm, "
+                f"the geometry's {pitch:g} mm"
             )
             raise LimitError.instead(message, self.pixel_mm, pitch, unit="mm")
         across, up = pixels.edges_mm

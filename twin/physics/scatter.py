@@ -389,8 +389,8 @@ def _lit(
     depth = (corners - source) @ normal / ((centre - source) @ normal)
     if depth.min() <= 1e-3:
         message = (
-            "the X-ray source lies in or beside the sample's box: its scatter is not "
-            "simulated"
+            "the X-ray source lies in or beside the sample's box: "
+            "its scatter is not simulated"
         )
         raise GeometryError.instead(
             message, source.tolist(), "a sample in front of the source"

@@ -375,8 +375,7 @@ def polyhedron_corners(shape: ConvexPolyhedron) -> FloatArray:
     if len(n) != len(d) or len(n) < 4:
         raise GeometryError(
             f"polyhedron with {len(n)} normals and {len(d)} offsets; allowed: the same "
-            "number of "
-            "both, at least 4"
+            "number of both, at least 4"
         )
     # The centre of the largest inscribed ball is an interior point.
     limits = [(None, None)] * 3 + [(0.0, None)]

@@ -38,13 +38,11 @@ CAUSES: Final = {
 }
 GRANTED: Final = (
     "taken for granted: the geometry, as far as images do not contradict it, and line "
-    "integrals "
-    "without beam hardening and scatter"
+    "integrals without beam hardening and scatter"
 )
 NOT_BOUNDED: Final = (
-    "accuracy: not bounded, because the object extends beyond the panel's sides: a "
-    "denser shell "
-    "out there makes every value too low, and no image shows it"
+    "accuracy: not bounded, because the object extends beyond the panel's sides: "
+    "a denser shell out there makes every value too low, and no image shows it"
 )
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
@@ -83,9 +81,9 @@ class Accuracy:
             f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most)
         )
         return (
-            f"accuracy: within {most} in nine of ten uniform regions and {half} in half "
-            "of them "
-            f"(noise not included); largest cause: {CAUSES[self.cause]}; {GRANTED}"
+            f"accuracy: within {most} in nine of ten uniform regions and {half} "
+            "in half of them (noise not included); largest cause: "
+            f"{CAUSES[self.cause]}; {GRANTED}"
         )
 
     @property
@@ -297,11 +295,9 @@ class Volume:
         least = float(self.data.min())
         most = float(self.data.max())
         return (
-            f"<table><caption>{escape(repr(self)[1:-1])}</caption><tr><th>size (x, y, "
-            "z)</th><td>"
-            f"{size} mm</td></tr><tr><th>values</th><td>{least:.4g} to {most:.4g} / "
-            "mm</td></tr>"
-            "</table>"
+            f"<table><caption>{escape(repr(self)[1:-1])}</caption>"
+            f"<tr><th>size (x, y, z)</th><td>{size} mm</td></tr>"
+            f"<tr><th>values</th><td>{least:.4g} to {most:.4g} / mm</td></tr></table>"
         )
 
     def to(self, device: str) -> Any:
@@ -328,8 +324,7 @@ class Volume:
                 why = ""
             raise NotBuiltError(
                 f"no volumes on device {device!r}{why}; allowed: 'cpu', and 'cuda' where "
-                "there is "
-                "a CUDA device. Projections use it by themselves, too",
+                "there is a CUDA device. Projections use it by themselves, too",
                 {"asked": device, "allowed": ["cpu", "cuda"]},
             )
         layout = self.layout

@@ -180,8 +180,8 @@ def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
     """
     if bias is None:
         return [
-            "accuracy is not known: a coarse copy of the scan, by which it is found, cannot be "
-            "reconstructed"
+            "accuracy is not known: a coarse copy of the scan, by which it is found, "
+            "cannot be reconstructed"
         ]
     if bias.contradiction is not None:
         return [str(bias.contradiction)]

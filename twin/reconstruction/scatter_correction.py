@@ -551,8 +551,7 @@ def doubts_about(dark: float, volume: Volume, chain: Chain, mu: FloatArray) -> l
         name = chain.substances[int(np.argmax(mu))].name
         voxel = volume.voxel_xyz[0]
         out.append(
-            f"the densest part attenuates {ratio:.2g} times as much as {name}: either it "
-            "is not "
-            f"{name}, or it is smaller than {voxel:.2g} mm voxels"
+            f"the densest part attenuates {ratio:.2g} times as much as {name}: either "
+            f"it is not {name}, or it is smaller than {voxel:.2g} mm voxels"
         )
     return out

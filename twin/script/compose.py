@@ -299,9 +299,8 @@ class _Writer(MotorTargets):
             moved = ("object_z",)
         if not self.has(*moved):
             message = (
-                "has no motors that raise source and detector together, and none that "
-                "lowers the "
-                "sample, which a helical scan needs"
+                "has no motors that raise source and detector together, and none "
+                "that lowers the sample, which a helical scan needs"
             )
             missing = ["source_z", "detector_z", "object_z"]
             raise self.lacking(message, asked="helical", missing=missing)
@@ -313,8 +312,8 @@ class _Writer(MotorTargets):
             moves = [q for q, factors in m.geometry.items() if motor in factors]
             if list(m.geometry[quantity]) != [motor] or moves != [quantity]:
                 message = (
-                    "raises or lowers with motors that move something else too, so flexdt "
-                    "writes"
+                    "raises or lowers with motors that move something else "
+                    "too, so flexdt writes"
                 )
                 axes = list(m.geometry[quantity])
                 raise self.lacking(
@@ -539,8 +538,8 @@ class _Writer(MotorTargets):
                 continue
             self.need(f"{asked:g} mm ({only:g} mm is all there is)", quantity)
             message = (
-                f"has no motor of its own for {QUANTITIES[quantity]}: {asked:g} mm were "
-                "asked for"
+                f"has no motor of its own for {QUANTITIES[quantity]}: "
+                f"{asked:g} mm were asked for"
             )
             it_is = f"{message}, it is {only:g} mm"
             raise self.lacking(it_is, asked=asked, allowed=only, missing=quantity)

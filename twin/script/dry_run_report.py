@@ -112,9 +112,8 @@ def _optics_facts(o: Optics) -> Facts:
         ("  magnification", f"{_span(o.magnification)}, voxel {_span(o.voxel_um)} um"),
         (
             "  field of view",
-            f"{o.field_mm[0]:.2f} x {o.field_mm[1]:.2f} mm at the axis; whole over a "
-            "full turn: "
-            f"{o.turn_field_mm:.2f} mm across",
+            f"{o.field_mm[0]:.2f} x {o.field_mm[1]:.2f} mm at the axis; whole over "
+            f"a full turn: {o.turn_field_mm:.2f} mm across",
         ),
     ]
     if o.truncation is not None:

@@ -170,10 +170,8 @@ def _line(
             motor = None
             message = (
                 f"the reply of {shorten(command.component)} ({len(reply)} bytes) is left "
-                "out: it "
-                f"must begin with {_REPLY_DOUBLES} big-endian doubles (position near the "
-                "target, "
-                "limits twice)"
+                f"out: it must begin with {_REPLY_DOUBLES} big-endian doubles (position "
+                "near the target, limits twice)"
             )
             problems.append(ScriptProblem("warning", "reply", number, 1, message))
     return Executed(command, own_s, 3600 * hour + 60 * minute + second, reply, motor)

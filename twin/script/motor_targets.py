@@ -182,8 +182,8 @@ def beside_beam(
     places = MotorTargets(machine, profile)
     if not places.aside:
         message = (
-            "has no motor that takes the sample out of the beam, so no flat image can be "
-            "taken"
+            "has no motor that takes the sample out of the beam, "
+            "so no flat image can be taken"
         )
         raise places.lacking(
             message, asked="a flat field", missing=["object_x", "object_z"]

@@ -352,9 +352,8 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     if is_log(text):
         message = (
             "this is an executed script, a log: `flexdt machine fit` learns the machine "
-            "from it, "
-            "and `flexdt check SCRIPT --against` it compares; to run, a script has seven "
-            "columns"
+            "from it, and `flexdt check SCRIPT --against` it compares; to run, "
+            "a script has seven columns"
         )
         return c.Script((), (), 0), (
             ScriptProblem("error", "executed_log", 0, 1, message),
@@ -613,10 +612,9 @@ class _Line:
             raise _Refused("unknown_command", fields[0].column, message)
         if not self._custom_form(fields):
             message = (
-                f"{shorten(name)!r} is not a component of the scanner"
-                f"{_meant(name, (*grammar.FIXED,))}; a custom component needs a name, a "
-                "command "
-                "and a wait"
+                f"{shorten(name)!r} is not a component of the "
+                f"scanner{_meant(name, (*grammar.FIXED,))}; a custom component needs "
+                "a name, a command and a wait"
             )
             raise _Refused(
                 "unknown_component" if fields else "syntax",

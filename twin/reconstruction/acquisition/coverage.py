@@ -222,10 +222,9 @@ class Sharing:
         most = float(((rows - 1) * (axis - wide) / scale).min())
         if circle.rise > most:
             raise no_fdk(
-                f"the helix rises by {circle.rise:.4g} mm a turn; FDK needs every voxel in "
-                f"every direction: at most {most:.4g} mm a turn for this panel and a "
-                "grid as wide "
-                "as this",
+                f"the helix rises by {circle.rise:.4g} mm a turn; FDK needs every "
+                f"voxel in every direction: at most {most:.4g} mm a turn for this panel "
+                "and a grid as wide as this",
                 circle.rise,
                 most,
             )

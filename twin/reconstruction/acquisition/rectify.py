@@ -85,8 +85,8 @@ def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
     level = np.hypot(away[:, 0], away[:, 1])
     if level.min() <= FLAT:
         why = (
-            "a panel lies flat: it has no rows across the rotation axis; FDK needs one "
-            "that stands"
+            "a panel lies flat: it has no rows across the rotation axis; "
+            "FDK needs one that stands"
         )
         raise no_fdk(why, float(level.min()), f"> {FLAT:g}")
     # Down times the normal is to the right, whatever turn the panel had about its normal.

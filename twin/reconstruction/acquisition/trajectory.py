@@ -164,11 +164,9 @@ def _circle_of(sources: bytes) -> Circle:
         worst = max(worst, float(np.abs(s[:, 2] - s[:, 2].mean()).max()))
     if worst > MAX_CIRCLE_DEVIATION * radius:
         raise no_fdk(
-            f"the sources leave a horizontal circle of radius {radius:.4g} mm by "
-            f"{worst:.4g} mm; "
-            "FDK needs a circle, or a helix that rises steadily for a turn or more and "
-            "has no gap "
-            "of angles",
+            f"the sources leave a horizontal circle of radius {radius:.4g} mm "
+            f"by {worst:.4g} mm; FDK needs a circle, or a helix that rises steadily for "
+            "a turn or more and has no gap of angles",
             worst,
             MAX_CIRCLE_DEVIATION * radius,
         )

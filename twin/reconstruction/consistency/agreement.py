@@ -122,9 +122,9 @@ class Contradiction:
                 f"{100.0 * self.change:.2g} % in a tenth of the uniform regions"
             )
         sentence = (
-            "no accuracy is claimed: images and geometry contradict each other; the volume, "
-            f"projected again, differs from the images {self.misfit:.2g} times as much "
-            "as it should"
+            "no accuracy is claimed: images and geometry contradict each other; "
+            f"the volume, projected again, differs from the images {self.misfit:.2g} "
+            "times as much as it should"
         )
         if not self.kinds:
             return f"{sentence}. {UNEXPLAINED}"

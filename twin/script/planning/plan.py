@@ -86,9 +86,8 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         """Format as one line: machine, steps, projections, duration [s], errors and warnings."""
         return (
             f"<ScanPlan on {self.machine.name}: {len(self.steps)} steps, {self.frames} "
-            "projections,"
-            f" {self.duration_s:.1f} s, {len(self.errors)} errors, {len(self.warnings)} "
-            "warnings>"
+            f"projections, {self.duration_s:.1f} s, {len(self.errors)} errors, "
+            f"{len(self.warnings)} warnings>"
         )
 
     @property
@@ -299,8 +298,8 @@ class CheckReport(WithProblems):
         if self.clearance:
             hits = len(self.clearance.collisions)
         return (
-            f"<CheckReport: {'ok' if self.ok else 'not ok'}, {hits} collisions, of "
-            f"{self.plan!r}>"
+            f"<CheckReport: {'ok' if self.ok else 'not ok'}, "
+            f"{hits} collisions, of {self.plan!r}>"
         )
 
     @property

@@ -491,10 +491,9 @@ class ImageCollector:
         ):
             self.findings.warn(
                 "frame_angles",
-                f"{found.frames} frames of {period * 1000:g} ms at {speed:.9g} {unit}/s cover "
-                f"{found.mismatch:+.4g} {unit} more than whole turns; images are put at "
-                "steps of "
-                f"{found.increment:.9g} {unit}",
+                f"{found.frames} frames of {period * 1000:g} ms at {speed:.9g} {unit}/s "
+                f"cover {found.mismatch:+.4g} {unit} more than whole turns; images "
+                f"are put at steps of {found.increment:.9g} {unit}",
             )
         if late <= _TIME_TOLERANCE_S:
             first = trigger.position

@@ -25,8 +25,8 @@ Pose = Mapping[str, float]
 Route = Callable[[Pose, Pose], Sequence[Pose] | None]
 """Finds the moves from one pose to another; None if there is no free path."""
 _NO_FLAT: Final = (
-    "no flat image is taken, as `flat` is false; without one the data set cannot be "
-    "reconstructed"
+    "no flat image is taken, as `flat` is false; without one the data set "
+    "cannot be reconstructed"
 )
 _NO_PATH: Final = (
     "no free path takes the sample out of the beam for the flat image; give `flat` a pose "

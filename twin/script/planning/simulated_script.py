@@ -194,8 +194,8 @@ class Simulation:
         if command.component in self.machine.axes:
             self.findings.warn(
                 "custom_component",
-                f"{command.component}: the twin does not know this command of the axis; "
-                "no effect",
+                f"{command.component}: the twin does not know this command "
+                "of the axis; no effect",
             )
         return self.timed("command", note=" (no effect)")
 
@@ -272,8 +272,8 @@ class Simulation:
         """
         if not self.tube.on:
             message = (
-                "waits until the X-rays are ready, but they are off: the script would "
-                "hang here"
+                "waits until the X-rays are ready, but they are off: "
+                "the script would hang here"
             )
             self.findings.error("xray_never_ready", message)
             return self.timed("command")
@@ -474,9 +474,9 @@ class Simulation:
             unit = self.machine.axes[motor].unit
             self.findings.error(
                 "unreachable_trigger",
-                f"{command.component} never passes the trigger {trigger:g} {unit} on its "
-                "way from "
-                f"{begin[motor]:g} to {trajectory.target:g} {unit}: the script would hang here",
+                f"{command.component} never passes the trigger {trigger:g} {unit} on "
+                f"its way from {begin[motor]:g} to {trajectory.target:g} {unit}: "
+                "the script would hang here",
             )
             self.imaging.trigger = None
             return end
