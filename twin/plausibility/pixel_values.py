@@ -168,8 +168,7 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
             share = float(bad.mean())
             cause = (
                 f"{100 * share:.3g} % of the voxels are no numbers, as beside the field "
-                "of view: "
-                "neither are line integrals through them"
+                "of view: neither are line integrals through them"
             )
             remedy = "give them a value first, such as np.nan_to_num(volume.data)"
             yield Finding("not finite", cause, remedy, Severity.WARNING, share)

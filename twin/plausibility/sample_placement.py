@@ -79,9 +79,8 @@ def placement_findings(
     cut = stretches(cone_vec, corners) > 1.0
     if exposed and cut.any():
         cause = (
-            f"the panel stands before or in the box around the sample in {cut.sum()} of "
-            f"{len(cut)} "
-            "views: rays run through it, as through a virtual one"
+            f"the panel stands before or in the box around the sample in {cut.sum()} "
+            f"of {len(cut)} views: rays run through it, as through a virtual one"
         )
         yield Finding(
             "panel in the sample", cause, UNITS, Severity.WARNING, float(cut.mean())
@@ -95,8 +94,7 @@ def placement_findings(
     if (largest := float((high - low).max())) * magnified < pixel:
         cause = (
             f"the sample measures {largest:.3g} mm, magnified {magnified:.3g} times less "
-            "than a "
-            f"pixel of {pixel:.3g} mm"
+            f"than a pixel of {pixel:.3g} mm"
         )
         yield Finding("units", cause, UNITS, Severity.WARNING, largest)
     ahead = (depths > 0.0).all(axis=1)

@@ -364,8 +364,7 @@ def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[F
     if inclined > INCLINED_DEG[0]:
         cause = (
             f"the beam is inclined by {inclined:.3g} deg to the plane in which the "
-            "source turns "
-            "(laminography), where FDK is wrong"
+            "source turns (laminography), where FDK is wrong"
         )
         refused = inclined > INCLINED_DEG[1]
         if refused:

@@ -97,8 +97,7 @@ def grid_findings(
     if unseen > MOST_UNSEEN:
         cause = (
             f"{100 * unseen:.3g} % of the grid lie beside the field of view, where "
-            "values are not "
-            "determined"
+            "values are not determined"
         )
         remedy = "a smaller grid, such as field_of_view gives, holds what was seen"
         yield Finding("grid not seen", cause, remedy, Severity.WARNING, unseen)
