@@ -139,8 +139,7 @@ def settle_motion(
             warning(
                 "motion_unsettled",
                 f"the motion differs by up to {worst:.1f} sigma from what the last fit "
-                "would make "
-                "of it; its sigmas contain that",
+                "would make of it; its sigmas contain that",
             )
         )
     wide = [

@@ -27,8 +27,7 @@ def require_scans(scans: Sequence[Scan]) -> None:
         if len(scan.poses) != len(scan.frames) or len(scan.frames) == 0:
             raise TwinError(
                 f"{scan.name}: {len(scan.frames)} frames and {len(scan.poses)} poses; "
-                "allowed: as "
-                "many of both, at least one"
+                "allowed: as many of both, at least one"
             )
         require_seen_from_source(scan)
 

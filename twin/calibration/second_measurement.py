@@ -231,11 +231,10 @@ def _judge_confirmation(state: Calibration) -> list[Finding]:
         out.append(
             error(
                 "spots_unconfirmed",
-                f"{scan.name}: {confirmed} of {int(before.sum())} spots are, where the "
-                "first fit "
-                "expects them, shadows of balls of the phantom's size; are the images "
-                "saturated or "
-                "clipped, and are phantom, geometry and pixel size right?",
+                f"{scan.name}: {confirmed} of {int(before.sum())} spots are, "
+                "where the first fit expects them, shadows of balls of the phantom's "
+                "size; are the images saturated or clipped, and are phantom, geometry "
+                "and pixel size right?",
             )
         )
     return out

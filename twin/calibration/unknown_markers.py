@@ -81,10 +81,9 @@ def link(
     for gate in GATES_PX:
         if len(places) < 3:
             raise TwinError(
-                f"{len(places)} markers are found that move as the angles say, among "
-                f"{counts.mean():.1f} spots in each of {n} frames; allowed: three or "
-                "more. Look at "
-                "the angles and at the axis's place",
+                f"{len(places)} markers are found that move as the angles say, "
+                f"among {counts.mean():.1f} spots in each of {n} frames; allowed: three "
+                "or more. Look at the angles and at the axis's place",
                 {"asked": len(places), "allowed": ">= 3"},
             )
         cone = poses.cone_vec(at)

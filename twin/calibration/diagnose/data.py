@@ -258,8 +258,7 @@ def explain_identification(
             return warning(
                 "bead_displaced",
                 f"{whose} where it should be, and in each frame {rest:.1f} spots are no "
-                "bead: it "
-                "is elsewhere, or lost; the others are used",
+                "bead: it is elsewhere, or lost; the others are used",
             )
         if convincing(found):
             if found.explained > SOME_SPOTS or not _extra(found, counts):
@@ -285,8 +284,8 @@ def explain_identification(
     radius = float(np.median(np.concatenate([d.radii_px for d in detections])))
     if abs(math.log(radius / expected)) > math.log(OTHER_SIZE):
         why += (
-            f"; their radius is {radius:.1f} px instead of {expected:.1f}: other pixels "
-            "or beads?"
+            f"; their radius is {radius:.1f} px instead of {expected:.1f}: "
+            "other pixels or beads?"
         )
     return error(
         "wrong_phantom",
@@ -425,8 +424,7 @@ def _alternative(
         )
         text = (
             f"the angles are off by a factor {factor:.5f}: the frames turn by 360 / "
-            f"{true}, not "
-            f"360 / {stated} (endpoint error)"
+            f"{true}, not 360 / {stated} (endpoint error)"
         )
         trials.append(("angle_endpoint", text, {"poses": turned}))
     across, along = (_flipped(detections, axis) for axis in (0, 1))
@@ -450,8 +448,8 @@ def _alternative(
         ),
         (
             "image_upside_down",
-            "the images are upside down, or each z of the phantom has the wrong sign, which "
-            "looks alike",
+            "the images are upside down, or each z of the phantom has the wrong "
+            "sign, which looks alike",
             {"detections": along},
         ),
         (
@@ -650,11 +648,9 @@ def _other_turn(
         return None
     return error(
         "angle_turn",
-        f"the first {n} frames fit the phantom if the stage turns {best[1]:.3f} times as "
-        "far as "
-        f"the angles say: {abs(math.degrees(float(turned[-1]))) * best[1]:.0f} deg from "
-        "the first "
-        "to the last frame",
+        f"the first {n} frames fit the phantom if the stage turns {best[1]:.3f} times "
+        f"as far as the angles say: {abs(math.degrees(float(turned[-1]))) * best[1]:.0f} "
+        "deg from the first to the last frame",
     )
 
 
@@ -686,7 +682,7 @@ def _one_by_one(
         return None
     return error(
         "frame_numbers",
-        f"{good} of {len(chosen)} frames that were tried fit the phantom each by itself, "
-        "together "
-        "they do not: the frames are in another order, or their angles are wrong",
+        f"{good} of {len(chosen)} frames that were tried fit the phantom each "
+        "by itself, together they do not: the frames are in another order, "
+        "or their angles are wrong",
     )

@@ -175,9 +175,8 @@ def judge_exact(
     assumed = ", ".join(f"{n} = {exact[n]:g}" for n in causes)
     return warning(
         "held_unchecked",
-        f"{assumed} is taken as exact, and the images cannot tell whether it is: with the "
-        "usual prior "
-        f"sigmas grow: {listed}; give prior 0 only to what was measured",
+        f"{assumed} is taken as exact, and the images cannot tell whether it is: with "
+        f"the usual prior sigmas grow: {listed}; give prior 0 only to what was measured",
     )
 
 
@@ -301,8 +300,7 @@ def _other_pixels(fit: FitResult, dD_z: float) -> str:
     sdd = float(np.median(poses.sdd))
     return (
         f"the pixels are {pixel * sdd / (sdd + dD_z):.4g} mm wide instead of {pixel:.4g} "
-        "mm, which "
-        "looks alike"
+        "mm, which looks alike"
     )
 
 
@@ -342,9 +340,9 @@ def narrow_priors(judged: PriorsJudged) -> Finding:
         cause = ""
     return warning(
         "priors_narrow",
-        f"the images have detector and axis {judged.factor:.1f} times as far from where "
-        "they are "
-        f"known to be as their priors say{cause}: all priors are widened by that factor",
+        f"the images have detector and axis {judged.factor:.1f} times as far "
+        f"from where they are known to be as their priors say{cause}: all priors "
+        "are widened by that factor",
     )
 
 

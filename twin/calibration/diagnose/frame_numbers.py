@@ -111,8 +111,7 @@ class FrameNumbers:
             return warning(
                 "frames_inconsistent",
                 f"{name}: in {len(again)} of {len(self.shift)} frames the shadows are "
-                "not where "
-                f"the others put them: {described}; those frames are not used",
+                f"not where the others put them: {described}; those frames are not used",
             )
         settled = self._settled
         changes = np.flatnonzero(np.diff(settled)) + 1

@@ -98,10 +98,9 @@ def _other_size(ratio: float) -> Finding:
     return error(
         "bead_size",
         f"the shadows are {100 * abs(ratio - 1):.0f} % "
-        f"{'larger' if ratio > 1 else 'smaller'} than "
-        "those that the phantom's beads cast at the fitted geometry: beads of another "
-        "size, or a "
-        "phantom of another scale",
+        f"{'larger' if ratio > 1 else 'smaller'} than those that the phantom's "
+        "beads cast at the fitted geometry: beads of another size, "
+        "or a phantom of another scale",
     )
 
 
@@ -141,12 +140,10 @@ def judge_lag(lag: Lag) -> Finding:
     """
     return warning(
         "lag",
-        f"the camera still shows {100 * lag.part:.2g} % of the frame "
-        "before: it was taken out of what was measured here; a volume is blurred by it "
-        "along the "
-        "turn, but with the correction reconstruct takes it out, of scans with as long "
-        "exposures "
-        "and pauses",
+        f"the camera still shows {100 * lag.part:.2g} % of the frame before: "
+        "it was taken out of what was measured here; a volume is blurred by it along "
+        "the turn, but with the correction reconstruct takes it out, of scans with as "
+        "long exposures and pauses",
     )
 
 

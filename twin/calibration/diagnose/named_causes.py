@@ -281,8 +281,6 @@ def _distorted(fit: FitResult) -> Finding:
     return warning(
         "panel_distorted",
         f"the panel distorts its picture by up to {size:.2f} px{tiles}: this was "
-        "estimated along "
-        "with the geometry, its uncertainty is in every sigma, and reconstruct undoes it "
-        "with the "
-        "correction",
+        "estimated along with the geometry, its uncertainty is in every sigma, "
+        "and reconstruct undoes it with the correction",
     )

@@ -412,9 +412,9 @@ class Certificate:
                     "a second placement at another SOD in the same fit would tell more",
                 )
                 out[name] = (
-                    f"+- {e.sigma:.2g} {e.unit}, of it {e.images:.1g} from the images "
-                    "and the rest "
-                    f"from what is not known of {', '.join(sources)}: {better}"
+                    f"+- {e.sigma:.2g} {e.unit}, of it {e.images:.1g} "
+                    "from the images and the rest from what is not known of "
+                    f"{', '.join(sources)}: {better}"
                 )
         return out
 

@@ -558,8 +558,7 @@ def estimate_geometry(
     if free_beads and not tolerance > 0:
         raise TwinError(
             "free beads need a tolerance as prior (phantom's, or bead_tolerance_mm > 0): "
-            "without "
-            "one, moving all beads is the same as moving the object",
+            "without one, moving all beads is the same as moving the object",
             {"asked": tolerance, "allowed": "> 0"},
         )
     problem = build_problem(
@@ -648,8 +647,8 @@ def require_identifiable(result: FitResult) -> FitResult:
     if not result.identifiable:
         directions = [d.text for d in result.certificate.open]
         raise NotIdentifiableError(
-            f"not identifiable: {len(directions)} of {len(spectrum.names)} directions "
-            "are open: " + "; ".join(directions),
+            f"not identifiable: {len(directions)} of {len(spectrum.names)} "
+            "directions are open: " + "; ".join(directions),
             {
                 "asked": list(spectrum.names),
                 "rank": spectrum.rank,

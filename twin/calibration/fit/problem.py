@@ -173,8 +173,7 @@ def require_tolerance(tolerance_mm: float) -> float:
     if not 0.0 <= tolerance_mm < math.inf:
         raise TwinError(
             f"bead tolerance {tolerance_mm:g} mm; allowed: 0 (beads sit where the "
-            "phantom says) "
-            "or more",
+            "phantom says) or more",
             {"asked": tolerance_mm, "allowed": ">= 0"},
         )
     return tolerance_mm

@@ -108,9 +108,9 @@ def advise(names: Sequence[str], beads: int) -> str:
             "@" in n and n.split("@")[0] in _OBJECT for n in names
         ):
             return (
-                "turning stages and detector together about the source changes (nearly) "
-                "no image: "
-                "give the detector a prior, or let the scans share dO_x, dO_y and dO_z"
+                "turning stages and detector together about the source changes "
+                "(nearly) no image: give the detector a prior, or let the scans "
+                "share dO_x, dO_y and dO_z"
             )
         case s if (
             s & {"det_roll", "axis_tilt_x", "axis_tilt_z"}

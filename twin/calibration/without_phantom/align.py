@@ -170,8 +170,7 @@ def _plane_parameters(
             prior = math.degrees(plane.priors_rad[i])
             refused[name] = (
                 f"the images tell it to +- {images:.2g} deg, its prior to +- {prior:.2g} "
-                "deg: that "
-                "is what the correction contains"
+                "deg: that is what the correction contains"
             )
     return parameters, refused
 
@@ -193,9 +192,8 @@ def _motion(
     """
     if turn.repeated:
         raise NotIdentifiableError(
-            f"frames {list(turn.repeated)} repeat the one before: from there on the "
-            "others may be "
-            "a step behind their angles"
+            f"frames {list(turn.repeated)} repeat the one before: from there on "
+            "the others may be a step behind their angles"
         )
     return planes.motion(corrected, random)
 
@@ -219,17 +217,15 @@ def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]
     if plane.gap is not None:
         out.append(
             f"{plane.gap.text}: it is closed in what is told here, its uncertainty is in "
-            "the axis "
-            "column's sigma, and reconstruct closes it with the correction"
+            "the axis column's sigma, and reconstruct closes it with the correction"
         )
     hidden = plane.hidden
     if hidden is not None and hidden.open:
         out.append(
             "the images do not exclude that a tile of the panel begins at columns "
             f"{hidden.first} to {hidden.last} behind a gap, which would move the axis by "
-            "half of "
-            f"its width: the column's sigma contains +- {hidden.column_px:.2g} px for it; "
-            "calibrate with a phantom, and give that correction"
+            f"half of its width: the column's sigma contains +- {hidden.column_px:.2g} "
+            "px for it; calibrate with a phantom, and give that correction"
         )
     if turn.repeated:
         out.append(f"frames {list(turn.repeated)} repeat the one before and are left out")
@@ -238,9 +234,8 @@ def _warnings(plane: SymmetryPlane, turn: Turn, missing: int) -> tuple[str, ...]
     right, down = turn.step_px
     if abs(right) > STEP_TOLD:
         out.append(
-            f"after frame {turn.step_after} the images step by {right:.2f} px to the right and "
-            f"{down:.2f} px down: a jump there, or a drift over the scan; the sigmas "
-            "contain half "
-            "of it"
+            f"after frame {turn.step_after} the images step by {right:.2f} px to the "
+            f"right and {down:.2f} px down: a jump there, or a drift over the scan; "
+            "the sigmas contain half of it"
         )
     return tuple(out)

@@ -129,10 +129,9 @@ class PlanePairs:
         whole = float((self.valid.sum(axis=1) >= FEWEST_BINS).mean())
         if whole < FEWEST_PAIRS:
             raise NotIdentifiableError(
-                f"the object reaches beyond the panel: {100 * whole:.0f} % of pairs of "
-                "views have "
-                f"planes through both sources that they see whole (at least "
-                f"{100 * FEWEST_PAIRS:.0f} %)"
+                f"the object reaches beyond the panel: {100 * whole:.0f} % of pairs "
+                "of views have planes through both sources that they see whole (at "
+                f"least {100 * FEWEST_PAIRS:.0f} %)"
             )
         ends = [self.rows(start + s * np.eye(len(start))[0])[0] for s in (1, -1)]
         magnified = np.hypot(*(here[0, 3:5] - flat)) / np.hypot(*flat)

@@ -125,11 +125,9 @@ class OppositeColumn(NamedTuple):
         if not abs(self.apart_px) > max(APART_SIGMAS * sigma, LEAST_APART_PX):
             return None
         return (
-            f"opposite rays put the axis {self.apart_px:+.3f} +- {self.sigma_px:.2g} px "
-            "beside the "
-            f"column of the mean, {abs(self.apart_px) / sigma:.1f} sigma apart: "
-            "something differs "
-            "between views; the column's sigma contains it"
+            f"opposite rays put the axis {self.apart_px:+.3f} +- {self.sigma_px:.2g} "
+            f"px beside the column of the mean, {abs(self.apart_px) / sigma:.1f} sigma "
+            "apart: something differs between views; the column's sigma contains it"
         )
 
 
@@ -306,10 +304,9 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
     reach = REACH * scan.shape[1]
     refuse_if(
         first.ratio == 0.0,
-        f"{first.preface}the images are symmetric about no column within {reach:.0f} px of the "
-        f"nominal one ({scan.column(scan.start):.1f}): the axis is elsewhere, or too "
-        "much of the "
-        "object is out of view",
+        f"{first.preface}the images are symmetric about no column within {reach:.0f} px "
+        f"of the nominal one ({scan.column(scan.start):.1f}): the axis is elsewhere, "
+        "or too much of the object is out of view",
     )
     refuse_if(
         first.ratio < LEAST_RATIO,
@@ -415,16 +412,14 @@ def _require_symmetric(found: Symmetry, preface: str) -> None:
     """
     refuse_if(
         not found.converged,
-        f"{preface}no plane of symmetry is found: too little structure for the noise, or "
-        "too few "
-        "columns on both sides of the axis",
+        f"{preface}no plane of symmetry is found: too little structure for the noise, "
+        "or too few columns on both sides of the axis",
     )
     refuse_if(
         found.asymmetry > MOST_ASYMMETRY,
-        f"{preface}{100 * found.asymmetry:.1f} % of the mean, or of opposite rays, is not "
-        f"symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn with "
-        "the stage, "
-        "or the angles or the object change during the scan",
+        f"{preface}{100 * found.asymmetry:.1f} % of the mean, or of opposite rays, "
+        f"is not symmetric (at most {100 * MOST_ASYMMETRY:g} %): something does not turn "
+        "with the stage, or the angles or the object change during the scan",
     )
 
 
@@ -654,8 +649,8 @@ def _opposite_rays(
     refuse_if(
         not -lean < row < rows - 1 + lean,
         f"the source turns in the plane of row {row:.0f}: rays to rows 0 to {rows - 1} "
-        "lean too "
-        f"much to be those of opposite views; allowed are regions within {lean:.0f} rows of it",
+        "lean too much to be those of opposite views; allowed are regions within "
+        f"{lean:.0f} rows of it",
     )
     top, end = np.clip(
         np.round(row) + (-BAND, BAND + 1), (0, 1), (rows - 1, rows)

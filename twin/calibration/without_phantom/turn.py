@@ -282,8 +282,7 @@ def _thumb(image: Float32Array) -> Float32Array:
     if min(image.shape) < 2 * factor:
         raise NotIdentifiableError.instead(
             f"images of {image.shape[0]} rows and {image.shape[1]} columns show no plane "
-            "of the "
-            "source and no roll",
+            "of the source and no roll",
             list(image.shape),
             f"{2 * factor} rows or more",
         )

@@ -150,8 +150,7 @@ class TurnPlanes:
         refuse_if(
             sigma > known / 2,
             f"the images tell it to +- {sigma:.2g} px, the priors of dD_y and "
-            "axis_tilt_x to +- "
-            f"{known:.2g} px",
+            f"axis_tilt_x to +- {known:.2g} px",
         )
         at = np.array([height, *(5 * [0.0])])
         cone_vec = about_axis(self.poses[self.sorted[:1]], self._of(at))
