@@ -844,17 +844,37 @@ def _widened(
         strongest = None
     shared = together is not None
     scattered = strongest is not None and strongest.jitter
+    shaken = None
     if len(left.problem.group) < FEWEST_CLUSTERS:
         shaken = frame_jitter(left, everything, strongest)
-        if shaken is not None:
-            # With the frames' own shifts taken out, less of the residuals is white noise.
-            white = (shaken.noise / left.noise) ** 2 * (covariance - prior)
-            jitter = shaken.covariance[:reported, :reported]
-            covariance = larger(covariance, prior + white + jitter)
-            shared = shaken.clear
-            scattered = strongest is not None and not shaken.drifts
-            if scattered:
-                moving = ()
+    if shaken is not None:
+        # With the frames' own shifts taken out, less of the residuals is white noise.
+        white = (shaken.noise / left.noise) ** 2 * (covariance - prior)
+        jitter = shaken.covariance[:reported, :reported]
+        covariance = larger(covariance, prior + white + jitter)
+        shared = shaken.clear
+        scattered = strongest is not None and not shaken.drifts
+        if scattered:
+            moving = ()
+    covariance = _with_common_shifts(left, predicted, covariance, sampling_px)
+    turning = turning_errors(left)
+    size = 0.0
+    if turning is not None:
+        covariance = covariance + turning.covariance[:reported, :reported]
+        size = turning.size
+    for drift in moving:
+        covariance = _with_drift(left, covariance, drift)
+    certain = moving if strongest is not None and not scattered else ()
+    return covariance, shared or scattered, size, certain
+
+
+def _with_common_shifts(
+    left: Residuals, predicted: FloatArray, covariance: FloatArray, sampling_px: float
+) -> FloatArray:
+    """Add to a covariance what shifts make of it that have one size in all frames: those
+    of places in the pixel grid, and those of the problem; arguments as of `_widened`.
+    """
+    reported = len(covariance)
     shifts = []
     if sampling_px > 0:
         shifts.append(sampling_px * _sampling_vectors(left.problem, predicted))
@@ -865,23 +885,23 @@ def _widened(
         # frames averages it out.
         gain = left.unit_covariance[:reported] @ cross(left.jacobian, shift[left.keep])
         covariance = covariance + gain @ gain.T
-    turning = turning_errors(left)
-    size = 0.0
-    if turning is not None:
-        covariance = covariance + turning.covariance[:reported, :reported]
-        size = turning.size
-    for drift in moving:
-        # The fit takes a part of the drift up, also in columns that do not drift.
-        bias = drift.bias[:reported]
-        covariance = covariance + np.outer(bias, bias)
-        i = left.problem.layout.names.index(drift.column)
-        if i < reported:
-            # Which of the values it had is the parameter's is a matter of definition: the
-            # first, or, of a drift that may not be one, the middle.
-            steady = drift.score <= SIGNIFICANT and drift.step_at is None
-            covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
-    certain = moving if strongest is not None and not scattered else ()
-    return covariance, shared or scattered, size, certain
+    return covariance
+
+
+def _with_drift(left: Residuals, covariance: FloatArray, drift: Drift) -> FloatArray:
+    """Add to a covariance what a drift makes of the estimates, and its own size to the
+    parameter that drifts.
+    """
+    # The fit takes a part of the drift up, also in columns that do not drift.
+    bias = drift.bias[: len(covariance)]
+    covariance = covariance + np.outer(bias, bias)
+    i = left.problem.layout.names.index(drift.column)
+    if i < len(covariance):
+        # Which of the values it had is the parameter's is a matter of definition: the
+        # first, or, of a drift that may not be one, the middle.
+        steady = drift.score <= SIGNIFICANT and drift.step_at is None
+        covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
+    return covariance
 
 
 def widened_by_structure(left: Residuals, covariance: FloatArray) -> FloatArray:

@@ -220,49 +220,28 @@ def layout(
                 f"per_group parameter {name!r} is not among the free ones: {', '.join(free)}",
                 {"asked": name, "allowed": list(free)},
             )
-    held = []
-    wanted = [n for n in NAMES if n in free]
-    for source, stage, detector in GAUGES:
-        if {source, stage, detector} <= set(wanted) - set(priors):
-            wanted.remove(source)
-            held.append(
-                (
-                    source,
-                    f"held at its start: shifting {source}, {stage} and {detector} together "
-                    "changes no image, so the source defines the frame",
-                )
-            )
-    asked = 0
+    held = _held_sources(free, priors)
+    unasked = {source for source, _ in held}
+    wanted = [n for n in NAMES if n in free and n not in unasked]
     extra = [n for n in NAMES if n in priors and n not in free]
-    names: list[str] = []
-    colmap = np.full((groups, len(NAMES)), -1, dtype=np.int64)
-    for name in (*wanted, *extra):
-        index = NAMES.index(name)
-        if name in per_group and groups > 1:
-            for g in range(groups):
-                colmap[g, index] = len(names)
-                names.append(f"{name}@{g}")
-        else:
-            colmap[:, index] = len(names)
-            names.append(name)
-        if name in wanted:
-            asked = len(names)
+    each = per_group if groups > 1 else ()
+    names, colmap = _parameter_columns((*wanted, *extra), each, groups)
+    asked = sum(groups if name in each else 1 for name in wanted)
     count = len(names)
-    bead_column = strain_column = arc_column = rows_column = -1
-    if free_beads:
-        bead_column = len(names)
-        names += [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
-    if strained:
-        strain_column = len(names)
-        names += [f"strain {term}" for term in STRAINS]
-    if arc:
-        arc_column = len(names)
-        names.append("arc")
-    if rows:
-        rows_column = len(names)
-        names.append("rows")
-    panel_column = len(names)
-    names += [f"panel {term}" for term in panel]
+
+    def appended(more: Sequence[str], there: bool) -> int:
+        """Append columns if they are there; returns the first one, -1 without."""
+        if not there:
+            return -1
+        names.extend(more)
+        return len(names) - len(more)
+
+    bead_names = [f"bead {k} {axis}" for k in range(beads) for axis in "xyz"]
+    bead_column = appended(bead_names, free_beads)
+    strain_column = appended([f"strain {term}" for term in STRAINS], strained)
+    arc_column = appended(["arc"], arc)
+    rows_column = appended(["rows"], rows)
+    panel_column = appended([f"panel {term}" for term in panel], there=True)
     active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
     return ColumnLayout(
         tuple(names),
@@ -275,7 +254,42 @@ def layout(
         count,
         panel_column,
         active,
-        tuple(held),
+        held,
+    )
+
+
+def _parameter_columns(
+    parameters: Sequence[str], each: Sequence[str], groups: int
+) -> tuple[list[str], npt.NDArray[np.int64]]:
+    """Assign columns to parameters in their order: one, or one a group to those of `each`.
+
+    Returns:
+        The columns' names, and (groups, 17) the column of each parameter, -1 without.
+    """
+    names: list[str] = []
+    colmap = np.full((groups, len(NAMES)), -1, dtype=np.int64)
+    for name in parameters:
+        own = [f"{name}@{g}" for g in range(groups)] if name in each else [name]
+        colmap[:, NAMES.index(name)] = len(names) + np.arange(len(own))
+        names += own
+    return names, colmap
+
+
+def _held_sources(
+    free: Sequence[str], priors: Sequence[str]
+) -> tuple[tuple[str, str], ...]:
+    """List the source's parameters that are held, with the reason: those of `GAUGES` whose
+    three shifts are all free and without a prior.
+    """
+    loose = set(free) - set(priors)
+    return tuple(
+        (
+            source,
+            f"held at its start: shifting {source}, {stage} and {detector} together "
+            "changes no image, so the source defines the frame",
+        )
+        for source, stage, detector in GAUGES
+        if {source, stage, detector} <= loose
     )
 
 
@@ -617,6 +631,46 @@ class FitProblem:
         return replace(self, base=base)
 
 
+def _groups(labels: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64]:
+    """Give the groups of n frames numbers in the order of their labels, (n,); 0 without.
+
+    Raises:
+        TwinError: not one label a frame.
+    """
+    if labels is None:
+        return np.zeros(n, dtype=np.int64)
+    given = np.asarray(labels)
+    if given.shape != (n,):
+        raise TwinError.of_shape("groups", given.shape, (n,))
+    return np.unique(given, return_inverse=True)[1].astype(np.int64).reshape(n)
+
+
+def _bases(
+    start: Offsets | Sequence[Offsets], groups: int, reading: Reading
+) -> FloatArray:
+    """Return the start of each group, (groups, 17), internal units, in a reading.
+
+    Raises:
+        TwinError: several starts, but not one a group.
+    """
+    starts = [start] * groups if isinstance(start, Offsets) else list(start)
+    if len(starts) != groups:
+        raise TwinError(f"{len(starts)} starts for {groups} groups of frames")
+    return np.array([values_in(from_printed_reading(p, reading)) for p in starts])
+
+
+def _common_shifts(common: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return shifts that all frames have in common, (n, k, 2, c).
+
+    Raises:
+        TwinError: they are not of the tracks' shape.
+    """
+    shared = np.asarray(common, dtype=np.float64)
+    if shared.shape[:-1] != shape:
+        raise TwinError.of_shape("common shifts", shared.shape[:-1], shape)
+    return shared
+
+
 def build_problem(
     tracks: npt.ArrayLike,
     model: BeadModel,
@@ -689,24 +743,13 @@ def build_problem(
     seen = np.ascontiguousarray(np.isfinite(t).all(axis=2))
     origin = (frame_shapes(shape, n)[:, ::-1] - 1) / 2
     measured = np.where(seen[:, :, None], t - origin[:, None, :], 0.0)
-    group = np.zeros(n, dtype=np.int64)
-    if groups is not None:
-        labels = np.asarray(groups)
-        if labels.shape != (n,):
-            raise TwinError.of_shape("groups", labels.shape, (n,))
-        group = np.unique(labels, return_inverse=True)[1].astype(np.int64).reshape(n)
-    count = int(group.max()) + 1 if n else 1
-    if isinstance(start, Offsets):
-        starts = [start] * count
-    else:
-        starts = list(start)
-    if len(starts) != count:
-        raise TwinError(f"{len(starts)} starts for {count} groups of frames")
-    base = np.array([values_in(from_printed_reading(p, reading)) for p in starts])
+    group = _groups(groups, n)
+    base = _bases(start, int(group.max()) + 1 if n else 1, reading)
     widths = {n: to_internal(n, w) for n, w in (priors or {}).items() if w > 0}
     terms, of_terms = ((), ()) if panel is None else (panel.names, panel.sigmas)
+    strained = max(strain) > 0
     columns = layout(
-        free, count, per_group, k, free_beads, tuple(widths), terms, max(strain) > 0, arc,
+        free, len(base), per_group, k, free_beads, tuple(widths), terms, strained, arc,
         rows,
     )  # fmt: skip
     centres = base[0]
@@ -714,15 +757,8 @@ def build_problem(
         centres = values_in(from_printed_reading(prior_centre, reading))
     bases = [n.split("@")[0] for n in columns.names[: columns.parameter_count]]
     beads = 3 * k if free_beads else 0
-    if max(strain) > 0:
-        strains = strain_widths(strain)
-    else:
-        strains = np.zeros(0)
-    shared = None
-    if common is not None:
-        shared = np.asarray(common, dtype=np.float64)
-        if shared.shape[:-1] != t.shape:
-            raise TwinError.of_shape("common shifts", shared.shape[:-1], t.shape)
+    strains = strain_widths(strain) if strained else np.zeros(0)
+    shared = None if common is None else _common_shifts(common, t.shape)
     turning = None
     if arc or rows:
         places = panel_heights(measured, origin)

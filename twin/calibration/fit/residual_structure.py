@@ -9,7 +9,9 @@ fits, so that clean data keep the nominal covariance. Causes are not looked for 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -116,86 +118,142 @@ def drifts(left: Residuals) -> tuple[Drift, ...]:
         beyond `SUSPECT_STEP`, steady drifts beyond `SUSPECT_SIGMAS`). Empty for few
         residuals or without noise.
     """
-    problem = left.problem
-    jacobian = left.jacobian
-    residual = left.values
-    frame = left.frame
-    unit_covariance = left.unit_covariance
-    noise = left.noise
+    names = left.problem.layout.names
+    columns = [i for i, n in enumerate(names) if n.split("@")[0] in MOVING]
+    if left.noise <= 0 or len(left.values) <= len(names) + 8 or not columns:
+        return ()
+    told = np.einsum("mp,m->p", left.jacobian, left.values)
+    clean = left.values - left.jacobian @ (left.unit_covariance @ told)
     found: list[Drift] = []
     suspects: list[Drift] = []
-    names = problem.layout.names
-    columns = [i for i, n in enumerate(names) if n.split("@")[0] in MOVING]
-    if noise <= 0 or len(residual) <= len(names) + 8:
-        return ()
-    clean = residual - jacobian @ (
-        unit_covariance @ np.einsum("mp,m->p", jacobian, residual)
-    )
-    for group in np.unique(problem.group):
-        members = np.flatnonzero(problem.group == group)
-        n = len(members)
-        if n < MIN_MOVING_FRAMES:
+    for group in np.unique(left.problem.group).tolist():
+        if np.count_nonzero(left.problem.group == group) < MIN_MOVING_FRAMES:
             continue
-        order = np.full(len(problem.group), 0.0)
-        order[members] = np.arange(n)
-        inside = (problem.group == group)[frame]
-        place = order[frame]
-        ramp = np.where(inside, place / (n - 1) - 0.5, 0.0)
-        shapes: list[tuple[int | None, FloatArray]] = [(None, ramp)]
-        for at in np.unique(np.linspace(2, n - 2, 11).round().astype(int)).tolist():
-            shapes.append((at, np.where(inside, (place >= at) - 0.5, 0.0)))
-        if not columns:
-            continue
-        vectors = np.stack(
-            [jacobian[:, c] * shape for c in columns for _, shape in shapes], axis=1
-        )
-        absorbed = cross(jacobian, vectors)
-        whole = np.einsum("mi,mi->i", vectors, vectors)
-        power = whole - np.einsum("pi,pq,qi->i", absorbed, unit_covariance, absorbed)
-        push = np.einsum("mi,m->i", vectors, clean)
-        usable = power > 1e-3 * np.maximum(whole, 1e-30)
-        score = np.where(usable, push / np.sqrt(np.maximum(power, 1e-30)) / noise, 0.0)
-        for i, c in enumerate(columns):
-            part = slice(i * len(shapes), (i + 1) * len(shapes))
-            each = np.abs(score[part])
-            best = int(np.argmax(each))
-            if each[best] > SUSPECT_STEP:
-                suspect = best
-            elif each[0] > SUSPECT_SIGMAS:
-                suspect = 0
-            else:
-                suspect = None
-            if each[best] > HINT_SIGMAS:
-                hint = best
-            else:
-                hint = None
-            for at, among in ((suspect, suspects), (hint, found)):
-                if at is not None:
-                    size = float(push[part][at] / power[part][at])
-                    taken = jacobian @ (unit_covariance @ absorbed[:, part][:, at])
-                    scatter = n < FEWEST_CLUSTERS and _scatters(
-                        left,
-                        np.where(inside, jacobian[:, c], 0.0),
-                        clean,
-                        (vectors[:, part][:, at] - taken) * size,
-                        len(score),
-                    )
-                    bias = unit_covariance @ (absorbed[:, part][:, at] * size)
-                    among.append(
-                        Drift(
-                            names[c],
-                            size,
-                            shapes[at][0],
-                            float(each[at]),
-                            bias,
-                            int(group),
-                            scatter,
-                        )
-                    )
+        motions = _Motions.of(left, clean, columns, group)
+        for i in range(len(columns)):
+            if (suspect := motions.suspect(i)) is not None:
+                suspects.append(motions.drift(i, suspect))
+            if (hint := motions.hint(i)) is not None:
+                found.append(motions.drift(i, hint))
     if not any(d.score > SIGNIFICANT for d in found):
         return tuple(suspects)
     # Where one thing moves, hints of others count too.
     return tuple(sorted(found, key=lambda d: -d.score))
+
+
+@dataclass(frozen=True, eq=False)
+class _Motions:
+    """A ramp, and jumps, of each of c columns in the frames of one group, beside the
+    residuals.
+
+    Attributes:
+        left: residuals.
+        clean: (m,) residuals, less what the fit's columns take.
+        columns: (c,) their numbers in the fit.
+        group: number of the group.
+        frames: its number of frames.
+        inside: (m,) which residuals are of its frames.
+        jumps_at: (s,) frame of each jump, counted in the group; None for the ramp, the first.
+        vectors: (m, c s) changes of the residuals.
+        absorbed: (p, c s) what the fit's columns see of them.
+        power: (c s,) squares of what these leave.
+        push: (c s,) what the residuals have in common with them.
+    """
+
+    left: Residuals
+    clean: FloatArray
+    columns: Sequence[int]
+    group: int
+    frames: int
+    inside: npt.NDArray[np.bool_]
+    jumps_at: Sequence[int | None]
+    vectors: FloatArray
+    absorbed: FloatArray
+    power: FloatArray
+    push: FloatArray
+
+    @classmethod
+    def of(
+        cls, left: Residuals, clean: FloatArray, columns: Sequence[int], group: int
+    ) -> _Motions:
+        """Compare a ramp, and 11 jumps at most, with the residuals."""
+        groups = left.problem.group
+        members = np.flatnonzero(groups == group)
+        n = len(members)
+        order = np.full(len(groups), 0.0)
+        order[members] = np.arange(n)
+        inside = (groups == group)[left.frame]
+        place = order[left.frame]
+        at = np.unique(np.linspace(2, n - 2, 11).round().astype(int)).tolist()
+        ramp = np.where(inside, place / (n - 1) - 0.5, 0.0)
+        shapes = [ramp, *(np.where(inside, (place >= a) - 0.5, 0.0) for a in at)]
+        vectors = np.stack(
+            [left.jacobian[:, c] * shape for c in columns for shape in shapes], axis=1
+        )
+        absorbed = cross(left.jacobian, vectors)
+        whole = np.einsum("mi,mi->i", vectors, vectors)
+        taken = np.einsum("pi,pq,qi->i", absorbed, left.unit_covariance, absorbed)
+        power = whole - taken
+        # What the columns take almost whole cannot be told: its power is rounding.
+        told = power > 1e-3 * np.maximum(whole, 1e-30)
+        return cls(
+            left,
+            clean,
+            columns,
+            group,
+            n,
+            inside,
+            (None, *at),
+            vectors,
+            absorbed,
+            power,
+            np.where(told, np.einsum("mi,m->i", vectors, clean), 0.0),
+        )
+
+    @cached_property
+    def score(self) -> FloatArray:
+        """Size of each motion in its standard deviations, (c, s); 0 where it cannot be told."""
+        deviation = np.sqrt(np.maximum(self.power, 1e-30))
+        score = np.abs(self.push / deviation / self.left.noise)
+        return score.reshape(len(self.columns), len(self.jumps_at))
+
+    def suspect(self, i: int) -> int | None:
+        """Return which motion of column i is possible: its best one, else the ramp; None
+        without.
+        """
+        best = int(np.argmax(self.score[i]))
+        if self.score[i, best] > SUSPECT_STEP:
+            return best
+        return 0 if self.score[i, 0] > SUSPECT_SIGMAS else None
+
+    def hint(self, i: int) -> int | None:
+        """Return the best motion of column i, if it counts beside a certain one; else None."""
+        best = int(np.argmax(self.score[i]))
+        return best if self.score[i, best] > HINT_SIGMAS else None
+
+    def drift(self, i: int, shape: int) -> Drift:
+        """Describe a motion of column i, fitted to the residuals."""
+        left = self.left
+        j = i * len(self.jumps_at) + shape
+        size = float(self.push[j] / self.power[j])
+        taken = left.jacobian @ (left.unit_covariance @ self.absorbed[:, j])
+        column = self.columns[i]
+        scatter = self.frames < FEWEST_CLUSTERS and _scatters(
+            left,
+            np.where(self.inside, left.jacobian[:, column], 0.0),
+            self.clean,
+            (self.vectors[:, j] - taken) * size,
+            len(self.push),
+        )
+        return Drift(
+            left.problem.layout.names[column],
+            size,
+            self.jumps_at[shape],
+            float(self.score[i, shape]),
+            left.unit_covariance @ (self.absorbed[:, j] * size),
+            self.group,
+            scatter,
+        )
 
 
 def _scatters(

@@ -7,8 +7,9 @@ directions are null or weak.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -29,6 +30,51 @@ _OBJECT = {"dO_x", "dO_y", "dO_z"}
 _DETECTOR = {"dD_x", "dD_y", "dD_z"}
 _SOURCE = {"dS_x", "dS_y"}
 _TAU = {"tau_x", "tau_z"}
+_AXIS_TILTS = {"axis_tilt_x", "axis_tilt_z"}
+_PANEL_TILTS = {"det_pitch", "det_yaw"}
+_TURNS = {"det_roll", *_AXIS_TILTS}
+
+_Names = frozenset[str]
+_ADVICE: Final[Sequence[tuple[Callable[[_Names, _Names], object], str]]] = (
+    (
+        lambda s, _: s & _SOURCE and s & _OBJECT and s & _DETECTOR,
+        "a common shift of source, object and detector changes no image: hold the source",
+    ),
+    (
+        lambda s, of_scans: s & _DETECTOR and of_scans & _OBJECT,
+        "turning stages and detector together about the source changes (nearly) no image: "
+        "give the detector a prior, or let the scans share dO_x, dO_y and dO_z",
+    ),
+    (
+        lambda s, _: s & _TURNS and len(s & (_TURNS | _PANEL_TILTS)) > 1,
+        "turning detector and axis together changes little: add placements at several "
+        "lateral positions and another SOD, or hold the axis tilts",
+    ),
+    (
+        lambda s, _: s & _DETECTOR and s & _OBJECT,
+        "add a placement at another SOD (lateral moves alone hardly help)",
+    ),
+    (
+        lambda s, _: s & _PANEL_TILTS,
+        "add a placement at another SOD or a larger phantom: a tilt shows as perspective",
+    ),
+    (
+        lambda s, _: s & _AXIS_TILTS and s & _OBJECT,
+        "use beads further apart in height",
+    ),
+    (lambda s, _: "angle_scale" in s, "spread the frames over a whole turn"),
+    (
+        lambda s, _: "alpha" in s and s & _TAU,
+        "use beads that do not lie on one line parallel to the axis",
+    ),
+    (
+        lambda s, _: "dO_z" in s,
+        "use a phantom with beads further apart, or more frames",
+    ),
+    (lambda s, _: s & _TAU, "spread the frames over a whole turn"),
+)
+"""Test of a direction's parameters, and of those with a value in each scan -> advice on data
+that would determine it; the first that holds counts."""
 
 
 @dataclass(frozen=True)
@@ -94,51 +140,18 @@ def advise(names: Sequence[str], beads: int) -> str:
         names: its columns; the group (@NUMBER) matters in one case alone.
         beads: number of beads seen.
     """
-    involved = {n.split("@")[0] for n in names}
     if beads < 2:
         return (
             "one bead alone fixes neither the scale nor the angle: use two or more beads"
         )
     if any(n.startswith("bead ") for n in names):
         return "measure the beads' positions, or give their tolerance as a prior"
-    match involved:
-        case s if s & _SOURCE and s & _OBJECT and s & _DETECTOR:
-            return "a common shift of source, object and detector changes no image: hold the source"
-        case s if s & _DETECTOR and any(
-            "@" in n and n.split("@")[0] in _OBJECT for n in names
-        ):
-            return (
-                "turning stages and detector together about the source changes "
-                "(nearly) no image: give the detector a prior, or let the scans "
-                "share dO_x, dO_y and dO_z"
-            )
-        case s if (
-            s & {"det_roll", "axis_tilt_x", "axis_tilt_z"}
-            and len(
-                s & {"det_roll", "det_pitch", "det_yaw", "axis_tilt_x", "axis_tilt_z"}
-            )
-            > 1
-        ):
-            return (
-                "turning detector and axis together changes little: add placements at several "
-                "lateral positions and another SOD, or hold the axis tilts"
-            )
-        case s if s & _DETECTOR and s & _OBJECT:
-            return "add a placement at another SOD (lateral moves alone hardly help)"
-        case s if s & {"det_pitch", "det_yaw"}:
-            return "add a placement at another SOD or a larger phantom: a tilt shows as perspective"
-        case s if s & {"axis_tilt_x", "axis_tilt_z"} and s & _OBJECT:
-            return "use beads further apart in height"
-        case s if "angle_scale" in s:
-            return "spread the frames over a whole turn"
-        case s if "alpha" in s and s & _TAU:
-            return "use beads that do not lie on one line parallel to the axis"
-        case s if "dO_z" in s:
-            return "use a phantom with beads further apart, or more frames"
-        case s if s & _TAU:
-            return "spread the frames over a whole turn"
-        case _:
-            return "add frames, beads or a placement at another SOD, or hold one of them"
+    involved = frozenset(n.split("@")[0] for n in names)
+    of_scans = frozenset(n.split("@")[0] for n in names if "@" in n)
+    for concerns, advice in _ADVICE:
+        if concerns(involved, of_scans):
+            return advice
+    return "add frames, beads or a placement at another SOD, or hold one of them"
 
 
 def null_directions(
