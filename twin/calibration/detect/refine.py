@@ -190,91 +190,202 @@ def measure_beads(
     """
     if turning is not None and draft:
         windows = exposed(windows, model, turning, smear.share)
-    n, k = windows.corner.shape[:2]
-    side = windows.side
-    described = Scene(()) if scene is None else without_beads(scene, model)
-    seen, body = _body(images, described, cone, model, windows)
-    data = images if body is None else images - body
-    patches = _patches(data, windows, contrast)
-    rough = 0.0
-    sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
-    first = centroids(patches, sample)
-    patches = replace(patches, peaks=contrasts(first, patches))
-    if known is None or not (known.seen or smear.told):
-        known = sharpness(patches, sample, BLUR_PX)
+    start = _Start.of(images, windows, cone, model, contrast, scene)
+    known = start.blur(known, smear.told)
+    if turning is not None and smear.told and not draft:
+        return _with_arc(start, known, turning, smear)
+    return _without_arc(start, known, turning, smear, draft)
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """The windows of a measurement, before it is known how the spots are blurred.
+
+    Attributes:
+        images: (n, k, side, side) line integrals.
+        windows: their places.
+        cone: geometry the windows were planned with.
+        model: the beads.
+        described: the body's solids.
+        seen: the body in the images.
+        body: its line integrals; None where none is described or seen.
+        patches: the windows less the body, with the contrasts of their spots.
+        sample: some of the complete spots.
+        first: their centroids, (n k, RESULTS).
+    """
+
+    images: Float32Array
+    windows: Windows
+    cone: ConeVec
+    model: BeadModel
+    described: Scene
+    seen: SeenBody
+    body: Float32Array | None
+    patches: Patches
+    sample: npt.NDArray[np.intp]
+    first: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        images: Float32Array,
+        windows: Windows,
+        cone: ConeVec,
+        model: BeadModel,
+        contrast: float | FloatArray,
+        scene: Scene | None,
+    ) -> _Start:
+        """Subtract the body, and measure some complete spots; arguments as of
+        `measure_beads`.
+        """
+        described = Scene(()) if scene is None else without_beads(scene, model)
+        seen, body = _body(images, described, cone, model, windows)
+        data = images if body is None else images - body
+        patches = _patches(data, windows, contrast)
+        sample = patches.entire[:: max(1, len(patches.entire) // SAMPLE)]
+        first = centroids(patches, sample)
+        patches = replace(patches, peaks=contrasts(first, patches))
+        return cls(
+            images, windows, cone, model, described, seen, body, patches, sample, first
+        )
+
+    def blur(self, known: Sharp | None, told: bool) -> Sharp:
+        """Return blur and size as they are known, or estimate them; where the arc of an
+        exposure is told, what is known need not have been seen.
+        """
+        if known is None or not (known.seen or told):
+            return sharpness(self.patches, self.sample, BLUR_PX)
+        return known
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """Rendered beads beside the images.
+
+    Attributes:
+        alone: beads rendered alone, (n, k, side, side); None in a draft of sharp images.
+        patches: the windows, less the body behind such beads.
+        seen: the body.
+        rough: error of rendering with finite rays [px].
+    """
+
+    alone: Float32Array | None
+    patches: Patches
+    seen: SeenBody
+    rough: float
+
+    def finished(self, measured: Refined, known: Sharp, smear: Smear) -> Refined:
+        """Add the error of rendering, and what is known of body, blur and arc."""
+        return replace(
+            measured,
+            body=self.seen,
+            as_fitted=known,
+            smear=smear,
+            covariances=measured.covariances + self.rough**2 * np.eye(2),
+        )
+
+
+def _without_arc(
+    start: _Start, known: Sharp, turning: Turning | None, smear: Smear, draft: bool
+) -> Refined:
+    """Measure spots whose arc is not told, and look for it where the object may turn; with
+    one that is found, they are measured anew.
+
+    A draft renders plain balls, and takes the arc as it is.
+    """
     sharp = known
     if draft:
-        plain = balls_of(model, sharp.lift * patches.peaks[:k], sharp.size)
+        k = start.windows.corner.shape[1]
+        plain = balls_of(start.model, sharp.lift * start.patches.peaks[:k], sharp.size)
         balls: Balls = ((plain, None),)
-    elif turning is not None and smear.told:
-        # The profile of a round blur tells neither blur nor size of smeared spots.
-        sharp = replace(sharp, scale=1.0, size=1.0, seen=False)
-        smear, balls = followed(patches, sharp, cone, model, turning, smear)
-        if not smear.told:
-            still = measure_beads(
-                images, windows, cone, model, contrast, scene, known=known
-            )
-            return replace(still, smear=smear)
-        windows = exposed(windows, model, turning, smear.share)
-        sharp = replace(sharp, true=smear.blur)
-        peaks = np.tile(np.array(smear.contrast), n)
-        patches = replace(patches, windows=windows, peaks=peaks)
     else:
-        sharp, balls = seen_sharpness(sharp, patches, sample, cone, model)
+        sharp, balls = seen_sharpness(
+            sharp, start.patches, start.sample, start.cone, start.model
+        )
+    drawn = _drawn(start, start.patches, sharp, balls, draft)
+    if turning is not None and drawn.alone is not None:
+        if smear.told:
+            way = smear.share * ways(start.windows, start.model, turning)
+            measured = _measured_smeared(
+                drawn.patches, drawn.alone, start.body, sharp, way
+            )
+            return drawn.finished(measured, known, smear)
+        smear = _smeared(
+            drawn.patches, drawn.alone, sharp, balls, start.cone, start.model, turning
+        )
+        if smear.told:
+            return _with_arc(start, known, turning, smear)
+    measured = _measured(drawn.patches, None if draft else drawn.alone, start.body, sharp)
+    return drawn.finished(measured, known, smear)
+
+
+def _with_arc(start: _Start, known: Sharp, turning: Turning, smear: Smear) -> Refined:
+    """Measure spots that are smeared by an arc, by rendered ones that are smeared as much.
+
+    If the spots do not tell the arc after all, they are measured as those of an object at
+    rest, and the result says so.
+    """
+    # The profile of a round blur tells neither blur nor size of smeared spots.
+    sharp = replace(known, scale=1.0, size=1.0, seen=False)
+    smear, balls = followed(start.patches, sharp, start.cone, start.model, turning, smear)
+    if not smear.told:
+        known = start.blur(known, told=False)
+        return replace(
+            _without_arc(start, known, None, UNMEASURED, draft=False), smear=smear
+        )
+    windows = exposed(start.windows, start.model, turning, smear.share)
+    sharp = replace(sharp, true=smear.blur)
+    peaks = np.tile(np.array(smear.contrast), len(windows.corner))
+    patches = replace(start.patches, windows=windows, peaks=peaks)
+    drawn = _drawn(start, patches, sharp, balls, draft=False)
+    assert drawn.alone is not None
+    way = smear.share * ways(windows, start.model, turning)
+    measured = _measured_smeared(drawn.patches, drawn.alone, start.body, sharp, way)
+    return drawn.finished(measured, known, smear)
+
+
+def _drawn(
+    start: _Start, patches: Patches, sharp: Sharp, balls: Balls, draft: bool
+) -> _Drawn:
+    """Render the beads as blurred as in the images, and with them the body behind them.
+
+    Args:
+        start: the images.
+        patches: their windows, as they are exposed.
+        sharp: blur and size.
+        balls: that are rendered.
+        draft: with fewer rays, the body as it is seen, and nothing for sharp images.
+    """
+    windows = patches.windows
     if sharp.blur < BODY_BLUR_PX:
         if draft:
-            alone = None
-        else:
-            rays = render_windows(Scene(()), cone, windows, 1, balls)
-            alone = blurred_windows(rays, sharp.true)
+            return _Drawn(None, patches, start.seen, 0.0)
+        rays = render_windows(Scene(()), start.cone, windows, 1, balls)
+        return _Drawn(blurred_windows(rays, sharp.true), patches, start.seen, 0.0)
+    # A blurred image comes from pixels that integrate, so an edge must not be put where the
+    # nearest ray is.
+    if windows.whole.size <= FEW_WINDOWS and not draft:
+        fine = fine_rays(windows, RADIUS_RAYS, CHECK_FINE)
     else:
-        # A blurred image comes from pixels that integrate, so an edge must not be put where the
-        # nearest ray is.
-        if n * k <= FEW_WINDOWS and not draft:
-            fine = fine_rays(windows, RADIUS_RAYS, CHECK_FINE)
-        else:
-            fine = fine_rays(windows, FEWER_RADIUS_RAYS, 2)
-        rest = rest_of_blur(sharp.true, fine)
-        beads = render_windows(Scene(()), cone, windows, fine, balls)
-        alone = blurred_windows(beads, rest)
-        # Fewer rays than the images' place a rim by where the lattice lies.
-        if not draft and len(sample):
-            rough = rendering_error(
-                sharp,
-                balls,
-                patches,
-                sample,
-                cone,
-                alone,
-                fine,
-                ring_noise(first, sample),
-            )
-        if body is not None:
-            seen, behind = _behind(
-                images, alone, described, cone, model, windows, fine, rest, balls,
-                None if draft else rest_of_blur(sharp.true, BLURRED_FINE), seen,
-            )  # fmt: skip
-            data = images - behind
-            patches = replace(patches, flat=data.reshape(n * k, side, side))
-    if turning is not None and smear.told and alone is not None:
-        way = smear.share * ways(windows, model, turning)
-        measured = _measured_smeared(patches, alone, body, sharp, way)
-    else:
-        if turning is not None and alone is not None:
-            smear = _smeared(patches, alone, sharp, balls, cone, model, turning)
-            if smear.told:
-                return measure_beads(
-                    images, windows, cone, model, contrast, scene, known=known,
-                    turning=turning, smear=smear,
-                )  # fmt: skip
-        measured = _measured(patches, None if draft else alone, body, sharp)
-    return replace(
-        measured,
-        body=seen,
-        as_fitted=known,
-        smear=smear,
-        covariances=measured.covariances + rough**2 * np.eye(2),
-    )
+        fine = fine_rays(windows, FEWER_RADIUS_RAYS, 2)
+    rest = rest_of_blur(sharp.true, fine)
+    beads = render_windows(Scene(()), start.cone, windows, fine, balls)
+    alone = blurred_windows(beads, rest)
+    rough = 0.0
+    # Fewer rays than the images' place a rim by where the lattice lies.
+    if not draft and len(start.sample):
+        noise = ring_noise(start.first, start.sample)
+        rough = rendering_error(
+            sharp, balls, patches, start.sample, start.cone, alone, fine, noise
+        )
+    if start.body is None:
+        return _Drawn(alone, patches, start.seen, rough)
+    seen, behind = _behind(
+        start.images, alone, start.described, start.cone, start.model, windows, fine, rest,
+        balls, None if draft else rest_of_blur(sharp.true, BLURRED_FINE), start.seen,
+    )  # fmt: skip
+    flat = (start.images - behind).reshape(patches.flat.shape)
+    return _Drawn(alone, replace(patches, flat=flat), seen, rough)
 
 
 def _behind(
