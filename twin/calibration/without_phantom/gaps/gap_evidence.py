@@ -42,7 +42,7 @@ from flexdt.twin.calibration.without_phantom.tile_gap import (
 )
 from flexdt.twin.calibration.without_phantom.turn import Turn
 from flexdt.twin.errors import NotIdentifiableError
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SIGMAS: Final = 3.0
 """Least width of a gap, in sigmas."""
@@ -103,26 +103,18 @@ def find_gap(
         NotIdentifiableError: there are two gaps.
     """
     values, sigma = rays.column(values)
-    if np.isfinite(sigma):
-        profile = rays.profile(values)
-    else:
-        profile = None
+    profile = rays.profile(values) if np.isfinite(sigma) else None
     axis = rays.scan.column(values, rays.row)
     frames = turn.samples
     stack = np.asarray(frames, dtype=np.float64)
     dead = dead_columns((stack - stack.mean(axis=0)).reshape(-1, rays.cols))
     of_mean = mirror_steps(turn.mean, turn.noise, rays.scan, values, dead)
-    if closed:
-        hidden = None
-    else:
+    hidden = None
+    if not closed:
         hidden = hidden_gap(frames, axis, profile, rays.smoothing, rays, of_mean)
     if profile is None:
         return GapFound(_by_mean(hidden, of_mean), hidden)
-    seen = [
-        gap
-        for gap in local_gaps(frames, axis, closed)
-        if abs(gap.column - 0.5 - axis) > OWN_MIRROR_PX
-    ]
+    seen = _shown_apart(frames, axis, closed)
     certified = [gap for gap in seen if _certified(gap, profile, axis)]
     likely = None if certified or hidden is None else hidden.likely
     gap = _measured(rays, values, [*certified, likely], profile.best(), axis)
@@ -135,26 +127,34 @@ def find_gap(
         return GapFound(None, possible_gap(gap))
     closed_rays, behind = _closed(rays, values, gap.column, gap.width)
     far = _far_from(gap, seen, about, axis)
-    second, step = _left_behind(closed_rays, behind, far)
-    second, step = (
-        None if one is None or of_mean.denied(one.column, about) else one
-        for one in (second, step)
-    )
-    if second is None:
-        second = next((one for one in far if of_mean.told(one.column, about)), None)
+    second, step = _left_behind(closed_rays, behind, far, of_mean, about)
     _require_one(gap, second)
     if likely is not None and step is not None:
         return GapFound(None, hidden)
     _require_one(gap, step)
-    inside = profile.at(abs(gap.column - 0.5 - axis))
-    far_enough = abs(gap.column - 0.5 - axis) > 2.0 * border_room(rays.cols)
-    fitted = far_enough and (told or np.isfinite(inside.sigma))
-    gap = gap._replace(beside_axis=not fitted)
     by_mean = [of_mean.width(gap.column, about)] if told else []
+    fitted = told or bool(np.isfinite(profile.at(_from_axis(gap, axis)).sigma))
+    near = _from_axis(gap, axis) <= 2.0 * border_room(rays.cols)
+    gap = gap._replace(beside_axis=near or not fitted)
     widths = ((gap.width, gap.sigma), *by_mean)
     return GapFound(
         contradicted(gap, by_mean), None if likely is None else hidden, behind, widths
     )
+
+
+def _shown_apart(
+    frames: Sequence[Float32Array], axis: float, closed: Sequence[float]
+) -> list[Gap]:
+    """List the gaps that single frames show away from their own mirror images
+    (`OWN_MIRROR_PX`).
+    """
+    shown = local_gaps(frames, axis, closed)
+    return [gap for gap in shown if _from_axis(gap, axis) > OWN_MIRROR_PX]
+
+
+def _from_axis(gap: Gap, axis: float) -> float:
+    """Return the distance of a gap's border from the axis [px]."""
+    return abs(gap.column - 0.5 - axis)
 
 
 def contradicted(gap: Gap, widths: Sequence[tuple[float, float]]) -> Gap:
@@ -229,12 +229,16 @@ def _far_from(gap: Gap, seen: Sequence[Gap], about: float, axis: float) -> list[
         about: least difference of the distances [px].
         axis: its column [px].
     """
-    own = abs(gap.column - 0.5 - axis)
-    return [one for one in seen if abs(abs(one.column - 0.5 - axis) - own) > about]
+    own = _from_axis(gap, axis)
+    return [one for one in seen if abs(_from_axis(one, axis) - own) > about]
 
 
 def _left_behind(
-    closed: ConjugateRays, values: FloatArray, far: Sequence[Gap]
+    closed: ConjugateRays,
+    values: FloatArray,
+    far: Sequence[Gap],
+    of_mean: MirrorSteps,
+    about: float,
 ) -> tuple[Gap | None, Gap | None]:
     """Find what looks like another gap once one is closed.
 
@@ -242,18 +246,28 @@ def _left_behind(
         closed: both ends of rays, the gap closed.
         values: parameters of the plane.
         far: gaps that single frames show, away from the closed one.
+        of_mean: steps of the mean; what it denies is none.
+        about: distance within which these count [px].
 
     Returns:
-        One that single frames show and both ends of rays certify, and one by a
+        One that single frames show and both ends of rays, or the mean, certify, and one by a
         significant step alone; None each without.
     """
+    second = None
+    by_step = None
     profile = closed.profile(values)
-    if profile is None:
-        return None, None
-    axis = closed.scan.column(values, closed.row)
-    second = next((one for one in far if _certified(one, profile, axis)), None)
-    step = profile.best()
-    return second, _from_step(step, axis) if step.significant else None
+    if profile is not None:
+        axis = closed.scan.column(values, closed.row)
+        second = next((one for one in far if _certified(one, profile, axis)), None)
+        step = profile.best()
+        by_step = _from_step(step, axis) if step.significant else None
+    if second is not None and of_mean.denied(second.column, about):
+        second = None
+    if by_step is not None and of_mean.denied(by_step.column, about):
+        by_step = None
+    if second is None:
+        second = next((one for one in far if of_mean.told(one.column, about)), None)
+    return second, by_step
 
 
 def _certified(gap: Gap, profile: Profile, axis: float) -> bool:
