@@ -149,13 +149,7 @@ def check_fixed(
     errors = {f.code for f in explained if f.forbids}
     if verdict.finding is not None and errors <= OF_RESIDUALS | {"misfit"}:
         left = _left_by_priors(state, usual, loose_fit, explained)
-        if any(f.code in OF_MOTION for f in left):
-            moved = moving(
-                fit, lambda motion: refit_scans(state, asked, fit, motion=motion)
-            )
-            if moved is not None:  # Beside the stated priors it explains all there is.
-                return fit, [*(f for f in left if f.code not in OF_MOTION), moved]
-        return fit, [*left, verdict.finding]
+        return fit, _with_priors_off(state, asked, fit, left, verdict.finding)
     found = []
     if verdict.factor > 1.0:
         found.append(narrow_priors(verdict))
@@ -168,11 +162,7 @@ def check_fixed(
         fit = _with_stated_priors(fit, before)
     fit = _doubted(fit, free_fit, fixed)
     if exact:
-        freed = refit_scans(state, usual, fit)
-        judged = judge_exact(fit, freed, exact)
-        if judged is not None and judged.forbids:  # With the sigmas of causes left open.
-            judged = judge_exact(fit, explain(state, usual, freed)[0], exact)
-        found += listed(judged)
+        found += listed(_exact_judged(state, usual, fit, exact))
     if any(f.forbids and f.code != "misfit" for f in explained):
         # What spoils the fit moves it as a scanner elsewhere would.
         return fit, [*explained, *(f for f in found if f.forbids)]
@@ -190,6 +180,39 @@ def check_fixed(
     if _moves(explained):  # What moves looks like other pixels in part.
         return fit, [*explained, *found]
     return fit, [*explained, *found, *listed(pitch)]
+
+
+def _with_priors_off(
+    state: Calibration,
+    asked: CalibrationRequest,
+    fit: FitResult,
+    left: list[Finding],
+    off: Finding,
+) -> list[Finding]:
+    """Return the findings where images contradict priors: those left, and that one; or
+    instead the motion that explains all there is beside the stated priors.
+    """
+    if any(f.code in OF_MOTION for f in left):
+        moved = moving(fit, lambda motion: refit_scans(state, asked, fit, motion=motion))
+        if moved is not None:
+            return [*(f for f in left if f.code not in OF_MOTION), moved]
+    return [*left, off]
+
+
+def _exact_judged(
+    state: Calibration,
+    usual: CalibrationRequest,
+    fit: FitResult,
+    exact: Mapping[str, float],
+) -> Finding | None:
+    """Judge the parameters stated as exact by a fit with their usual priors; an error only
+    stands with the sigmas of causes left open.
+    """
+    freed = refit_scans(state, usual, fit)
+    judged = judge_exact(fit, freed, exact)
+    if judged is not None and judged.forbids:
+        return judge_exact(fit, explain(state, usual, freed)[0], exact)
+    return judged
 
 
 def _centre(asked: CalibrationRequest) -> dict[str, float]:

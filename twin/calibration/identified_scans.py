@@ -72,15 +72,8 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             out.append(identified(scan.index, detections, request.start))
             continue
         search = Search(turn=_stated_turn(scan, request))
-        seek = partial(
-            attempt,
-            detections,
-            state.model,
-            scan.poses,
-            start=request.start,
-            search=search,
-        )
-        found = seek()
+        seek = partial(attempt, model=state.model, poses=scan.poses, start=request.start)
+        found = seek(detections, search=search)
         numbers = _numbers(found, detections, state.model, scan, request.start)
         if numbers is not None and (odd := numbers.judged(scan.name)) is not None:
             findings.append(odd)
@@ -88,22 +81,16 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
                 break
             looks[i] = _without(looks[i], numbers.again.tolist())
             detections = _spots(scan, looks[i])
-            seek = partial(
-                attempt, detections, state.model, scan.poses, start=request.start,
-                search=search,
-            )  # fmt: skip
-            found = seek()
+            found = seek(detections, search=search)
         finding = explain_identification(
             found, detections, state.model, scan.poses, scan.name, request.start
         )
         if found is not None and finding is not None and finding.code == "wrong_phantom":
-            drawn_out = _of_exposure(found, state.model, scan)
-            if drawn_out is not None:
-                followed = request.second_look and _agreeing(found)
-                finding = None if followed else drawn_out
+            finding = _by_exposure(finding, found, state.model, scan, request)
         if request.per_frame and finding is not None and finding.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
-            found = seek(search=replace(search, gate_px=WIDE_GATE_PX)) or found
+            wide = replace(search, gate_px=WIDE_GATE_PX)
+            found = seek(detections, search=wide) or found
             finding = None
         findings += listed(finding)
         if found is None:
@@ -114,6 +101,22 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         findings = [f for f in findings if f.code != "extra_spots"]
     found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
     return found_so_far.with_findings(*findings)
+
+
+def _by_exposure(
+    finding: Finding,
+    found: Identification,
+    model: BeadModel,
+    scan: Scan,
+    request: CalibrationRequest,
+) -> Finding | None:
+    """Return the finding of a wrong phantom, or where shadows are drawn out by an
+    exposure's arc that finding; None if a second measurement will follow the arc.
+    """
+    drawn_out = _of_exposure(found, model, scan)
+    if drawn_out is None:
+        return finding
+    return None if request.second_look and _agreeing(found) else drawn_out
 
 
 def _of_exposure(found: Identification, model: BeadModel, scan: Scan) -> Finding | None:

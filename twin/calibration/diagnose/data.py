@@ -245,34 +245,63 @@ def explain_identification(
         )
     if found is not None:
         found = _without_bad_frames(found)
-        counts = np.array([len(d) for d in detections])
-        rest = (1.0 - found.explained) * counts.sum() / max(int((counts > 0).sum()), 1)
-        if missing := _missing(found):
-            whose = f"{name}: bead {', '.join(map(str, missing))} of {model.name!r} has no spot"
-            if found.explained >= SOME_SPOTS:
-                return warning(
-                    "beads_missing",
-                    f"{whose} in any frame, and all spots fit the others: it is lost or out of "
-                    "view; the others are used",
-                )
-            return warning(
-                "bead_displaced",
-                f"{whose} where it should be, and in each frame {rest:.1f} spots are no "
-                "bead: it is elsewhere, or lost; the others are used",
-            )
-        if convincing(found):
-            if found.explained > SOME_SPOTS or not _extra(found, counts):
-                return None
-            return warning(
-                "extra_spots",
-                f"{name}: in each frame {rest:.1f} of the spots are none of the beads of "
-                f"{model.name!r}: other balls, or something round; not used",
-            )
+        judged_beads = _beads_or_spots(found, detections, model, name)
+        if judged_beads is not None or convincing(found):
+            return judged_beads
     explanation = _alternative(found, detections, model, poses, start)
     if explanation is not None:
         return replace(explanation, text=f"{name}: {explanation.text}")
     if found is not None and _plausible(found):
         return None
+    why = _why_wrong(found, detections, model, poses)
+    return error(
+        "wrong_phantom",
+        f"{name}: the shadows do not fit the phantom {model.name!r}: {why}; wrong phantom, or "
+        "wrong frame angles",
+    )
+
+
+def _beads_or_spots(
+    found: Identification, detections: Sequence[Detections], model: BeadModel, name: str
+) -> Finding | None:
+    """Warn of beads that are lost or displaced, or of spots that are none, in an assignment
+    that is good for the rest; None without.
+    """
+    counts = np.array([len(d) for d in detections])
+    rest = (1.0 - found.explained) * counts.sum() / max(int((counts > 0).sum()), 1)
+    if missing := _missing(found):
+        whose = (
+            f"{name}: bead {', '.join(map(str, missing))} of {model.name!r} has no spot"
+        )
+        if found.explained >= SOME_SPOTS:
+            return warning(
+                "beads_missing",
+                f"{whose} in any frame, and all spots fit the others: it is lost or out of "
+                "view; the others are used",
+            )
+        return warning(
+            "bead_displaced",
+            f"{whose} where it should be, and in each frame {rest:.1f} spots are no "
+            "bead: it is elsewhere, or lost; the others are used",
+        )
+    if not convincing(found):
+        return None
+    if found.explained > SOME_SPOTS or not _extra(found, counts):
+        return None
+    return warning(
+        "extra_spots",
+        f"{name}: in each frame {rest:.1f} of the spots are none of the beads of "
+        f"{model.name!r}: other balls, or something round; not used",
+    )
+
+
+def _why_wrong(
+    found: Identification | None,
+    detections: Sequence[Detections],
+    model: BeadModel,
+    poses: Poses,
+) -> str:
+    """Describe how badly an assignment fits, and another size of the spots."""
     why = "no orientation of the phantom explains them"
     if found is not None:
         why = (
@@ -287,11 +316,7 @@ def explain_identification(
             f"; their radius is {radius:.1f} px instead of {expected:.1f}: "
             "other pixels or beads?"
         )
-    return error(
-        "wrong_phantom",
-        f"{name}: the shadows do not fit the phantom {model.name!r}: {why}; wrong phantom, or "
-        "wrong frame angles",
-    )
+    return why
 
 
 def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
@@ -359,6 +384,16 @@ def _leaves_less(some: Identification, every: Identification) -> bool:
     return without[0] < without[1] and some.rms_px < every.rms_px
 
 
+def _clearly_better(other: Identification, found: Identification | None) -> bool:
+    """Check whether an assignment fits much closer, or explains many more spots, than one
+    that was found; any is better than none.
+    """
+    if found is None:
+        return True
+    much_closer = other.rms_px < 0.3 * found.rms_px
+    return much_closer or other.explained > found.explained + 0.2
+
+
 def _plausible(found: Identification) -> bool:
     return found.explained >= 0.85 and found.found >= 0.85 and found.rms_px < 4.0
 
@@ -388,34 +423,17 @@ def _flipped(detections: Sequence[Detections], axis: int) -> list[Detections]:
     return out
 
 
-def _alternative(
-    found: Identification | None,
-    detections: Sequence[Detections],
-    model: BeadModel,
-    poses: Poses,
-    start: Offsets,
-) -> Finding | None:
-    """Find the mistake that makes phantom and spots agree best.
+_Mistake = tuple[str, str, dict[str, Any]]
+"""Code and text of a mistake, and what is different if it was made: arguments of `attempt`."""
 
-    Tried are endpoint errors of the angles, mirrored or turned phantoms and images, a
-    reversed or resting stage, and each bead left out (5 to `MOST_LEFT_OUT` beads). Only
-    if none is convincing and clearly better than `found`: motion, a bead without which
-    less is left, parts of the scan, another turn, and single frames; these not for a
-    plausible assignment.
 
-    Args:
-        found: the poor assignment, or None.
-        detections: spots of each frame.
-        model: the beads.
-        poses: nominal geometry.
-        start: offsets that are known before.
-
-    Returns:
-        Its finding, an error; None if no mistake explains the spots.
-    """
+def _mistakes(
+    detections: Sequence[Detections], model: BeadModel, poses: Poses
+) -> list[_Mistake]:
+    """List the mistakes that are tried, see `_alternative`."""
     n = len(poses)
     k = len(model)
-    trials: list[tuple[str, str, dict[str, Any]]] = []
+    trials: list[_Mistake] = []
     for factor, true, stated in (
         ((n / (n - 1), n - 1, n), ((n - 1) / n, n, n - 1)) if n > 1 else ()
     ):
@@ -476,6 +494,35 @@ def _alternative(
             f"without bead {j} the others fit: it is not where the phantom's model has it"
         )
         trials.append(("bead_displaced", text, {"model": others}))
+    return trials
+
+
+def _alternative(
+    found: Identification | None,
+    detections: Sequence[Detections],
+    model: BeadModel,
+    poses: Poses,
+    start: Offsets,
+) -> Finding | None:
+    """Find the mistake that makes phantom and spots agree best.
+
+    Tried are endpoint errors of the angles, mirrored or turned phantoms and images, a
+    reversed or resting stage, and each bead left out (5 to `MOST_LEFT_OUT` beads). Only
+    if none is convincing and clearly better than `found`: motion, a bead without which
+    less is left, parts of the scan, another turn, and single frames; these not for a
+    plausible assignment.
+
+    Args:
+        found: the poor assignment, or None.
+        detections: spots of each frame.
+        model: the beads.
+        poses: nominal geometry.
+        start: offsets that are known before.
+
+    Returns:
+        Its finding, an error; None if no mistake explains the spots.
+    """
+    trials = _mistakes(detections, model, poses)
     given: dict[str, Any] = {
         "detections": detections, "model": model, "poses": poses, "start": start,
     }  # fmt: skip
@@ -485,18 +532,13 @@ def _alternative(
         other = attempt(**(given | change))
         if other is None:
             continue
-        better = (
-            found is None
-            or other.rms_px < 0.3 * found.rms_px
-            or (other.explained > found.explained + 0.2)
-        )
         # A mistake that explains all spots comes before one that fits most of them more
         # closely: four of the LEGO phantom's five beads are a helix, which turns round into
-        #     itself.
+        # itself.
         off = (round(1.0 - other.explained, 1), other.rms_px)
         if not convincing(other):
             continue
-        if better and (best is None or off < best[:2]):
+        if _clearly_better(other, found) and (best is None or off < best[:2]):
             best = (*off, code, text)
         if code == "bead_displaced" and found is not None and _leaves_less(other, found):
             elsewhere = min(elsewhere, (*off, code, text), key=lambda one: one[:2])

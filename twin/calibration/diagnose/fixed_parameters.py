@@ -9,16 +9,18 @@ changed; the finding names the parameters that should be free.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtri, fdtrc
 
 from flexdt.twin.calibration.diagnose import Finding, error, warning
-from flexdt.twin.calibration.fit.certificate import widened
+from flexdt.twin.calibration.fit.certificate import Estimate, widened
 from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import to_edge
 
 HELD_SIGMAS: Final = 5.0
@@ -160,11 +162,7 @@ def judge_exact(
         for n, e in fit.certificate.estimates.items()
         if n in after and e.sigma > 0 and after[n].sigma > MIN_GROWTH * e.sigma
     }
-    own = {n: after[n].prior or math.inf for n in exact if n in after}
-    causes = dict.fromkeys(c for n in growth for c in after[n].priors if c in exact)
-    causes |= dict.fromkeys(
-        n for n, prior in own.items() if MIN_GROWTH * after[n].sigma > prior
-    )
+    causes = _unchecked(after, growth, exact)
     if not causes:
         return None
     worst = sorted(growth, key=lambda n: -growth[n])[:3] or list(causes)
@@ -177,6 +175,24 @@ def judge_exact(
         "held_unchecked",
         f"{assumed} is taken as exact, and the images cannot tell whether it is: with "
         f"the usual prior sigmas grow: {listed}; give prior 0 only to what was measured",
+    )
+
+
+def _unchecked(
+    after: Mapping[str, Estimate], growth: Iterable[str], exact: Mapping[str, float]
+) -> dict[str, None]:
+    """List the values stated as exact that sigmas depend on, or whose usual priors the
+    images hardly narrow.
+
+    Args:
+        after: estimates with the usual priors.
+        growth: parameters whose sigmas grow.
+        exact: parameter -> value, edge units.
+    """
+    own = {n: after[n].prior or math.inf for n in exact if n in after}
+    causes = dict.fromkeys(c for n in growth for c in after[n].priors if c in exact)
+    return causes | dict.fromkeys(
+        n for n, prior in own.items() if MIN_GROWTH * after[n].sigma > prior
     )
 
 
@@ -226,66 +242,104 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     sigmas = np.array([e.sigma for e in found])
     ratios = np.abs(moved) / np.sqrt(1.0 / LOOSE_FACTOR**2 + sigmas**2 / width**2)
     scores = np.array([_deviate_of(ratio, c.dof) for ratio in ratios.tolist()])
-    # The images alone, as a quadratic of curvature A and gradient y, and what they and all
-    # priors but one would say of that one.
+    gains, alone = _without_each(values, vectors, some, moved)
+    likely = _likely(gains)
+    if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
+        factor = math.sqrt(square / count) if chance < NARROW_CHANCE else 1.0
+        return PriorsJudged(None, factor, tuple(names[i] for i in likely))
+    # Something is off all the same: the likeliest is named.
+    believed = [
+        _Believed(
+            names[i],
+            float(means[i]),
+            float(width[i] / LOOSE_FACTOR),
+            float(means[i] + alone[i][0] * width[i]),
+            float(alone[i][1] * width[i]),
+            found[i].unit,
+        )
+        for i in likely or [int(np.argsort(gains)[-1])]
+    ]
+    causes = tuple(one.name for one in believed)
+    return PriorsJudged(_priors_off(loose, believed, exact), 1.0, causes)
+
+
+def _likely(gains: Sequence[float]) -> list[int]:
+    """List the priors that may be wrong, the likeliest first, by how much the squared
+    residuals fall without each; empty if without none they fall enough to doubt it.
+    """
+    order: list[int] = np.argsort(gains)[::-1].tolist()
+    best = gains[order[0]]
+    if best <= DOUBT_SIGMAS**2:
+        return []
+    return [i for i in order if gains[i] > max(best - MAX_RIVAL_CHI2, best / 2)]
+
+
+@dataclass(frozen=True)
+class _Believed:
+    """One parameter, edge units: what is known of it, and what the images say alone."""
+
+    name: str
+    centre: float
+    prior: float
+    value: float
+    sigma: float
+    unit: str
+
+
+def _priors_off(
+    fit: FitResult, believed: Sequence[_Believed], exact: Container[str]
+) -> Finding:
+    """Make the error that images contradict priors, of which each of these may be wrong."""
+    texts = []
+    for one in believed:
+        known = "exactly" if one.name in exact else f"+- {one.prior:g} {one.unit}"
+        texts.append(
+            f"{one.name} is known as {one.centre:g} {known}, the images say "
+            f"{one.value:.4g} +- {one.sigma:.1g} {one.unit}"
+        )
+    texts += [_other_pixels(fit, one.value) for one in believed if one.name == "dD_z"]
+    # One of them alone would take up what is another's.
+    names = [one.name for one in believed]
+    text = f"{'; or '.join(texts)}: free {', '.join(names)} too, or give the prior it has"
+    # Those of one scan are no option.
+    offered = [name for name in names if "@" not in name]
+    return error("held_parameter", text, free=offered)
+
+
+def _without_each(
+    values: FloatArray,
+    vectors: FloatArray,
+    some: npt.NDArray[np.bool_],
+    moved: FloatArray,
+) -> tuple[list[float], list[tuple[float, float]]]:
+    """Compute what the images, and all priors but one, say of that one; for each of p.
+
+    All in units of the loose priors.
+
+    Args:
+        values, vectors: eigenvalues and vectors of the estimates' covariance, (p,), (p, p).
+        some: (p,) which directions the images tell.
+        moved: (p,) estimates less the priors' centres.
+
+    Returns:
+        How much the squared residuals fall without each prior, and value and standard
+        deviation of each parameter then.
+    """
+    # The images alone are a quadratic of this curvature, and of the gradient y.
     weight = np.where(some, 1.0 / values - 1.0, 0.0)
     curvature = (vectors * weight) @ vectors.T
     gradient = np.where(some, 1.0 / values, 0.0)
     y = vectors @ (gradient * (vectors.T @ moved))
-    everything = np.linalg.inv(curvature + LOOSE_FACTOR**2 * np.eye(len(width)))
+    everything = np.linalg.inv(curvature + LOOSE_FACTOR**2 * np.eye(len(moved)))
     gains = []
     alone = []
-    for j in range(len(width)):
-        priors = np.full(len(width), LOOSE_FACTOR**2)
+    for j in range(len(moved)):
+        priors = np.full(len(moved), LOOSE_FACTOR**2)
         priors[j] = 1e-6 * LOOSE_FACTOR**2
         without = np.linalg.inv(curvature + np.diag(priors))
         gains.append(float(y @ (without - everything) @ y))
-        alone.append(
-            (
-                float((without @ y)[j] * width[j]),
-                float(np.sqrt(max(without[j, j], 0.0)) * width[j]),
-            )
-        )
-    order = np.argsort(gains)[::-1].tolist()
-    best = gains[order[0]]
-    enough = best > DOUBT_SIGMAS**2
-    if enough:
-        likely = [i for i in order if gains[i] > max(best - MAX_RIVAL_CHI2, best / 2)]
-    else:
-        likely = []
-    if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
-        if chance < NARROW_CHANCE:
-            factor = math.sqrt(square / count)
-        else:
-            factor = 1.0
-        return PriorsJudged(None, factor, tuple(names[i] for i in likely))
-    likely = likely or order[:1]
-    causes = tuple(names[i] for i in likely)
-    texts = [
-        f"{names[i]} is known as {means[i]:g} "
-        + (
-            "exactly"
-            if names[i] in exact
-            else f"+- {width[i] / LOOSE_FACTOR:g} {found[i].unit}"
-        )
-        + f", the images say {means[i] + alone[i][0]:.4g} +- {alone[i][1]:.1g} {found[i].unit}"
-        for i in likely
-    ]
-    if "dD_z" in causes:
-        texts.append(
-            _other_pixels(
-                loose, means[names.index("dD_z")] + alone[names.index("dD_z")][0]
-            )
-        )
-    # One of them alone would take up what is another's.
-    text = (
-        f"{'; or '.join(texts)}: free {', '.join(causes)} too, or give the prior it has"
-    )
-    offered = [
-        name for name in causes if "@" not in name
-    ]  # those of one scan are no option
-    finding = error("held_parameter", text, free=offered)
-    return PriorsJudged(finding, 1.0, causes)
+        alone.append((float((without @ y)[j]), float(np.sqrt(max(without[j, j], 0.0)))))
+    return gains, alone
 
 
 def _other_pixels(fit: FitResult, dD_z: float) -> str:

@@ -77,18 +77,7 @@ def _judged_scan(
         predicted: places of the beads in all frames.
     """
     of_scan = f" of scan {scan + 1}" if not own.all() else ""
-    seen = fit.problem.seen[own].sum(axis=1)
-    used = fit.certificate.used[own].sum(axis=1)
-    bad = np.flatnonzero((seen >= 2) & (used < 0.5 * seen)).tolist()
-    for i, (d, beads) in enumerate(zip(detections, predicted[own], strict=True)):
-        places = d.centers[d.whole]
-        if len(places) < 2:
-            continue
-        gap = np.linalg.norm(beads[:, None] - places[None], axis=2).min(axis=0)
-        near = int((gap < 5.0).sum())
-        if near < 0.5 * min(len(places), len(beads)):
-            bad.append(i)
-    bad = sorted(set(bad))
+    bad = _frames_off(fit, own, detections, predicted)
     if not bad:
         return None
     n = len(detections)
@@ -109,10 +98,8 @@ def _judged_scan(
     at_end = bad[0] == 0 or bad[-1] == n - 1
     block = len(bad) >= BLOCK_SHARE * (bad[-1] - bad[0] + 1)
     block = block and at_end and 2 <= len(bad) < n
-    if block:
-        places_of = f"{bad[0]} to {bad[-1]}"
-    else:
-        places_of = ", ".join(str(i) for i in bad[:12])
+    listed_frames = ", ".join(str(i) for i in bad[:12])
+    places_of = f"{bad[0]} to {bad[-1]}" if block else listed_frames
     if block and (aside := _aside(fit, np.flatnonzero(own)[bad].tolist())) is not None:
         column, row = aside.tolist()
         return error(
@@ -135,6 +122,29 @@ def _judged_scan(
         f"in {len(bad)} of {n} frames{of_scan} ({places_of}) the shadows are not where the "
         "others put them" + ("" if many else "; those frames are not used"),
     )
+
+
+def _frames_off(
+    fit: FitResult,
+    own: npt.NDArray[np.bool_],
+    detections: Sequence[Detections],
+    predicted: FloatArray,
+) -> list[int]:
+    """List the frames of a scan of which the fit left out most beads, or where most
+    complete spots are at no bead's place; arguments as of `_judged_scan`.
+    """
+    seen = fit.problem.seen[own].sum(axis=1)
+    used = fit.certificate.used[own].sum(axis=1)
+    bad = set(np.flatnonzero((seen >= 2) & (used < 0.5 * seen)).tolist())
+    for i, (d, beads) in enumerate(zip(detections, predicted[own], strict=True)):
+        places = d.centers[d.whole]
+        if len(places) < 2:
+            continue
+        gap = np.linalg.norm(beads[:, None] - places[None], axis=2).min(axis=0)
+        near = int((gap < 5.0).sum())
+        if near < 0.5 * min(len(places), len(beads)):
+            bad.add(i)
+    return sorted(bad)
 
 
 def _aside(fit: FitResult, frames: Sequence[int]) -> FloatArray | None:

@@ -73,7 +73,7 @@ def explained_by_causes(
         chosen = tuple(options.values())
         settled = chosen == applied or not (applied or any(chosen))
         # What moves is no column of the fit, and correlates its residuals itself.
-        moves = any(pick for name, pick in before.items() if name.startswith(MOTION_OF))
+        moves = _moves(before)
         beside = candidates.correlated(choice) if moves else None
         if settled and alike == (beside or fit.certificate.enlargement):
             break
@@ -87,29 +87,56 @@ def explained_by_causes(
     odds = candidates.odds()
     # What moves looks like other causes in part, and most of it stays in the residuals.
     if moves and fit.certificate.rms_px > MAX_REST_SHARE * first.certificate.rms_px:
-        likely = None
-        if names := _applied(candidates, choice):
-            likely = (fit, Found(odds, names, (), candidates.strain(choice)))
-        whole = Found(odds, beside_motion=likely)
-        alone = motions_alone(candidates, choice)
-        return _stated(first, candidates, alone, (), refit), whole
+        return _beside_motion(first, fit, candidates, choice, refit)
     names = _applied(candidates, choice)
-    doubtful = tuple(
-        n
-        for n, o in odds.items()
-        if -OPEN_LOG_ODDS < o < NAMED_LOG_ODDS and not n.startswith(RIVALS)
-    )
-    lost = lost_beads(first)
-    elsewhere = (
-        "beads" in names
-        and not left_out
-        and 0 < len(lost) <= len(first.problem.model) - LEAST_BEADS
-        and candidates.elsewhere(choice, lost)
-    )
-    if elsewhere:
-        return explained_by_causes(first, known, refit, lost)
-    found = Found(odds, names, doubtful, candidates.strain(choice))
+    if "beads" in names and not left_out:
+        lost = lost_beads(first)
+        left = len(first.problem.model) - len(lost)
+        if lost and left >= LEAST_BEADS and candidates.elsewhere(choice, lost):
+            return explained_by_causes(first, known, refit, lost)
+    found = Found(odds, names, _open(odds), candidates.strain(choice))
     return _stated(fit, candidates, choice, borders, refit), found
+
+
+def _moves(widths: Mapping[str, float]) -> bool:
+    """Return whether something moves among the widths of causes by name."""
+    return any(pick for name, pick in widths.items() if name.startswith(MOTION_OF))
+
+
+def _open(odds: Mapping[str, float]) -> tuple[str, ...]:
+    """Name the causes that are neither named nor excluded by their logarithmic odds; not
+    rivals.
+    """
+    return tuple(
+        name
+        for name, log_odds in odds.items()
+        if -OPEN_LOG_ODDS < log_odds < NAMED_LOG_ODDS and not name.startswith(RIVALS)
+    )
+
+
+def _beside_motion(
+    first: FitResult,
+    fit: FitResult,
+    candidates: Candidates,
+    choice: Choice,
+    refit: Refit,
+) -> tuple[FitResult, Found]:
+    """State the fit without causes, wider by what moves, and keep the fit with the others.
+
+    Args:
+        first: fit without causes.
+        fit: with those of `choice`.
+        candidates: all causes, judged.
+        choice: the most likely one.
+        refit: as of `explained_by_causes`.
+    """
+    odds = candidates.odds()
+    likely = None
+    if names := _applied(candidates, choice):
+        likely = (fit, Found(odds, names, (), candidates.strain(choice)))
+    alone = motions_alone(candidates, choice)
+    stated = _stated(first, candidates, alone, (), refit)
+    return stated, Found(odds, beside_motion=likely)
 
 
 def _stated(
