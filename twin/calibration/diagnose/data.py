@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -427,6 +427,37 @@ _Mistake = tuple[str, str, dict[str, Any]]
 """Code and text of a mistake, and what is different if it was made: arguments of `attempt`."""
 
 
+class _Tried(NamedTuple):
+    """A mistake, and the assignment of spots to beads as if it was made."""
+
+    code: str
+    text: str
+    found: Identification
+
+    @property
+    def off(self) -> tuple[float, float]:
+        """How far spots and phantom disagree, for comparison."""
+        # A mistake that explains all spots comes before one that fits most of them more
+        # closely: four of the LEGO phantom's five beads are a helix, which turns round into
+        # itself.
+        return round(1.0 - self.found.explained, 1), self.found.rms_px
+
+    @property
+    def finding(self) -> Finding:
+        """The finding that the mistake was made."""
+        return error(self.code, self.text)
+
+
+def _bead_elsewhere(fit_well: Sequence[_Tried], found: Identification) -> Finding | None:
+    """Find the bead without which less is left of an assignment to all; None without."""
+    less = [
+        one
+        for one in fit_well
+        if one.code == "bead_displaced" and _leaves_less(one.found, found)
+    ]
+    return min(less, key=lambda one: one.off).finding if less else None
+
+
 def _mistakes(
     detections: Sequence[Detections], model: BeadModel, poses: Poses
 ) -> list[_Mistake]:
@@ -526,33 +557,20 @@ def _alternative(
     given: dict[str, Any] = {
         "detections": detections, "model": model, "poses": poses, "start": start,
     }  # fmt: skip
-    best: tuple[float, float, str, str] | None = None
-    elsewhere = (math.inf, math.inf, "", "")
-    for code, text, change in trials:
-        other = attempt(**(given | change))
-        if other is None:
-            continue
-        # A mistake that explains all spots comes before one that fits most of them more
-        # closely: four of the LEGO phantom's five beads are a helix, which turns round into
-        # itself.
-        off = (round(1.0 - other.explained, 1), other.rms_px)
-        if not convincing(other):
-            continue
-        if _clearly_better(other, found) and (best is None or off < best[:2]):
-            best = (*off, code, text)
-        if code == "bead_displaced" and found is not None and _leaves_less(other, found):
-            elsewhere = min(elsewhere, (*off, code, text), key=lambda one: one[:2])
-    if best is not None:
-        return error(*best[2:])
+    fit_well = [
+        _Tried(code, text, other)
+        for code, text, change in trials
+        if (other := attempt(**(given | change))) is not None and convincing(other)
+    ]
+    better = [one for one in fit_well if _clearly_better(one.found, found)]
+    if better:
+        return min(better, key=lambda one: one.off).finding
     plausible = found is not None and _plausible(found)
     if found is not None and plausible and found.typical_px > 0.3 * found.rms_px:
         return None  # The right beads in about the right places: the residuals will tell.
-    without = None
-    if elsewhere[2] and not plausible:
-        without = error(*elsewhere[2:])
     return (
         _in_motion(detections, model, poses, start)
-        or without
+        or (None if found is None or plausible else _bead_elsewhere(fit_well, found))
         or _in_parts(detections, model, poses, start)
         or _other_turn(detections, model, poses, start)
         or _one_by_one(detections, model, poses, start)
