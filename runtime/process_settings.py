@@ -1,7 +1,7 @@
 """The settings of each server process, and the parsers of their words.
 
 Each process has a frozen dataclass of settings; `flexdt.runtime.settings` derives options,
-keys and help from it.
+keys and help from it. The docstring of one with a `command` says what the command does.
 """
 
 # ruff: noqa: RUF009  (the calls make fields; they are not values shared by all instances)
@@ -185,7 +185,7 @@ class ServerSettings(ProcessSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ProjectorSettings(ServerSettings):
-    """`flexdt projector`.
+    """Run the projector server alone.
 
     Attributes:
         port: Listen on this port; 0 is any free one.
@@ -245,7 +245,7 @@ class FarProjectorSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class TwinSettings(FarProjectorSettings, ScannerSettings):
-    """`flexdt twin`.
+    """Run the twin server alone.
 
     Attributes:
         data: Write everything to this directory.
@@ -304,7 +304,7 @@ class TwinClientSettings(ProcessSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerSettings(TwinClientSettings, ServerSettings):
-    """`flexdt viewer`.
+    """Run the viewer, the lab in the browser, alone.
 
     Attributes:
         port: Listen on this port; 0: any free one.
@@ -322,7 +322,9 @@ class ViewerSettings(TwinClientSettings, ServerSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class GatewaySettings(TwinClientSettings):
-    """`flexdt gateway`.
+    """Serve the scanner software's own ZeroMQ interface (Acquila) for a running twin.
+
+    Programs written for the scanner connect to it as they do to the scanner.
 
     Attributes:
         host: Listen on this address of the loopback; use a tunnel beyond.
@@ -344,7 +346,11 @@ class GatewaySettings(TwinClientSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class UpSettings(FarProjectorSettings, ScannerSettings):
-    """Settings of `flexdt up`: those of the twin and of the other processes.
+    """Start projector, twin and viewer; Ctrl-C stops all.
+
+    They run as processes under one supervisor, which restarts a dead one. Prints one
+    JSON `ready` line with the addresses once everything listens. `flexdt twin --help` and its
+    like list further options, which `up` takes, too.
 
     Attributes:
         projector_port: Give the projector this port; 0 is any free one.

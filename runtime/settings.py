@@ -22,6 +22,8 @@ from typer.main import get_command
 class Settings:
     """A table of the settings file.
 
+    The help of a process begins with the text of its class's docstring.
+
     Attributes:
         command: the `flexdt` command that the table is for.
     """
@@ -133,7 +135,10 @@ def read(settings: type[S], words: Sequence[str] | None = None) -> S | None:
 
     has_parameters(take, parameters(settings).values())
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    app.command(context_settings={"help_option_names": ["-h", "--help"]})(take)
+    app.command(
+        help=described(settings)[0],
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )(take)
     get_command(app).main(words, f"flexdt {settings.command}", standalone_mode=False)
     return settings(**found) if found else None
 

@@ -15,9 +15,9 @@ import pytest
 from doc_pages import pages
 from typer.main import get_command
 
-from flexdt.clients.cli.command_tree import GROUPS, SECTIONS, build
+from flexdt.clients.cli.command_tree import GROUPS, SECTIONS, build, run
 from flexdt.clients.cli.settings_file import TABLES
-from flexdt.runtime.settings import parameters
+from flexdt.runtime.settings import parameters, read
 
 MOST_OPTIONS = 217
 THEIRS = ("flexdt study", "flexdt batch", "flexdt bench", "flexdt phantom design")
@@ -52,16 +52,6 @@ def test_every_command_is_documented_and_every_documented_command_exists() -> No
     assert documented() == commands(get_command(build()))
 
 
-def test_every_command_says_what_it_does() -> None:
-    def walk(group: Any) -> None:
-        for name, command in group.commands.items():
-            assert (command.help or "").strip(), name
-            if getattr(command, "commands", None):
-                walk(command)
-
-    walk(get_command(build()))
-
-
 def parts() -> Iterator[tuple[str, Any]]:
     """Every command and group with its path."""
 
@@ -71,6 +61,37 @@ def parts() -> Iterator[tuple[str, Any]]:
             yield from walk(inner, f"{path} {name}")
 
     return walk(get_command(build()), "flexdt")
+
+
+def first_sentence(text: str | None) -> str:
+    paragraph, *_ = (text or "").strip().split("\n\n")
+    return " ".join(paragraph.split())
+
+
+def test_every_help_page_begins_with_what_the_command_does(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The printed page has the sentence of the list of commands, and each its own: a process
+    prints its page itself, and may have another text than the tree."""
+    begins = {}
+    for path, command in parts():
+        assert run([*path.split()[1:], "--help"]) == 0
+        usage, page = capsys.readouterr().out.split("\n\n", 1)
+        assert usage.startswith(f"Usage: {path} ")
+        begins[path] = first_sentence(page)
+        assert begins[path] == first_sentence(command.help) != "", path
+    assert len({*begins.values()}) == len(begins) > 50
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_a_process_started_as_a_module_has_the_help_of_its_command(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert read(TABLES[name], ["--help"]) is None
+    _, page = capsys.readouterr().out.split("\n\n", 1)
+    assert first_sentence(page) == first_sentence(
+        get_command(build()).commands[name].help
+    )
 
 
 def options(command: Any) -> list[Any]:

@@ -19,7 +19,13 @@ from flexdt.clients.cli import value_completion
 from flexdt.clients.cli.console import COMPLETION_VARIABLE
 from flexdt.clients.cli.settings_file import TABLES, settings_of
 from flexdt.runtime.process_settings import UpSettings
-from flexdt.runtime.settings import Settings, has_parameters, parameters, words
+from flexdt.runtime.settings import (
+    Settings,
+    described,
+    has_parameters,
+    parameters,
+    words,
+)
 
 MODULES: Final = {
     "up": "flexdt.clients.launch.up",
@@ -49,12 +55,7 @@ Only = Annotated[
 
 
 def up(context: typer.Context, only: str | None, **given: object) -> None:
-    """Start projector, twin and viewer; Ctrl-C stops all.
-
-    They run as processes under one supervisor, which restarts a dead one. Prints one
-    JSON `ready` line with the addresses once everything listens. `flexdt twin --help` and its
-    like list further options, which `up` takes, too.
-    """
+    """Start the processes of `flexdt up`, or one of them; the help is that of its settings."""
     start(only or "up", [*words(given), *context.args])
 
 
@@ -80,6 +81,7 @@ def _public() -> list[inspect.Parameter]:
     return [p if p.default is False else p.replace(default=None) for p in own]
 
 
+up.__doc__ = described(UpSettings)[0]
 has_parameters(
     up,
     [
@@ -94,9 +96,8 @@ has_parameters(
 )
 
 
-def alone(name: str, about: str) -> Callable[..., None]:
-    """Make the command that starts one process with the words that follow it; `about` is
-    its help.
+def alone(name: str) -> Callable[..., None]:
+    """Make the command that starts one process with the words that follow it.
 
     The process reads them itself; its options are declared here for shells that complete.
     Options are declared only while a shell completes words.
@@ -105,21 +106,17 @@ def alone(name: str, about: str) -> Callable[..., None]:
     def command(context: typer.Context, **_: object) -> None:
         start(name, context.args)
 
-    command.__doc__ = about
+    command.__doc__ = described(TABLES[name])[0]
     own = inspect.signature(command, eval_str=True).parameters["context"]
     completing = COMPLETION_VARIABLE in os.environ
     has_parameters(command, [own, *(_declared(TABLES[name]) if completing else ())])
     return command
 
 
-twin = alone("twin", "Run the twin server alone.")
-projector = alone("projector", "Run the projector server alone.")
-viewer = alone("viewer", "Run the viewer, the lab in the browser, alone.")
-gateway = alone(
-    "gateway",
-    "Serve the scanner software's own ZeroMQ interface (Acquila) for a running twin.\n\n"
-    "Programs written for the scanner connect to it as they do to the scanner.",
-)
+twin = alone("twin")
+projector = alone("projector")
+viewer = alone("viewer")
+gateway = alone("gateway")
 
 
 def start(name: str, more: Sequence[str]) -> None:
