@@ -47,6 +47,7 @@ from flexdt.library.datasets.notebook_html import emphasised, values_table
 from flexdt.phantoms import Phantom, load_phantom, phantom_names
 from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin import long_work
+from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import Finding, Severity, error
 from flexdt.twin.calibration.fit.certificate import Estimate
@@ -259,71 +260,140 @@ def calibrate_datasets(
     want = request or CalibrationRequest(free=("dO_x",) if unknown else SIX)
     if markers is None:
         datasets = [squared(d) for d in datasets]
-    passes = long_work.Passes(sum(map(len, datasets)))
-    frames = [DatasetFrames(d, passes.step) for d in datasets]
     saturated = [finding for d in datasets if (finding := saturation(d)) is not None]
-    low, high = SpotFinder().radius_px
-    sought = None
-    if radius_px is not None:
-        if not low <= radius_px <= high:
-            allowed = f"{low:g} to {high:g}"
-            raise TwinError.instead(f"radius {radius_px:g} px", float(radius_px), allowed)
-        sought = SpotFinder((0.65 * radius_px, 1.5 * radius_px))
-    if (unknown or markers is not None) and len(datasets) != 1:
-        raise TwinError(
-            f"{len(datasets)} data sets with markers or an unknown phantom; allowed: one",
-            {"asked": len(datasets), "allowed": 1},
-        )
-    if scale is not None and not unknown:
-        raise TwinError(
-            "a scale is for phantom unknown: this phantom states its own size"
-        )
-    marker_document: dict[str, object] = {}
+    sought = _spots_of_radius(radius_px)
+    _require_together(
+        len(datasets), marked=markers is not None, unknown=unknown, scale=scale
+    )
     marked = None
     if markers is not None:
         marked = read_markers(markers, len(datasets[0]))
         datasets, marked = seen_alone(datasets[0], marked)
+    marker_document: dict[str, object] = {}
     if unknown:
+        images = DatasetFrames(datasets[0]) if marked is None else None
         result, marker_document = calibrate_unknown(
-            datasets[0],
-            frames[0] if marked is None else None,
-            marked,
-            want,
-            scale,
-            sought,
+            datasets[0], images, marked, want, scale, sought
         )
-        beads = result.model.beads
-        radii = result.model.bead_radius_mm
-        size = tuple((np.ptp(beads, axis=0) + 2 * radii.max()).tolist())
-        target = Phantom(
-            UNKNOWN, "markers of unknown positions", Scene(()), size, beads, radii
-        )
+        target = _phantom_of(result.model)
     else:
         target = find_phantom(phantom)
         if marked is not None:
             result = calibrate_known(datasets[0], marked, target, want)
         else:
-            scans = [
-                Scan(
-                    f,
-                    d.poses,
-                    d.name,
-                    prior_widths(d.machine, d.profile),
-                    arc=exposure_share(d),
-                )
-                for f, d in zip(frames, datasets, strict=True)
-            ]
-            with (
-                long_work.during("calibrating") as passes.advance,
-                saturation_named(saturated),
-            ):
-                result = calibrate(scans, target, want, detector=sought)
+            result = _calibrate_images(datasets, target, want, sought, saturated)
     result = replace(result, findings=explained_by(saturated, result.findings))
     result = with_undetermined(result)
     seconds = time.perf_counter() - start
-    document = calibration_document(result, seconds) | marker_document
     if typed is None:
         typed = typed_words(datasets, phantom, {"free": want.free} if request else {})
+    document = calibration_document(result, seconds) | marker_document
+    return _outcome(result, document, datasets, target, typed)
+
+
+def _spots_of_radius(radius_px: float | None) -> SpotFinder | None:
+    """Make what finds spots of 0.65 to 1.5 times a radius [px]; None for None.
+
+    Raises:
+        TwinError: a radius that `SpotFinder` does not look for.
+    """
+    if radius_px is None:
+        return None
+    low, high = SpotFinder().radius_px
+    if not low <= radius_px <= high:
+        allowed = f"{low:g} to {high:g}"
+        raise TwinError.instead(f"radius {radius_px:g} px", float(radius_px), allowed)
+    return SpotFinder((0.65 * radius_px, 1.5 * radius_px))
+
+
+def _require_together(
+    count: int, *, marked: bool, unknown: bool, scale: Scale | None
+) -> None:
+    """Check that data sets, markers, phantom and scale go together.
+
+    Args:
+        count: number of data sets.
+        marked: whether markers are given.
+        unknown: whether their positions are to be found.
+        scale: a known distance of two of them.
+
+    Raises:
+        TwinError: several data sets with markers or an unknown phantom, or a scale with a
+            known one.
+    """
+    if (unknown or marked) and count != 1:
+        raise TwinError(
+            f"{count} data sets with markers or an unknown phantom; allowed: one",
+            {"asked": count, "allowed": 1},
+        )
+    if scale is not None and not unknown:
+        raise TwinError(
+            "a scale is for phantom unknown: this phantom states its own size"
+        )
+
+
+def _phantom_of(model: BeadModel) -> Phantom:
+    """Make the phantom of markers whose positions were found; its size includes their
+    radii.
+    """
+    radii = model.bead_radius_mm
+    size = tuple((np.ptp(model.beads, axis=0) + 2 * radii.max()).tolist())
+    about = "markers of unknown positions"
+    return Phantom(UNKNOWN, about, Scene(()), size, model.beads, radii)
+
+
+def _calibrate_images(
+    datasets: Sequence[ImageSet],
+    phantom: Phantom,
+    request: CalibrationRequest,
+    detector: SpotFinder | None,
+    saturated: Sequence[Finding],
+) -> Calibration:
+    """Calibrate from the beads that are detected in the images of data sets; announces
+    the work.
+
+    Args:
+        datasets: of the phantom.
+        phantom: whose beads are detected.
+        request: the parameters to estimate.
+        detector: finds spots; None for the default.
+        saturated: findings on saturated images, which explain an error.
+    """
+    passes = long_work.Passes(sum(map(len, datasets)))
+    scans = [
+        Scan(
+            DatasetFrames(d, passes.step),
+            d.poses,
+            d.name,
+            prior_widths(d.machine, d.profile),
+            arc=exposure_share(d),
+        )
+        for d in datasets
+    ]
+    with (
+        long_work.during("calibrating") as passes.advance,
+        saturation_named(saturated),
+    ):
+        return calibrate(scans, phantom, request, detector=detector)
+
+
+def _outcome(
+    result: Calibration,
+    document: dict[str, object],
+    datasets: Sequence[Images],
+    phantom: Phantom,
+    typed: Typed,
+) -> Outcome[Images]:
+    """Add the found motion to the data sets, and to the document the commands to run next,
+    the motion and where all comes from.
+
+    Args:
+        result: of the calibration.
+        document: of the result; changed.
+        datasets: as calibrated.
+        phantom: that was scanned.
+        typed: the words of the command.
+    """
     document["next"] = next_commands(result, typed)
     document["geometry"] = list(typed.geometry)
     if result.identifiable and result.motions:
@@ -332,9 +402,9 @@ def calibrate_datasets(
             d.with_motion(m) for d, m in zip(datasets, result.motions, strict=True)
         ]
     document["datasets"] = [d.where for d in datasets]
-    document["phantom"] = target.name
+    document["phantom"] = phantom.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]
-    return Outcome(result, document, tuple(datasets), target)
+    return Outcome(result, document, tuple(datasets), phantom)
 
 
 @contextmanager
@@ -470,21 +540,32 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
             for f in result.findings
         ],
     }
-    if fit is None:
-        return document
+    if fit is not None:
+        document |= _fit_members(result, fit)
+        if result.identifiable:
+            document |= _use_members(result, fit, seen)
+    return document
+
+
+def _fit_members(result: Calibration, fit: FitResult) -> dict[str, object]:
+    """Return the document's members about a fit, which stand whatever its use: estimates,
+    certificate, residuals and outliers.
+
+    Estimates have no numbers if there is an error other than `UNDETERMINED`, and none of
+    a parameter that is not determined.
+
+    Args:
+        result: of the calibration.
+        fit: its fit.
+    """
     certificate = fit.certificate
     off = np.hypot(*np.moveaxis(certificate.residuals_px, 2, 0))
     offered = all(finding.code == UNDETERMINED for finding in result.errors)
-    parameters = {}
-    for name, e in certificate.estimates.items():
-        known = offered and math.isfinite(e.sigma)
-        if known:
-            hidden = {}
-        else:
-            hidden = dict.fromkeys(NUMBERS) | {"priors": {}}
-        parameters[name] = asdict(e) | hidden
-    document |= {
-        "parameters": parameters,
+    return {
+        "parameters": {
+            name: _estimate_member(e, offered)
+            for name, e in certificate.estimates.items()
+        },
         "rank": certificate.spectrum.rank,
         "condition": _finite(certificate.spectrum.condition),
         "weak": list(certificate.weak),
@@ -510,19 +591,41 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "rms_per_bead_px": [_finite(v) for v in certificate.rms_per_bead.tolist()],
         "rms_per_frame_px": [_finite(v) for v in certificate.rms_per_frame.tolist()],
     }
-    if result.identifiable:
-        document["correction"] = fit.parameters.to_edge()
-        if result.panel is not None:
-            document["panel"] = result.panel.to_json()
-        document["limited"] = certificate.limited
-        document["image_space"] = [
+
+
+def _estimate_member(estimate: Estimate, offered: bool) -> dict[str, object]:
+    """Return an estimate as JSON, without `NUMBERS` and priors unless the calibration's
+    numbers are `offered` and this one's sigma is finite.
+    """
+    if offered and math.isfinite(estimate.sigma):
+        return asdict(estimate)
+    return asdict(estimate) | dict.fromkeys(NUMBERS) | {"priors": {}}
+
+
+def _use_members(
+    result: Calibration, fit: FitResult, seen: Sequence[Mapping[str, Estimate]]
+) -> dict[str, object]:
+    """Return the document's members of an identifiable calibration: correction, panel if
+    there is one, limits, and what the images show.
+
+    Args:
+        result: of the calibration.
+        fit: its fit.
+        seen: its `image_quantities`, of each group of frames.
+    """
+    panel = {} if result.panel is None else {"panel": result.panel.to_json()}
+    return {
+        "correction": fit.parameters.to_edge(),
+        **panel,
+        "limited": fit.certificate.limited,
+        "image_space": [
             {
                 n: {"value": e.value, "sigma": e.sigma, "unit": e.unit}
                 for n, e in some.items()
             }
             for some in seen
-        ]
-    return document
+        ],
+    }
 
 
 def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:

@@ -53,7 +53,7 @@ from flexdt.twin.calibration.unknown_markers import (
 )
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.projection.analytic_solids import Scene
 
@@ -397,6 +397,25 @@ def calibrate_known(
     return _calibrated(data, looks, every, phantom, request)
 
 
+@dataclass(frozen=True, eq=False)
+class _Located:
+    """k markers of unknown positions, located by their spots in n frames.
+
+    Attributes:
+        names: of the markers.
+        looks: spots of each frame.
+        index: (n, k) spot of each marker in each frame, -1 where unseen.
+        at: offsets with which they were located.
+        model: their positions and radii in the object's frame.
+    """
+
+    names: tuple[str, ...]
+    looks: Sequence[FrameSpots]
+    index: Index
+    at: Offsets
+    model: BeadModel
+
+
 def calibrate_unknown(
     data: ImageSet,
     images: Frames | None,
@@ -431,64 +450,142 @@ def calibrate_unknown(
             neither images nor markers, or a scale with dO_z free, with one marker or with
             one that is not there.
     """
-    poses = data.poses
-    if markers is None:
-        if images is None:
-            raise TwinError(
-                "neither images nor markers: there is nothing to calibrate from"
-            )
-        looks = images.look(detector or SpotFinder())
-        index, places, at = link(
-            [look.detections for look in looks], poses, request.start
-        )
-        names = tuple(str(k) for k in range(len(places)))
-        radii = _radii(looks, index, poses)
-    else:
-        looks, index = spots_of(markers, data.shape)
-        names = markers.names
-        if len(names) < 3:
-            raise TwinError.instead(f"{len(names)} markers", len(names), "three or more")
-        at = centred(markers.tracks, poses, data.shape, request.start)
-        places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
-        radii = np.full(len(names), 1e-3)
+    sod = float(np.median(data.poses.sod))
+    if markers is not None:
         images = None
+        found = _locate_marked(data, markers, request.start)
+    elif images is not None:
+        found = _locate_detected(data, images, detector or SpotFinder(), request.start)
+    else:
+        raise TwinError("neither images nor markers: there is nothing to calibrate from")
+    want = _free_of_frame(request, found.at, sod)
+    if scale is None:
+        stated = _scale_origin(request)
+        calibration = _calibrated(
+            data, found.looks, found.index, found.model, want, images
+        )
+    else:
+        stated = f"{scale.a}-{scale.b} = {scale.mm:g} +- {scale.sigma_mm:g} mm"
+        calibration = _calibrate_scaled(data, images, found, want, scale)
+    calibration = _turning_back(calibration, data, markers)
+    return calibration, {
+        "markers": _described(calibration, found.names, found.index),
+        "scale": stated,
+    }
+
+
+def _locate_detected(
+    data: ImageSet, images: Frames, detector: SpotFinder, start: Offsets
+) -> _Located:
+    """Detect markers in the images, and link their spots by the geometry; they are named
+    0, 1, ...
+
+    Args:
+        data: geometry.
+        images: its frames.
+        detector: finds spots.
+        start: offsets to begin with.
+
+    Raises:
+        TwinError: as `link`.
+    """
+    looks = images.look(detector)
+    spots = [look.detections for look in looks]
+    index, places, at = link(spots, data.poses, start)
+    names = tuple(str(k) for k in range(len(places)))
+    model = BeadModel(places, _radii(looks, index, data.poses), 0.0, "unknown")
+    return _Located(names, looks, index, at, model)
+
+
+def _locate_marked(data: ImageSet, markers: Markers, start: Offsets) -> _Located:
+    """Triangulate markers from their pixels; their radii, which nobody states, are 1 um.
+
+    Args:
+        data: geometry.
+        markers: their pixels.
+        start: offsets to begin with.
+
+    Raises:
+        TwinError: fewer than three markers, or as `triangulate`.
+    """
+    looks, index = spots_of(markers, data.shape)
+    names = markers.names
+    if len(names) < 3:
+        raise TwinError.instead(f"{len(names)} markers", len(names), "three or more")
+    at = centred(markers.tracks, data.poses, data.shape, start)
+    places = triangulate(markers.tracks, data.poses.cone_vec(at), data.shape)
+    model = BeadModel(places, np.full(len(names), 1e-3), 0.0, "unknown")
+    return _Located(names, looks, index, at, model)
+
+
+def _free_of_frame(
+    request: CalibrationRequest, at: Offsets, sod: float
+) -> CalibrationRequest:
+    """Complete a request for markers, which define the object's frame: the parameters
+    that the frame takes up are exact, dO_z has a wide prior unless it is free or has one,
+    and beads may be anywhere.
+
+    Args:
+        request: of the user.
+        at: offsets with which the markers were located; a free dO_x without a prior
+            begins there.
+        sod: source to axis [mm].
+    """
     known = {n: 0.0 for n in SIX if n not in ("dO_x", "dO_z") and n not in request.free}
-    sod = float(np.median(poses.sod))
     if "dO_z" not in request.free:
         known["dO_z"] = FREE_SCALE * sod
     start = request.start
     if "dO_x" in request.free and "dO_x" not in request.priors:
         start = replace(start, dO_x=at.dO_x)
-    want = replace(
+    return replace(
         request,
         start=start,
         priors=known | dict(request.priors),
         bead_tolerance_mm=ANYWHERE_MM,
         known_sizes=False,
     )
-    model = BeadModel(places, radii, 0.0, "unknown")
-    if scale is None:
-        if "dO_z" in request.free:
-            scale_origin = "estimated"
-        else:
-            scale_origin = "free"
-        if "dO_z" in request.priors:
-            scale_origin = "from the prior on dO_z"
-        calibration = _calibrated(data, looks, index, model, want, images)
-        calibration = _turning_back(calibration, data, markers)
-        return calibration, {
-            "markers": _described(calibration, names, index),
-            "scale": scale_origin,
-        }
-    pair = [_numbered(names, n) for n in (scale.a, scale.b)]
+
+
+def _scale_origin(request: CalibrationRequest) -> str:
+    """Return where the scale comes from without a known distance."""
+    if "dO_z" in request.priors:
+        return "from the prior on dO_z"
+    return "estimated" if "dO_z" in request.free else "free"
+
+
+def _calibrate_scaled(
+    data: ImageSet,
+    images: Frames | None,
+    found: _Located,
+    request: CalibrationRequest,
+    scale: Scale,
+) -> Calibration:
+    """Calibrate with a known distance of two markers: markers and axis are scaled and
+    fitted until the distance holds to a tenth of its sigma, up to four times.
+
+    Args:
+        data: geometry, and names.
+        images: its frames; None for markers without images.
+        found: the markers.
+        request: the parameters to estimate.
+        scale: the known distance.
+
+    Raises:
+        TwinError: dO_z is free, or the distance is of one marker or one that is not
+            there.
+    """
+    pair = [_numbered(found.names, n) for n in (scale.a, scale.b)]
     if pair[0] == pair[1] or "dO_z" in request.free:
         raise TwinError.instead(
             f"scale {scale.a}-{scale.b} with {', '.join(request.free)} free",
             [scale.a, scale.b, *request.free],
             "two markers, and dO_z not free (the scale says where the axis is)",
         )
-    width = sod * scale.sigma_mm / scale.mm
-    ratio = scale.mm / float(np.linalg.norm(places[pair[0]] - places[pair[1]]))
+    poses = data.poses
+    width = float(np.median(poses.sod)) * scale.sigma_mm / scale.mm
+    start = request.start
+    model = found.model
+    ratio = scale.mm / _distance(model.beads, pair)
     for _ in range(4):
         # Everything smaller by a factor and nearer by it gives the same images.
         away = (poses.axis - poses.source)[0] + [start.dO_x, start.dO_z, start.dO_y]
@@ -496,24 +593,23 @@ def calibrate_unknown(
         start = replace(
             start, dO_x=start.dO_x + dx, dO_y=start.dO_y + dy, dO_z=start.dO_z + dz
         )
-        model = replace(model, beads=model.beads * ratio, bead_radius_mm=radii * ratio)
-        scaled = replace(want, start=start, priors={**want.priors, "dO_z": width})
-        calibration = _calibrated(data, looks, index, model, scaled, images)
+        model = replace(
+            model, beads=model.beads * ratio, bead_radius_mm=model.bead_radius_mm * ratio
+        )
+        scaled = replace(request, start=start, priors={**request.priors, "dO_z": width})
+        calibration = _calibrated(data, found.looks, found.index, model, scaled, images)
         if calibration.fit is None:
             break
-        beads = calibration.fit.beads
-        last = ratio
-        ratio = scale.mm / float(np.linalg.norm(beads[pair[0]] - beads[pair[1]]))
+        model = replace(model, beads=calibration.fit.beads)
+        ratio = scale.mm / _distance(model.beads, pair)
         if abs(ratio - 1.0) < 0.1 * scale.sigma_mm / scale.mm:
             break
-        radii = radii * last
-        model = replace(model, beads=beads)
-    stated_scale = f"{scale.a}-{scale.b} = {scale.mm:g} +- {scale.sigma_mm:g} mm"
-    calibration = _turning_back(calibration, data, markers)
-    return calibration, {
-        "markers": _described(calibration, names, index),
-        "scale": stated_scale,
-    }
+    return calibration
+
+
+def _distance(places: FloatArray, pair: Sequence[int]) -> float:
+    """Return the distance of two of the places (k, 3) [mm]."""
+    return float(np.linalg.norm(places[pair[0]] - places[pair[1]]))
 
 
 def _turning_back(
