@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -24,10 +24,14 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.acquisition import Acquisition, FrameListener
-from flexdt.server.scans.checking import CheckInput, Checks
+from flexdt.server.scans.checking import Checked, CheckInput, Checks
 from flexdt.server.scans.jobs import Jobs
-from flexdt.server.scans.sample_prediction import forecast_sample, predict_counts
-from flexdt.server.scans.scan_job import Job, JobInputs, Prepare, is_complete
+from flexdt.server.scans.sample_prediction import (
+    Prediction,
+    forecast_sample,
+    predict_counts,
+)
+from flexdt.server.scans.scan_job import Job, JobInputs, is_complete
 from flexdt.server.scans.scan_record import FOLDER, JobRecord, ScanSource, StartConditions
 from flexdt.server.scans.stage import Stage
 from flexdt.server.scans.twin_clock import SpeedUp
@@ -35,6 +39,7 @@ from flexdt.server.storage.dataset_writer import DatasetWriter
 from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.job_files import JobFiles, number_of
 from flexdt.server.storage.memory import Memory, StateStore
+from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.file_names import (
     DOCUMENT,
@@ -49,10 +54,90 @@ from flexdt.twin.physics.predicted_beam import PredictedExposure
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import ScanPlan, StartState
+from flexdt.twin.script.planning.plan_values import SampleSize
 from flexdt.twin.script.planning.sample_findings import SampleForecast
 
 RESERVED = ("corrections", FOLDER, "samples")
 """Folders of the data directory that are not data sets."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CheckedScan:
+    """A scan that may run, as it was checked when it was submitted.
+
+    Attributes:
+        record: of the scan.
+        name: of its data set.
+        resume: whether the data set exists and is continued.
+        checked: plan and warnings of the check.
+        predicted: counts of its projections.
+        warnings: for the user.
+    """
+
+    record: JobRecord
+    name: str
+    resume: bool
+    checked: Checked
+    predicted: Prediction
+    warnings: list[str]
+
+
+@dataclass(eq=False, repr=False)
+class QueueEntry:
+    """The change of `StateStore.keep` that puts a checked scan into the queue: its three
+    steps, in the order in which they are called.
+
+    Attributes:
+        submissions: whose queue, files and folder are meant.
+        scan: as it was checked.
+        ensure_allowed: raises if the requester has lost control.
+        continued: ended job that goes on; None for a new one.
+        draft: the job; None before `counted`.
+    """
+
+    submissions: Submissions
+    scan: CheckedScan
+    ensure_allowed: Callable[[], None]
+    continued: Job | None
+    draft: Job | None = None
+
+    def counted(self, memory: Memory) -> Memory:
+        """Draft the job, and return the state's document with its number counted."""
+        # Here, because no other job is numbered while the store writes this one.
+        own = self.submissions
+        scan = self.scan
+        self.draft = own.jobs.draft(
+            scan.name,
+            str(own.root.path / scan.name),
+            scan.checked.plan,
+            partial(own.prepare, scan),
+            scan.record.speed_up,
+            scan.warnings,
+            self.continued,
+            scan.record.begin.sample,
+        )
+        made = max(memory.jobs_made, number_of(self.draft.id))
+        return memory.model_copy(update={"jobs_made": made})
+
+    def put(self, changes: Changes) -> None:
+        """Add the records of scan and job to the change."""
+        assert self.draft is not None
+        self.scan.record.keep(changes, self.submissions.root, self.scan.name)
+        self.submissions.job_files.put(changes, self.draft.memory())
+
+    def take(self) -> Job:
+        """Put the drafted job into the queue and return it.
+
+        Raises:
+            RpcError: the requester has lost control, or a job writes the data set of that
+                name.
+        """
+        assert self.draft is not None
+        self.ensure_allowed()
+        # Another job may have begun with the name while the records were written.
+        if self.submissions.jobs.uses(self.draft.folder):
+            raise name_conflict(self.scan.name, "a job is writing it")
+        return self.submissions.jobs.enqueue(self.draft)
 
 
 @dataclass(eq=False, repr=False)
@@ -180,18 +265,10 @@ class Submissions:
         else:
             chosen = self._free_name()
         job_record = JobRecord(source, begin, speed_up, operator)
-        plan, prepare, warnings = await self._check_and_prepare(
+        scan = await self._checked(
             job_record, chosen, resumed is not None, ensure_allowed
         )
-        folder = str(self.root.path / chosen)
-        return await self._enqueue(
-            job_record,
-            chosen,
-            ensure_allowed,
-            lambda: self.jobs.draft(
-                chosen, folder, plan, prepare, speed_up, warnings, sample=begin.sample
-            ),
-        )
+        return await self._enqueue(scan, ensure_allowed)
 
     async def again(
         self, job: Job, ensure_allowed: Callable[[], None] = lambda: None
@@ -224,31 +301,14 @@ class Submissions:
             begin = self._resumable(name, job_record.source)
             assert begin is not None
             job_record = replace(job_record, begin=begin)
-        plan, prepare, warnings = await self._check_and_prepare(
-            job_record, name, begun, ensure_allowed
-        )
-        await self._enqueue(
-            job_record,
-            name,
-            ensure_allowed,
-            lambda: self.jobs.draft(
-                name,
-                job.folder,
-                plan,
-                prepare,
-                job_record.speed_up,
-                warnings,
-                job,
-                job_record.begin.sample,
-            ),
-        )
+        scan = await self._checked(job_record, name, begun, ensure_allowed)
+        await self._enqueue(scan, ensure_allowed, job)
 
     async def _enqueue(
         self,
-        job_record: JobRecord,
-        name: str,
+        scan: CheckedScan,
         ensure_allowed: Callable[[], None],
-        make: Callable[[], Job],
+        continued: Job | None = None,
     ) -> Job:
         """Write the scan's and the job's records as one change, then put the job into the
         queue.
@@ -256,53 +316,26 @@ class Submissions:
         If the requester has lost control by then, nothing is queued.
 
         Args:
-            job_record: record of the scan.
-            name: of the data set.
+            scan: as it was checked.
             ensure_allowed: raises if the requester has lost control.
-            make: drafts the job.
+            continued: ended job that goes on; None for a new one.
 
         Raises:
             DatasetWriteError: the records cannot be written; nothing is queued.
             RpcError: -32602, another job has taken the name; -32003, too many jobs wait,
                 or control is lost.
         """
-        drafts: list[Job] = []
+        entry = QueueEntry(self, scan, ensure_allowed, continued)
+        return await self.state_store.keep(entry.take, entry.counted, entry.put)
 
-        def after(memory: Memory) -> Memory:
-            """Draft the job, and return the state's document with its number counted."""
-            drafts.append(make())
-            made = max(memory.jobs_made, number_of(drafts[0].id))
-            return memory.model_copy(update={"jobs_made": made})
-
-        def files(changes: Changes) -> None:
-            """Add the records of scan and job to the change."""
-            job_record.keep(changes, self.root, name)
-            self.job_files.put(changes, drafts[0].memory())
-
-        def take() -> Job:
-            """Put the drafted job into the queue and return it.
-
-            Raises:
-                RpcError: the requester has lost control, or a job writes the data set of
-                    that name.
-            """
-            ensure_allowed()
-            [draft] = drafts
-            if self.jobs.uses(draft.folder):
-                raise name_conflict(name, "a job is writing it")
-            return self.jobs.enqueue(draft)
-
-        return await self.state_store.keep(take, after, files)
-
-    async def _check_and_prepare(
+    async def _checked(
         self,
         job_record: JobRecord,
         name: str,
         resume: bool,
         ensure_allowed: Callable[[], None],
-    ) -> tuple[ScanPlan, Prepare, list[str]]:
-        """Check a scan completely (text, plan, collisions, disk, memory, counts) and
-        prepare its start.
+    ) -> CheckedScan:
+        """Check a scan completely: text, plan, collisions, disk, memory, counts.
 
         Warnings are those of the check and of the predicted counts. For a resumed scan
         the first ones say how many images exist, and whether another sample is on the
@@ -313,10 +346,6 @@ class Submissions:
             name: of the data set.
             resume: whether the data set exists and is continued.
             ensure_allowed: raises if the requester has lost control.
-
-        Returns:
-            The plan, a function that checks again and makes the job's inputs at its turn,
-            and warnings.
 
         Raises:
             RpcError: as `submit`.
@@ -331,58 +360,61 @@ class Submissions:
         predicted = await predict_counts(self.radiography, begin, checked.plan)
         warnings = [*checked.warnings, *(p.where_and_what for p in predicted.problems)]
         if resume:
-            there = sum(n.endswith(".tif") for n in self.root.folder(name).names())
-            warnings.insert(
-                0, f"taking up the data set {name}, of which {there} images exist"
-            )
-            shown = job_record.begin.sample
-            stands = self.scanner.sample
-            if shown != stands:
-                a, b = shown.name or "nothing", stands.name or "nothing"
-                warnings.insert(
-                    1, f"its images go on showing {a}, although {b} is on the stage"
-                )
+            warnings = [*self._warnings_of_resuming(name, begin.sample), *warnings]
         ensure_allowed()
+        return CheckedScan(job_record, name, resume, checked, predicted, warnings)
 
-        async def prepare() -> JobInputs:
-            """Check the scan again at its turn, open its data set, and return the inputs
-            of the job.
+    def _warnings_of_resuming(self, name: str, shown: Sample) -> Iterator[str]:
+        """Yield how many images of a data set exist, and whether they show another sample
+        than the one on the stage.
+        """
+        there = sum(n.endswith(".tif") for n in self.root.folder(name).names())
+        yield f"taking up the data set {name}, of which {there} images exist"
+        stands = self.scanner.sample
+        if shown != stands:
+            a, b = shown.name or "nothing", stands.name or "nothing"
+            yield f"its images go on showing {a}, although {b} is on the stage"
 
-            A scan that is not resumed begins from the motors and the sample of now.
-            Counts are predicted again only if plan or sample have changed.
+    async def prepare(self, scan: CheckedScan) -> JobInputs:
+        """Check the scan again at its turn, open its data set, and return the inputs of
+        the job.
 
-            Raises:
-                RpcError: it may not run any more.
-                DatasetWriteError: the data set cannot be opened.
-            """
-            begun = job_record
-            if (
-                not resume
-            ):  # others may have moved since, and put something else on the stage
-                begin = replace(
-                    job_record.begin, start=self.start(), sample=self.scanner.sample
-                )
-                begun = replace(job_record, begin=begin)
-                self.jobs.shows(begin.sample)
-            # The sample's file and the correction may be others by now; then it is checked
-            # again.
-            final = await self.checks.runnable(
-                await self._check_input(
-                    begun.source, begun.begin.start, begun.begin.sample
-                )
-            )
-            self._ensure_same(begun.begin)
-            shows = begun.begin.revision or self.stage.revision(begun.begin.sample)
-            begun = replace(begun, begin=replace(begun.begin, revision=shows))
-            same = final is checked and begun.begin.sample == job_record.begin.sample
-            counts = predicted
-            if not same:
-                counts = await predict_counts(self.radiography, begun.begin, final.plan)
-            return await asyncio.to_thread(
-                self._open_dataset, begun, final.plan, name, resume, counts.exposures
-            )
+        A scan that is not resumed begins from the motors and the sample of now. Counts
+        are predicted again only if plan or sample have changed.
 
-        return checked.plan, prepare, warnings
+        Args:
+            scan: as it was checked at its submission.
+
+        Raises:
+            RpcError: it may not run any more.
+            DatasetWriteError: the data set cannot be opened.
+        """
+        begun = scan.record
+        if not scan.resume:
+            # Others may have moved since, and put something else on the stage.
+            begin = replace(begun.begin, start=self.start(), sample=self.scanner.sample)
+            begun = replace(begun, begin=begin)
+            self.jobs.shows(begin.sample)
+        # The sample's file and the correction may be others by now; then it is checked
+        # again.
+        final = await self.checks.runnable(
+            await self._check_input(begun.source, begun.begin.start, begun.begin.sample)
+        )
+        self._ensure_same(begun.begin)
+        shows = begun.begin.revision or self.stage.revision(begun.begin.sample)
+        begun = replace(begun, begin=replace(begun.begin, revision=shows))
+        same = final is scan.checked and begun.begin.sample == scan.record.begin.sample
+        counts = scan.predicted
+        if not same:
+            counts = await predict_counts(self.radiography, begun.begin, final.plan)
+        return await asyncio.to_thread(
+            self._open_dataset,
+            begun,
+            final.plan,
+            scan.name,
+            scan.resume,
+            counts.exposures,
+        )
 
     async def _check_input(
         self, source: ScanSource, start: StartState, shown: Sample
@@ -398,34 +430,28 @@ class Submissions:
             shown: sample through which the beam passes, of which the size is taken.
         """
         scanner = self.scanner
-        stage = self.stage
-        stands = self.scanner.sample
         parameters = scanner.parameters
+        physics = self.radiography.physics
+        size, pieces = await asyncio.to_thread(self._shapes, shown, scanner.sample)
+        return CheckInput(
+            source,
+            scanner.machine,
+            scanner.profile,
+            start,
+            size,
+            pieces,
+            parameters,
+            physics,
+        )
 
-        def work() -> CheckInput:
-            """Compute the sample's shapes and put the check's input together, in a thread.
-
-            Convex pieces only for a machine with components to collide with.
-            """
-            if scanner.machine.components:
-                pieces = stage.pieces(stands)
-            else:
-                pieces = ()
-            size = stage.size(shown)
-            machine = scanner.machine
-            profile = scanner.profile
-            return CheckInput(
-                source,
-                machine,
-                profile,
-                start,
-                size,
-                pieces,
-                parameters,
-                self.radiography.physics,
-            )
-
-        return await asyncio.to_thread(work)
+    def _shapes(
+        self, shown: Sample, stands: Sample
+    ) -> tuple[SampleSize | None, tuple[Polytope, ...]]:
+        """Compute the size of the sample that is shown, and the convex pieces of the one
+        that stands there; none for a machine without components to collide with.
+        """
+        pieces = self.stage.pieces(stands) if self.scanner.machine.components else ()
+        return self.stage.size(shown), pieces
 
     def start(self) -> StartState:
         """Return the start of a plan: motors at rest at their targets, present rates and
