@@ -12,8 +12,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Coroutine, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final
 
 from flexdt.protocol import Code, RpcError
@@ -53,6 +54,52 @@ class _Member:
     rests_until: float = 0.0
     kind: tuple[str, str] | None = None
     views: int = 0
+
+
+@dataclass(eq=False)
+class _Asked:
+    """Whom one request has been sent to.
+
+    Attributes:
+        deadline: end of the patience, on the loop's clock.
+        late: time at which another projector is asked as well.
+        running: requests under way -> their projectors.
+        members: projectors asked since none ran.
+        refused: projectors that answered with an error.
+    """
+
+    deadline: float
+    late: float = 0.0
+    running: dict[asyncio.Future[Any], _Member] = field(default_factory=dict)
+    members: set[_Member] = field(default_factory=set)
+    refused: set[_Member] = field(default_factory=set)
+
+    def answers(self, task: asyncio.Future[Any], now: float, size: int) -> bool:
+        """Take out a request that has ended, and return whether it has the answer.
+
+        Args:
+            task: of `running`, done.
+            now: on the loop's clock.
+            size: number of projectors.
+
+        Raises:
+            ProjectorUnavailable, RpcError: its failure, where no other projector can
+                answer in its place.
+        """
+        member = self.running.pop(task)
+        try:
+            task.result()
+        except ProjectorUnavailable:
+            if not self.running and now >= self.deadline:
+                raise
+            return False
+        except RpcError as error:
+            self.refused.add(member)
+            # The request itself is wrong, and so it is for all.
+            if error.code == Code.INVALID_PARAMS or len(self.refused) == size:
+                raise
+            return False
+        return True
 
 
 class ProjectorPool:
@@ -175,56 +222,66 @@ class ProjectorPool:
                 has refused.
         """
         loop = asyncio.get_running_loop()
-        value = self._values.get(name)
-        deadline = loop.time() + self.patience_s
-        late = 0.0
-        running: dict[asyncio.Future[Any], _Member] = {}
-        members: set[_Member] = set()
-        refused: set[_Member] = set()
+        ask = partial(
+            self._ask, name=name, value=self._values.get(name), views=views, shape=shape
+        )
+        asked = _Asked(loop.time() + self.patience_s)
         try:
             while True:
                 now = loop.time()
+                # All that wait share one future; a done one has woken those of before.
                 if self._turn is None or self._turn.done():
                     self._turn = loop.create_future()
-                wanted = not running or now >= late
-                member = None
-                if wanted:
-                    member = self._free_member(members | refused, now)
-                if member is not None:
-                    members.add(member)
-                    asking = self._ask(member, name, value, views, shape)
-                    running[self._start_request(member, asking)] = member
-                    late = (
-                        now
-                        + LATE_S
-                        + LATE_FACTOR * (member.pace_s or 0.0) * len(views or ())
-                    )
-                wakes = [m.rests_until for m in self._members if m.rests_until > now]
-                wakes += [late] if late > now else []
+                self._ask_another(asked, ask, len(views or ()), now)
                 done, _ = await asyncio.wait(
-                    {*running, self._turn},
-                    timeout=min(wakes) - now if wakes else None,
+                    {*asked.running, self._turn},
+                    timeout=self._until_wake(asked.late, now),
                     return_when=asyncio.FIRST_COMPLETED,
                 )
-                for task in running.keys() & done:
-                    member = running.pop(task)
-                    try:
+                for task in asked.running.keys() & done:
+                    if asked.answers(task, loop.time(), len(self)):
+                        asked.running.clear()  # late requests keep their place until answered
                         images: Float32Array | None = task.result()
-                    except ProjectorUnavailable:
-                        if not running and loop.time() >= deadline:
-                            raise
-                    except RpcError as error:
-                        refused.add(member)
-                        if error.code == Code.INVALID_PARAMS or len(refused) == len(self):
-                            raise
-                    else:
-                        running.clear()  # late requests keep their place until they are answered
                         return images
-                if not running:
-                    members.clear()
+                if not asked.running:
+                    asked.members.clear()
         finally:
-            for task in running:
+            for task in asked.running:
                 task.cancel()
+
+    def _ask_another(
+        self,
+        asked: _Asked,
+        ask: Callable[[_Member], Coroutine[Any, Any, Float32Array | None]],
+        views: int,
+        now: float,
+    ) -> None:
+        """Ask a free projector if none is asked, or if the one asked last is late; nothing
+        happens while all others are busy.
+
+        Args:
+            asked: whom the request has been sent to; changed.
+            ask: sends it.
+            views: how many it asks for.
+            now: on the loop's clock.
+        """
+        if asked.running and now < asked.late:
+            return
+        member = self._free_member(asked.members | asked.refused, now)
+        if member is None:
+            return
+        asked.members.add(member)
+        asked.running[self._start_request(member, ask(member))] = member
+        asked.late = now + LATE_S + LATE_FACTOR * (member.pace_s or 0.0) * views
+
+    def _until_wake(self, late: float, now: float) -> float | None:
+        """Return the time until a request is late or a projector has rested [s]; None if
+        neither is to come.
+        """
+        wakes = [m.rests_until for m in self._members if m.rests_until > now]
+        if late > now:
+            wakes.append(late)
+        return min(wakes) - now if wakes else None
 
     def _free_member(self, asked: set[_Member], now: float) -> _Member | None:
         """Choose the next projector: of the free ones that with least to do, then the
