@@ -11,7 +11,7 @@ import math
 import os
 import stat
 import time
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -446,6 +446,36 @@ def _list(
         The rows, the number that match, that of unread ones, and `left_out`: folders
         beyond `MAX_SETS` or with a bad name.
     """
+    folders, left_out = _folders(root)
+    words = asked.search.lower().split()
+    until = time.monotonic() + LIST_S
+    found = []
+    unread = 0
+    for modified, name in folders:
+        info, late = _row_until(until, root, name, modified)
+        if info is None:
+            continue
+        info = _as_it_runs(info, context)
+        if _matches(info, words):
+            unread += late
+            found.append(info)
+    shown = found[asked.start : asked.start + asked.count]
+    if asked.thumbnail:
+        shown = [
+            _with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown
+        ]
+    return p.DatasetListResult(
+        datasets=shown, total=len(found), unread=unread, left_out=left_out
+    )
+
+
+def _folders(root: Directory) -> tuple[list[tuple[float, str]], int]:
+    """List the `MAX_SETS` newest folders of the data directory that are not hidden.
+
+    Returns:
+        Time of modification [s] and name of each, newest first, and the number of folders
+        beyond these or with a bad name.
+    """
     folders = []
     left_out = 0
     with root.entries() as entries:
@@ -461,44 +491,48 @@ def _list(
             except OSError:  # it has gone meanwhile
                 continue
     folders.sort(reverse=True)
-    left_out += len(folders[MAX_SETS:])
-    words = asked.search.lower().split()
-    until = time.monotonic() + LIST_S
-    found = []
-    unread = 0
-    for modified, name in folders[:MAX_SETS]:
-        try:
-            path, key = _place(root, name)
-            late = key not in _INFOS and time.monotonic() > until
-            info = None if late else _INFOS.get(key, lambda: _list_row(path, modified))  # noqa: B023
-        except ds.DatasetError:
-            continue  # it has gone meanwhile, or is no data set
-        if info is None:
-            info = p.DatasetInfo(name=name, modified=modified, problem="not read yet")
-        elif info == "":
-            continue
-        info = _as_it_runs(info, context)
-        texts = (
-            info.name,
-            info.state,
-            info.sample,
-            info.operator,
-            info.machine,
-            info.mode,
-            info.started,
-            f"{info.kV or 0:g}kV {info.exposure_ms or 0:g}ms {info.power_W or 0:g}W",
-        )
-        if all(any(word in str(text).lower() for text in texts) for word in words):
-            unread += late
-            found.append(info)
-    shown = found[asked.start : asked.start + asked.count]
-    if asked.thumbnail:
-        shown = [
-            _with_thumbnail(root, info, asked.thumbnail, until + LIST_S) for info in shown
-        ]
-    return p.DatasetListResult(
-        datasets=shown, total=len(found), unread=unread, left_out=left_out
+    return folders[:MAX_SETS], left_out + len(folders[MAX_SETS:])
+
+
+def _row_until(
+    until: float, root: Directory, name: str, modified: float
+) -> tuple[p.DatasetInfo | None, bool]:
+    """Summarise the data set in a folder; one that is not in the cache is read only until
+    a time.
+
+    Args:
+        until: monotonic time [s].
+        root: data directory.
+        name: of the folder.
+        modified: its time of modification [s].
+
+    Returns:
+        The summary, None for a folder that holds no data set or has gone, and whether it
+        was too late to read it.
+    """
+    try:
+        path, key = _place(root, name)
+        if key not in _INFOS and time.monotonic() > until:
+            late = p.DatasetInfo(name=name, modified=modified, problem="not read yet")
+            return late, True
+        return _INFOS.get(key, lambda: _list_row(path, modified)) or None, False
+    except ds.DatasetError:
+        return None, False  # it has gone meanwhile, or is no data set
+
+
+def _matches(info: p.DatasetInfo, words: Sequence[str]) -> bool:
+    """Return whether each of the words, in lower case, is in a text of a summary."""
+    texts = (
+        info.name,
+        info.state,
+        info.sample,
+        info.operator,
+        info.machine,
+        info.mode,
+        info.started,
+        f"{info.kV or 0:g}kV {info.exposure_ms or 0:g}ms {info.power_W or 0:g}W",
     )
+    return all(any(word in str(text).lower() for text in texts) for word in words)
 
 
 def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
