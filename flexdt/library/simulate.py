@@ -33,7 +33,7 @@ from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.errors import GeometryError, LimitError, require_within
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.long_work import Progress
+from flexdt.twin.long_work import Advance, Progress
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics.blur import spot_blur_px
@@ -174,6 +174,13 @@ class Truth:
             yield from radiographs(
                 chain, self._paths(ConeVec(cone)), cone, exposures, moments, added
             )
+
+    def read(self, number: int, expected: Expected, lit: ExposureSettings) -> Counts:
+        """Read out an expected image as counts, with the noise of image `number` unless
+        noise is off.
+        """
+        rng = None if self.seed is None else frame_rng(self.seed, number)
+        return read_out(self.chain.panel, expected, self.camera, lit, rng)
 
     def line_integrals(self) -> Float32Array:
         """Compute -log of the noise-free signal over the open beam's, float32 (n, rows,
@@ -317,14 +324,7 @@ def simulate(
     if geometry is None:
         given = (tube, detector, machine, shape, material, voxel_mm, exposure_ms)
         other = scatter != "off" or spot_points != 1 or given != (None,) * 7
-        if not isinstance(sample, str | os.PathLike) or other:
-            raise GeometryError(
-                "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
-                {"asked": None},
-            )
-        scenario = extension("scenario", "a CTSimU scenario")
-        made: DataSet = scenario(sample, noise, 3 if rays is None else rays)
-        return made
+        return _of_scenario(sample, noise, 3 if rays is None else rays, alone=not other)
     rays = 1 if rays is None else rays
     _check_sampling(noise, rays, spot_points)
     cone = as_cone_vec(geometry)
@@ -347,20 +347,12 @@ def simulate(
         placed = settled(findings, GeometryError)
         parts = channels(phantom)
         chain = chain_through(parts, panel, design, settings.mono_keV)
-        nothing = np.zeros(size, np.float32)
-        open_paths = np.zeros((len(parts), *size), np.float32)
         if exposure_ms is not None:
             require_within("exposure_ms", exposure_ms, *EXPOSURES_MS, "ms")
             camera = replace(camera, exposure_ms=float(exposure_ms))
         elif detector is not None and detector.exposure_ms is None:
             unit = settings.exposure(1.0)
-            brightest = max(
-                _different(cone), key=lambda row: float(flux_of(row, size).max())
-            )
-            beam = expected_signal(chain, open_paths, brightest, unit).mean_e
-            camera = replace(
-                camera, exposure_ms=_chosen_ms(panel, camera, float(beam.max()))
-            )
+            camera = replace(camera, exposure_ms=_chosen_ms(chain, camera, cone, unit))
         exposure = settings.exposure(camera.exposure_ms, camera.averages)
         scattered = None
         if scatter != "off":
@@ -383,26 +375,7 @@ def simulate(
             rays,
             spot_points,
         )
-
-        def read(
-            number: int, expected: Expected, lit: ExposureSettings = exposure
-        ) -> Counts:
-            """Read out an expected image as counts, with the noise of frame `number`
-            unless noise is off (None).
-            """
-            if noise is None:
-                rng = None
-            else:
-                rng = frame_rng(noise, number)
-            return read_out(panel, expected, camera, lit, rng)
-
-        dark = read(0, Expected(nothing, nothing), replace(exposure, xrays_on=False))
-        flat = read(1, expected_signal(chain, open_paths, cone.rows[0], exposure))
-        counts = np.empty((len(cone), *size), np.uint16)
-        for i, image in enumerate(truth.radiographs()):
-            assert image.expected is not None
-            counts[i] = read(2 + i, image.expected)
-            advance((i + 1) / len(cone))
+        counts, dark, flat = _exposed(truth, advance)
     made = DataSet.from_arrays(
         counts, cone, dark=dark, flat=flat, name=phantom.name, truth=truth
     )
@@ -411,6 +384,54 @@ def simulate(
     for doubt in doubts:
         warn_caller(doubt)
     return replace(made, warnings=(*truth.assumed, *doubts))
+
+
+def _of_scenario(sample: object, noise: int | None, rays: int, *, alone: bool) -> DataSet:
+    """Simulate a CTSimU scenario, which `flexdt-extensions` does.
+
+    Args:
+        sample: path of the scenario.
+        noise: seed; None for none.
+        rays: along each side of a pixel.
+        alone: whether nothing else was given, which the scenario states.
+
+    Raises:
+        GeometryError: it is no path, or not alone.
+    """
+    if not isinstance(sample, str | os.PathLike) or not alone:
+        raise GeometryError(
+            "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
+            {"asked": None},
+        )
+    scenario = extension("scenario", "a CTSimU scenario")
+    made: DataSet = scenario(sample, noise, rays)
+    return made
+
+
+def _exposed(truth: Truth, advance: Advance) -> tuple[Counts, Counts, Counts]:
+    """Expose all views, then return their counts (n, rows, cols), and the dark and the
+    flat image (rows, cols), uint16.
+
+    The flat image is that of the first view's geometry.
+
+    Args:
+        truth: what is simulated.
+        advance: takes the fraction done.
+    """
+    lit = truth.exposure
+    size = truth.camera.shape
+    nothing = np.zeros(size, np.float32)
+    open_paths = np.zeros((len(truth.parts), *size), np.float32)
+    open_beam = expected_signal(truth.chain, open_paths, truth.geometry.rows[0], lit)
+    unlit = replace(lit, xrays_on=False)
+    dark = truth.read(0, Expected(nothing, nothing), unlit)
+    flat = truth.read(1, open_beam, lit)
+    counts = np.empty((len(truth.geometry), *size), np.uint16)
+    for i, image in enumerate(truth.radiographs()):
+        assert image.expected is not None
+        counts[i] = truth.read(2 + i, image.expected, lit)
+        advance((i + 1) / len(counts))
+    return counts, dark, flat
 
 
 def _check_sampling(noise: int | None, rays: int, spot_points: int) -> None:
@@ -444,13 +465,26 @@ def _attenuation(body: Volume | Phantom) -> npt.NDArray[Any] | None:
     return voxels.data
 
 
-def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) -> float:
-    """Compute the exposure that fills `FILLED_SHARE` of the panel's range with the open
-    beam, dark charge and offset included [ms]; within `EXPOSURES_MS`.
+def _chosen_ms(
+    chain: Chain, camera: CameraSettings, cone: ConeVec, unit: ExposureSettings
+) -> float:
+    """Compute the exposure that fills `FILLED_SHARE` of the panel's range with the
+    brightest open beam, dark charge and offset included [ms]; within `EXPOSURES_MS`.
+
+    Args:
+        chain: tube and panel.
+        camera: mode and region of interest.
+        cone: the views.
+        unit: an exposure of 1 ms.
 
     Raises:
         LimitError: the panel's offset is more than half of its full scale.
     """
+    panel = chain.panel
+    size = camera.shape
+    open_paths = np.zeros((len(chain.substances), *size), np.float32)
+    brightest = max(_different(cone), key=lambda row: float(flux_of(row, size).max()))
+    beam = expected_signal(chain, open_paths, brightest, unit).mean_e
     # A panel that is half full in the dark has little range left: say so, not an odd exposure.
     require_within(
         "offset_counts", panel.offset_counts, 0.0, 0.5 * panel.full_scale, "counts"
@@ -458,7 +492,7 @@ def _chosen_ms(panel: Detector, camera: CameraSettings, beam_e_per_ms: float) ->
     dark_e_per_ms = panel.dark_charge(camera) / 1000.0
     range_e = (FILLED_SHARE * panel.full_scale - panel.offset_counts) * panel.gain(camera)
     low, high = EXPOSURES_MS
-    return min(max(range_e / (beam_e_per_ms + dark_e_per_ms), low), high)
+    return min(max(range_e / (float(beam.max()) + dark_e_per_ms), low), high)
 
 
 def _pitch(cone: ConeVec) -> tuple[float, float]:

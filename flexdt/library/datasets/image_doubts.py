@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.library.datasets.image_set import Counts, ImageSet, flats_of
 from flexdt.runtime.files.dataset_folder import read_image
@@ -102,56 +104,16 @@ def image_doubts(
     dark = scan.dark
     alive = flat > dark
     unlit = 1.0 - float(alive.mean())
-    wanted = scan.present
     if scan.interpolated is not None and (alive & ~scan.interpolated).any():
         alive &= ~scan.interpolated
-    in_files = scan.arrays is None or scan.arrays.counts is None
-    look = scan.counts if counts is None or not in_files else counts
-    if in_files:
-        some = np.linspace(0, len(wanted) - 1, MAX_FROM_DISK).astype(int)
-        wanted = tuple(wanted[i] for i in np.unique(some))
-    doubts: list[str] = [] if alive.any() else [DARK]
     held = bool(alive.any())
+    doubts = [DARK]
     if held:
-        top: float | None = scan.full_scale
-        if top is None:
-            top = float(max(flat.max(), max(int(look(i).max()) for i in wanted)))
-            if not np.log2(top + 1.0).is_integer():
-                top = np.inf
-        few = dark[alive] + FEW_COUNTS
-        opened = np.where(alive, flat - dark, np.nan)
-        beam: list[float | None] = []
-        each: list[tuple[float, float]] = []
-        for i in wanted:
-            image = look(i)
-            seen = image[alive]
-            each.append(((seen >= top).mean(), (seen < few).mean()))
-            beam.append(open_beam(image, dark, opened))
-        saturated, starved = np.mean(each, axis=0)
-        shares = {
-            RADIOGRAPHS: float(saturated),
-            FLAT_IMAGE: float((flat[alive] >= top).mean()),
-        }
-        held = min(shares.values()) <= 1.0 - WARNING_SHARE
-        doubts = [
-            saturated_part(kind, share)
-            for kind, share in shares.items()
-            if share >= WARNING_SHARE
-        ]
-        if unlit >= WARNING_SHARE:
-            doubts.append(
-                f"{100.0 * unlit:.3g} % of the pixels are {UNLIT}: their line integrals are "
-                "interpolated from their neighbours'"
-            )
-        if starved >= WARNING_SHARE:
-            doubts.append(
-                f"{100.0 * starved:.3g} % of the pixels of the radiographs are starved (fewer "
-                f"than {FEW_COUNTS:g} counts of signal), where attenuation is mostly "
-                "noise: raise "
-                "the tube's power, its voltage or the exposure"
-            )
+        shares = _shares(scan, alive, counts)
+        held = min(shares.saturated.values()) <= 1.0 - WARNING_SHARE
+        doubts = [*_sentences(shares, unlit)]
         if held:
-            compared = *flat_findings(flats_of(scan), dark), *beam_findings(beam)
+            compared = *flat_findings(flats_of(scan), dark), *beam_findings(shares.beam)
             doubts += settled(compared, DatasetFormatError)
     if needed and not held:
         raise DatasetFormatError(
@@ -159,3 +121,84 @@ def image_doubts(
             {"path": scan.where},
         )
     return doubts
+
+
+@dataclass(frozen=True)
+class _Shares:
+    """Parts of the pixels of a scan's images that are out of range.
+
+    Attributes:
+        saturated: kind of image -> part of its pixels.
+        starved: part of the radiographs' pixels.
+        beam: open beam of each radiograph, as `open_beam` tells it.
+    """
+
+    saturated: Mapping[str, float]
+    starved: float
+    beam: list[float | None]
+
+
+def _shares(
+    scan: ImageSet,
+    alive: npt.NDArray[np.bool_],
+    counts: Callable[[int], Counts] | None,
+) -> _Shares:
+    """Measure saturated and starved pixels of radiographs and flat image, and the open
+    beam of each radiograph.
+
+    Args:
+        scan: the data set.
+        alive: pixels to measure, at least one.
+        counts: gives those of a frame in a file; None reads them.
+    """
+    flat = scan.flat
+    dark = scan.dark
+    wanted = scan.present
+    in_files = scan.arrays is None or scan.arrays.counts is None
+    look = scan.counts if counts is None or not in_files else counts
+    if in_files:
+        some = np.linspace(0, len(wanted) - 1, MAX_FROM_DISK).astype(int)
+        wanted = tuple(wanted[i] for i in np.unique(some))
+    top: float | None = scan.full_scale
+    if top is None:
+        top = float(max(flat.max(), max(int(look(i).max()) for i in wanted)))
+        if not np.log2(top + 1.0).is_integer():
+            top = np.inf
+    few = dark[alive] + FEW_COUNTS
+    opened = np.where(alive, flat - dark, np.nan)
+    beam: list[float | None] = []
+    each: list[tuple[float, float]] = []
+    for i in wanted:
+        image = look(i)
+        seen = image[alive]
+        each.append(((seen >= top).mean(), (seen < few).mean()))
+        beam.append(open_beam(image, dark, opened))
+    saturated, starved = np.mean(each, axis=0)
+    in_flat = float((flat[alive] >= top).mean())
+    return _Shares(
+        {RADIOGRAPHS: float(saturated), FLAT_IMAGE: in_flat}, float(starved), beam
+    )
+
+
+def _sentences(shares: _Shares, unlit: float) -> Iterator[str]:
+    """Yield a sentence for each share that reaches `WARNING_SHARE`: saturated, unlit and
+    starved pixels, in this order.
+
+    Args:
+        shares: of the images.
+        unlit: part of the pixels that has no open beam.
+    """
+    for kind, share in shares.saturated.items():
+        if share >= WARNING_SHARE:
+            yield saturated_part(kind, share)
+    if unlit >= WARNING_SHARE:
+        yield (
+            f"{100.0 * unlit:.3g} % of the pixels are {UNLIT}: their line integrals are "
+            "interpolated from their neighbours'"
+        )
+    if shares.starved >= WARNING_SHARE:
+        yield (
+            f"{100.0 * shares.starved:.3g} % of the pixels of the radiographs are starved "
+            f"(fewer than {FEW_COUNTS:g} counts of signal), where attenuation is mostly "
+            "noise: raise the tube's power, its voltage or the exposure"
+        )

@@ -118,10 +118,7 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
 def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     """List the names of the projections by their numbers, missing ones included.
 
-    Fewer names than views are completed by names like that of the lowest number, from 1,
-    0 or that number on: the first start from which the numbers that are there are in the
-    range. Without such a start, or where a name does not end in a number of its own, they
-    are returned as found. Names of another form are left out with a doubt.
+    Names of another form are left out with a doubt.
 
     Args:
         folder: of the images.
@@ -145,18 +142,33 @@ def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
             f"{', '.join(found.others)} are no projections by their names: left out"
         )
     names = [name for name in found.names if name not in found.others]
+    return _completed(names, views), told
+
+
+def _completed(names: list[str], views: int) -> list[str]:
+    """Complete fewer names than views by names like that of the lowest number, from 1, 0
+    or that number on: the first start from which the numbers that are there are in the
+    range.
+
+    Without such a start, or where a name does not end in a number of its own, the names
+    are returned as they are.
+
+    Args:
+        names: of the images that are there.
+        views: that the file states.
+    """
     parts = [PROJECTION.fullmatch(name) for name in names]
     numbers = {int(part[2]): part for part in parts if part is not None}
     if len(numbers) < len(names) or len(names) >= views or not names:
-        return names, told
+        return names
     first = min(numbers)
     last = max(numbers)
     start = next((at for at in (1, 0, first) if at <= first and last < at + views), None)
     if start is None:
-        return names, told
+        return names
     before, digits, after = numbers[first].groups()
     width = len(digits) if digits.startswith("0") else 1
-    return [f"{before}{n:0{width}d}{after}" for n in range(start, start + views)], told
+    return [f"{before}{n:0{width}d}{after}" for n in range(start, start + views)]
 
 
 def _stated(text: str) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -253,17 +253,9 @@ def _geometry(
         DatasetFormatError: the file states too little (lists the missing quantities), in
             an unknown unit, or distances are such as no scanner has.
     """
-    entry = file[name.split("/")[0]]
-    rows = next(
-        (
-            g
-            for g in (_member(file, "cone_vec"), _member(entry, "flexdt/cone_vec"))
-            if g is not None
-        ),
-        None,
-    )
+    rows = _cone_rows(file, file[name.split("/")[0]])
     if rows is not None:
-        return ConeVec(rows[:]), []
+        return ConeVec(rows), []
     angles = _angles(file, name, projections)
     lengths = {
         what: _length(file, name, *places)
@@ -276,19 +268,11 @@ def _geometry(
         impossible = distance_findings(sod, sdd, lengths["x_pixel_size"] or 1e-9 * sdd)
         settled(impossible, DatasetFormatError, f"{path}: distances={distances}")
         lengths |= {"source distance": sod, "detector distance": sdd - sod}
-    pixel = lengths["x_pixel_size"]
     if angles is None:
         missing.insert(0, "rotation_angle")
+    pixel = lengths["x_pixel_size"]
     if missing or angles is None or pixel is None:
-        way = "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"
-        if {*missing} <= {"source distance", "detector distance"}:
-            way = (
-                "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
-            )
-        raise DatasetFormatError(
-            f"{path}: the file has no cone_vec and no {', '.join(missing)}; give {way}",
-            {"missing": missing},
-        )
+        raise _too_little(path, missing)
     sod, beyond = (
         abs(lengths[what] or 0.0) for what in ("source distance", "detector distance")
     )
@@ -306,6 +290,30 @@ def _geometry(
         "column; `align` "
         "or `calibrate` finds them"
     ]
+
+
+def _cone_rows(file: Any, entry: Any) -> npt.NDArray[Any] | None:
+    """Read the rows of the cone_vec (n, 12) at the file's root, or else in the entry's
+    `flexdt`; None without either.
+    """
+    for group, place in ((file, "cone_vec"), (entry, "flexdt/cone_vec")):
+        found = _member(group, place)
+        if found is not None:
+            return np.asarray(found[:])
+    return None
+
+
+def _too_little(path: Path, missing: Sequence[str]) -> DatasetFormatError:
+    """Make the error for quantities that a geometry needs and the file lacks; it names the
+    argument that gives them.
+    """
+    way = "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"
+    if {*missing} <= {"source distance", "detector distance"}:
+        way = "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
+    return DatasetFormatError(
+        f"{path}: the file has no cone_vec and no {', '.join(missing)}; give {way}",
+        {"missing": missing},
+    )
 
 
 LENGTHS: Final[Mapping[str, tuple[str, ...]]] = {
