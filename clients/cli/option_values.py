@@ -8,12 +8,20 @@ knows the names of the axes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TypeVar
 
 import typer
 
 from flexdt.library.failure import CommandError
+
+T = TypeVar("T")
+
+
+def if_given(word: str | None, read: Callable[[str], T]) -> T | None:
+    """Read the word of an option; None for one that was left out. Raises as `read`."""
+    return None if word is None else read(word)
 
 
 def number(word: str, what: str) -> float:

@@ -7,7 +7,7 @@ and choose the exit code.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -94,6 +94,7 @@ def calibrate(
     """
     if report is not None:
         option_values.require_ending(report, ".html", ".json")
+    from flexdt.library.calibration.bead_tracks import write_tracks
     from flexdt.library.calibration.calibrate import calibrate_with
     from flexdt.library.calibration.calibration_report import write_report
     from flexdt.library.calibration.calibration_request import request_of
@@ -113,40 +114,44 @@ def calibrate(
         "scale": scale,
         "radius": radius,
     }
+    folders = datasets or []
+    geometries = geometry or []
     target = _require_phantom(phantom)
-    if per_scan and len(datasets or ()) > 1 and push:
-        raise typer.BadParameter(
-            "--push: with --per-scan there is no one geometry to push"
-        )
     if push:
+        _require_one_geometry(per_scan, folders)
         _require_answer(twin)
-    if report is not None and report.suffix.lower() != ".json":
+    as_json_file = report is not None and report.suffix.lower() == ".json"
+    if report is not None and not as_json_file:
         require_plots()
     request_of(target, options)  # refuses impossible options before images are read
-    given = _load_inputs(
-        datasets or [],
-        frames,
-        markers,
-        geometry or [],
-        geometry_options(None, shape, pixel),
-    )
+    known = geometry_options(None, shape, pixel)
+    given = _load_inputs(folders, frames, markers, geometries, known)
     typed = Typed(
-        tuple(map(str, datasets or ())),
+        tuple(map(str, folders)),
         target,
-        tuple(map(str, geometry or ())),
+        tuple(map(str, geometries)),
         option_words(options) | _words(frames=frames, shape=shape, pixel=pixel),
-        None if report is None or report.suffix.lower() != ".json" else str(report),
+        str(report) if as_json_file else None,
     )
     outcome = calibrate_with(given, target, options, typed)
-    document: dict[str, Any] = outcome.document
     if report is not None:
         write_report(outcome, report)
     if tracks is not None:
-        from flexdt.library.calibration.bead_tracks import write_tracks
-
         write_tracks(outcome, tracks)
+    document: dict[str, Any] = outcome.document
     yield document
     yield from show(document)
+    _report_problems(document)
+    if push:
+        _push(twin, outcome.correction, outcome.sources, document)
+
+
+def _report_problems(document: Mapping[str, Any]) -> None:
+    """Write the problems of a calibration to standard error.
+
+    Raises:
+        CommandError: it is not identifiable; names the errors' codes.
+    """
     for problem in document["problems"]:
         note(f"{problem['severity']}: {problem['text']} [{problem['code']}]")
     if not document["identifiable"]:
@@ -154,8 +159,16 @@ def calibrate(
             p["code"] for p in document["problems"] if p["severity"] == "error"
         )
         raise CommandError(f"not to be used{codes and ': '}{codes}", NOT_IDENTIFIABLE)
-    if push:
-        _push(twin, outcome.correction, outcome.sources, document)
+
+
+def _require_one_geometry(per_scan: str, folders: Collection[Path]) -> None:
+    """Check that a calibration gives one geometry; several scans with parameters of their
+    own are a usage error.
+    """
+    if per_scan and len(folders) > 1:
+        raise typer.BadParameter(
+            "--push: with --per-scan there is no one geometry to push"
+        )
 
 
 def _words(**options: object) -> dict[str, str]:

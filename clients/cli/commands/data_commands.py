@@ -7,7 +7,7 @@ The work is in `flexdt.library.reconstruction` and `flexdt.library.datasets.exch
 from __future__ import annotations
 
 import json as json_text
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,20 +113,11 @@ def reconstruct(
         reconstruct_dataset,
     )
     from flexdt.library.reconstruction.reconstruct import preview as quick_look
-    from flexdt.twin.projection.volume import Accuracy
 
-    voxels = None if shape is None else _shape(shape)
-    if scatter_correction is None:
-        scattering = None
-    else:
-        scattering = option_values.names(scatter_correction)
-    if material is None:
-        made_of = None
-    else:
-        made_of = option_values.names(material)
-    center_mm = None
-    if center is not None:
-        center_mm = option_values.triple(center, "center", "X,Y,Z, e.g. 0,0,-5.5")
+    voxels = option_values.if_given(shape, _shape)
+    scattering = option_values.if_given(scatter_correction, option_values.names)
+    made_of = option_values.if_given(material, option_values.names)
+    center_mm = option_values.if_given(center, _center)
     request = VolumeRequest(
         algorithm=algorithm or DEFAULT,
         voxel_mm=voxel,
@@ -145,11 +136,8 @@ def reconstruct(
     )
     option_values.require_folder(out)
     parameters, report = _correction(correction, twin)
-    if None not in (correction, geometry) and not (report and report.of_geometry):
-        raise typer.BadParameter(
-            f"--correction: {correction} corrects the scanner's own geometry, not one from a "
-            "file; allowed: a report of a calibration or alignment with --geometry"
-        )
+    if correction is not None and geometry is not None:
+        _require_of_geometry(correction, report)
     # Workers have working directories of their own.
     shared = scheduler is not None or slurm is not None
     data = scan_of(dataset.resolve() if shared else dataset, texts, report, geometry)
@@ -159,13 +147,7 @@ def reconstruct(
             f"{dataset}: warning: {len(data.missing)} frames are missing and are left out"
         )
     workers = _workers(scheduler, slurm)
-    direct = ALGORITHMS[request.algorithm].direct
-    if not direct:
-        unit = "iterations"
-    elif workers is None:
-        unit = "images"
-    else:
-        unit = "slabs"
+    unit = _unit_of_progress(request.algorithm, shared)
     with ProgressBar(f"{request.algorithm} of {dataset.name}", unit) as bar:
         if preview:
             document = quick_look(data, out, parameters=parameters, progress=bar.update)
@@ -181,11 +163,27 @@ def reconstruct(
             )
     warn(document["warnings"], dataset)
     yield document
+    yield from _lines_of(document, out)
+
+
+def _unit_of_progress(algorithm: str, shared: bool) -> str:
+    """Return what the progress of an algorithm counts; `shared` if workers do it."""
+    if not ALGORITHMS[algorithm].direct:
+        return "iterations"
+    return "slabs" if shared else "images"
+
+
+def _lines_of(document: Mapping[str, Any], out: Path) -> Iterator[str]:
+    """Yield the document of a volume as lines: file and size, accuracy if known, files of
+    slices.
+    """
+    from flexdt.twin.projection.volume import Accuracy
+
     z, y, x = document["shape"]
     yield (
         f"{out}: {x} x {y} x {z} voxels of {document['voxel_mm']:g} mm from "
-        f"{document['frames']} "
-        f"frames, {size(bytes_of(out))}, {duration(document['seconds'])}"
+        f"{document['frames']} frames, {size(bytes_of(out))}, "
+        f"{duration(document['seconds'])}"
     )
     if document["accuracy"] is not None:
         yield f"  {Accuracy(**document['accuracy'])}"
@@ -286,6 +284,20 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
     return report.parameters, report
 
 
+def _require_of_geometry(correction: str, report: Report | None) -> None:
+    """Check that a correction comes from a report of a scan whose geometry came from a
+    file.
+
+    Raises:
+        typer.BadParameter: there is no report, or its geometry is the scanner's own.
+    """
+    if report is None or not report.of_geometry:
+        raise typer.BadParameter(
+            f"--correction: {correction} corrects the scanner's own geometry, not one from a "
+            "file; allowed: a report of a calibration or alignment with --geometry"
+        )
+
+
 def scan_of(
     folder: Path, texts: bool, report: Report | None, geometry: Path | None = None
 ) -> DataSet:
@@ -342,6 +354,10 @@ def _workers(
     name, asked = ("slurm", slurm) if scheduler is None else ("scheduler", scheduler)
     workers: AbstractContextManager[Executor] = extension(name, f"--{name}")(asked)
     return workers
+
+
+def _center(text: str) -> tuple[float, float, float]:
+    return option_values.triple(text, "center", "X,Y,Z, e.g. 0,0,-5.5")
 
 
 def _shape(text: str) -> tuple[int, int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -10,6 +11,7 @@ import typer
 
 from flexdt.clients.cli import option_values, value_completion
 from flexdt.clients.cli.command_settings import MachineNewSettings
+from flexdt.clients.cli.option_values import if_given
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.clients.cli.settings_file import chosen
 from flexdt.library import machines
@@ -87,14 +89,8 @@ def new(
         kv,
         f"{like.tube.min_kV:g}:{like.tube.max_kV:g}",
     )
-    if kv is None:
-        volts = None
-    else:
-        volts = option_values.span(kv, "--kv")
-    if size is None:
-        pixels = None
-    else:
-        pixels = _pair(size, "--detector", whole=True)
+    volts = if_given(kv, partial(option_values.span, what="--kv"))
+    pixels = if_given(size, partial(_pair, what="--detector", whole=True))
     lines = [word.partition("=") for word in limit or []]
     answers = Answers(
         name=name,
@@ -102,10 +98,10 @@ def new(
         scanner=chosen(MachineNewSettings).scanner,
         columns=None if pixels is None else int(pixels[0]),
         rows=None if pixels is None else int(pixels[1]),
-        pitch_mm=None if pitch is None else _pair(pitch, "--pitch"),
+        pitch_mm=if_given(pitch, partial(_pair, what="--pitch")),
         bits=bits,
-        sod_mm=None if sod is None else option_values.span(sod, "--sod"),
-        sdd_mm=None if sdd is None else option_values.span(sdd, "--sdd"),
+        sod_mm=if_given(sod, partial(option_values.span, what="--sod")),
+        sdd_mm=if_given(sdd, partial(option_values.span, what="--sdd")),
         min_kV=volts[0] if volts is not None and ":" in str(kv) else None,
         max_kV=None if volts is None else volts[1],
         max_W=None if power is None else option_values.number(f"{power}", "--power"),
