@@ -407,23 +407,39 @@ class LabScene:
             near: leave out shapes that do not turn with the sample.
         """
         poses = dict(self._sent)
-        turning = {
-            "object",
-            *(part.name for part in self.machine.components if part.role in NEAR),
-        }
+        out = self._drawn_parts(poses, shown, near)
+        out += self._drawn_sample(poses, shown, near)
+        if near:
+            return out
+        if "panel" in shown:
+            out.append(image_on(np.asarray(self._image.image), world))
+        if self._lit and "beam" in shown:
+            out.append(cone(world, LIGHT, CONE_OPACITY))
+        return out
+
+    def _drawn_parts(
+        self, poses: Mapping[str, tuple[float, ...]], shown: Shown, near: bool
+    ) -> list[Shape]:
+        """Collect the shapes of the machine's parts that are shown; `near`: of those alone
+        that turn with the sample.
+        """
         drawn = [n for n in self._solids if (n if n == "cabinet" else "machine") in shown]
         if near:
+            parts = self.machine.components
+            turning = {"object", *(part.name for part in parts if part.role in NEAR)}
             drawn = [n for n in drawn if n in turning]
-        out = [shape for n in drawn for shape in placed(self._solids[n], poses[n])]
+        return [shape for n in drawn for shape in placed(self._solids[n], poses[n])]
+
+    def _drawn_sample(
+        self, poses: Mapping[str, tuple[float, ...]], shown: Shown, near: bool
+    ) -> list[Shape]:
+        """Collect the shapes of the sample, if there is one and it is shown; opaque where
+        it is `near` and nothing in it is dense.
+        """
         skins = () if self._look is None or "sample" not in shown else self._look.skins
         solid = near and not any(skin.dense for skin in skins)
         opacity = 1.0 if solid else shown.opacity
-        out += placed([shape_of(skin, opacity) for skin in skins], poses["sample"])
-        if "panel" in shown and not near:
-            out.append(image_on(np.asarray(self._image.image), world))
-        if self._lit and "beam" in shown and not near:
-            out.append(cone(world, LIGHT, CONE_OPACITY))
-        return out
+        return placed([shape_of(skin, opacity) for skin in skins], poses["sample"])
 
     # -- visible parts -----------------------------------------------------------------------
 
