@@ -236,25 +236,10 @@ def assemble(
         PhantomError: there are no parts, another number of priorities, one of several
             parts is voxels, or one cannot be cut.
     """
-    if priority and len(priority) != len(parts):
-        raise PhantomError(
-            f"{name}: {len(priority)} priorities for {len(parts)} parts",
-            {"asked": len(priority), "allowed": len(parts)},
-        )
-    if not parts:
-        raise PhantomError(
-            f"{name}: there is nothing in it", {"asked": 0, "allowed": "1 or more"}
-        )
+    _require_joinable(name, parts, priority)
     if len(parts) == 1:
         return replace(
             parts[0], name=name, description=description or parts[0].description
-        )
-    grids = [p.name for p in parts if p.voxels is not None]
-    if grids:
-        raise PhantomError(
-            f"{name}: voxels ({', '.join(grids)}) stand for a whole sample and cannot be put "
-            "together with other parts",
-            {"asked": grids, "allowed": "solids and meshes"},
         )
     scene = Scene(tuple(solid for p in parts for solid in p.scene.solids))
     surfaces = tuple(surface for p in parts for surface in p.surfaces)
@@ -272,3 +257,30 @@ def assemble(
         tuple(dict.fromkeys(line for p in parts for line in p.assumed)),
         surfaces,
     )
+
+
+def _require_joinable(
+    name: str, parts: Sequence[Phantom], priority: Sequence[float]
+) -> None:
+    """Check that phantoms can be one: that there are some, with a priority each or none,
+    and that voxels stand alone.
+
+    Raises:
+        PhantomError: they cannot.
+    """
+    if priority and len(priority) != len(parts):
+        raise PhantomError(
+            f"{name}: {len(priority)} priorities for {len(parts)} parts",
+            {"asked": len(priority), "allowed": len(parts)},
+        )
+    if not parts:
+        raise PhantomError(
+            f"{name}: there is nothing in it", {"asked": 0, "allowed": "1 or more"}
+        )
+    grids = [p.name for p in parts if p.voxels is not None]
+    if grids and len(parts) > 1:
+        raise PhantomError(
+            f"{name}: voxels ({', '.join(grids)}) stand for a whole sample and cannot be put "
+            "together with other parts",
+            {"asked": grids, "allowed": "solids and meshes"},
+        )

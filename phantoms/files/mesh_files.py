@@ -13,6 +13,7 @@ import os
 import struct
 import warnings
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -488,6 +489,25 @@ def _check_gltf(document: Any, total: int) -> None:
             raise ValueError(
                 f"it needs the extension {name[:80]!r}, which is not read here"
             )
+    _check_gltf_data(document, total)
+    nodes = document.get("nodes", [])
+    _check_gltf_places(document, nodes)
+    meshes = document.get("meshes", [])
+    drawn = [meshes[node["mesh"]]["primitives"] for node in nodes if "mesh" in node]
+    # Counted before they are listed: many nodes may draw one mesh of many parts.
+    parts = len(nodes) + sum(len(primitives) for primitives in drawn)
+    if parts > MAX_PARTS:
+        raise ValueError(f"it has {parts} nodes and parts; allowed: {MAX_PARTS}")
+    accessors = document.get("accessors", [])
+    corners = sum(_corners(part, accessors) for part in chain.from_iterable(drawn))
+    if corners > 3 * MAX_FACES:
+        raise ValueError(f"it has more than {MAX_FACES} triangles")
+
+
+def _check_gltf_data(document: Any, total: int) -> None:
+    """Check that the data of a GLB document are in its file, as they are, and claim no
+    more than `total` bytes; errors as `_check_gltf`.
+    """
     if any("uri" in buffer for buffer in document.get("buffers", [])):
         raise ValueError("its data are not in this file")
     accessors = document.get("accessors", [])
@@ -501,28 +521,29 @@ def _check_gltf(document: Any, total: int) -> None:
     ]
     if min((*views, *sizes), default=0) < 0 or not max(sum(views), sum(sizes)) <= total:
         raise ValueError(f"it claims more than its {total} bytes hold")
-    nodes = document.get("nodes", [])
-    meshes = document.get("meshes", [])
+
+
+def _check_gltf_places(document: Any, nodes: Any) -> None:
+    """Check that the scene of a GLB document has each node in one place; errors as
+    `_check_gltf`.
+    """
     scenes = document.get("scenes", [{}])
     places = [*scenes[document.get("scene", 0)].get("nodes", [])]
     places += [child for node in nodes for child in node.get("children", [])]
     if len(set(places)) < len(places):
         raise ValueError("a node has two places in the scene")
-    drawn = [meshes[node["mesh"]]["primitives"] for node in nodes if "mesh" in node]
-    parts = len(nodes) + sum(len(primitives) for primitives in drawn)
-    if parts > MAX_PARTS:
-        raise ValueError(f"it has {parts} nodes and parts; allowed: {MAX_PARTS}")
-    corners = 0
-    for part in (part for primitives in drawn for part in primitives):
-        if part.get("mode") == TRIANGLE_FAN:
-            raise ValueError("it has triangle fans, which are not read here")
-        used = [
-            part["attributes"]["POSITION"],
-            *([part["indices"]] if "indices" in part else []),
-        ]
-        corners += max(accessors[i]["count"] for i in used)
-    if corners > 3 * MAX_FACES:
-        raise ValueError(f"it has more than {MAX_FACES} triangles")
+
+
+def _corners(part: Any, accessors: Any) -> Any:
+    """Count the corners that a part of a GLB document draws: of its indices, or of its
+    points if these are more; errors as `_check_gltf`.
+    """
+    if part.get("mode") == TRIANGLE_FAN:
+        raise ValueError("it has triangle fans, which are not read here")
+    used = [part["attributes"]["POSITION"]]
+    if "indices" in part:
+        used.append(part["indices"])
+    return max(accessors[i]["count"] for i in used)
 
 
 def _check_stl(raw: bytes) -> None:
