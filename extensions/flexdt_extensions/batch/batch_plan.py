@@ -91,6 +91,21 @@ _SAMPLERS: Final[Mapping[str, Callable[[Any, Generator], Any]]] = {
     "choice": lambda v, rng: v[int(rng.integers(len(v)))],
 }
 KINDS: Final = tuple(k for k in _SAMPLERS if k != "fixed")
+_PairRule: TypeAlias = tuple[Callable[[Any, Any], bool], str]
+_ORDERED: Final[_PairRule] = (lambda low, high: low <= high, "the lower number first")
+_PAIR_RULES: Final[Mapping[str, tuple[_PairRule, ...]]] = {
+    "uniform": (_ORDERED,),
+    "loguniform": ((lambda low, high: low > 0, "numbers above 0"), _ORDERED),
+    "normal": ((lambda mean, sigma: sigma >= 0, "a mean and a standard deviation >= 0"),),
+    "integers": (
+        (
+            lambda low, high: isinstance(low, int) and isinstance(high, int),
+            "whole numbers",
+        ),
+        _ORDERED,
+    ),
+}
+"""Kind that takes two numbers -> what must hold of them, and how an error says it."""
 
 
 def _number(value: object) -> bool:
@@ -121,6 +136,27 @@ def parse(value: object) -> Draw:
         return value
     if isinstance(value, str) or _number(value):
         return Draw("fixed", (value,))  # type: ignore[arg-type]
+    kind, given = _table(value)
+    if kind == "choice":
+        if not (all(isinstance(v, str) for v in given) or all(_number(v) for v in given)):
+            raise ValueError(
+                f"choice takes texts or numbers, not both or others: {given!r}"
+            )
+        return Draw(kind, tuple(given))
+    if len(given) != 2 or not all(_number(v) for v in given):
+        raise ValueError(f"{kind} takes two numbers, got {given!r}")
+    for holds, taken in _PAIR_RULES[kind]:
+        if not holds(*given):
+            raise ValueError(f"{kind} takes {taken}, got {given!r}")
+    return Draw(kind, tuple(given))
+
+
+def _table(value: object) -> tuple[str, list[Any]]:
+    """Split a table of one of `KINDS` into the kind and its list.
+
+    Raises:
+        ValueError: another form, or an empty list.
+    """
     if (
         not isinstance(value, Mapping)
         or len(value) != 1
@@ -132,26 +168,7 @@ def parse(value: object) -> Draw:
     ((kind, given),) = value.items()
     if not isinstance(given, list) or not given:
         raise ValueError(f"{kind} takes a list, got {given!r}")
-    if kind == "choice":
-        if not (all(isinstance(v, str) for v in given) or all(_number(v) for v in given)):
-            raise ValueError(
-                f"choice takes texts or numbers, not both or others: {given!r}"
-            )
-        return Draw(kind, tuple(given))
-    if len(given) != 2 or not all(_number(v) for v in given):
-        raise ValueError(f"{kind} takes two numbers, got {given!r}")
-    low, high = given
-    if kind == "normal" and high < 0:
-        raise ValueError(
-            f"normal takes a mean and a standard deviation >= 0, got {given!r}"
-        )
-    if kind == "loguniform" and low <= 0:
-        raise ValueError(f"loguniform takes numbers above 0, got {given!r}")
-    if kind == "integers" and not all(isinstance(v, int) for v in given):
-        raise ValueError(f"integers takes whole numbers, got {given!r}")
-    if kind != "normal" and low > high:
-        raise ValueError(f"{kind} takes the lower number first, got {given!r}")
-    return Draw(kind, (low, high))
+    return kind, given
 
 
 def _numbers(value: object) -> Draw:

@@ -292,26 +292,13 @@ class ScenarioReader:
                 where, "the form of file format 1.0 and later (center, deviations)"
             )
         center = part.get("center")
-        names = [
-            r for r in allowed if isinstance(center, dict) and set(r) <= center.keys()
-        ]
-        if not isinstance(center, dict) or not names:
+        reference = next((r for r in allowed if _has_axes(center, r)), None)
+        if not isinstance(center, dict) or reference is None:
             raise self._error(f"{where}.center", " or ".join(map(", ".join, allowed)))
-        reference = names[0]
         moves = [self._frames(center[a], f"{where}.center.{a}", MM) for a in reference]
         start = [self._value(center[a], f"{where}.center.{a}", MM) for a in reference]
-        first, last = "uw" if allowed == (WORLD,) else "rt"
-        u, w = (
-            self._vector(part.get(f"vector_{a}"), f"{where}.vector_{a}")
-            for a in (first, last)
-        )
-        if u[0] != reference or w[0] != reference:
-            raise self._error(
-                where, f"vector_{first} and vector_{last} in {', '.join(reference)}"
-            )
-        axes = _orthonormal(u[1], w[1])
-        if axes is None:
-            raise self._error(where, f"vector_{first} and vector_{last} at right angles")
+        named = ("u", "w") if allowed == (WORLD,) else ("r", "t")
+        axes = self._axes(part, where, reference, named)
         deviations = part.get("deviations") or []
         if isinstance(deviations, dict):
             deviations = [deviations]
@@ -330,6 +317,40 @@ class ScenarioReader:
             ),
             reference == STAGE,
         )
+
+    def _axes(
+        self,
+        part: Mapping[str, Any],
+        where: str,
+        reference: Sequence[str],
+        named: tuple[str, str],
+    ) -> FloatArray:
+        """Read the two vectors of a part, which need not be of unit length, as its axes.
+
+        Args:
+            part: its object in the scenario.
+            where: its place, for errors.
+            reference: names of the axes in which they have to be given.
+            named: letters of the two vectors.
+
+        Returns:
+            Orthonormal axes, as columns (3, 3).
+
+        Raises:
+            ExchangeError: another reference, or not at right angles.
+        """
+        first, last = named
+        u, w = (
+            self._vector(part.get(f"vector_{a}"), f"{where}.vector_{a}") for a in named
+        )
+        if u[0] != reference or w[0] != reference:
+            raise self._error(
+                where, f"vector_{first} and vector_{last} in {', '.join(reference)}"
+            )
+        axes = _orthonormal(u[1], w[1])
+        if axes is None:
+            raise self._error(where, f"vector_{first} and vector_{last} at right angles")
+        return axes
 
     def _deviation(self, value: object, where: str) -> _Deviation:
         """Read a deviation: a translation [mm] or a rotation [rad] about a pivot.
@@ -655,6 +676,11 @@ def place(
         center = pivot + rotation @ (center - pivot)
         axes = rotation @ axes
     return center + np.array([m.of(real)[frame] for m in part.moves]), axes
+
+
+def _has_axes(center: object, reference: Sequence[str]) -> bool:
+    """Return whether a centre states a coordinate along each axis of a reference."""
+    return isinstance(center, dict) and set(reference) <= center.keys()
 
 
 def _orthonormal(u: FloatArray, w: FloatArray) -> FloatArray | None:

@@ -3,11 +3,15 @@ published ones."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flexdt.extending import Answer, CommandError, argument, option, table
+
+if TYPE_CHECKING:
+    from flexdt_extensions.evidence.real_data import Case, Figure, NotRead
 
 
 def evidence(
@@ -25,38 +29,75 @@ def evidence(
         For each case its source and licence, a table of published and own figures, and what
         was not read; then all as document of --json.
     """
-    from flexdt_extensions.evidence.real_data import CASES, Figure, NotRead
+    from flexdt_extensions.evidence.real_data import CASES
 
-    unknown = sorted(set(names or ()) - set(CASES))
+    files = _files_at_hand(names or [], data)
+    document: list[dict[str, Any]] = []
+    for name, own in files.items():
+        case = CASES[name]
+        yield f"{name}: {case.source}, {case.licence}"
+        figures, unread = _compared(case, own)
+        if not own:
+            yield f"  not at hand in {data}"
+        if figures:
+            yield table(
+                [_row(one) for one in figures], ("what", "published", "ours", "agrees")
+            )
+        for one in unread:
+            yield f"  not read: {one.what}: {one.why}"
+        document.append(
+            {
+                "name": name,
+                "source": case.source,
+                "licence": case.licence,
+                "figures": [asdict(figure) for figure in figures],
+                "not_read": [asdict(one) for one in unread],
+            }
+        )
+    yield {"cases": document}
+    missed = sum(not f["agrees"] for told in document for f in told["figures"])
+    if missed:
+        raise CommandError(f"{missed} figures miss what was published")
+
+
+def _files_at_hand(names: Sequence[str], data: Path) -> dict[str, list[Path]]:
+    """Find the files of the named cases below a folder, or those of all cases.
+
+    Returns:
+        Case -> its files; a case that was not named may have none.
+
+    Raises:
+        CommandError: an unknown name, or a named case that is not at hand.
+    """
+    from flexdt_extensions.evidence.real_data import CASES
+
+    unknown = sorted(set(names) - set(CASES))
     if unknown:
         raise CommandError(f"no data {', '.join(unknown)}; allowed: {', '.join(CASES)}")
     files = {name: sorted(data.glob(CASES[name].files)) for name in names or CASES}
-    for name in names or ():
+    for name in names:
         if not files[name]:
             case = CASES[name]
             raise CommandError(
                 f"{name}: no {case.files} in {data}; the data: {case.source}"
             )
-    document: list[dict[str, Any]] = []
-    for name, own in files.items():
-        case = CASES[name]
-        yield f"{name}: {case.source}, {case.licence}"
-        told = list(case.told(own)) if own else []
-        figures = [one for one in told if isinstance(one, Figure)]
-        rows = [
-            (f.what, f.published, f.ours, "yes" if f.agrees else "NO") for f in figures
-        ]
-        if not own:
-            yield f"  not at hand in {data}"
-        if rows:
-            yield table(rows, ("what", "published", "ours", "agrees"))
-        unread = [one for one in told if isinstance(one, NotRead)]
-        for one in unread:
-            yield f"  not read: {one.what}: {one.why}"
-        document.append({"name": name, "source": case.source, "licence": case.licence})
-        document[-1]["figures"] = [asdict(figure) for figure in figures]
-        document[-1]["not_read"] = [asdict(one) for one in unread]
-    yield {"cases": document}
-    missed = sum(not f["agrees"] for told in document for f in told["figures"])
-    if missed:
-        raise CommandError(f"{missed} figures miss what was published")
+    return files
+
+
+def _compared(case: Case, files: list[Path]) -> tuple[list[Figure], list[NotRead]]:
+    """Compute a case's figures from its files, and list what was not read; nothing
+    without files.
+    """
+    from flexdt_extensions.evidence.real_data import Figure, NotRead
+
+    told = list(case.told(files)) if files else []
+    return (
+        [one for one in told if isinstance(one, Figure)],
+        [one for one in told if isinstance(one, NotRead)],
+    )
+
+
+def _row(figure: Figure) -> tuple[object, ...]:
+    """Return a row of the table of figures."""
+    agrees = "yes" if figure.agrees else "NO"
+    return (figure.what, figure.published, figure.ours, agrees)

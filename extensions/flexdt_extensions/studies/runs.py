@@ -329,38 +329,51 @@ def rows_of(experiment: str, runs: Sequence[Run]) -> list[dict[str, object]]:
         iterations, mean errors and sigmas by parameter, `method`, `beside` of the other
         method, `thesis_*`.
     """
-    out: list[dict[str, object]] = []
-    for setting in dict.fromkeys(r.setting for r in runs):
-        some = [r for r in runs if r.setting == setting]
-        solved = [r for r in some if r.errors]
-        maes = np.array([r.mae for r in solved])
-        beside = [r.beside for r in some if r.beside]
-        printed = thesis_row(experiment, setting) or {}
-        names = list(solved[0].errors) if solved else []
-        out.append(
-            {
-                "setting": setting,
-                "runs": len(some),
-                "success": sum(r.success for r in some),
-                "unidentifiable": sum(not r.identifiable for r in some),
-                "failed": sum(r.failed for r in some),
-                "weak": sum(bool(r.weak) for r in some),
-                "mae": _mean(maes),
-                "mae_max": clean(float(maes.max())) if len(maes) else None,
-                "cost_reduction_pct": _mean([r.cost_reduction_pct for r in solved]),
-                "iterations": _mean([r.iterations for r in solved]),
-                "iterations_max": max((r.iterations for r in solved), default=None),
-                "mean_absolute": {n: _mean([r.errors[n] for r in solved]) for n in names},
-                "mean_sigma": {
-                    n: _mean([r.sigmas[n] for r in solved if n in r.sigmas])
-                    for n in names
-                },
-                "method": some[0].method,
-                "beside": _mean_figures(some[0].method, beside),
-                **{f"thesis_{k}": printed.get(k) for k in COMPARED_FIGURES},
-            }
-        )
-    return out
+    settings = dict.fromkeys(r.setting for r in runs)
+    return [_row(experiment, [r for r in runs if r.setting == s]) for s in settings]
+
+
+def _row(experiment: str, runs: Sequence[Run]) -> dict[str, object]:
+    """Sum up the runs of one setting; see `rows_of`."""
+    setting = runs[0].setting
+    method = runs[0].method
+    printed = thesis_row(experiment, setting) or {}
+    return {
+        "setting": setting,
+        **_counts(runs),
+        **_mean_results([r for r in runs if r.errors]),
+        "method": method,
+        "beside": _mean_figures(method, [r.beside for r in runs if r.beside]),
+        **{f"thesis_{k}": printed.get(k) for k in COMPARED_FIGURES},
+    }
+
+
+def _counts(runs: Sequence[Run]) -> dict[str, object]:
+    """Count the runs: all, and those that succeed, are unidentifiable, fail or are weak."""
+    return {
+        "runs": len(runs),
+        "success": sum(r.success for r in runs),
+        "unidentifiable": sum(not r.identifiable for r in runs),
+        "failed": sum(r.failed for r in runs),
+        "weak": sum(bool(r.weak) for r in runs),
+    }
+
+
+def _mean_results(solved: Sequence[Run]) -> dict[str, object]:
+    """Average the results of runs that have one; None, and no parameters, without any."""
+    maes = np.array([r.mae for r in solved])
+    names = list(solved[0].errors) if solved else []
+    return {
+        "mae": _mean(maes),
+        "mae_max": clean(float(maes.max())) if len(maes) else None,
+        "cost_reduction_pct": _mean([r.cost_reduction_pct for r in solved]),
+        "iterations": _mean([r.iterations for r in solved]),
+        "iterations_max": max((r.iterations for r in solved), default=None),
+        "mean_absolute": {n: _mean([r.errors[n] for r in solved]) for n in names},
+        "mean_sigma": {
+            n: _mean([r.sigmas[n] for r in solved if n in r.sigmas]) for n in names
+        },
+    }
 
 
 def _mean_figures(method: str, figures: Sequence[dict[str, float]]) -> dict[str, object]:
