@@ -23,7 +23,7 @@ import struct
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import chain, islice
-from typing import Any, Final, TypeGuard
+from typing import Any, Final, TypeGuard, assert_never
 
 from flexdt.protocol import codec as codecs
 from flexdt.protocol.codec import Codec
@@ -209,10 +209,13 @@ class Connection:
                 self.codec = Codec.MSGPACK
             else:
                 self.codec = Codec.JSON
-        if self.codec is Codec.JSON:
-            self._feed_lines(bytes(data))
-        else:
-            self._feed_frames(data)
+        match self.codec:
+            case Codec.JSON:
+                self._feed_lines(bytes(data))
+            case Codec.MSGPACK:
+                self._feed_frames(data)
+            case _:
+                assert_never(self.codec)
 
     def _feed_lines(self, data: bytes) -> None:
         """Divide received bytes into JSON lines; a chunk of many short lines is split at
@@ -336,10 +339,13 @@ class Connection:
         `Malformed` with a parse error, other invalid messages `Malformed` as `from_plain`
         makes it.
         """
-        if self.codec is Codec.MSGPACK:
-            read = codecs.read_msgpack
-        else:
-            read = codecs.read_json
+        match self.codec:
+            case Codec.MSGPACK:
+                read = codecs.read_msgpack
+            case Codec.JSON | None:
+                read = codecs.read_json
+            case _:
+                assert_never(self.codec)
         try:
             document = read(raw)
         except (ValueError, RecursionError, MemoryError) as error:
@@ -435,12 +441,16 @@ class Connection:
         Returns:
             The document in pieces, in order.
         """
-        if self.codec is Codec.MSGPACK:
-            return [_array_head(len(bodies)), *chain.from_iterable(bodies)]
-        out = [b"["]
-        for i, body in enumerate(bodies):
-            out += [b","] * (i > 0) + list(body)
-        return [*out, b"]"]
+        match self.codec:
+            case Codec.MSGPACK:
+                return [_array_head(len(bodies)), *chain.from_iterable(bodies)]
+            case Codec.JSON | None:
+                out = [b"["]
+                for i, body in enumerate(bodies):
+                    out += [b","] * (i > 0) + list(body)
+                return [*out, b"]"]
+            case _:
+                assert_never(self.codec)
 
     def framed(self, body: Sequence[bytes]) -> list[bytes]:
         """Add framing to an encoded body: a newline for JSON (also without a codec), a
@@ -495,31 +505,57 @@ def _body(codec: Codec, message: Message) -> list[bytes]:
         ValueError, TypeError, OverflowError: a value that the codec cannot hold.
     """
     match message:
-        case Response(id, Encoded(pieces)) if codec is Codec.JSON:
-            return [
-                b'{"jsonrpc":"2.0","id":%b,"result":' % codecs.write_json(id),
-                *pieces,
-                b"}",
-            ]
         case Response(id, Encoded(pieces)):
-            head = {"jsonrpc": "2.0", "id": id, "result": None}
-            return [codecs.write_msgpack(head)[:-1], *pieces]  # nil is one byte
+            return _around(codec, id, pieces)
     return _pieces(codec, to_plain(message))
+
+
+def _around(codec: Codec, id: object, pieces: Sequence[bytes]) -> list[bytes]:
+    """Put the answer to the request `id` around a result that is encoded already."""
+    match codec:
+        case Codec.JSON:
+            head = b'{"jsonrpc":"2.0","id":%b,"result":' % codecs.write_json(id)
+            return [head, *pieces, b"}"]
+        case Codec.MSGPACK:
+            answer = {"jsonrpc": "2.0", "id": id, "result": None}
+            return [codecs.write_msgpack(answer)[:-1], *pieces]  # nil is one byte
+        case _:
+            assert_never(codec)
 
 
 def _pieces(codec: Codec, document: object) -> list[bytes]:
     """Encode a document: JSON in pieces, MessagePack as one piece; no framing."""
-    json = codec is Codec.JSON
-    if json:
-        return codecs.json_pieces(document)
-    return [codecs.write_msgpack(document)]
+    match codec:
+        case Codec.JSON:
+            return codecs.json_pieces(document)
+        case Codec.MSGPACK:
+            return [codecs.write_msgpack(document)]
+        case _:
+            assert_never(codec)
 
 
 def _framed(codec: Codec, body: Sequence[bytes]) -> list[bytes]:
     """Add the newline of JSON lines, or the length of a MessagePack frame."""
-    if codec is Codec.JSON:
-        return [*body, b"\n"]
-    return [frame_head(sum(map(len, body))), *body]
+    match codec:
+        case Codec.JSON:
+            return [*body, b"\n"]
+        case Codec.MSGPACK:
+            return [frame_head(sum(map(len, body))), *body]
+        case _:
+            assert_never(codec)
+
+
+def answer_bytes(size: int, codec: Codec) -> int:
+    """Return how many bytes of an answer binary data of `size` bytes take: in JSON they
+    are base64.
+    """
+    match codec:
+        case Codec.JSON:
+            return size * 4 // 3
+        case Codec.MSGPACK:
+            return size
+        case _:
+            assert_never(codec)
 
 
 def _array_head(count: int) -> bytes:

@@ -25,7 +25,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Generic, TypeVar
+from typing import Generic, TypeVar, assert_never
 
 from flexdt.protocol.method import PROTOCOL
 from flexdt.protocol.rpc_errors import (
@@ -455,9 +455,13 @@ class Correlation(Generic[_W]):
     @property
     def open(self) -> int:
         """Number of requests without an answer: sent by a client, received by a server."""
-        if self.role is Role.CLIENT:
-            return len(self._open_requests)
-        return self._owed_answers.total()
+        match self.role:
+            case Role.CLIENT:
+                return len(self._open_requests)
+            case Role.SERVER:
+                return self._owed_answers.total()
+            case _:
+                assert_never(self.role)
 
     # -- both sides --------------------------------------------------------------------------
 
@@ -487,8 +491,24 @@ class Correlation(Generic[_W]):
             raise self.violation
         if isinstance(message, Batch):
             return [each for item in message.items for each in self.receive(item)]
-        if self.role is Role.SERVER:
-            return self._receive_call(message)
+        match self.role:
+            case Role.SERVER:
+                return self._receive_call(message)
+            case Role.CLIENT:
+                return self._receive_answer(message)
+            case _:
+                assert_never(self.role)
+
+    def _receive_answer(
+        self, message: Single
+    ) -> list[Answered[_W] | Request | Notification]:
+        """Match what a server sends, other than a batch, to the open requests; see
+        `receive`.
+
+        Raises:
+            ProtocolError: a request, an answer to no open request, or a fatal error;
+                recorded as the violation.
+        """
         match message:
             case Notification():
                 return [message]
@@ -509,7 +529,11 @@ class Correlation(Generic[_W]):
                 return self._settle(Failure(id, error))
             case Response() | Failure():
                 return self._settle(message)
-        raise self._violated(f"the server sent a request ({clip(message.method, 40)})")
+            case Request():
+                asked = clip(message.method, 40)
+                raise self._violated(f"the server sent a request ({asked})")
+            case _:
+                assert_never(message)
 
     def violate(self, violation: ProtocolError) -> None:
         """Record that the peer's bytes break the protocol (see `Connection.receive_end`)."""

@@ -15,7 +15,7 @@ import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, assert_never
 
 from flexdt.protocol import Codec
 from flexdt.protocol.codec import write_json, write_msgpack
@@ -346,10 +346,13 @@ def _encoded(
         more = sample_problems(seen, found.problems)
         found = replace(found, problems=in_order((*found.problems, *more)))
     report = found.to_dict()
-    if codec is Codec.JSON:
-        data = write_json(report)
-    else:
-        data = write_msgpack(report)
+    match codec:
+        case Codec.JSON:
+            data = write_json(report)
+        case Codec.MSGPACK:
+            data = write_msgpack(report)
+        case _:
+            assert_never(codec)
     if len(data) > most - 1000:  # room for the frame around it
         raise too_large("a report", len(data), most - 1000)
     return [data[at : at + ANSWER_PIECE] for at in range(0, len(data), ANSWER_PIECE)]

@@ -15,13 +15,13 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, assert_never
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.protocol import Codec, image
-from flexdt.protocol.connection import MAX_ANSWER, encoded
+from flexdt.protocol.connection import MAX_ANSWER, answer_bytes, encoded
 from flexdt.protocol.fields import ImageValue, Params
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
@@ -869,23 +869,24 @@ def _frame(
         raise LimitError(
             f"binning {asked.binning} leaves nothing of {counts.shape} pixels"
         )
-    pixels: npt.NDArray[np.generic] = counts
-    if asked.kind == "line_integral":
-        if frame.kind != "projection":
-            raise LimitError(
-                f"{frame.file} is a {frame.kind} image: it has no line integrals"
-            )
-        rows, cols = counts.shape
-        pixels = _line_integrals_of(scan, (rows, cols))(counts)
-    small = binned_mean(pixels.astype(np.float32), asked.binning)
-    if asked.kind == "counts":
-        small = np.rint(small).astype(np.uint16)
+    small: npt.NDArray[np.generic]
+    match asked.kind:
+        case "counts":
+            mean = binned_mean(counts.astype(np.float32), asked.binning)
+            small = np.rint(mean).astype(np.uint16)
+        case "line_integral":
+            if frame.kind != "projection":
+                raise LimitError(
+                    f"{frame.file} is a {frame.kind} image: it has no line integrals"
+                )
+            rows, cols = counts.shape
+            integrals = _line_integrals_of(scan, (rows, cols))(counts)
+            small = binned_mean(integrals.astype(np.float32), asked.binning)
+        case _:
+            assert_never(asked.kind)
     before = sum(f.kind == "projection" for f in images[: asked.index])
     kV, power_W = scan.beam
-    if codec is Codec.MSGPACK:
-        size = small.nbytes
-    else:
-        size = small.nbytes * 4 // 3
+    size = answer_bytes(small.nbytes, codec)
     if size > (limit_bytes := MAX_ANSWER[codec] - (1 << 16)):  # beside the pixels
         raise too_large("an image (ask for a binned one)", size, limit_bytes)
     return p.DatasetFrameResult(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from typing import assert_never
 
 import numpy as np
 
 from flexdt.protocol import Codec, image
 from flexdt.protocol import state_model as w
-from flexdt.protocol.connection import MAX_ANSWER, encoded
+from flexdt.protocol.connection import MAX_ANSWER, answer_bytes, encoded
 from flexdt.protocol.fields import Empty, ImageValue
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import image_messages as p
@@ -124,9 +125,14 @@ def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec)
         RpcError: -32008, it does not fit; names both sizes [bytes].
     """
     rows, cols = (n // params.binning for n in shape)
-    size = rows * cols * ((2 if params.kind == "counts" else 4) + params.marks)
-    if codec is not Codec.MSGPACK:
-        size = size * 4 // 3
+    match params.kind:
+        case "counts":
+            pixel_bytes = 2
+        case "line_integral":
+            pixel_bytes = 4
+        case _:
+            assert_never(params.kind)
+    size = answer_bytes(rows * cols * (pixel_bytes + params.marks), codec)
     most = MAX_ANSWER[codec] - 4096  # beside the pixels
     if size > most:
         raise too_large("an image", size, most)
