@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
+from typing import TYPE_CHECKING, assert_never
 
 from flexdt.twin.attenuation.substances import (
     Substance,
@@ -22,6 +23,9 @@ from flexdt.twin.attenuation.substances import (
     tables,
 )
 from flexdt.twin.errors import LimitError, UnknownNameError
+
+if TYPE_CHECKING:
+    from flexdt.twin.physics.predicted_beam import Physics
 
 
 @dataclass(frozen=True)
@@ -121,6 +125,19 @@ def materials() -> Mapping[str, Material]:
 def stated_keV() -> float:
     """Return the energy at which phantoms state their attenuation [keV]."""
     return next(iter(materials().values())).effective_energy_keV
+
+
+def only_keV(physics: Physics) -> float | None:
+    """Return the energy of all photons [keV], `stated_keV` for "mono"; None for physics
+    without one energy.
+    """
+    match physics:
+        case "mono":
+            return stated_keV()
+        case "ideal" | "poly":
+            return None
+        case _:
+            assert_never(physics)
 
 
 def material(name: str) -> Material:

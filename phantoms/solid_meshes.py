@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, assert_never, cast
 
 import numpy as np
 
@@ -193,6 +193,8 @@ def _mesh(shape: analytic.Shape) -> trimesh.Trimesh:
             )
         case analytic.ConvexPolyhedron():
             mesh = trimesh.convex.convex_hull(polyhedron_corners(shape))
+        case _:
+            assert_never(shape)
     return mesh
 
 

@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, assert_never
 
 import numpy as np
 import numpy.typing as npt
@@ -177,7 +177,14 @@ def filled_mesh(
             f"at most {MAX_EXTENT_MM:g} mm. Is the unit right ({', '.join(UNITS_MM)})?",
             {"asked": float((high - low).max()), "allowed": MAX_EXTENT_MM},
         )
-    shift = ((low + high) / 2.0 if place == "center" else np.zeros(3)) - np.asarray(at_mm)
+    match place:
+        case "center":
+            middle = (low + high) / 2.0
+        case "keep":
+            middle = np.zeros(3)
+        case _:
+            assert_never(place)
+    shift = middle - np.asarray(at_mm)
     vertices = vertices - shift
     low = low - shift
     high = high - shift

@@ -26,7 +26,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal, Protocol, assert_never
 
 import numpy as np
 
@@ -512,12 +512,16 @@ class Imaging:
         phantom = await asyncio.to_thread(self.samples.load, sample.name, sample.material)
         divided = self._divided.pop(key, None)
         if divided is None or divided.phantom is not phantom:
-            if pieces == "part":
-                found: Any = await asyncio.to_thread(attenuating, phantom)
-                bodies = [body for body, _ in found]
-            else:
-                found = await asyncio.to_thread(channels, phantom)
-                bodies = [channel.body for channel in found]
+            found: Any
+            match pieces:
+                case "part":
+                    found = await asyncio.to_thread(attenuating, phantom)
+                    bodies = [body for body, _ in found]
+                case "material":
+                    found = await asyncio.to_thread(channels, phantom)
+                    bodies = [channel.body for channel in found]
+                case _:
+                    assert_never(pieces)
             divided = _DividedSample(phantom, found, bodies)
         self._divided[key] = divided
         return divided

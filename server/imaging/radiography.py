@@ -16,14 +16,14 @@ import asyncio
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, assert_never
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import Phantom, exposure_forecast
 from flexdt.phantoms.channels import chain_through
-from flexdt.phantoms.materials import stated_keV
+from flexdt.phantoms.materials import only_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
@@ -71,6 +71,19 @@ STARVED = 2
 CUT_OFF = 4
 
 
+def counts_photons(physics: Physics) -> bool:
+    """Return whether a physics computes photons through tube, materials and panel, instead
+    of the response to line integrals.
+    """
+    match physics:
+        case "ideal":
+            return False
+        case "mono" | "poly":
+            return True
+        case _:
+            assert_never(physics)
+
+
 def with_spectra(machine: Machine, physics: Physics) -> Machine:
     """Restrict a machine's tube to the voltages for which the physics has spectra.
 
@@ -83,7 +96,7 @@ def with_spectra(machine: Machine, physics: Physics) -> Machine:
     Raises:
         LimitError: the voltage at start has none.
     """
-    if physics == "ideal":
+    if not counts_photons(physics):
         return machine
     tube = machine.tube
     lowest, highest = voltages()
@@ -130,7 +143,7 @@ class Radiography:
         Raises:
             LimitError: ideal physics has no scatter.
         """
-        if physics == "ideal" and scatter != "off":
+        if not counts_photons(physics) and scatter != "off":
             raise LimitError(
                 f"scatter {scatter} needs physics mono or poly, not ideal",
                 {"asked": scatter, "allowed": ["off"]},
@@ -140,14 +153,19 @@ class Radiography:
         return cls(imaging, ideal.ideal_response(machine), physics, panel, tube, scatter)
 
     @property
+    def photons(self) -> bool:
+        """Whether images are counts of photons."""
+        return counts_photons(self.physics)
+
+    @property
     def remembers(self) -> bool:
         """Whether a frame depends on earlier frames."""
-        return self.physics != "ideal" and (self.panel.lag_fraction > 0.0 or self.traps)
+        return self.photons and (self.panel.lag_fraction > 0.0 or self.traps)
 
     @property
     def traps(self) -> bool:
         """Whether a frame depends on all earlier frames."""
-        return self.physics != "ideal" and self.panel.long_lag_fraction > 0.0
+        return self.photons and self.panel.long_lag_fraction > 0.0
 
     def record(self) -> Mapping[str, float]:
         """List the figures of the images' physics by name, for data sets.
@@ -155,7 +173,7 @@ class Radiography:
         "ideal": the noise model's, without its reference; else markers of physics and
         scatter, and the figures of detector and tube.
         """
-        if self.physics == "ideal":
+        if not self.photons:
             return {
                 name: float(getattr(self.model, name))
                 for name in self.model.__dataclass_fields__
@@ -171,9 +189,7 @@ class Radiography:
 
         By parts for "ideal", else by materials; raises as `Imaging.require_room`.
         """
-        pieces: Pieces = "material"
-        if self.physics == "ideal":
-            pieces = "part"
+        pieces: Pieces = "material" if self.photons else "part"
         await self.imaging.require_room(sample, pieces)
 
     async def take(
@@ -209,7 +225,7 @@ class Radiography:
             LimitError: a voltage without a spectrum.
         """
         count = len(exposures)
-        if self.physics == "ideal":
+        if not self.photons:
             lines = await self.imaging.line_integrals(sample, poses, camera, truth=truth)
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
@@ -228,10 +244,7 @@ class Radiography:
         channels, paths, views = await self.imaging.path_lengths(
             sample, poses, camera, truth=truth, spot=spot
         )
-        mono_keV = None
-        if self.physics == "mono":
-            mono_keV = stated_keV()
-        chain = chain_through(channels, self.panel, self.tube, mono_keV)
+        chain = chain_through(channels, self.panel, self.tube, only_keV(self.physics))
         if points > 1:
             chain = without_spot(chain)
             moments = moments * points
@@ -293,17 +306,14 @@ class Radiography:
             LimitError: a voltage without a spectrum.
         """
         cone = probe.cone_vec
-        if self.physics == "ideal":
+        if not self.photons:
             lines = await self.imaging.nominal_integrals(sample, cone)
             counts = np.exp(-lines) * np.float32(
                 ideal.open_beam(self.model, probe.exposure)
             )
             return CountShares.of(counts, self.saturating)
         parts, paths = await self.imaging.nominal_paths(sample, cone)
-        mono_keV = None
-        if self.physics == "mono":
-            mono_keV = stated_keV()
-        chain = chain_through(parts, self.panel, self.tube, mono_keV)
+        chain = chain_through(parts, self.panel, self.tube, only_keV(self.physics))
         return await asyncio.to_thread(shares_behind, chain, probe, paths, cone.rows)
 
     def dark(self, camera: CameraSettings) -> Radiograph:
@@ -312,21 +322,21 @@ class Radiography:
         With physics other than "ideal" also expected counts, all zero.
         """
         nothing = np.zeros(camera.shape, dtype=np.float32)
-        if self.physics == "ideal":
+        if not self.photons:
             return Radiograph(nothing)
         return Radiograph(nothing, Expected(nothing, nothing))
 
     @property
     def full_scale(self) -> int:
         """Largest count of an image, by the ideal model or the panel."""
-        if self.physics == "ideal":
+        if not self.photons:
             return self.model.full_scale
         return self.panel.full_scale
 
     @property
     def offset(self) -> float:
         """Mean count without signal, by the ideal model (dark counts) or the panel."""
-        if self.physics == "ideal":
+        if not self.photons:
             return self.model.dark_counts
         return self.panel.offset_counts
 

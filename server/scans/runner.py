@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, assert_never
 
 from flexdt.protocol.rpc_errors import Code, RpcError
 from flexdt.server.scans.frame_pipeline import FramePipeline
@@ -280,6 +280,8 @@ class ScanRunner:
                         length = 0.0
                         if steps == self._steps:
                             length = event.duration_s
+                    case _:
+                        assert_never(event)
                 if self._single_step and length > 0.0:
                     await self._wait_until(moment + length)
                     self.pause()

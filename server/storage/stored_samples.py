@@ -16,6 +16,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 
@@ -465,16 +466,25 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
             be read.
         UnknownNameError: no such material.
     """
-    if head.kind == "mesh":
-        return mesh_apart(
-            raw,
-            unit=head.unit,
-            material=DEFAULT_MATERIAL if material is None else material,
-            file_type=head.format,
-            name=head.name,
-        )
-    if head.kind == "scene":
-        return scene_apart(raw, name=head.name)
+    match head.kind:
+        case "mesh":
+            return mesh_apart(
+                raw,
+                unit=head.unit,
+                material=DEFAULT_MATERIAL if material is None else material,
+                file_type=head.format,
+                name=head.name,
+            )
+        case "scene":
+            return scene_apart(raw, name=head.name)
+        case "voxels":
+            return _voxels(head, raw, material)
+        case _:
+            assert_never(head.kind)
+
+
+def _voxels(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
+    """Make a phantom of uploaded voxels; arguments and errors as `_parse`."""
     if material is not None:
         phantoms.material(material)
     assert head.shape is not None

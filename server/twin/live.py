@@ -12,7 +12,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, assert_never
 
 import numpy as np
 
@@ -144,14 +144,17 @@ def image_of(
     """
     integrals = radiograph.shown
     factor = min(view.binning, *integrals.shape)
-    if view.kind == "counts":
-        counts = radiography.counts(radiograph, shot.camera, shot.exposure, rng)
-        if factor > 1:
-            mean = binned_mean(counts.astype(np.float32), factor)
-            counts = np.rint(mean).astype(np.uint16)
-        value = image.encode(counts)
-    else:
-        value = image.encode(binned_mean(integrals, factor))
+    match view.kind:
+        case "counts":
+            counts = radiography.counts(radiograph, shot.camera, shot.exposure, rng)
+            if factor > 1:
+                mean = binned_mean(counts.astype(np.float32), factor)
+                counts = np.rint(mean).astype(np.uint16)
+            value = image.encode(counts)
+        case "line_integral":
+            value = image.encode(binned_mean(integrals, factor))
+        case _:
+            assert_never(view.kind)
     if factor > 1:
         cone = cone.binned(factor, (integrals.shape[0], integrals.shape[1]))
     return Projection(

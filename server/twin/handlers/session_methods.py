@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from datetime import UTC, datetime
 from functools import cache
-from typing import Any
+from typing import Any, assert_never
 
 from flexdt.protocol import PROTOCOL, require_compatible
 from flexdt.protocol import state_model as w
@@ -77,6 +77,8 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlRes
             loser = twin.control.force(client.name)
             if loser is not None:
                 twin.tell("warning", f"{client.name} took control from {loser}")
+        case _:
+            assert_never(params.action)
     twin.feed.changed()
     holder = twin.control.holder
     if before is not None and holder != before:
