@@ -12,7 +12,7 @@ import html
 import re
 import time
 from collections.abc import Mapping
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, assert_never
 
 import numpy as np
 import viser
@@ -137,8 +137,17 @@ def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "")
         title: of the page.
         beside: HTML at its end.
     """
-    if form != "html":
-        return bytes(serializer.serialize())
+    match form:
+        case "viser":
+            return bytes(serializer.serialize())
+        case "html":
+            return _page(serializer, dark, title, beside)
+        case _:
+            assert_never(form)
+
+
+def _page(serializer: Any, dark: bool, title: str, beside: str) -> bytes:
+    """Make an exported scene a page of its own; arguments as `_file`."""
     page = re.sub(
         r"<title>.*?</title>", "", str(serializer.as_html(dark_mode=dark)), count=1
     )

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, assert_never
 
 import typer
 
@@ -474,6 +474,17 @@ def apply_motion(data: DataSet, report: Report) -> DataSet:
 Rows = Literal["down", "up"]
 
 
+def _are_up(rows: Rows) -> bool:
+    """Return whether rows are counted upwards."""
+    match rows:
+        case "up":
+            return True
+        case "down":
+            return False
+        case _:
+            assert_never(rows)
+
+
 def export(
     dataset: Path = argument(..., "DATASET"),
     format: str = option(..., among=exported),
@@ -529,7 +540,7 @@ def export(
         format,
         parameters=parameters,
         real=real,
-        rows_up=rows == "up",
+        rows_up=_are_up(rows),
     )
     height, width = written.shape or (0, 0)
     yield {
@@ -578,7 +589,7 @@ def import_(
 
     from flexdt.library.datasets.exchange import import_geometry, save_geometry
 
-    geometry = import_geometry(file, format, given, rows_up=rows == "up")
+    geometry = import_geometry(file, format, given, rows_up=_are_up(rows))
     if real and geometry.real is not None:
         geometry = replace(geometry, cone_vec=geometry.real, real=None, notes=())
     save_geometry(geometry, out)
