@@ -15,13 +15,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, assert_never
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
+from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material
 from flexdt.phantoms.channels import chain_through, channels, line_integrals
+from flexdt.phantoms.materials import only_keV
 from flexdt.phantoms.scan_limits import (
     check_distances,
     check_placement,
@@ -375,10 +376,13 @@ def layout(plan: Plan) -> dict[str, tuple[tuple[int, ...], str]]:
         "cone_vec_true": ((frames, 12), "<f8"),
     }
     if plan.batch.kind == "projections":
-        if plan.images.values == "counts":
-            dtype = "<u2"
-        else:
-            dtype = "<f4"
+        match plan.images.values:
+            case "counts":
+                dtype = "<u2"
+            case "line_integrals":
+                dtype = "<f4"
+            case _:
+                assert_never(plan.images.values)
         out["projections"] = ((frames, *detector_shape(plan)), dtype)
         if plan.reconstruct is not None:
             z, y, x = plan.reconstruct.shape
@@ -477,19 +481,25 @@ def _projections(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, An
         `projections` (frames, rows, cols) and `volumes` (z, y, x); no figures.
     """
     cone = item.poses.cone_vec(item.truth)
-    if plan.images.physics == "ideal":
-        images = _ideal(plan, item, cone)
-    else:
-        images = _physical(plan, item, cone)
+    match plan.images.physics:
+        case "ideal":
+            images = _ideal(plan, item, cone)
+        case "mono" | "poly":
+            images = _physical(plan, item, cone)
+        case _:
+            assert_never(plan.images.physics)
     arrays: dict[str, Array] = {"projections": images}
     if plan.reconstruct is not None:
         want = plan.reconstruct
         z, y, x = want.shape
         like = Volume(np.zeros((z, y, x), np.float32), want.voxel_mm)
-        if want.geometry == "true":
-            geometry = cone
-        else:
-            geometry = item.poses.cone_vec()
+        match want.geometry:
+            case "true":
+                geometry = cone
+            case "nominal":
+                geometry = item.poses.cone_vec()
+            case _:
+                assert_never(want.geometry)
         arrays["volumes"] = fdk(
             images, geometry, like, window=want.window, errors=False
         ).data
@@ -524,12 +534,15 @@ def _ideal(plan: Plan, item: Item, cone: ConeVec) -> Array:
         expose(model, image, item.exposure, _rng(plan, item, i))
         for i, image in enumerate(lines)
     ]
-    if plan.images.values == "counts":
-        return np.stack(counts)
-    bright = np.float32(open_beam(model, item.exposure))
-    return np.stack(
-        [_logarithm(c, np.float32(model.dark_counts), bright) for c in counts]
-    )
+    match plan.images.values:
+        case "counts":
+            return np.stack(counts)
+        case "line_integrals":
+            bright = np.float32(open_beam(model, item.exposure))
+            dark = np.float32(model.dark_counts)
+            return np.stack([_logarithm(c, dark, bright) for c in counts])
+        case _:
+            assert_never(plan.images.values)
 
 
 def _logarithm(
@@ -558,29 +571,28 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     parts = channels(item.phantom)
     panel = detector_of(item.machine.detector)
     tube = tube_of(item.machine.tube)
-    if plan.images.physics == "mono":
-        mono_keV = stated_keV()
-    else:
-        mono_keV = None
-    chain = chain_through(parts, panel, tube, mono_keV)
+    chain = chain_through(parts, panel, tube, only_keV(plan.images.physics))
     paths = np.stack([project_body(part.body, cone, item.shape) for part in parts])
     nothing = Chain(panel, tube, mono_keV=chain.mono_keV)
     empty = np.empty((0, *item.shape), dtype=np.float32)
-    dark = np.float32(panel.offset_counts)
     images: list[Array] = []
     for i, row in enumerate(cone.rows):
         expected = expected_signal(chain, paths[:, i], row, item.exposure)
         counts = read_out(
             panel, expected, item.camera, item.exposure, _rng(plan, item, i)
         )
-        if plan.images.values == "counts":
-            images.append(counts)
-            continue
-        # As the laboratory does it: an open-beam image of the same pose, free of noise.
-        beam = expected_signal(nothing, empty, row, item.exposure)
-        flat = read_out(panel, beam, item.camera, item.exposure)
-        bright = np.maximum(flat.astype(np.float32) - dark, np.float32(0.5))
-        images.append(_logarithm(counts, dark, bright))
+        match plan.images.values:
+            case "counts":
+                images.append(counts)
+            case "line_integrals":
+                # As the laboratory does it: an open-beam image of the same pose, free of noise.
+                beam = expected_signal(nothing, empty, row, item.exposure)
+                flat = read_out(panel, beam, item.camera, item.exposure)
+                dark = np.float32(panel.offset_counts)
+                bright = np.maximum(flat.astype(np.float32) - dark, np.float32(0.5))
+                images.append(_logarithm(counts, dark, bright))
+            case _:
+                assert_never(plan.images.values)
     return np.stack(images)
 
 
@@ -604,22 +616,28 @@ def _calibrations(plan: Plan, item: Item) -> tuple[dict[str, Array], dict[str, A
     model = bead_model(item.phantom)
     free = tuple(plan.calibrate.free)
     request = CalibrationRequest(free=free, priors=plan.calibrate.stated_priors)
-    if plan.calibrate.fidelity == "points":
-        scan = _seen_points(plan, item, model)
-        result = calibrate([scan], model, replace(request, second_look=False))
-    else:
-        from flexdt_extensions.studies.rendered_runs import Rendering, render
-
-        camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
-        key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
-        frames = render(
-            item.phantom.scene, model, item.poses, item.truth, camera, key, item.shape
-        )
-        result = calibrate(
-            [Scan(frames, item.poses)], model, request, scene=item.phantom.scene
-        )
+    match plan.calibrate.fidelity:
+        case "points":
+            scan = _seen_points(plan, item, model)
+            result = calibrate([scan], model, replace(request, second_look=False))
+        case "images":
+            scan = _rendered(plan, item, model)
+            result = calibrate([scan], model, request, scene=item.phantom.scene)
+        case _:
+            assert_never(plan.calibrate.fidelity)
     note = "; ".join(f.text for f in result.errors)
     return {}, _compare_with_truth(result.fit, item, free, result.identifiable, note)
+
+
+def _rendered(plan: Plan, item: Item, model: BeadModel) -> Scan:
+    """Render the images of an item's scan, with noise of the item's seed."""
+    from flexdt_extensions.studies.rendered_runs import Rendering, render
+
+    camera = Rendering(counts=item.counts, blur_px=plan.calibrate.blur_px)
+    key = [int(v) for v in seed_of(plan, item.index, NOISE).generate_state(4)]
+    scene = item.phantom.scene
+    frames = render(scene, model, item.poses, item.truth, camera, key, item.shape)
+    return Scan(frames, item.poses)
 
 
 def _seen_points(plan: Plan, item: Item, model: BeadModel) -> Scan:

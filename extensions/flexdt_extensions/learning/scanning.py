@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, assert_never
 
 import gymnasium
 import numpy as np
@@ -117,12 +117,15 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         self._sectors = np.zeros(SECTORS, np.float32)
         self._taken = 0
         self._over = True
-        if action == "discrete":
-            self.action_space = gymnasium.spaces.Discrete(SECTORS)
-        else:
-            self.action_space = gymnasium.spaces.Box(
-                -1.0, 1.0, (4 if action == "pose" else 1,), np.float32
-            )
+        match action:
+            case "discrete":
+                self.action_space = gymnasium.spaces.Discrete(SECTORS)
+            case "angle":
+                self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+            case "pose":
+                self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+            case _:
+                assert_never(action)
         if self._shows:
             self.observation_space = gymnasium.spaces.Box(
                 0, 255, (*self.lab.small_shape, 1), np.uint8
@@ -244,14 +247,20 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         axis scaled to -1...1 over its range (its present place if not in `targets`).
         """
         angle = (targets["rot_obj"] + 180.0) % 360.0 - 180.0
-        if self.kind == "discrete":
-            return np.int64(round(angle * SECTORS / 360.0) % SECTORS)
+        match self.kind:
+            case "discrete":
+                return np.int64(round(angle * SECTORS / 360.0) % SECTORS)
+            case "angle":
+                moved: tuple[str, ...] = ()
+            case "pose":
+                moved = POSE_AXES
+            case _:
+                assert_never(self.kind)
         values = [angle / 180.0]
-        if self.kind == "pose":
-            for axis in POSE_AXES:
-                lower, upper = self.lab.range_of(axis)
-                where = targets.get(axis, self.lab.position(axis))
-                values.append(2.0 * (where - lower) / (upper - lower) - 1.0)
+        for axis in moved:
+            lower, upper = self.lab.range_of(axis)
+            where = targets.get(axis, self.lab.position(axis))
+            values.append(2.0 * (where - lower) / (upper - lower) - 1.0)
         return np.array(values, np.float32)
 
     def forecast(self, candidates: list[dict[str, float]]) -> npt.NDArray[np.float64]:
@@ -323,9 +332,14 @@ Policy = Callable[[ScanEnv, int], Action]
 
 def uniform(env: ScanEnv, frame: int) -> Action:
     """Draw any action; poses anywhere in the travel, collisions included."""
-    if env.kind == "pose":
-        return env.np_random.uniform(-1.0, 1.0, 4).astype(np.float32)
-    return env.action_for({"rot_obj": float(env.np_random.uniform(-180.0, 180.0))})
+    match env.kind:
+        case "pose":
+            return env.np_random.uniform(-1.0, 1.0, 4).astype(np.float32)
+        case "angle" | "discrete":
+            angle = float(env.np_random.uniform(-180.0, 180.0))
+            return env.action_for({"rot_obj": angle})
+        case _:
+            assert_never(env.kind)
 
 
 def equidistant(env: ScanEnv, frame: int) -> Action:

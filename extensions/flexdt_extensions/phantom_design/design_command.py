@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, assert_never
 
 import typer
 
@@ -93,12 +93,17 @@ def design(
     request = work.DesignRequest(
         beads, radius, bead, per_brick, criterion, seed=seed, trials=trials
     )
-    if grid == "lego":
-        n, m = map(int, numbers(studs, "studs", "NxM, e.g. 3x2", 2, by="x", whole=True))
-        stack = stack_of((n, m), bricks)
-        holder = work.BeadHolder(stack, stack.size_mm)
-    else:
-        holder = work.BeadHolder(None, triple(size, "size", "W,B,H, e.g. 20,40,60"), body)
+    match grid:
+        case "lego":
+            form = "NxM, e.g. 3x2"
+            n, m = map(int, numbers(studs, "studs", form, 2, by="x", whole=True))
+            stack = stack_of((n, m), bricks)
+            holder = work.BeadHolder(stack, stack.size_mm)
+        case "free":
+            sides = triple(size, "size", "W,B,H, e.g. 20,40,60")
+            holder = work.BeadHolder(None, sides, body)
+        case _:
+            assert_never(grid)
     document = work.run_design(holder, scans, request, out=out, tell=note)
     yield document
     yield table(work.table_rows(document), work.HEADER)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, assert_never
 
 import numpy as np
 import numpy.typing as npt
@@ -309,5 +309,7 @@ def score_of(covariance: FloatArray, criterion: Criterion) -> FloatArray:
             return np.asarray(
                 np.exp(0.5 * np.log(np.maximum(values, RIDGE**2)).mean(axis=-1))
             )
-        case _:
+        case "worst":
             return np.asarray(np.sqrt(variances.max(axis=-1)))
+        case _:
+            assert_never(criterion)
