@@ -168,8 +168,7 @@ class Forecast:
         """Format as one line: images, time [s], least transmission, pixel shares, best kV."""
         return (
             f"<Forecast: {self.images} images in {self.seconds:.0f} s, "
-            f"least transmission {self.transmission.least:.3g}, {self.saturated:.1%} "
-            "saturated, "
+            f"least transmission {self.transmission.least:.3g}, {self.saturated:.1%} saturated, "
             f"{self.starved:.1%} starved, best at {self.best[0].kV:g} kV>"
         )
 
@@ -392,8 +391,7 @@ def _check_settings(
                 integers = "whole numbers from " if counted else ""
                 raise LimitError(
                     f"{name} is {value:g}; allowed with {machine.name}: "
-                    f"{integers}{low_end:g} to "
-                    f"{high_end:g}",
+                    f"{integers}{low_end:g} to {high_end:g}",
                     {"asked": value, "allowed": [low_end, high_end]},
                 )
 

@@ -82,8 +82,7 @@ class Material:
         high = float(ends[-1])
         if not low <= energy_keV <= high:
             raise LimitError(
-                f"{self.name}: {energy_keV:g} keV is outside the table's [{low:g}, "
-                f"{high:g}] keV",
+                f"{self.name}: {energy_keV:g} keV is outside the table's [{low:g}, {high:g}] keV",
                 {"asked": energy_keV, "allowed": [low, high], "unit": "keV"},
             )
         if not self.points:
@@ -160,9 +159,8 @@ def material(name: str) -> Material:
     if "@" in name:
         return _by_formula(name)
     raise UnknownNameError(
-        f"unknown material {name!r}; there are: {', '.join(table)}, and FORMULA@DENSITY "
-        "such as "
-        "C8H8@1.05 (g/cm3)",
+        f"unknown material {name!r}; "
+        f"there are: {', '.join(table)}, and FORMULA@DENSITY such as C8H8@1.05 (g/cm3)",
         {"asked": name, "allowed": [*table, "FORMULA@DENSITY"]},
     )
 

@@ -245,8 +245,7 @@ def _solid(
         solids.append(manifold3d.Manifold(given))
         if solids[-1].status() != manifold3d.Error.NoError:
             raise PhantomError(
-                f"a mesh's surface meets itself ({solids[-1].status().name}); it cannot "
-                "be united "
-                "with or cut out of another"
+                f"a mesh's surface meets itself ({solids[-1].status().name}); "
+                "it cannot be united with or cut out of another"
             )
     return manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)

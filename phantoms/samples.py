@@ -63,10 +63,9 @@ TEXT_SUFFIXES: Final = (".toml", ".json")
 ALLOWED_FORMS: Final = (
     "a phantom or its name, the path of a file (TOML, JSON, "
     + ", ".join(FORMATS).upper()
-    + "), a "
-    "Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, a Scene "
-    "or Solid, a "
-    "dictionary as in a scene file, (any of these, material), or a list of them"
+    + "), a Volume, an array [z, y, x] with voxel_mm, a mesh with vertices and faces, "
+    "a Scene or Solid, a dictionary as in a scene file, (any of these, material), "
+    "or a list of them"
 )
 """Kinds of samples, for error messages."""
 
@@ -99,9 +98,8 @@ def shepp_logan(size_mm: float = 50.0) -> Phantom:
     skull = _ELLIPSOIDS[0][1]
     return Phantom(
         "shepp-logan",
-        f"Shepp-Logan head phantom of ten ellipsoids in a {size_mm:g} mm cube, contrast "
-        "times the "
-        "attenuation of water",
+        f"Shepp-Logan head phantom of ten ellipsoids in a {size_mm:g} mm cube, "
+        "contrast times the attenuation of water",
         Scene(tuple(solids)),
         (size_mm * skull[0], size_mm * skull[1], size_mm * skull[2]),
         assumed=("attenuation 1 of the table is that of water", f"size {size_mm:g} mm"),
@@ -330,11 +328,9 @@ def _array(
         high = float(data.max())
         if low < -FILLED_TOLERANCE or high > 1.0 + FILLED_TOLERANCE:
             raise PhantomError(
-                f"with material={material!r} an array holds the part of each voxel that "
-                "it fills, "
-                f"0 to 1, and this one goes from {low:g} to {high:g}; for an array of "
-                "labels give "
-                "material={1: ...}",
+                f"with material={material!r} an array holds the part of each voxel that it fills, "
+                f"0 to 1, and this one goes from {low:g} to {high:g}; "
+                "for an array of labels give material={1: ...}",
                 {"asked": [low, high], "allowed": [0, 1]},
             )
         data *= np.float32(material_of(material).mu_per_mm)
@@ -377,9 +373,8 @@ def _labelled(
     unknown = np.unique(labels[~known]).tolist()
     if unknown or 0 in names or len(order) > 256:
         raise PhantomError(
-            f"labels {unknown or list(names)}: allowed are 0 for nothing and the at most "
-            "255 that "
-            f"have a material ({', '.join(map(str, order[1:]))})",
+            f"labels {unknown or list(names)}: allowed are 0 for nothing "
+            f"and the at most 255 that have a material ({', '.join(map(str, order[1:]))})",
             {"asked": unknown or list(names), "allowed": order},
         )
     mu = np.array(

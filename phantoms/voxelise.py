@@ -164,8 +164,7 @@ def _add_surface(
     if leaks > MAX_LEAK_SHARE * hit:
         raise PhantomError(
             f"the mesh is not closed: {leaks} of {hit} columns through it do not end; "
-            "repair it "
-            "(close holes, orient faces) and try again",
+            "repair it (close holes, orient faces) and try again",
             {"asked": leaks, "allowed": int(MAX_LEAK_SHARE * hit)},
         )
 

@@ -299,8 +299,8 @@ def _plain(name: str, text: str) -> str:
         if name in BINARY_FIELDS:
             but = "surrogates"
         raise AcquilaError(
-            f"{name} holds U+{ord(character[0]):04X} at {character.start()}; allowed: anything "
-            f"but {but}"
+            f"{name} holds U+{ord(character[0]):04X} at {character.start()}; "
+            f"allowed: anything but {but}"
         )
     return text
 

@@ -98,9 +98,8 @@ def plain_name(value: str) -> str:
         raise ValueError("a name may hold anything but /, \\ and control characters")
     if (size := len(encoded(value))) > MAX_STEM:
         raise ValueError(
-            f"too long: {size} bytes percent-encoded (what is no letter, digit, space, "
-            "_, - or ~ "
-            f"takes 3 to 12), {MAX_STEM} allowed"
+            f"too long: {size} bytes percent-encoded (what is no letter, "
+            f"digit, space, _, - or ~ takes 3 to 12), {MAX_STEM} allowed"
         )
     return value
 

@@ -90,8 +90,7 @@ def from_bytes(
     size = memoryview(data).nbytes
     if size != expected:
         raise invalid_params(
-            f"an image of shape {list(shape)} and dtype {dtype} has {expected} bytes, "
-            f"not {size}",
+            f"an image of shape {list(shape)} and dtype {dtype} has {expected} bytes, not {size}",
             [problem("data", "wrong size", size)],
             {"bytes": expected},
         )

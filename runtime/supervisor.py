@@ -276,11 +276,8 @@ class Supervisor:
                 if clock() - since >= STALLED_S:
                     raise _Ended(f"it did nothing for {STALLED_S:g} s")
                 if clock() >= note_at and (note or used_s is not None):
-                    work = (
-                        f"the {service.name} is still starting: {used_s or 0:.0f} s of "
-                        "work so far"
-                    )
-                    self.note(note or work)
+                    work = f"{used_s or 0:.0f} s of work so far"
+                    self.note(note or f"the {service.name} is still starting: {work}")
                     note = ""
                     note_at = clock() + SILENT_S
                 await asyncio.wait(

@@ -424,8 +424,7 @@ def _run(argv: Sequence[str]) -> int:
     if argv and argv[0] in REMOVED_COMMANDS:
         note(
             f"flexdt {argv[0]}: has been removed; the data directory of a stopped twin is an "
-            "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` "
-            "unpacks it"
+            "ordinary folder: `tar -cf ARCHIVE.tar DIR` copies it, `tar -xf ARCHIVE.tar` unpacks it"
         )
         return USAGE
     completing = COMPLETION_VARIABLE in os.environ  # a shell requests completions

@@ -258,9 +258,8 @@ async def _go(
     at = state.axes[axis]
     if at.target != bound or abs(at.position - bound) > 1e-9:
         raise Refusal(
-            f"{axis} was bound for {bound:g} {at.unit} and is at {at.position:g}: it was "
-            "stopped "
-            f"or sent elsewhere{_why(state)}"
+            f"{axis} was bound for {bound:g} {at.unit} and is at {at.position:g}: "
+            f"it was stopped or sent elsewhere{_why(state)}"
         )
     return twin.motor_text(axis, at)
 

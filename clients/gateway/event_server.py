@@ -488,9 +488,9 @@ def check_loopback(host: str) -> None:
     """
     if not is_loopback(host):
         raise AccessError(
-            f"the gateway does not listen on {host!r}: its interface has no token and no "
-            "encryption; allowed: 127.0.0.1, ::1 and localhost, from elsewhere through an SSH "
-            "tunnel"
+            f"the gateway does not listen on {host!r}: "
+            "its interface has no token and no encryption; "
+            "allowed: 127.0.0.1, ::1 and localhost, from elsewhere through an SSH tunnel"
         )
 
 

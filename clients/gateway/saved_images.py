@@ -229,9 +229,8 @@ class Recording:
         taken = sorted(set(names) & self._folder.names())
         if taken:
             raise DatasetError(
-                f"{self._folder.path} has {taken[0]} already; allowed: another name, or "
-                "another "
-                "output path",
+                f"{self._folder.path} has {taken[0]} already; "
+                "allowed: another name, or another output path",
                 {"asked": taken},
             )
         return self._folder

@@ -63,9 +63,8 @@ FOR_GOOD: Final = "private, max-age=31536000, immutable"
 """Cache header of files whose name changes with their content."""
 NO_TOKEN: Final = "This viewer wants a token: open its first page, and type it there.\n"
 POLICY: Final = (
-    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' "
-    "data: blob: "
-    "ws: wss:; frame-ancestors 'self'"
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
+    "connect-src 'self' data: blob: ws: wss:; frame-ancestors 'self'"
 )
 
 PageHandler = Callable[[str, ServerConnection], Awaitable[None]]

@@ -238,9 +238,8 @@ def _readable_error(
     """
     if isinstance(error, CancelledError):
         return CommandError(
-            f"the dask scheduler at {address} is lost; once there is one, run the "
-            "command again to "
-            "go on",
+            f"the dask scheduler at {address} is lost; "
+            "once there is one, run the command again to go on",
             REFUSED,
         )
     if isinstance(error, killed):

@@ -159,9 +159,8 @@ class SlurmJobs:
             why = _outcome(job.id)
             if self._barren >= MAX_BARREN:
                 raise CommandError(
-                    f"{MAX_BARREN} jobs have ended before a worker of theirs came, the "
-                    "last one, "
-                    f"{job.id}: {why}; slurm-{job.id}.out may say more",
+                    f"{MAX_BARREN} jobs have ended before a worker of theirs came, "
+                    f"the last one, {job.id}: {why}; slurm-{job.id}.out may say more",
                     REFUSED,
                 )
             lines.append(f"job {job.id} has ended ({why}); another one is submitted")

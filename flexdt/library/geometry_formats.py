@@ -151,9 +151,8 @@ def from_tomosipo(geometry: Any) -> ConeVec:
         lost = [name for name in names if not hasattr(vectors, name)]
         if lost:
             raise GeometryError(
-                f"a {type(geometry).__name__} has no {', '.join(lost)}; allowed: a cone "
-                "geometry "
-                "of tomosipo",
+                f"a {type(geometry).__name__} has no {', '.join(lost)}; "
+                "allowed: a cone geometry of tomosipo",
                 {"asked": type(geometry).__name__, "missing": lost},
             )
         stored = (np.asarray(getattr(vectors, name)) for name in names)

@@ -552,11 +552,9 @@ def _panel(
         > PITCH_TOLERANCE
     ):
         raise LimitError(
-            f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; allowed with "
-            f"{spec.model}: "
-            f"one whole number times {edges[0]:g} x {edges[1]:g} mm. Give "
-            "detector=Detector(...) "
-            "for another detector",
+            f"the geometry's pixels are {pitch:g} x {row_pitch:g} mm; "
+            f"allowed with {spec.model}: one whole number times {edges[0]:g} x {edges[1]:g} mm. "
+            "Give detector=Detector(...) for another detector",
             {"asked": [pitch, row_pitch], "allowed": list(edges), "unit": "mm"},
         )
     camera = spec.camera
@@ -603,9 +601,8 @@ def _flat_doubt(shape: tuple[int, int], cone: ConeVec) -> Iterator[str]:
     )
     if worst > 1e-3:
         yield (
-            "the flat image is that of the first view; the open beam of other views "
-            "differs by up "
-            f"to {100.0 * worst:.2g} %"
+            "the flat image is that of the first view; "
+            f"the open beam of other views differs by up to {100.0 * worst:.2g} %"
         )
 
 
@@ -624,8 +621,7 @@ def _spot_doubt(truth: Truth) -> Iterator[str]:
         yield (
             f"the focal spot blurs the whole sample by {axis:.2g} pixels (standard deviation), "
             f"really by {far:.2g} to {near:.2g}, from its far side to its near one: "
-            "spot_points="
-            f"{max(16, 4 * int(np.ceil(min(near, 200.0))))} has each depth as it is"
+            f"spot_points={max(16, 4 * int(np.ceil(min(near, 200.0))))} has each depth as it is"
         )
 
 

@@ -172,8 +172,7 @@ def filled_mesh(
     high = vertices.max(axis=0)
     if (high - low).max() > MAX_EXTENT_MM or (high - low).max() <= 0.0:
         raise PhantomError(
-            f"{label} measures {(high - low).max():g} mm in unit {unit!r}; allowed: more "
-            "than 0, "
+            f"{label} measures {(high - low).max():g} mm in unit {unit!r}; allowed: more than 0, "
             f"at most {MAX_EXTENT_MM:g} mm. Is the unit right ({', '.join(UNITS_MM)})?",
             {"asked": float((high - low).max()), "allowed": MAX_EXTENT_MM},
         )

@@ -199,9 +199,8 @@ def require_replaced(phantom: Phantom, solids: object) -> None:
         )
         if least < -MAX_ABSENT_SHARE * material_of(name).mu_per_mm:
             raise PhantomError(
-                f"{name} is replaced where there is none of it, or twice; allowed: "
-                "inside solids "
-                f"of {name} that are not replaced already",
+                f"{name} is replaced where there is none of it, or twice; "
+                f"allowed: inside solids of {name} that are not replaced already",
                 {"asked": name, "allowed": "inside it"},
             )
 
@@ -260,11 +259,9 @@ def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, floa
     )
     if folder is None:
         raise PhantomError(
-            f"{where}.file is {given['file']!r}, but a text by itself has no folder to "
-            "look in; "
-            "read the scene from its file, or send it as `flexdt sample FILE` does, with "
-            "the mesh "
-            "inside",
+            f"{where}.file is {given['file']!r}, but a text by itself has no folder to look in; "
+            "read the scene from its file, "
+            "or send it as `flexdt sample FILE` does, with the mesh inside",
             {"path": f"{where}.file", "asked": given["file"]},
         )
     at = given.get("position_mm")

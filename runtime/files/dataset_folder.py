@@ -352,9 +352,8 @@ def read_values(
         raise ds.DatasetFormatError(message, {"path": str(path)}) from None
     if shape is not None and image.shape != shape:
         raise ds.DatasetFormatError(
-            f"{path} has {image.shape[1]} x {image.shape[0]} pixels, the data set has "
-            f"{shape[1]} "
-            f"x {shape[0]}",
+            f"{path} has {image.shape[1]} x {image.shape[0]} pixels, "
+            f"the data set has {shape[1]} x {shape[0]}",
             {"path": str(path), "asked": list(image.shape), "allowed": list(shape)},
         )
     return image
@@ -445,10 +444,8 @@ def _check_kind(
     words = ", ".join(map(str, allowed))
     way = ""
     if len(shape) == 3:
-        way = (
-            "; several images in one file: fx.DataSet.from_arrays(tifffile.imread(FILE), "
-            "geometry)"
-        )
+        call = "fx.DataSet.from_arrays(tifffile.imread(FILE), geometry)"
+        way = f"; several images in one file: {call}"
     raise ds.DatasetFormatError(
         f"{path} is {kind} of shape {shape}; allowed: {words} (rows, columns){way}",
         {"path": str(path), "asked": [str(kind), list(shape)]},

@@ -350,9 +350,8 @@ class ObstacleMoves:
             pair = contact.pair
         if found is None:
             raise CollisionError(
-                f"no free way to {_text(goal)} was found: {' and '.join(pair)} would "
-                "collide on "
-                "the direct one",
+                f"no free way to {_text(goal)} was found: "
+                f"{' and '.join(pair)} would collide on the direct one",
                 {
                     "asked": dict(goal),
                     "pair": list(pair),

@@ -551,9 +551,8 @@ class Submissions:
         name = begin.sample.name
         if begin.revision not in (None, now):
             raise busy(
-                f"the sample {name!r} has been uploaded anew since this scan began, and "
-                "its images "
-                "would show two objects; upload the first file again, or begin another scan",
+                f"the sample {name!r} has been uploaded anew since this scan began, and its "
+                "images would show two objects; upload the first file again, or begin another scan",
                 {"asked": now, "allowed": begin.revision, "sample": name},
             )
 

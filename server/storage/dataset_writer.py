@@ -158,9 +158,8 @@ class DatasetWriter:
         missing = self.missing
         if missing:
             raise ds.DatasetMissingError(
-                f"{self.folder}: {len(missing)} of {len(self.record.files)} images are "
-                "missing: "
-                f"{summary(missing)}",
+                f"{self.folder}: {len(missing)} "
+                f"of {len(self.record.files)} images are missing: {summary(missing)}",
                 {"path": str(self.folder), "missing": list(missing[:100])},
             )
         self._write_end(True, "", duration_s)
@@ -193,8 +192,7 @@ class DatasetWriter:
         names = self._files.names()
         if names and not resume:
             raise ds.DatasetExistsError(
-                f"{self.folder} holds {len(names)} files already; allowed: another name, "
-                "or resume",
+                f"{self.folder} holds {len(names)} files already; allowed: another name, or resume",
                 {"path": str(self.folder), "files": len(names)},
             )
         if DOCUMENT in names:
@@ -249,8 +247,7 @@ class DatasetWriter:
         ):
             if a != b:
                 raise ds.DatasetExistsError(
-                    f"{self.folder} holds another scan (its {what} differ); allowed: "
-                    "another name",
+                    f"{self.folder} holds another scan (its {what} differ); allowed: another name",
                     {"path": str(self.folder), "differs": what},
                 )
         # The scan began then, and with that correction in force.
@@ -275,8 +272,7 @@ class DatasetWriter:
         free = free_bytes(self.folder)
         if free is not None and free < need:
             raise ds.DiskFullError(
-                f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes "
-                "are free",
+                f"{self.folder}: {len(missing)} images need {need} bytes, {free} bytes are free",
                 {"path": str(self.folder), "bytes": need, "free": free},
             )
 

@@ -161,9 +161,8 @@ class DiskRoom:
             free = left if free is None else min(free, left)
         if free is not None and free < need:
             raise DiskFullError(
-                f"{what} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} "
-                "MB are to "
-                f"stay free; {free / 1e6:.1f} MB are free in {self.root.path}",
+                f"{what} needs {need / 1e6:.1f} MB, of which {RESERVE_BYTES / 1e6:.1f} MB "
+                f"are to stay free; {free / 1e6:.1f} MB are free in {self.root.path}",
                 {"asked": need, "allowed": free, "path": str(self.root.path)},
             )
 

@@ -212,9 +212,8 @@ class Incoming:
         """
         return LimitError(
             f"upload {name!r}: the chunk begins at {start}, but {received} bytes have come; "
-            f"chunks come in order, from 0, and {MAX_UPLOADS} uploads and {self._limit} "
-            "bytes are "
-            "kept at a time: one begun before may have been dropped for newer ones",
+            f"chunks come in order, from 0, and {MAX_UPLOADS} uploads and {self._limit} bytes "
+            "are kept at a time: one begun before may have been dropped for newer ones",
             {"asked": start, "allowed": received},
         )
 

@@ -243,9 +243,8 @@ class SampleStore:
         documents.file_stem(head.name)
         if head.name not in self._heads and len(self._heads) >= self._most:
             raise LimitError(
-                f"there are {len(self._heads)} uploads, {self._most} allowed; "
-                "sample.delete makes "
-                "room",
+                f"there are {len(self._heads)} uploads, "
+                f"{self._most} allowed; sample.delete makes room",
                 {"asked": len(self._heads) + 1, "allowed": self._most},
             )
         return self._incoming.receive(head, start, data)

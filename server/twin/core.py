@@ -151,8 +151,8 @@ class ControlLease:
         not raised.
         """
         return busy(
-            f"{what}: {self.holder} is the controller; session.control with action force takes "
-            "control over",
+            f"{what}: {self.holder} is the controller; "
+            "session.control with action force takes control over",
             {
                 "asked": what,
                 "controller": self.holder,

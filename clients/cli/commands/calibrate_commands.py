@@ -499,8 +499,7 @@ def motions(document: Mapping[str, Any]) -> Iterator[str]:
             values = told["values"]
             sigma = sum(told["sigmas"]) / len(values)
             yield (
-                f"{name} moves by {max(values) - min(values):.3g} {told['unit']} during "
-                "the scan, "
+                f"{name} moves by {max(values) - min(values):.3g} {told['unit']} during the scan, "
                 f"each frame known to {sigma:.2g}"
             )
 

@@ -306,9 +306,8 @@ def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
             ["the calibration is not identifiable", *problems], NOT_IDENTIFIABLE
         )
     tell(
-        f"calibrated in {duration(time.monotonic() - begun)}: {document['detections']} "
-        "beads seen, "
-        f"rms {document['rms_px']:.4f} px"
+        f"calibrated in {duration(time.monotonic() - begun)}: "
+        f"{document['detections']} beads seen, rms {document['rms_px']:.4f} px"
     )
     return outcome
 

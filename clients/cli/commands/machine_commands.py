@@ -127,10 +127,9 @@ def fit(
     yield "\n" + _times(found.machine)
     lines = found.lines
     yield (
-        f"\n{len(lines.rows)} lines, {lines.total_real_s:.2f} s; absolute errors sum to "
-        f"{lines.sum_abs_error_s:.2f} s, {found.cross_validated_s:.2f} s with each time "
-        "predicted "
-        "from the others of its kind"
+        f"\n{len(lines.rows)} lines, {lines.total_real_s:.2f} s; "
+        f"absolute errors sum to {lines.sum_abs_error_s:.2f} s, "
+        f"{found.cross_validated_s:.2f} s with each time predicted from the others of its kind"
     )
     if len(logs) == 1:
         yield (

@@ -61,8 +61,7 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
     if not is_shipped(name):
         raise TwinError(
             f"{dataset.where}: what the sample {name!r} is made of is not known here; "
-            "known: the "
-            "phantoms of flexdt, in scans of the twin",
+            "known: the phantoms of flexdt, in scans of the twin",
             {"asked": name, "allowed": "a phantom that ships with flexdt"},
         )
     phantom = load_phantom(name)

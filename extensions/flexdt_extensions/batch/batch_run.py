@@ -175,8 +175,7 @@ class Store:
         if not self._log_path.exists():
             if any(self.folder.iterdir()):
                 raise CommandError(
-                    f"{self.folder}: holds files that are no batch of flexdt; choose "
-                    "another folder"
+                    f"{self.folder}: holds files that are no batch of flexdt; choose another folder"
                 )
             return False
         whole = self._log_path.read_bytes()
@@ -433,9 +432,8 @@ def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> No
                     tell(count, store.plan.batch.items, rate)
     except BrokenProcessPool as error:
         raise CommandError(
-            f"a worker died ({error}); {len(store.records)} items are done: run the "
-            "command again "
-            "to go on"
+            f"a worker died ({error}); "
+            f"{len(store.records)} items are done: run the command again to go on"
         ) from None
     finally:
         for future in flying:

@@ -135,9 +135,8 @@ class TrainingData:
             )
         if augment is not None and augment.photons and plan["images"]["noise"]:
             raise CommandError(
-                f"{self.folder}: its images have noise; photons would add to it. Make "
-                "the batch "
-                "with noise = false, or give Augment(photons=None)"
+                f"{self.folder}: its images have noise; photons would add to it. "
+                "Make the batch with noise = false, or give Augment(photons=None)"
             )
         self.names = tuple(manifest["arrays"])
         self.shard = int(plan["batch"]["shard"])

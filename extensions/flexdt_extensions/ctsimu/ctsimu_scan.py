@@ -318,8 +318,7 @@ class _ScanReader(ScenarioReader):
         if scan.scattering and (varies or any(s.on_stage is None for s in scan.samples)):
             raise self._error(
                 "acquisition.scattering",
-                "false, where the spectrum or a sample's place on the stage changes in "
-                "the scan",
+                "false, where the spectrum or a sample's place on the stage changes in the scan",
             )
 
     # Geometry
@@ -552,8 +551,7 @@ class _ScanReader(ScenarioReader):
             self._given("source", "target", name)
         self._notes.append(
             "source.target: the spectrum is that of tungsten reflecting at 12 degrees, "
-            "whatever "
-            "type and angles are; source.spectrum.file states another"
+            "whatever type and angles are; source.spectrum.file states another"
         )
 
     def _read_spectrum(self, name: object, where: str) -> Spectrum:

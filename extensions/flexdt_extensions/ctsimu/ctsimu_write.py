@@ -136,8 +136,7 @@ def scenario_document(scan: Scenario) -> dict[str, Any]:
             view = int(np.argmax(turned))
             raise ExchangeError(
                 f"CTSimU: the panel's {what} in frame {view} is not that of frame 0; "
-                "only panels "
-                "that keep their orientation are written",
+                "only panels that keep their orientation are written",
                 {"row": view},
             )
     origin = poses.source[0]

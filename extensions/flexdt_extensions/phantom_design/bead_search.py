@@ -394,8 +394,7 @@ def design(
         discarded += 1
     raise TwinError(
         f"all {discarded} bead sets found are ambiguous: their shadows fit at another "
-        "start angle "
-        "as well; use another number of beads, more bricks or fewer beads in one brick",
+        "start angle as well; use another number of beads, more bricks or fewer beads in one brick",
         {"asked": count, "discarded": discarded},
     )
 
@@ -470,8 +469,7 @@ def _random_set(
         free = np.flatnonzero(_allowed_seats(table, rules, chosen))
         if len(free) == 0:
             raise TwinError(
-                f"{count} beads do not fit: after {len(chosen)} no seat is left that is "
-                "in view, "
+                f"{count} beads do not fit: after {len(chosen)} no seat is left that is in view, "
                 "far enough from the others and in a brick that may hold more",
                 {"asked": count, "allowed": len(chosen)},
             )

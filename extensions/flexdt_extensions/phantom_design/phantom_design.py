@@ -115,9 +115,8 @@ def circle_poses(
     for sod, lateral in placements:
         if not (0.0 < sod < sdd_mm < math.inf and math.isfinite(lateral)):
             raise CommandError(
-                f"SOD {sod:g} mm, lateral {lateral:g} mm and SDD {sdd_mm:g} mm; allowed: "
-                "finite, "
-                "0 < SOD < SDD"
+                f"SOD {sod:g} mm, lateral {lateral:g} mm and SDD {sdd_mm:g} mm; "
+                "allowed: finite, 0 < SOD < SDD"
             )
     camera = machine.detector.camera
     pitch = camera.pixel_mm(machine.detector.pixels)

@@ -185,8 +185,7 @@ def real_lines(document: Mapping[str, Any]) -> list[str]:
     )
     lines = [
         f"logged fits of real scans from N = {ENOUGH} up, against their simulation: "
-        f"{sum(r['within'] for r in found)} of {sum(r['fits'] for r in found)} agree "
-        "within 1 deg "
+        f"{sum(r['within'] for r in found)} of {sum(r['fits'] for r in found)} agree within 1 deg "
         f"of alpha and 15 % of the residual, all of a scan's in {whole} of {len(found)} scans; "
         f"with the rms of alpha's differences instead of each, {most} of {len(found)}"
     ]

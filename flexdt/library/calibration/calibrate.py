@@ -463,9 +463,8 @@ def saturation(dataset: ImageSet) -> Finding | None:
     return Finding(
         "saturated",
         Severity.WARNING,
-        f"{dataset.name}: {100 * share:.0f} % of the flat field is saturated: lower the "
-        "exposure "
-        "or the power",
+        f"{dataset.name}: {100 * share:.0f} % of the flat field is saturated: "
+        "lower the exposure or the power",
     )
 
 

@@ -662,10 +662,9 @@ def _turning_back(
         return calibration
     off = error(
         "angle_reversed",
-        f"the markers fit to {fit.certificate.rms_px:.2g} px instead of "
-        f"{calibration.fit.certificate.rms_px:.2g} if the stage turns the other way than the "
-        "angles say, "
-        "or if the images are mirrored",
+        f"the markers fit to {fit.certificate.rms_px:.2g} px instead "
+        f"of {calibration.fit.certificate.rms_px:.2g} if the stage turns the other way "
+        "than the angles say, or if the images are mirrored",
     )
     return replace(calibration, findings=(off, *calibration.findings))
 

@@ -42,9 +42,8 @@ def saturated_part(what: str, share: float) -> str:
         share: of their pixels, 0 to 1.
     """
     return (
-        f"{100.0 * share:.3g} % of the pixels of the {what} {SATURATED}: lower the "
-        "tube's power or "
-        "the exposure"
+        f"{100.0 * share:.3g} % of the pixels of the {what} {SATURATED}: "
+        "lower the tube's power or the exposure"
     )
 
 

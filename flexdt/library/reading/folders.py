@@ -124,8 +124,7 @@ def load_dataset(
     content = list_folder(Path(folder))
     if UNFINISHED in content.names:
         raise DatasetMissingError(
-            f"{unfinished(content.path)}; save it once more with resume=True, or remove "
-            "the folder",
+            f"{unfinished(content.path)}; save it once more with resume=True, or remove the folder",
             {"path": str(content.path)},
         )
     foreign = _foreign_file(content)
@@ -504,9 +503,8 @@ def _from_texts(
     names = [content.projection_name(i) for i in range(count)]
     if settings.projections is not None and count > settings.projections:
         warnings.append(
-            f"{count} projections are there, the text says {settings.projections}; "
-            "angles follow "
-            "the text"
+            f"{count} projections are there, "
+            f"the text says {settings.projections}; angles follow the text"
         )
     full_scale = None
     if rebuilt.machine is not None:
@@ -597,8 +595,7 @@ def _require_one_circle(content: Folder) -> None:
         return
     if not one:
         raise DatasetFormatError(
-            f"{path} says that the scan has several sections (tiled, helical, repeated): "
-            "the texts "
-            f"state the pose of one only; {DOCUMENT} is needed",
+            f"{path} says that the scan has several sections (tiled, "
+            f"helical, repeated): the texts state the pose of one only; {DOCUMENT} is needed",
             {"path": str(path), "missing": [DOCUMENT]},
         )

@@ -188,9 +188,8 @@ def markers_alone(geometry: ConeVec, name: str) -> DataSet:
     """
     if geometry.shape is None:
         raise TwinError(
-            f"{name}: the geometry does not state the detector's rows and columns; write "
-            "one that "
-            "does with flexdt import, or give the frames too"
+            f"{name}: the geometry does not state the detector's rows and columns; "
+            "write one that does with flexdt import, or give the frames too"
         )
     shape = (geometry.shape[1], geometry.shape[2])
     frames = tuple(

@@ -284,11 +284,9 @@ def _geometry(
         pixel=(pixel, lengths["y_pixel_size"] or pixel),
     )
     return cone, [
-        f"{path.name} says angles, pixels and distances (source to axis {sod:g} mm, axis "
-        "to panel "
-        f"{beyond:g} mm): an upright panel is assumed, and the axis in its middle "
-        "column; `align` "
-        "or `calibrate` finds them"
+        f"{path.name} says angles, pixels and distances (source to axis {sod:g} mm, "
+        f"axis to panel {beyond:g} mm): an upright panel is assumed, "
+        "and the axis in its middle column; `align` or `calibrate` finds them"
     ]
 
 

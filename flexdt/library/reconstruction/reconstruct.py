@@ -912,9 +912,8 @@ def _source(
     kV = stated_kV if request.kV is None else request.kV
     if kV is None:
         raise LimitError(
-            f"{dataset.where} does not say its tube voltage, which corrections of beam "
-            "hardening "
-            "and scatter need; give kV= or tube=",
+            f"{dataset.where} does not say its tube voltage, "
+            "which corrections of beam hardening and scatter need; give kV= or tube=",
             {"missing": "kV"},
         )
     figures = {} if dataset.document is None else dataset.document.noise.model
