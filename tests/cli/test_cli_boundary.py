@@ -127,8 +127,7 @@ def test_help_imports_nothing_heavy() -> None:
         "import sys\n"
         "from flexdt.clients.cli.command_tree import run\n"
         "code = run(['--help'])\n"
-        f"bad = [m for m in sys.modules for h in {HEAVY!r} if m == h or m.startswith(h + "
-        "'.')]\n"
+        f"bad = [m for m in sys.modules for h in {HEAVY!r} if f'{{m}}.'.startswith(f'{{h}}.')]\n"
         "sys.exit(str(bad) if bad else code)\n"
     )
     done = subprocess.run(

@@ -152,8 +152,8 @@ def test_a_phantom_is_added_by_its_recipe(copy: Path) -> None:
         '    """Return a ball of water of 10 mm."""\n'
         "    water = material_of('water').mu_per_mm\n"
         "    ball = Solid(Ellipsoid((0.0, 0.0, 0.0), (5.0, 5.0, 5.0)), 'water', water)\n"
-        "    return Phantom('added', 'a ball of water', Scene((ball,)), (10.0, 10.0, "
-        "10.0))\n\n\n"
+        "    size = (10.0, 10.0, 10.0)\n"
+        "    return Phantom('added', 'a ball of water', Scene((ball,)), size)\n\n\n"
     )
     before = "_MAKERS: Final[Mapping[str, Callable[[], Phantom]]] = {\n"
     assert text.count(before) == 1

@@ -221,8 +221,8 @@ def test_mesh_and_voxel_documents_come_back_equal() -> None:
         ('name = "a"\n[[bead]]\nposition_mm=[0,0,1]\nradius_mm=1\nmaterial="x"', "steel"),
         ('name = "a"\n[body]\nsize_mm=[4,4,4]\n[[bead]]\nposition_mm=[0,0,9]\nradius_mm=1',
          "bead 0 at [0.0, 0.0, 9.0] mm with radius 1 mm sticks out"),
-        ('name = "a"\n[[bead]]\nposition_mm=[0,0,9]\nradius_mm=1\n[[bead]]\nposition_mm=[0,0,8]\n'
-         'radius_mm=2', "beads 0 and 1 overlap by 2 mm"),
+        ('name = "a"\n[[bead]]\nposition_mm=[0,0,9]\nradius_mm=1\n'
+         '[[bead]]\nposition_mm=[0,0,8]\nradius_mm=2', "beads 0 and 1 overlap by 2 mm"),
         ('name = "a"\n[spiral]\nbeads=5', "needs a [body]"),
         ('name = ', "not valid TOML"),
     ],

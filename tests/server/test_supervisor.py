@@ -247,8 +247,7 @@ def test_a_service_killed_before_it_was_ready_is_started_again(
     assert len(started(tmp_path, "killed-early")) == 3
     assert notes == [
         "the killed-early ended (killed by SIGKILL, while starting); starting it again",
-        "the killed-early ended (killed by SIGKILL, while starting); starting it again "
-        "in 0.5 s",
+        "the killed-early ended (killed by SIGKILL, while starting); starting it again in 0.5 s",
     ]
 
 

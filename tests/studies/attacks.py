@@ -617,8 +617,7 @@ def big_mesh(g: Ground) -> str:
     assert code_of(answer) in (-32602, -32008), answer
     return (
         f"{code_of(answer)} after {took:.0f} s; twin now {g.twin.memory_mb():.0f} MB; "
-        "slowest ping "
-        f"of another client {1000 * worst:.0f} ms"
+        f"slowest ping of another client {1000 * worst:.0f} ms"
     )
 
 

@@ -140,9 +140,8 @@ def run(case: str, cache: Path | None) -> None:
         spent[function] += seconds
         kinds[function].append(signature)
     print(
-        f"{case}: {sum(spent.values()):.1f} s of {used_s() - before:.1f} s processor "
-        "time compile, "
-        f"{wall:.1f} s in all"
+        f"{case}: {sum(spent.values()):.1f} s "
+        f"of {used_s() - before:.1f} s processor time compile, {wall:.1f} s in all"
     )
     for function in sorted(spent, key=lambda f: -spent[f]):
         if spent[function] >= 0.05:

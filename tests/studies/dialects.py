@@ -54,8 +54,7 @@ def days(hours: float, seed: int) -> None:
             errors = sum(n for (severity, _), n in kinds.items() if severity == "error")
             print(
                 f"{hours:g} h, {what} times, {dialect.name}: {len(messages)} messages, "
-                f"{errors} "
-                f"errors, {len(listener.alarms) - errors} warnings {dict(kinds)}; "
+                f"{errors} errors, {len(listener.alarms) - errors} warnings {dict(kinds)}; "
                 f"{time.monotonic() - began:.0f} s",
                 flush=True,
             )

@@ -363,11 +363,12 @@ def writes(root: Path, count: int, rng: random.Random) -> int:
             w.round(number, {"at": at, "error": error, "lasting": lasting})
     finally:
         w.rays.end()
-    print(f"{count} servers with a file operation to fail at a drawn moment (or all that take room "
-          f"from then on): it came to that in {w.failed}; {w.unstarted} said so and did "
-          "not start, "
-          f"{w.refused} requests were refused; {w.wrong} things were wrong "
-          "after a kill -9.")  # fmt: skip
+    print(
+        f"{count} servers with a file operation to fail at a drawn moment "
+        f"(or all that take room from then on): it came to that in {w.failed}; "
+        f"{w.unstarted} said so and did not start, {w.refused} requests were refused; "
+        f"{w.wrong} things were wrong after a kill -9."
+    )
     return w.wrong
 
 

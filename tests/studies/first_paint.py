@@ -78,9 +78,8 @@ def main() -> None:
         for what in ("cold", "warm", "warm"):
             paint, picture, live, mb = opened(context, url)
             print(
-                f"{what}: first paint {paint:.2f} s, picture {picture:.2f} s, live "
-                f"{live:.2f} s, "
-                f"{mb:.2f} MB; load average {os.getloadavg()[0]:.1f}",
+                f"{what}: first paint {paint:.2f} s, picture {picture:.2f} s, "
+                f"live {live:.2f} s, {mb:.2f} MB; load average {os.getloadavg()[0]:.1f}",
                 flush=True,
             )
         browser.close()

@@ -1167,9 +1167,11 @@ def fuzz(count: int, seed: str, which: list[str], out: File, most: int) -> int:
             f"{kind}: " + ", ".join(f"{code}: {n}" for code, n in sorted(codes.items()))
         )
     memory = ", ".join(f"{n} {min(v):.0f} to {max(v):.0f} MB" for n, v in series.items())
-    print(f"{done} messages with {len(fields)} fields (seed {seed}) in "
-          f"{time.monotonic() - begun:.0f} s; {memory}; {len(lab.found.kept)} problems. "
-          f"{machine()}.")  # fmt: skip
+    print(
+        f"{done} messages with {len(fields)} fields (seed {seed}) "
+        f"in {time.monotonic() - begun:.0f} s; {memory}; "
+        f"{len(lab.found.kept)} problems. {machine()}."
+    )
     return len(lab.found.kept)
 
 

@@ -229,14 +229,11 @@ def main() -> int:
         for entry in bad[:3]:
             print("LOG:", str(entry)[-1200:])
     print(
-        f"{r.kills['twin']} twins, {r.kills['starting']} more while they started, and "
-        f"{r.kills['projector']} projectors killed in {scans} scans of "
-        f"{FRAMES} frames within {time.monotonic() - begun:.0f} s: {r.lost} completed "
-        "frames lost, "
-        f"{r.corrupt} corrupt files, {r.unresumed} scans not resumed, {r.different} "
-        "results that "
-        f"differ; a twin was back after {sum(r.down_s) / max(1, len(r.down_s)):.1f} s on "
-        "average."
+        f"{r.kills['twin']} twins, {r.kills['starting']} more while they started, "
+        f"and {r.kills['projector']} projectors killed in {scans} scans of {FRAMES} frames "
+        f"within {time.monotonic() - begun:.0f} s: {r.lost} completed frames lost, {r.corrupt} "
+        f"corrupt files, {r.unresumed} scans not resumed, {r.different} results that differ; "
+        f"a twin was back after {sum(r.down_s) / max(1, len(r.down_s)):.1f} s on average."
     )
     return 1 if r.lost or r.corrupt or r.unresumed or r.different or bad else 0
 

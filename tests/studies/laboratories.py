@@ -118,17 +118,15 @@ def main() -> None:
         pulls = ", ".join(f"{n} {p:+.1f}" for n, p in out.pulls.items())
         worst = max(map(abs, out.columns.values()), default=math.nan)
         print(
-            f"{k}: worst column {worst:.4f} px; {pulls}; wrong {out.wrong}; missed "
-            f"{out.missed}; "
-            f"not planted {out.false}; {out.seconds:.1f} s", flush=True,
+            f"{k}: worst column {worst:.4f} px; {pulls}; wrong {out.wrong}; "
+            f"missed {out.missed}; not planted {out.false}; {out.seconds:.1f} s", flush=True,
         )  # fmt: skip
     columns = np.abs([c for out in done for c in out.columns.values()])
     print(f"\n{len(done)} laboratories, {sum(o.seconds for o in done):.0f} s in all")
     print(f"limits, rates or signs wrong in {sum(bool(o.wrong) for o in done)}")
     print(
-        f"axis column of {len(columns)} scans: rms {np.sqrt(np.mean(columns**2)):.4f} "
-        "px, worst "
-        f"{columns.max():.4f} px, {np.sum(columns > 0.05)} beyond 0.05 px"
+        f"axis column of {len(columns)} scans: rms {np.sqrt(np.mean(columns**2)):.4f} px, "
+        f"worst {columns.max():.4f} px, {np.sum(columns > 0.05)} beyond 0.05 px"
     )
     for name in ("drift", "axs_tan", "det_tan", "det_roll_deg"):
         told = np.abs([o.pulls[name] for o in done if name in o.pulls])

@@ -106,9 +106,8 @@ def main() -> None:
     here = os.cpu_count() or 1
     print(
           f"{machine()}: {found['updates'] / 1e9:.2f} G voxel updates, "
-          f"{found['filtered'] / 1e6:.0f} M pixels filtered, {found['read'] / 1e6:.0f} M "
-          "pixels "
-          f"read and made line integrals, {found['written'] / 1e6:.0f} MB written a second"
+          f"{found['filtered'] / 1e6:.0f} M pixels filtered, {found['read'] / 1e6:.0f} "
+          f"M pixels read and made line integrals, {found['written'] / 1e6:.0f} MB written a second"
     )  # fmt: skip
     grid = fx.Grid((o.side,) * 3, 1.0)
     count = len(slabs(grid))

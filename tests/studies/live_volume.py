@@ -77,8 +77,7 @@ def main(frames: int = 120) -> None:
     """The table."""
     print(f"load average before: {os.getloadavg()[0]:.1f}; {os.cpu_count()} processors")
     print(
-        "| side | voxel | views/s | from picture to picture | at worst | behind the last "
-        "image |"
+        "| side | voxel | views/s | from picture to picture | at worst | behind the last image |"
     )
     print("|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder, fx.LocalTwin(data=folder) as twin:

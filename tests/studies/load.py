@@ -160,12 +160,11 @@ def main() -> int:
                 factor = wire.call("state.get")["clock"]["real_time_factor"]
                 print(
                     f"{name}: {options.clients} clients, {got['events'] / took:.0f} events/s, "
-                    f"{got['disorder']} out of order, {got['lost']} cut off; {len(ms)} "
-                    "state.get: "
+                    f"{got['disorder']} out of order, {got['lost']} cut off; {len(ms)} state.get: "
                     f"median {percentile(ms, 0.5):.1f} ms, p99 {percentile(ms, 0.99):.1f} ms, "
-                    f"worst {max(ms):.1f} ms; {done / took:.1f} frames/s (x{factor:.2f}); twin "
-                    f"{before:.0f} -> {server.memory_mb():.0f} MB, {server.descriptors()} "
-                    f"descriptors. {machine()}.", flush=True,
+                    f"worst {max(ms):.1f} ms; {done / took:.1f} frames/s (x{factor:.2f}); "
+                    f"twin {before:.0f} -> {server.memory_mb():.0f} MB, "
+                    f"{server.descriptors()} descriptors. {machine()}.", flush=True,
                 )  # fmt: skip
                 wire.call("job.abort", job=job)
                 wire.wait(job, "aborted")

@@ -189,8 +189,9 @@ def main() -> int:
                 break
             if n % max(1, count // 20) == 0:
                 seconds = time.monotonic() - begun
-                print(f"{tally.requests} requests, {seconds:.0f} s, {sum(tally.found.values())}"
-                      " violations", file=sys.stderr, flush=True)  # fmt: skip
+                found = f"{sum(tally.found.values())} violations"
+                done = f"{tally.requests} requests, {seconds:.0f} s, {found}"
+                print(done, file=sys.stderr, flush=True)
     report(tally, machines, options.seed, time.monotonic() - begun)
     for kind, (number, start, history, what) in tally.first.items():
         if not options.no_shrink:

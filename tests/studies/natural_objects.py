@@ -669,12 +669,10 @@ def summary(runs: list[dict[str, Any]], gaps: bool, near: bool = False) -> int:
     disagree = sum(run["disagree"] for run in runs)
     named, left_open = (sum(run[word] for run in runs) for word in ("named", "open"))
     print(
-        f"{len(pulls)} of {len(runs)} told, {len(wrong)} with a wrong word about gaps or "
-        "repeats, "
-        f"{named} told a gap, {left_open} that one is not excluded, {disagree} that two ways "
-        f"disagree, {len(far)} columns beyond {SIGMAS:g} sigma; in sigmas "
-        f"{math.sqrt(float(np.square(pulls).mean())):.2f} rms, largest "
-        f"{np.abs(pulls).max():.2f}"
+        f"{len(pulls)} of {len(runs)} told, {len(wrong)} with a wrong word about gaps or repeats, "
+        f"{named} told a gap, {left_open} that one is not excluded, "
+        f"{disagree} that two ways disagree, {len(far)} columns beyond {SIGMAS:g} sigma; in sigmas "
+        f"{math.sqrt(float(np.square(pulls).mean())):.2f} rms, largest {np.abs(pulls).max():.2f}"
     )
     return int(bool(wrong or far))
 

@@ -178,10 +178,12 @@ def pulls() -> None:
                for name in ("mean", "error", "spread"))  # fmt: skip
     print(f"1 and {threads} threads: {'the same bytes' if same else 'another image'}")
     pull = np.array([(one.mean - truth) / one.error for one in found])
-    print(f"100 seeds, {truth.size} nodes: pulls have mean {pull.mean():.3f} and standard "
-          f"deviation {pull.std():.3f} (Student's t with 31 degrees of freedom: 1.034); "
-          "beyond 2: "
-          f"{100 * np.mean(np.abs(pull) > 2):.1f} % (5.4 %)")  # fmt: skip
+    print(
+        f"100 seeds, {truth.size} nodes: pulls have mean {pull.mean():.3f} "
+        f"and standard deviation {pull.std():.3f} "
+        "(Student's t with 31 degrees of freedom: 1.034); "
+        f"beyond 2: {100 * np.mean(np.abs(pull) > 2):.1f} % (5.4 %)"
+    )
     balance = np.mean([one.balance for one in found], axis=0)
     print(f"photons absorbed and escaped over those that interact: {balance[1:3].sum():.4f}; "
           f"energy: {balance[4:].sum() / balance[3]:.4f}")  # fmt: skip

@@ -349,8 +349,7 @@ def main() -> None:
         print(json.dumps(found, indent=2))
         return
     print(
-        f"{found['machines']} machines, seed {found['seed']}; {found['limits_wrong']} "
-        "limits wrong"
+        f"{found['machines']} machines, seed {found['seed']}; {found['limits_wrong']} limits wrong"
     )
     print(
         f"median width of a total's range: {found['total_width_percent']:.0f} % of the total"
@@ -362,8 +361,7 @@ def main() -> None:
     )
     for group, x in found["inside"].items():
         print(
-            f"{group:36} {x['percent']:6.1f} {x['binomial']:9.1f} {x['machines']:9.1f} "
-            f"{x['n']:6d}"
+            f"{group:36} {x['percent']:6.1f} {x['binomial']:9.1f} {x['machines']:9.1f} {x['n']:6d}"
         )
 
 

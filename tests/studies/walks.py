@@ -89,10 +89,11 @@ def main() -> None:
         what = f"{volume.shape} voxels, {shape} pixels: {WAYS[chosen]} chosen; {said} ms"
         rows.append((times[chosen] / min(times), times[0] / times[chosen], what))
     lost, gained = np.log([[r[0], r[1]] for r in rows]).T
-    print(f"{len(rows)} views: {np.exp(lost.mean()):.2f} times the quickest way's time (90 %: "
-          f"{np.exp(np.quantile(lost, 0.9)):.2f}), {np.exp(gained.mean()):.2f} times as "
-          "fast as "
-          "along z")  # fmt: skip
+    print(
+        f"{len(rows)} views: {np.exp(lost.mean()):.2f} times the quickest way's time "
+        f"(90 %: {np.exp(np.quantile(lost, 0.9)):.2f}), "
+        f"{np.exp(gained.mean()):.2f} times as fast as along z"
+    )
     for loss, _, what in sorted(rows, reverse=True)[:5]:
         print(f"{loss:.1f} times: {what}")
 

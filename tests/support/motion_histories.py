@@ -83,8 +83,8 @@ def drawn_machine(rng: Rng) -> str:
         hard = round(speed * float(rng.uniform(0.5, 4.0)), 4)
         text += (
             f'[axes.{motor}]\nkind = "{"rotation" if motor == "turn" else "linear"}"\n'
-            f"lower = {-wide}\nupper = {wide}\nhome = 0.0\nspeed = {speed}\nmax_speed = "
-            f"{speed}\n"
+            f"lower = {-wide}\nupper = {wide}\nhome = 0.0\n"
+            f"speed = {speed}\nmax_speed = {speed}\n"
             f"acceleration = {hard}\nmax_acceleration = {hard}\n"
         )
     text += "[geometry]\nangle = { turn = 1.0 }\n"

@@ -24,8 +24,7 @@ FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_t
         ('parent = "source_platform"', 'parent = "source_platfrom"',
          r"source_tower.parent: must be a known earlier component: .*value: 'source_platfrom'"),
         ('parent = "source_platform"', 'parent = "detector"',
-         "components.source_tower.parent: must be a known earlier component: .*value: "
-         "'detector'"),
+         "components.source_tower.parent: must be a known earlier component: .*value: 'detector'"),
         ('axis = "tra_tube"', 'axis = "tra_tub"',
          "components.source_tower.axis: must be a known axis: ver_tube, .*value: 'tra_tub'"),
         ('axis = "tra_tube"', 'axis = "tra_det"',
@@ -85,9 +84,8 @@ CABINET = 'base = "xyzr_cabinet"\nname = "mine"\n'
     ("text", "message"),
     [
         ("[axes.D]\n{axis}[geometry]\ndetector_y = {{ D = 1.0 }}",
-         "components.panel.axis: must be carried by every motor that .geometry. gives "
-         "the detector"
-         ".*say axis = 'D'"),
+         "components.panel.axis: must be carried by every motor that .geometry. "
+         "gives the detector.*say axis = 'D'"),
         ("[axes.S]\n{axis}[geometry]\nsource_x = {{ S = 1.0 }}", "components.source.axis.*'S'"),
         ("[axes.S]\n{axis}[geometry]\nobject_y = {{ Z = 1.0, S = 1.0 }}",
          "components.turntable.axis: .*gives the object.*'S'"),
@@ -116,8 +114,7 @@ CABINET = 'base = "xyzr_cabinet"\nname = "mine"\n'
         ("[geometry]\ndetector_y = {{ Z = -1.0 }}\n[fixed]\ndetector_y = 1600.0\n[[components]]\n"
          'name = "panel"\naxis = "Z"\n[[components]]\nname = "table"\nparent = "panel"\n'
          'anchor = "object"\nsize_mm = [1.0, 1.0, 1.0]\ncenter_mm = [0.0, 0.0, 0.0]',
-         "components.table.anchor: must be 'detector', as that of the part that carries "
-         "it, panel"),
+         "components.table.anchor: must be 'detector', as that of the part that carries it, panel"),
         ("[fixed]\nmount_x = 200.0", "fixed.mount_x: must be left out where no stage"),
         ("[axes.S]\n{axis}[geometry]\nmount_x = {{ S = 1.0 }}\n[[components]]\nname = 'lift'\n"
          "axis = 'S'\n", "components.lift.axis: must be carried by the turntable"),

@@ -180,8 +180,7 @@ def test_what_a_file_leaves_out() -> None:
         ("micro_ct", "[[components]]\nname = 'pin'\ncenter_mm = [6.1, 8.0, 0.0]",
          "components.pin.center_mm: must be such that the cylinder"),
         ("micro_ct", "[[components]]\nname = 'pin'\nparent = 'turntable'",
-         "components.pin.axis: must be carried by every motor that .geometry. gives the "
-         "object"),
+         "components.pin.axis: must be carried by every motor that .geometry. gives the object"),
         ("micro_ct", "[[components]]\nname = 'mount'\nparent = 'floor'\nanchor = 'object'",
          "components.mount.axis: must be carried by the turntable .R., as mount_x and mount_y"),
         ("micro_ct", "[[components]]\nname = 'pin'\naxis = 'CX'", "has already|every motor"),
@@ -349,8 +348,7 @@ VER_OBJ = "moves = { ver_tube = -1.0, ver_det = -1.0 }"
         (
             'of = "ver_tube"',
             'of = "ver_tub"',
-            "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tub' (the `of`) "
-            "among them",
+            "virtual_axes.ver_obj.moves: must be shares of motors, 'ver_tub' (the `of`) among them",
         ),
         (
             "factor = -1.0",
@@ -371,8 +369,7 @@ VER_OBJ = "moves = { ver_tube = -1.0, ver_det = -1.0 }"
         (
             VER_OBJ,
             "moves = { ver_tube = 1.0 }",
-            "virtual_axes.ver_obj.moves.ver_tube: must be 1 / factor, -1, so that the "
-            "axis gets",
+            "virtual_axes.ver_obj.moves.ver_tube: must be 1 / factor, -1, so that the axis gets",
         ),
         (
             VER_OBJ,
@@ -620,8 +617,8 @@ def test_what_a_distance_is_the_sum_of_adds_up(name: str) -> None:
     """The words are read again as a sum: a number, motors, factors before them."""
     if name == "drawn":
         extra = "".join(
-            f"[axes.{m}]\nlower = -7.0\nupper = 50.0\nhome = 3.0\nspeed = 1.0\nmax_speed "
-            "= 1.0\n"
+            f"[axes.{m}]\nlower = -7.0\nupper = 50.0\nhome = 3.0\n"
+            "speed = 1.0\nmax_speed = 1.0\n"
             "acceleration = 1.0\nmax_acceleration = 1.0\n" for m in "AB"
         )  # fmt: skip
         machine = parse_machine(

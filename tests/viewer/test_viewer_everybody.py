@@ -228,12 +228,10 @@ def test_slices_grow_while_a_scan_runs(page: Any, twin: TwinClient, wait: Wait) 
     # What is shown in the end is the finished volume, also where it was told while one was
     # fetched.
     apart = (
-        "async ([z, y, x]) => { const b = flexdt.volume().three.block;"
-        " const at = [x >> 1, y >> 1, z >> 1];"
-        " const code = b.codes[(at[2] * y + at[1]) * x + at[0]], step = (b.high - b.low) "
-        "/ 65534;"
-        " const exact = await flexdt.call('viewer.voxel', { ...flexdt.volume().of, at });"
-        " return Math.abs(b.low + (code - 1) * step - exact.volume) / step; }"
+        "async ([z, y, x]) => { const b = flexdt.volume().three.block; const at = [x >> 1, y >> 1, "
+        "z >> 1]; const code = b.codes[(at[2] * y + at[1]) * x + at[0]], step = (b.high - b.low) "
+        "/ 65534; const exact = await flexdt.call('viewer.voxel', { ...flexdt.volume().of, at }); "
+        "return Math.abs(b.low + (code - 1) * step - exact.volume) / step; }"
     )
     wait(lambda: page.evaluate(apart, shape) <= 0.51, "the newest volume")
     for name in ("top", "front", "side"):

@@ -46,11 +46,10 @@ def number(page: Any, axis: str) -> Any:
 def asked(page: Any) -> Iterator[Callable[[], list[str]]]:
     """The methods that the page has asked for so far."""
     page.evaluate(
-        "(() => { const send = WebSocket.prototype.send; window.asked = [];"
-        " WebSocket.prototype.send = function (t) { const { method } = JSON.parse(t);"
-        " if (method) window.asked.push(method);"
-        " send.call(this, t); }; window.unspy = () => { WebSocket.prototype.send = send; "
-        "}; })()"
+        "(() => { const send = WebSocket.prototype.send; window.asked = []; "
+        "WebSocket.prototype.send = function (t) { const { method } = JSON.parse(t); "
+        "if (method) window.asked.push(method); "
+        "send.call(this, t); }; window.unspy = () => { WebSocket.prototype.send = send; }; })()"
     )
     yield lambda: list(page.evaluate("window.asked"))
     page.evaluate("window.unspy()")
@@ -175,12 +174,10 @@ def test_emergency_stop_is_in_view(page: Any, width: int) -> None:
     page.set_viewport_size({"width": width, "height": 600})
     page.wait_for_function("width => innerWidth === width", arg=width)
     at = page.evaluate(
-        "(() => { document.querySelector('#holder').textContent ="
-        " 'held by a-rather-long-name-indeed';"
-        " const e = document.querySelector('#estop'), b = e.getBoundingClientRect();"
-        " const hit = (x, y) => document.elementFromPoint(x, y) === e;"
-        " return [b.left, b.right, hit(b.left + 9, b.top + 9), hit(b.right - 9, b.bottom - 9)];"
-        " })()"
+        "(() => { document.querySelector('#holder').textContent = 'held "
+        "by a-rather-long-name-indeed'; const e = document.querySelector('#estop'), b "
+        "= e.getBoundingClientRect(); const hit = (x, y) => document.elementFromPoint(x, y) === e; "
+        "return [b.left, b.right, hit(b.left + 9, b.top + 9), hit(b.right - 9, b.bottom - 9)]; })()"
     )
     page.set_viewport_size({"width": 1280, "height": 800})
     assert at[0] > 0
@@ -477,10 +474,9 @@ def test_a_page_without_its_viewer_says_so(
 
 def test_no_quantity_has_two_fields(page: Any) -> None:
     fields = page.evaluate(
-        "[...document.querySelectorAll(':is(#tab-scan, #tab-setup) :is(input, select, "
-        "textarea)')]"
-        ".map((e) => [e.id, e.dataset.quantity ?? (e.dataset.layer && "
-        "`layer.${e.dataset.layer}`)])"
+        "[...document.querySelectorAll(':is(#tab-scan, "
+        "#tab-setup) :is(input, select, textarea)')].map((e) => [e.id, e.dataset.quantity ?? "
+        "(e.dataset.layer && `layer.${e.dataset.layer}`)])"
     )
     assert [id for id, quantity in fields if not quantity] == []
     quantities = [quantity for _, quantity in fields]

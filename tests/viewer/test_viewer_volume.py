@@ -104,11 +104,9 @@ def scrolls_and_turns(page: Any) -> None:
     print(f"{per_s:.0f} times all three slices a second")
     before = picture(page.locator("#volume-ray"))
     ms = page.evaluate(
-        "() => new Promise((done) => { const s = flexdt.volume().solid, all = [];"
-        " const next = () => { s.yaw += 0.1; s.draw(); requestAnimationFrame(() =>"
-        " requestAnimationFrame(() => { all.push(s.ms); all.length < 8 ? next() : "
-        "done(all); }));"
-        " }; next(); })"
+        "() => new Promise((done) => { const s = flexdt.volume().solid, all = []; const next = "
+        "() => { s.yaw += 0.1; s.draw(); requestAnimationFrame(() => requestAnimationFrame(() "
+        "=> { all.push(s.ms); all.length < 8 ? next() : done(all); })); }; next(); })"
     )
     wide = page.evaluate("document.querySelector('#volume-ray').width")
     print(

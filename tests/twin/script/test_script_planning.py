@@ -594,8 +594,8 @@ def test_a_rate_of_a_geared_virtual_axis_is_shared_out() -> None:
         "moves = { ver_tube = -2.0, ver_det = -0.5 }\n"
     )
     text = (
-        "ver_obj set speed 3 ACK\nver_obj set acceleration 4 ACK\nscanner write settings "
-        "file ACK"
+        "ver_obj set speed 3 ACK\nver_obj set acceleration 4 ACK\n"
+        "scanner write settings file ACK"
     )
     plan = plan_script(parse_script(text), geared, profile_of(geared))
     assert plan.settings is not None
