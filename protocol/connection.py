@@ -91,6 +91,7 @@ class Prepared:
         if codec not in self._pieces:
             pieces = _framed(codec, _body(codec, self.message))
             small = sum(map(len, pieces)) <= MAX_OVERTAKING_BYTES
+            # Joined once, not at each of the connections.
             self._pieces[codec] = [b"".join(pieces)] if small else pieces
         return self._pieces[codec]
 
@@ -143,6 +144,7 @@ class Connection:
     @property
     def pending(self) -> int:
         """Bytes held of messages that have not been taken out, framing included."""
+        # Counted with the bodies, so that a flood of empty messages fills the allowance, too.
         framing = 1 if self.codec is Codec.JSON else 4
         return self._held + framing * self.waiting + len(self._begun)
 
@@ -201,6 +203,7 @@ class Connection:
         Args:
             data: any part of the stream, also an empty one.
         """
+        # From here `holds` searches: each message once, not all that wait at each chunk.
         self._fed = len(self._new)
         if self.closed or self._broken or not data:
             return
@@ -236,6 +239,8 @@ class Connection:
         # Of many short lines only the first, which may have begun before, can be one to refuse.
         self._feed_each_line(data[:first])
         if not self._broken:
+            # Split and filtered in C: a loop over ten thousand lines would hold up all
+            # connections.
             lines = [*filter(bytes.strip, data[first : last - 1].split(b"\n"))]
             self._new.extend(lines)
             self._held += sum(map(len, lines))
@@ -270,6 +275,7 @@ class Connection:
                 self._held += len(line)
         if not self._skip:
             self._begun += rest
+        # Before its end has come, or a line without one would fill the memory.
         if (came := len(self._begun)) > self.max_message:
             self._skip = 1
             self._refuse(too_large("a line", f"at least {came}", self.max_message))
@@ -289,6 +295,7 @@ class Connection:
         self._skip -= skipped
         begun = self._begun
         at = 0
+        # A view, so that the chunk is copied once.
         begun += memoryview(data)[skipped:]
         held: bytes | bytearray = begun
         while (available := len(held)) - at >= 4:
@@ -303,11 +310,13 @@ class Connection:
                 self._held += size
             elif size <= MAX_FRAME:
                 self._new.append(Malformed(too_large("a frame", size, self.max_message)))
+                # The rest of it is counted, not kept.
                 self._skip = max(0, end - available)
             else:
                 self._refuse(too_large("a frame", size, MAX_FRAME), fatal=True)
                 return
             at = min(end, available)
+        # Once for all frames, because each cut moves the bytes behind it.
         del begun[:at]
 
     def _refuse(self, error: RpcError, *, fatal: bool = False) -> None:
@@ -379,6 +388,7 @@ class Connection:
         out = list[bytes]()
         looked = 0
         if not self._suspect:
+            # One search for all of them: usually there is no name, and none is looked at alone.
             searched = _joined(self._new)
             self._suspect = any(name in searched for name in names)
         if not self._suspect:
@@ -393,6 +403,7 @@ class Connection:
                     self._held -= len(message)
                     continue
             self._ready.append(message)
+        # The search is not repeated for what remains of it.
         self._suspect = bool(self._new)
         return out
 
@@ -464,6 +475,7 @@ class Connection:
 
 def _may_hold_http(data: bytes) -> bool:
     """Return whether each line must be checked for the head of an HTTP request."""
+    # Two searches in C spare nearly all chunks the expression at each of their lines.
     lower = data.lower()
     return any(mark in lower for mark in _HTTP_MARKS)
 
@@ -602,6 +614,8 @@ def pack(message: Message) -> tuple[bytes, memoryview | None]:
     if inner is None or payload is None:
         head = codecs.write_msgpack(document)
         return frame_head(len(head)) + head, None
+    # Encoded empty; as the last member it ends the head, and its type and length are put in
+    # place of the empty ones. The payload itself is never copied.
     data, inner["data"] = inner["data"], b""
     try:
         head = codecs.write_msgpack(document)

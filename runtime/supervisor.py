@@ -98,11 +98,13 @@ class Ends:
             self.row = self.row + 1
         if self.row == 1:
             return 0.0
+        # The exponent has a limit, because a float overflows after a thousand ends in a row.
         return min(FIRST_PAUSE_S * 2.0 ** min(self.row - 2, 60), LONGEST_PAUSE_S)
 
     @property
     def reported(self) -> bool:
         """Whether the last end is reported."""
+        # A power of two has a single bit.
         return self.row <= MAX_SINGLE_REPORTS or self.row & (self.row - 1) == 0
 
 
@@ -141,6 +143,7 @@ class Supervisor:
             if work.done():
                 work.result()
         finally:
+            # First the keepers: they would start again what is stopped after this.
             for task in (work, stopping):
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError, ServiceError):
@@ -162,6 +165,8 @@ class Supervisor:
             starts = [_Start(service) for service in self.services]
             for start in starts:
                 keepers.append(asyncio.create_task(self._keep_alive(start)))
+                # The next service needs no more than this address, and compiles at the same
+                # time.
                 await _unless_one_ends(start.bound, keepers)
             for start in starts:
                 await _unless_one_ends(start.ready, keepers)
@@ -199,12 +204,15 @@ class Supervisor:
                 start.ready.set()
                 how = _how(await _drained(process))
             except _Ended as end:
+                # Below 0 a signal has ended it: that was not its own decision, and says nothing
+                # of its options.
                 if first and end.returncode is not None and end.returncode >= 0:
                     raise ServiceError(
                         f"the {service.name} did not start ({end})", end.returncode
                     ) from None
                 how = f"{end}, while starting"
             first = False
+            # Before the next start, because one of its children may hold the port.
             self._forget(service)
             pause = ends.after(0.0 if begun is None else clock() - begun)
             if ends.reported:
@@ -236,8 +244,11 @@ class Supervisor:
                 "-m",
                 "flexdt.runtime.child",
                 *service.command(dict(self.addresses)),
+                # Open as long as we live: `child` takes its end for ours.
                 stdin=PIPE,
                 stdout=PIPE,
+                # A terminal sends Ctrl-C to its whole session; only the supervisor is to get
+                # it.
                 start_new_session=True,
                 env=os.environ | {SUPERVISED: "1"},
             )
@@ -263,6 +274,7 @@ class Supervisor:
         service = start.service
         ready = asyncio.create_task(self._read_addresses(process, start))
         end = asyncio.create_task(_ended(process))
+        # Of the whole session: a compiler that it starts counts as its work.
         used_s = session_seconds(process.pid)
         since = clock()
         note_at = clock() + SILENT_S
@@ -328,6 +340,7 @@ class Supervisor:
 
         Nothing happens if none is recorded.
         """
+        # It led its session, so that its number is the group's, also after its own end.
         process = self._running.pop(service.name, None)
         if process is not None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -339,10 +352,13 @@ class Supervisor:
 
         One that takes over `STOP_GRACE_S` is killed, which is noted.
         """
+        # Clients end before the servers that they ask.
         for service in reversed(self.services):
             process = self._running.get(service.name)
             if process is not None and process.returncode is None:
                 with contextlib.suppress(ProcessLookupError):
+                    # The process alone: it ends its children in order, and the group is killed
+                    # after that.
                     process.terminate()
                 try:
                     async with asyncio.timeout(STOP_GRACE_S):
@@ -417,6 +433,8 @@ async def _ended(process: Process) -> int:
 
     It is looked at every `CHECK_INTERVAL_S`.
     """
+    # In some versions of Python `wait` also waits until the pipes are closed, which a child of
+    # the process may hold open.
     end = asyncio.create_task(process.wait())
     try:
         while process.returncode is None:

@@ -56,6 +56,7 @@ class Worker:
         """
         self._memory = memory_bytes
         ours, theirs = socket.socketpair()
+        # It reads strangers' files, and has no use for the token.
         environment = {k: v for k, v in os.environ.items() if k != "FLEXDT_TOKEN"}
         try:
             self._process = subprocess.Popen(
@@ -77,6 +78,7 @@ class Worker:
             ours.close()
             raise
         finally:
+            # While this process holds that end, too, it would never see the worker close it.
             theirs.close()
         self._channel = ours
         self.kept = True
@@ -109,11 +111,14 @@ class Worker:
         """
         sound = False
         try:
+            # Of each transfer; how long the work may take is processor time, see `_wait`.
             self._channel.settimeout(seconds)
             call = pickle.dumps((work, arguments))
             send_parts(self._channel, [f"{seconds}".encode(), call, *raw])
             self._wait(seconds)
             how, peak, *answer = receive_parts(self._channel)
+            # Running out of memory may leave anything half made, and only its end gives what a
+            # large process took back to the system.
             sound = how in (b"done", b"refused") and int(peak) <= MAX_KEPT_BYTES
         except TimeoutError:
             raise too_large(
@@ -122,6 +127,7 @@ class Worker:
         except (OSError, EOFError, ValueError):
             raise self._end_error(work, seconds) from None
         finally:
+            # An answer that came later would be taken for that of the next request.
             if not sound:
                 self.kill()
         match how:
@@ -148,6 +154,7 @@ class Worker:
         Raises:
             TimeoutError: the work has used, or done nothing for, so much time.
         """
+        # Not the time that passes: work must not fail because the machine is busy.
         begun = used = process_seconds(self.pid)
         since = time.monotonic()
         with selectors.DefaultSelector() as answer:
@@ -238,15 +245,18 @@ class Workers:
             RpcError: as `Worker.ask`; -32003, no process could be started.
             RuntimeError: as `Worker.ask`.
         """
+        # First the place, then the process: requests that wait hold none.
         async with self._turn:
             loop = asyncio.get_running_loop()
             worker = self._idle.pop() if self._idle else None
             if worker is None:
+                # In a thread, because a start blocks for as long as the system takes.
                 worker = await loop.run_in_executor(self._threads, self._new)
             asked = loop.run_in_executor(
                 self._threads, worker.ask, work, arguments, raw, self.seconds
             )
             try:
+                # A thread cannot be cancelled: it reads until `stop` has ended the process.
                 return await asyncio.shield(asked)
             except asyncio.CancelledError:
                 worker.stop()
@@ -290,6 +300,7 @@ class Workers:
     def close(self) -> None:
         """End the idle processes, and the threads without waiting for those at work."""
         self.rest()
+        # Workers at work end by themselves as soon as our end of their socket is closed.
         self._threads.shutdown(wait=False)
 
 

@@ -89,6 +89,7 @@ class Scenes:
         self.path = self._folder / "viser"
         try:
             with _listening_at(self.path), redirect_stdout(io.StringIO()):  # its banner
+                # Neither address is used: `_listening_at` puts the socket in their place.
                 self.server = viser.ViserServer(host="127.0.0.1", port=0, label=label)
             # No request of a page or a button of viser's opens a way in from outside.
             for message in (ShareUrlRequest, ShareUrlDisconnect):
@@ -126,6 +127,7 @@ class Scenes:
             str(self.path),
             f"ws://localhost{path}",
             subprotocols=None if subprotocol is None else [subprotocol],
+            # The bytes do not leave the machine: packing them would only take time.
             compression=None,
             max_size=MAX_OF_VISER,
         ) as connection:
@@ -180,10 +182,12 @@ def clear_left_behind(folder: Path) -> None:
     """
     for left in folder.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
+            # Between bind and listen a socket of a living viewer refuses connections, too.
             if time.time() - left.stat().st_mtime < YOUNG_S:
                 continue
             try:
                 probe.connect(str(left / "viser"))
+            # Refused: the socket is there, and nobody listens. Other errors prove nothing.
             except ConnectionRefusedError:
                 shutil.rmtree(left, ignore_errors=True)
 
@@ -193,6 +197,7 @@ def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
 
     `nodes` is node -> properties; the nodes themselves are not checked.
     """
+    # In one piece: else the page may draw a frame between two of the messages.
     with client.atomic():
         for message in _changes(nodes):
             client._websock_connection.queue_message(message)
@@ -295,6 +300,8 @@ def _listening_at(path: Path) -> Iterator[None]:
         used = True
         return serve(handler, unix=True, sock=listener, **options)
 
+    # The library's function belongs to the whole process: two at a time would put back each
+    # other's replacement, and one would listen on a port.
     with _one_at_a_time:
         try:
             listener.bind(str(path))
@@ -305,6 +312,7 @@ def _listening_at(path: Path) -> Iterator[None]:
             raise
         finally:
             library.serve = serve  # type: ignore[misc]
+    # A version that does not call the function may have opened a port of its own.
     if not used:
         listener.close()
         raise GateError(f"viser {viser.__version__} starts its server in another way")

@@ -73,14 +73,18 @@ class _Change:
 
         Nothing is done if the file has been changed since by another.
         """
+        # Another may have written meanwhile, as a server at its end: the newest content stays.
         if not self._is_still():
             return
         if self.before is not None:
+            # The kept file replaces the new one in a step: there is no moment without a
+            # document.
             self.folder.rename(self.before, self.name)
         elif self.old is not None:
             (self.keep or self.folder.keep)(self.name, self.old)
         else:
             self.folder.unlink(self.name)
+        # A rename is atomic, not durable: a power cut could bring the new file back.
         self.folder.sync()
 
     def _is_still(self) -> bool:
@@ -131,6 +135,7 @@ class Changes:
         old = None
         try:
             kept = None
+            # A link takes no blocks, and the old content outlives the rename of the new file.
             if _second_name(folder, name, before):
                 kept = before
         except DiskFullError:
@@ -138,6 +143,7 @@ class Changes:
                 raise
             kept = None
             old = folder.read(name)
+        # Before the write: if that fails half-way, `undo` still removes the second name.
         self._made.append(_Change(folder, name, data, kept, old, keep))
         (keep or folder.keep)(name, data)
 
@@ -160,11 +166,13 @@ class Changes:
                 folder.rename(name, before)
             except (FileNotFoundError, NotADirectoryError):
                 return
+            # Before the sync, which may fail: the file is away, and `undo` has to know.
             self._made.append(_Change(folder, name, None, before))
             folder.sync()
 
     def _before(self) -> str:
         """Return an unused name for a replaced file."""
+        # By process, thread and number: other writers at the same time have other names.
         return f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
 
     def __enter__(self) -> Changes:
@@ -188,6 +196,7 @@ class Changes:
         """
         for change in self._made:
             if change.before is not None:
+                # What stays is swept at the next start (`settle`), and takes only room.
                 with suppress(OSError):
                     change.folder.unlink(change.before)
         self._made.clear()
@@ -198,6 +207,7 @@ class Changes:
         A file that somebody else has changed since, or deleted, is left alone. Failures
         are logged.
         """
+        # A file that was written twice goes back through its second version to the first.
         for change in reversed(self._made):
             try:
                 change.undo()
@@ -210,6 +220,7 @@ class Changes:
                     file=str(change.folder.path / change.name),
                     reason=str(error),
                 )
+        # Also second names of files that somebody else has changed since.
         self.done()
 
 
@@ -361,6 +372,7 @@ def lock_folder(root: Directory) -> Callable[[], None]:
     import fcntl
 
     try:
+        # Without waiting: a second twin is told at once instead of standing still.
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise DatasetWriteError(

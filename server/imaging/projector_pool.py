@@ -90,6 +90,7 @@ class _Asked:
         try:
             task.result()
         except ProjectorUnavailable:
+            # While another one works, its answer may come however late.
             if not self.running and now >= self.deadline:
                 raise
             return False
@@ -243,9 +244,12 @@ class ProjectorPool:
                         asked.running.clear()  # late requests keep their place until answered
                         images: Float32Array | None = task.result()
                         return images
+                # All have failed: after their rest each is asked again, until the patience
+                # ends.
                 if not asked.running:
                     asked.members.clear()
         finally:
+            # There are some only after an error, or where the requester has gone.
             for task in asked.running:
                 task.cancel()
 
@@ -267,11 +271,13 @@ class ProjectorPool:
         """
         if asked.running and now < asked.late:
             return
+        # One that is late keeps the request, and one that refused it would refuse it again.
         member = self._free_member(asked.members | asked.refused, now)
         if member is None:
             return
         asked.members.add(member)
         asked.running[self._start_request(member, ask(member))] = member
+        # By its own pace: a slow projector that works as usual is not late.
         asked.late = now + LATE_S + LATE_FACTOR * (member.pace_s or 0.0) * views
 
     def _until_wake(self, late: float, now: float) -> float | None:
@@ -290,12 +296,14 @@ class ProjectorPool:
         Those in `asked` and those that rest are not free; a single projector has no limit
         of open requests. Unknown pace counts as fastest.
         """
+        # A single projector queues by itself; the limit is for dealing out among several.
         limit = MAX_OPEN_REQUESTS if len(self) > 1 else math.inf
         free = (
             m
             for m in self._members
             if m not in asked and m.open < limit and m.rests_until <= now
         )
+        # One of unknown pace is taken for the fastest, so that it is measured soon.
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 
     def _start_request(
@@ -376,6 +384,7 @@ class ProjectorPool:
         except (ProjectorUnavailable, RpcError) as error:
             if isinstance(error, ProjectorUnavailable) or len(self) > 1:
                 member.rests_until = loop.time() + REST_S
+                # What listens there when it is back may be of another version.
                 member.kind = None
                 self._lines.log(
                     "a projector gave no answer", logging.WARNING, reason=str(error)

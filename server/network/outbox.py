@@ -114,9 +114,14 @@ class Outbox:
         if self.over or self.link.transport.is_closing():
             return
         if slot is not None and not self.ready.is_set():
+            # A slot keeps its place in the row: one that is filled often does not pass the
+            # others.
             self.slots[slot] = message
             return
+        # Ordered events cannot be left out: a client that does not take them is cut off.
         if len(self.queue) >= self.link.limits.max_events:
+            # At once: the transport tells of its end in a later turn, and events may come
+            # before.
             self.over = True
             self.link.abort(f"{len(self.queue)} events unread")
             return
@@ -134,6 +139,7 @@ class Outbox:
 
         Else each piece in writes of its own of at most `WRITE_BYTES`.
         """
+        # Each write costs a system call; joining small pieces costs less than a second one.
         if sum(map(len, pieces)) <= WRITE_BYTES:
             self._put(b"".join(pieces))
             return
@@ -148,6 +154,7 @@ class Outbox:
         """
         if self.over or self.link.transport.is_closing():
             return  # asyncio would complain of every write to a connection that is gone
+        # The transport may call `pause` within `write`: the next piece is then queued behind.
         if self.ready.is_set():
             self.link.transport.write(data)
         else:
@@ -166,11 +173,13 @@ class Outbox:
         dropped if the transport is closing.
         """
         self.ready.set()
+        # Each write may fill the transport again, which clears `ready`.
         while self.queue and self.ready.is_set():
             data = self.queue.popleft()
             self.unsent -= len(data)
             if not self.link.transport.is_closing():
                 self.link.transport.write(data)
+        # Slots last: answers in the queue may be older than the state in a slot.
         while self.slots and self.ready.is_set():
             slot = next(iter(self.slots))
             self._put_event(self.slots.pop(slot))

@@ -248,6 +248,8 @@ class _Link(asyncio.BufferedProtocol):
         peer = self.transport.get_extra_info("peername") or ("?", 0)
         self.number = self.server.opened
         self.name = f"{peer[0]}:{peer[1]}#{self.number}"
+        # As without TLS, where asyncio's own limit is eight times as high: beyond it events
+        # wait in `out`, where newer ones replace them.
         self.transport.set_write_buffer_limits(high=64 * 1024)
         tune(self.transport.get_extra_info("socket"))
         self.address = neighbourhood(str(peer[0]))
@@ -257,6 +259,8 @@ class _Link(asyncio.BufferedProtocol):
         else:
             self.deadlines.start("hello", self.limits.hello_timeout_s)
         self.worker = self.loop.create_task(self._serve_messages())
+        # Nobody awaits it: without this a connection whose loop has failed stays, and is
+        # silent.
         self.worker.add_done_callback(self._crashed)
 
     def _take_place(self) -> bool:
@@ -292,6 +296,7 @@ class _Link(asyncio.BufferedProtocol):
 
     def buffer_updated(self, nbytes: int) -> None:
         """Process the bytes in the buffer."""
+        # A copy, because the next bytes go into the same buffer.
         self.data_received(bytes(self.read[:nbytes]))
 
     def data_received(self, data: bytes) -> None:
@@ -313,6 +318,7 @@ class _Link(asyncio.BufferedProtocol):
         if self.wire.holds(ESTOP_BYTES):
             self.estop_came = True
             self.overtake()
+        # All connections share `LOOK_S` a turn for urgent requests other than E-stops.
         elif self.wire.unjudged:
             self.server.look_soon(self)
         if self.wire.whole:
@@ -321,6 +327,7 @@ class _Link(asyncio.BufferedProtocol):
             self.deadlines.start("message", self.limits.message_timeout_s)
             self.arrived.set()  # a line too long is refused before its end
         if self._full:
+            # The kernel's buffers fill up, and TCP holds the sender back.
             self.transport.pause_reading()
             self.deadlines.stop("message")  # the rest comes when we read again
 
@@ -358,6 +365,8 @@ class _Link(asyncio.BufferedProtocol):
             ):
                 return False
             if isinstance(message, m.Batch) and not all(map(self._urgent, message.items)):
+                # By identity, as batches may have equal bytes; `Split` keeps these alive, and
+                # so their id.
                 split = self.split[id(raw)] = batches.Split(
                     raw, self._batch(message.items)
                 )
@@ -371,6 +380,8 @@ class _Link(asyncio.BufferedProtocol):
             for work in found:
                 self._start(work)
             self.estop_came = self.estop_came and self.wire.unjudged
+            # At once, whatever other connections have: an E-stop may be behind what one look
+            # takes.
             if self.estop_came:
                 self.loop.call_soon(self.overtake)
             elif self.wire.unjudged:
@@ -388,6 +399,7 @@ class _Link(asyncio.BufferedProtocol):
         self.arrived.set()
         self.deadlines.stop("message")
         self.deadlines.start("end", self.limits.end_timeout_s)
+        # asyncio's TLS transports cannot stay half open.
         return self.transport.get_extra_info("ssl_object") is None
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -442,6 +454,7 @@ class _Link(asyncio.BufferedProtocol):
         log why.
         """
         self.log("closing", reason=reason)
+        # This waits until all has been sent, for ever if the client does not read.
         self.transport.close()
         self.deadlines.start("send", self.limits.send_timeout_s)
 
@@ -560,6 +573,7 @@ class _Link(asyncio.BufferedProtocol):
                 if isinstance(raw, m.Malformed):
                     await self._serve(raw)
                 elif (split := self.split.pop(id(raw), None)) is not None:
+                    # Its answers go out together, so that those begun earlier have to be there.
                     await split.urgent_done.wait()
                     await self._answer_batch(split.batch, waits=False)
                 elif raw is not None:
@@ -572,6 +586,7 @@ class _Link(asyncio.BufferedProtocol):
                 await self.out.flushed()
                 self.transport.close()
                 return
+            # Nothing was awaited since the queue was seen empty: no arrival is lost.
             self.arrived.clear()
             await self.arrived.wait()
 
@@ -724,6 +739,7 @@ class _Link(asyncio.BufferedProtocol):
         try:
             self.calls.receive(item.message if isinstance(item, parts.Call) else item)
         except ProtocolError as error:
+            # Later, so that the answer with the reason is written before.
             self.loop.call_soon(self.close, str(error))
             return m.Failure(None, errors.invalid_request(str(error)))
         match item:
@@ -893,6 +909,7 @@ class _Link(asyncio.BufferedProtocol):
         ahead = 0
         if self.wire.whole:
             ahead = self.wire.pending
+        # Half of what stops it, so that reading does not stop and go with each message.
         if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD_BYTES // 2:
             self.transport.resume_reading()
 
@@ -920,5 +937,6 @@ class _Link(asyncio.BufferedProtocol):
     def _start(self, work: Coroutine[object, object, None]) -> None:
         """Run work as a task of the connection."""
         task = self.loop.create_task(work)
+        # asyncio itself refers to tasks weakly; this keeps it until it is done.
         self.tasks.add(task)
         task.add_done_callback(self._done)

@@ -193,6 +193,7 @@ class Jobs:
         try:
             yield
         except Exception:
+            # The number of programmes of motion tells whether the command has moved anything.
             if self._scanner.programmes == programmes:
                 self._manual = by_hand
                 self._schedule_resume()
@@ -319,6 +320,7 @@ class Jobs:
         """
         self._count += draft.id not in self._all
         job = self._all.setdefault(draft.id, draft)
+        # Into the same object: who holds the job, such as a wait for its end, follows it.
         vars(job).update(vars(draft))
         self._forget_old()
         self._queue.put_nowait(job)
@@ -424,6 +426,7 @@ class Jobs:
 
         The record is None for a forgotten job.
         """
+        # Taken whole: what changes from now on is for the next write.
         names = self._changed
         self._changed = set()
         known = {name: self._all.get(name) for name in sorted(names, key=number_of)}
@@ -583,6 +586,7 @@ class Jobs:
         Raises:
             CancelledError: the server ends; the data set is marked incomplete first.
         """
+        # Stops from before its turn do not concern this job.
         self._interrupted = None
         self._manual = False
         try:
@@ -604,6 +608,7 @@ class Jobs:
         job.duration_s = scan.plan.duration_s
         try:
             runner = await self._make_runner(job, scan)
+            # Looked at again after each await: an abort may have come while a thread worked.
             if job.aborting:
                 raise JobAborted(job.aborted_for)
             job.runner = runner
@@ -614,6 +619,8 @@ class Jobs:
             self._tell(job)
             await job.runner.run()
             await asyncio.to_thread(scan.store.finish, duration_s=scan.plan.duration_s)
+            # The record goes when the data set is complete: killed in between, the job is found
+            # done.
             await asyncio.to_thread(scan.finished)
         except JobAborted as ended:
             if job.runner is not None:
@@ -642,6 +649,7 @@ class Jobs:
             job: whose progress the runner reports.
             scan: plan, data set and producer of frames.
         """
+        # While the thread works, nobody may move what has been checked.
         self._preparing = True
         try:
             return await asyncio.to_thread(
@@ -728,6 +736,7 @@ class Jobs:
         assert job.runner is not None
         p = job.runner.progress
         phase = job.phase
+        # Queued and the ended phases are the queue's to set, not the runner's.
         if p.phase in ("running", "paused") and phase in ("running", "paused"):
             job.phase = p.phase
         error = None

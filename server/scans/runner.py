@@ -286,6 +286,7 @@ class ScanRunner:
                     await self._wait_until(moment + length)
                     self.pause()
             await self._wait_until(self.plan.duration_s)
+            # The last frames are still being made when the plan's time is over.
             await self._drain()
             self._set_progress(phase="done", tau=self.plan.duration_s, what="")
         except Exception:
@@ -391,6 +392,7 @@ class ScanRunner:
 
     def _wake(self) -> None:
         """Wake the run, wherever it waits, to look at its requests."""
+        # It waits for a request or for the clock, and only one of the two is there.
         self._signal.set()
         if self._waiting is not None and not self._waiting.done():
             self._waiting.set_result(None)
@@ -512,6 +514,7 @@ class ScanRunner:
             if self._has_request():
                 return
             now = self.clock.now()
+            # Stage or motors have changed since it was swept: sweep again.
             if not self.scanner.holds(certificate):
                 continue
             if certificate.contact is not None:
@@ -593,6 +596,7 @@ class ScanRunner:
                     await self._obey_requests(moment)
                 self._signal.clear()
                 signal = asyncio.ensure_future(self._signal.wait())
+                # Making frames takes no twin time: the run would fall behind its plan.
                 with self.clock.held():
                     await asyncio.wait(
                         {task, signal}, return_when=asyncio.FIRST_COMPLETED

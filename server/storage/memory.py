@@ -249,6 +249,8 @@ class StateStore:
         """Called when there is a problem, and with None when it is over."""
         self._changed = asyncio.Event()
         self._at_once = asyncio.Event()
+        # Lock order: `_writing` is held by tasks over awaits, and within it `_file` by threads
+        # over system calls. `_file` alone orders threads whose tasks have been cancelled.
         self._writing = asyncio.Lock()
         self._file = threading.Lock()
         self._ended = False
@@ -273,12 +275,15 @@ class StateStore:
         while True:
             if not moving():
                 await self._changed.wait()
+            # Before the write: a change that comes meanwhile is for the next one.
             self._changed.clear()
             self._at_once.clear()
             pause = MIN_INTERVAL_S
             try:
                 await self.flush()
             except JobsNotWrittenError as error:
+                # The document is on the disk, so that its further changes need not wait for the
+                # jobs.
                 log("jobs were not written", logging.ERROR, reason=str(error))
                 asyncio.get_running_loop().call_later(FAR_S, self._changed.set)
             except (OSError, DatasetError) as error:
@@ -302,6 +307,7 @@ class StateStore:
         """
         async with self._writing:
             try:
+                # The document is made here: only the loop's thread may look at the scanner.
                 await asyncio.to_thread(
                     self._put, self._make(False), self._unwritten_jobs()
                 )
@@ -359,13 +365,19 @@ class StateStore:
         async with self._writing:
             document = None
             if after is not None:
+                # Within the lock: of two changes the second document contains the first change.
                 document = after(self._make(False))
             changes = documents.Changes()
             try:
                 await asyncio.to_thread(self._put_all, changes, document, files)
+                # The disk comes first: a kill in between leaves a change that nobody was told
+                # of, never one that was answered and is lost.
                 taken = take()
+            # Of a cancellation too: `shield` in `keep` stops a requester's, not that of a
+            # closing loop.
             except BaseException:
                 await asyncio.to_thread(self._undo, changes)
+                # The document of before is back, and owes what has changed since.
                 self.changed()
                 raise
             await asyncio.to_thread(changes.done)
@@ -406,6 +418,7 @@ class StateStore:
         """
         now = self._changed_jobs()
         self._unwritten |= now
+        # All that changed now, whatever their number: `flush` promises that they survive a kill.
         return now | dict(islice(self._unwritten.items(), max(0, most - len(now))))
 
     def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
@@ -425,6 +438,7 @@ class StateStore:
         with self._file:
             if self._ended and not memory.ended:
                 return
+            # Before the write, which may fail: threads that come later must not write either.
             self._ended = memory.ended
             self._spares.keep(FILE, _text(memory))
             for name, job in jobs.items():
@@ -441,6 +455,7 @@ class StateStore:
             self._job_files.write(name, job)
         except DatasetWriteError as error:
             raise JobsNotWrittenError(error.message, error.data) from None
+        # The loop may have noted a newer state of the job while this thread wrote.
         if self._unwritten.get(name, ...) == job:
             del self._unwritten[name]
 
@@ -464,6 +479,8 @@ class StateStore:
         with self._file:
             if self._ended:
                 raise DatasetWriteError("the server is ending; nothing has changed")
+            # The document last, because it names the files: a kill in between leaves files that
+            # nothing names, never a name without its file.
             if files is not None:
                 files(changes)
             if document is not None:

@@ -156,7 +156,9 @@ class Hub:
         topics = set(topics)
         view = view or ImageRequest()
         self._require_room(listener, topics, view)
+        # In a fixed order, which sets do not have: kept events of several topics go out here.
         for topic in sorted(topics):
+            # A timer of the earlier subscription would go on at the earlier rate.
             self.unsubscribe(listener, [topic])
             subscription = _Subscription(view, interval)
             self._listeners.setdefault(topic, {})[listener] = subscription
@@ -212,6 +214,8 @@ class Hub:
         """End a connection's subscriptions, and forget what it has been sent."""
         self.unsubscribe(listener, list(self._listeners))
         for topic in self._kept:
+            # Else a server that runs for months keeps an entry of each connection there ever
+            # was.
             self._last_sent.pop((listener, topic), None)
 
     def wanted(self, topic: TopicName) -> bool:
@@ -276,6 +280,7 @@ class Hub:
         """
         subscription = self._listeners.get(topic, {}).get(listener)
         if subscription is not None:
+            # Not a number of its own: to all other subscribers that would be a gap.
             seq = max(0, self._seq.get(topic, 0) - 1)
             self._deliver(
                 listener, subscription, _Event(topic, seq, self._now(), data, slot)
@@ -289,8 +294,11 @@ class Hub:
         """
         loop = asyncio.get_running_loop()
         wait = subscription.next_at - loop.time()
+        # While a timer runs, later events wait with it even if the interval is over: sent at
+        # once they would overtake the pending ones.
         if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
             subscription.pending[new.slot] = new
+            # One timer for all slots: the rate is the subscription's.
             if subscription.timer is None:
                 subscription.timer = loop.call_later(
                     wait, self._flush, listener, subscription
@@ -324,13 +332,18 @@ class Hub:
         Events of subscriptions that have ended are dropped and do not count. Of topics
         with a history the last number posted to the listener is noted.
         """
+        # One allowance for all that is published in a turn, by whomever: a burst of hundreds of
+        # events lets requests through after each few.
         while self._due_events and self._room:
             listener, subscription, new = self._due_events.popleft()
+            # By identity: who has subscribed anew meanwhile gets no event in the earlier view.
             if self._listeners.get(new.topic, {}).get(listener) is subscription:
                 listener.post(new.prepared(subscription.view), new.slot)
                 if new.topic in self._kept:
                     self._last_sent[listener, new.topic] = new.seq
                 self._room -= 1
+        # Also with nothing left to send: the next turn has a whole allowance again. In that
+        # turn received bytes are served as well.
         if not self._refilling:
             self._refilling = True
             asyncio.get_running_loop().call_soon(self._refill)
