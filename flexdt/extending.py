@@ -10,9 +10,11 @@ and, once, the document of `--json`. The entry point group `flexdt.commands` giv
 A dot in the name stands for a group: `phantom.design` is `flexdt phantom design`.
 """
 
+import argparse
+from typing import NoReturn
+
 from flexdt.clients.cli.commands.process_commands import become
 from flexdt.clients.cli.console import note, size, table, warn
-from flexdt.clients.cli.one_line import OneLine
 from flexdt.clients.cli.option_values import assignments, names, numbers, position, triple
 from flexdt.clients.cli.options import (
     Answer,
@@ -63,3 +65,12 @@ __all__ = [
     "warn",
     "write_whole",
 ]
+
+
+class OneLine(argparse.ArgumentParser):
+    """A parser of `argparse` that reports a wrong option in one line, without the page of
+    all options."""
+
+    def error(self, message: str) -> NoReturn:
+        """End the program with exit code 2 and one line."""
+        self.exit(2, f"{self.prog}: {message}\n")

@@ -131,7 +131,7 @@ def test_axes_of_a_plotted_geometry_are_equal() -> None:
 
 def test_widgets_show_any_layer_and_window() -> None:
     widgets = pytest.importorskip("ipywidgets", reason="the extra `notebook`")
-    from flexdt.library.notebook.notebook_widgets import volume_widgets
+    from flexdt.library.notebook.notebook_show import volume_widgets
 
     values = np.random.default_rng(7).normal(size=(6, 4, 5)).astype(np.float32)
     box = volume_widgets(widgets, fx.Volume(values, 0.5))

@@ -2,7 +2,7 @@
 themselves.
 
 The pages need no package and no server: the images are in them, and a slider shows one of them.
-They are kept when a notebook is saved, and `save` writes them as files. `notebook_widgets`
+They are kept when a notebook is saved, and `save` writes them as files. `notebook_show`
 shows volumes live where ipywidgets is installed.
 """
 

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
+from flexdt.library.datasets.pictures import png_of
 from flexdt.library.extras import lacking, package
 from flexdt.library.notebook.notebook_pages import (
     NotebookPage,
     geometry_page,
     volume_page,
 )
-from flexdt.library.notebook.notebook_widgets import volume_widgets
+from flexdt.library.notebook.notebook_slices import AXES, grey_of, layer_of, window_of
 from flexdt.runtime.progress_bars import in_notebook
 
 if TYPE_CHECKING:
     from flexdt.twin.geometry.cone_vec import ConeVec
     from flexdt.twin.projection import Volume
+
+WIDTH_PX: Final = 240
+"""Width of a picture."""
+WINDOW_REACH_WIDTHS: Final = 0.5
+"""Reach of the window's slider beyond the window, on each side, as a share of its width."""
 
 
 def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
@@ -32,3 +40,67 @@ def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
 def show_geometry(cone_vec: ConeVec) -> NotebookPage:
     """Return the page of a geometry; see `ConeVec.show`."""
     return geometry_page(cone_vec)
+
+
+def volume_widgets(
+    widgets: Any, volume: Volume, window: Sequence[float] | None = None
+) -> Any:
+    """Make three linked slices of a volume: a slider for each axis, and one for the
+    window.
+
+    They begin at the middle of each axis, and are drawn again when a slider has moved
+    (that of the window when it is released). White lines mark the two other slices.
+
+    Args:
+        widgets: the package ipywidgets.
+        volume: is seen from above, from the front and from the right.
+        window: attenuation of black and of white at first [1/mm]; its slider reaches
+            `WINDOW_REACH_WIDTHS` times the width beyond both. None: percentiles of the
+            volume.
+
+    Returns:
+        A box of widgets, which a notebook shows.
+
+    Raises:
+        TwinError: the window is not two growing numbers.
+    """
+    low, high = window_of(volume.data, window)
+    beyond = WINDOW_REACH_WIDTHS * (high - low)
+    chosen = widgets.FloatRangeSlider(
+        value=(low, high),
+        min=low - beyond,
+        max=high + beyond,
+        step=(high - low) / 200.0,
+        description="1/mm",
+        readout_format=".4f",
+        continuous_update=False,
+    )
+    sliders = {}
+    pictures = {}
+    for name, axis, _ in AXES:
+        count = volume.shape[axis]
+        sliders[name] = widgets.IntSlider(
+            value=count // 2, min=0, max=count - 1, description=name
+        )
+        pictures[name] = widgets.Image(format="png", width=WIDTH_PX)
+
+    def draw(_: object = None) -> None:
+        """Draw the three slices in the grey window, each with white lines at the two
+        others; the argument is ignored.
+        """
+        black, white = chosen.value
+        places = {name: slider.value for name, slider in sliders.items()}
+        for name, axis, across in AXES:
+            layer = layer_of(volume.data, axis, places[name])
+            pixels = np.repeat(grey_of(layer, black, white)[:, :, None], 3, axis=2)
+            right = across[0]
+            up = across[1]
+            pixels[:, places[right], 0] = 255
+            pixels[len(pixels) - 1 - places[up], :, 0] = 255
+            pictures[name].value = png_of(pixels)
+
+    for control in (chosen, *sliders.values()):
+        control.observe(draw, names="value")
+    draw()
+    columns = [widgets.VBox([pictures[name], sliders[name]]) for name, _, _ in AXES]
+    return widgets.VBox([widgets.HBox(columns), chosen])
