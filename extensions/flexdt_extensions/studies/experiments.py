@@ -278,7 +278,7 @@ def tasks(
             # Scenario by scenario, so that rendered images serve all dampings.
             rows = [six(name, "small-3", lam) for name, lam in DAMPING.items()]
             return [t for same in zip(*rows, strict=True) for t in same]
-        case _:
+        case "detector":
             home = placements()["scenario"]
             return [
                 WorkUnit(
@@ -286,3 +286,4 @@ def tasks(
                 )
                 for g in placements()["sets"]
             ]
+    raise AssertionError(f"{experiment} is in EXPERIMENTS and has no tasks")
