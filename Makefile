@@ -13,6 +13,7 @@ LINTED := build/.linted
 TYPED := build/.typed
 WEB := clients/viewer/web
 WEB_STAMP := $(WEB)/node_modules/.installed
+PAGE_LINTED := build/.linted-page
 
 # Tests of the pure core for `make quick`: those that take at most a second or two each.
 TWIN := frames frames_astra frames_off_centre values machine exposure physics_source scanner_tube
@@ -58,15 +59,16 @@ $(DOCS_STAMP): $(STAMP)
 	  -e 'extensions[docs]'
 	touch $@
 
-# TypeScript and eslint for the page. Without npm's registry the tests that need them are skipped.
-$(WEB_STAMP): $(TEST_STAMP) $(WEB)/package-lock.json
+# What checks the page: TypeScript's compiler, eslint, prettier. npm is the system's, or comes with the
+# tests' packages, which CI waits for.
+$(WEB_STAMP): $(WEB)/package-lock.json | $(if $(filter true,$(CI)),$(TEST_STAMP),$(STAMP))
 	@(PATH="$(CURDIR)/$(BIN):$$PATH" npm ci --prefix $(WEB) --no-audit --no-fund --silent --fetch-retries=1 && touch $@) \
-	  || echo "npm could not install TypeScript and eslint: the page's source is not checked"
+	  || echo "npm could not install what checks the page"
 
 demo: $(BASE_STAMP)
 	$(BIN)/flexdt demo --no-viewer
 
-lint: $(LINTED)
+lint: $(LINTED) $(PAGE_LINTED)
 
 typecheck: $(TYPED)
 
@@ -78,6 +80,11 @@ $(LINTED): $(SOURCES) | install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+	@mkdir -p $(@D) && touch $@
+
+# The page's modules: types, rules, format. Without node or npm's packages a line says so; CI fails.
+$(PAGE_LINTED): $(wildcard clients/viewer/data/*.js $(WEB)/*.* clients/viewer/tsconfig.json) $(WEB_STAMP) | install
+	$(BIN)/python tests/viewer/test_page_source.py --check
 	@mkdir -p $(@D) && touch $@
 
 $(TYPED): $(SOURCES) | install $(TEST_STAMP)
@@ -98,7 +105,7 @@ quick: lint typecheck
 	$(BIN)/pytest -q -n 2 --dist loadfile -m 'not slow' $(QUICK)
 
 # Three workers on two cores: they wait for processes, clocks and disks a quarter of their time.
-test: lint typecheck kernels $(COLLECTED) $(WEB_STAMP)
+test: lint typecheck kernels $(COLLECTED)
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow and not browser' \
 	  --junitxml=build/durations/test.xml
 
@@ -111,7 +118,7 @@ slow: studies page campaigns
 
 # Tests that take more than a second or two: servers as processes, the demonstration, the site, studies
 # in their short form. With three workers two cores had nothing to do for almost half of the time.
-studies: $(TEST_STAMP)
+studies: $(TEST_STAMP) $(WEB_STAMP)
 	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'slow and not browser and not night' \
 	  --junitxml=build/durations/studies.xml
 
@@ -131,7 +138,7 @@ failed: lint typecheck $(TEST_STAMP)
 	@echo "Failed in the last run:"
 	$(BIN)/python .ci/last_failed.py --run
 
-# What follows from the table of methods, and the page from its TypeScript.
+# What follows from the table of methods, the page's types among it.
 web: install $(WEB_STAMP)
 	$(BIN)/python tests/protocol/test_openrpc_file.py
 	$(BIN)/python tests/clients/test_shared_methods.py

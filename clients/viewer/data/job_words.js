@@ -1,64 +1,125 @@
 // What is said of a scan: its state, who ended it, how long it takes, and what stands elsewhere
 // than where it began.
 import { fixed, isNumber, seconds } from "./figures.js";
+/** @import { AxisState, JobStatus, State } from "../web/viewer.d.ts" */
+
+/** @type {Array<JobStatus["state"]>} */
 const FINAL = ["done", "failed", "aborted", "incomplete"];
 const MOVED = 0.01; // mm or degrees
 const NAMED_MOTORS = 3;
+
+/**
+ * @param {JobStatus} job
+ * @returns {boolean}
+ */
 export const isOver = (job) => FINAL.includes(job.state);
-// Whether images of it are missing that `job.resume` makes.
+
+/**
+ * Whether images of it are missing that `job.resume` makes.
+ * @param {JobStatus} job
+ * @returns {boolean}
+ */
 export const isUnfinished = (job) => isOver(job) && job.state !== "done";
-export const problem = (job) => typeof job.error?.message === "string" ? job.error.message : "";
+
+/**
+ * @param {JobStatus} job
+ * @returns {string}
+ */
+export const problem = (job) =>
+  typeof job.error?.message === "string" ? job.error.message : "";
+
+/**
+ * @param {JobStatus} job
+ * @param {string | null} session
+ * @returns {string}
+ */
 export function stateWords(job, session) {
-    const by = job.ended_by;
-    if (job.state === "aborted" && by)
-        return `aborted by ${by === session ? "you" : by}`;
-    if (isOver(job))
-        return job.state;
-    const pace = job.speed_up === "max" ? " · max" : job.speed_up === 1 ? "" : ` · ${job.speed_up}×`;
-    return `${job.state}${pace}`;
+  const by = job.ended_by;
+  if (job.state === "aborted" && by) return `aborted by ${by === session ? "you" : by}`;
+  if (isOver(job)) return job.state;
+  const pace =
+    job.speed_up === "max" ? " · max" : job.speed_up === 1 ? "" : ` · ${job.speed_up}×`;
+  return `${job.state}${pace}`;
 }
-// The part that is done, from 0 to 1.
+
+/**
+ * The part that is done, from 0 to 1.
+ * @param {JobStatus} job
+ * @returns {number}
+ */
 export function progress(job) {
-    if (job.frames_total)
-        return job.frames_done / job.frames_total;
-    return job.state === "done" ? 1 : 0;
+  if (job.frames_total) return job.frames_done / job.frames_total;
+  return job.state === "done" ? 1 : 0;
 }
+
+/**
+ * @param {JobStatus} job
+ * @returns {string}
+ */
 export function timeLeft(job) {
-    if (isOver(job))
-        return seconds(job.elapsed_s);
-    if (!isNumber(job.remaining_s))
-        return "";
-    const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
-    return `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left`;
+  if (isOver(job)) return seconds(job.elapsed_s);
+  if (!isNumber(job.remaining_s)) return "";
+  const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
+  return `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left`;
 }
-// The motors that do not stand where they stood when the scan began.
+
+/** @typedef {Record<string, Pick<AxisState, "position" | "moving" | "unit">>} Axes */
+
+/**
+ * @typedef {object} Moved
+ * @property {string} motor
+ * @property {number} now
+ * @property {number} start
+ */
+
+/**
+ * The motors that do not stand where they stood when the scan began.
+ * @param {JobStatus} job
+ * @param {Axes} axes
+ * @returns {Moved[]}
+ */
 export function moved(job, axes) {
-    const known = Object.entries(job.start ?? {}).filter(([motor]) => motor in axes);
-    const all = known.map(([motor, start]) => ({ motor, now: axes[motor].position, start }));
-    return all.filter(({ now, start }) => Math.abs(now - start) > MOVED);
+  const known = Object.entries(job.start ?? {}).filter(([motor]) => motor in axes);
+  const all = known.map(([motor, start]) => ({ motor, now: axes[motor].position, start }));
+  return all.filter(({ now, start }) => Math.abs(now - start) > MOVED);
 }
-// What the scan does, or what it has left behind.
+
+/**
+ * What the scan does, or what it has left behind.
+ * @param {JobStatus} job
+ * @param {State | null} state
+ * @returns {string}
+ */
 export function whatWords(job, state) {
-    if (!isOver(job)) {
-        if (state?.projector && job.state === "running")
-            return `waits: ${state.projector}`;
-        return problem(job) || `${job.line ? `line ${job.line}: ` : ""}${job.what}`;
-    }
-    const why = job.state === "done" ? "" : problem(job);
-    const stands = job.state === "done" || !state ? [] : [xrays(state), places(job, state)];
-    return [why, ...stands].filter(Boolean).join(" · ");
+  if (!isOver(job)) {
+    if (state?.projector && job.state === "running") return `waits: ${state.projector}`;
+    return problem(job) || `${job.line ? `line ${job.line}: ` : ""}${job.what}`;
+  }
+  const why = job.state === "done" ? "" : problem(job);
+  const stands = job.state === "done" || !state ? [] : [xrays(state), places(job, state)];
+  return [why, ...stands].filter(Boolean).join(" · ");
 }
+
+/**
+ * @param {State} state
+ * @returns {string}
+ */
 function xrays({ tube }) {
-    return tube.on ? "X-rays are on" : "X-rays are off";
+  return tube.on ? "X-rays are on" : "X-rays are off";
 }
+
+/**
+ * @param {JobStatus} job
+ * @param {State} state
+ * @returns {string}
+ */
 function places(job, { axes }) {
-    const all = moved(job, axes);
-    if (!all.length)
-        return "everything stands where it began";
-    const words = all.slice(0, NAMED_MOTORS).map(({ motor, now, start }) => {
-        const unit = axes[motor].unit === "deg" ? "°" : " mm";
-        return `${motor} at ${fixed(now, 2)}${unit}, began at ${fixed(start, 2)}${unit}`;
-    });
-    const more = all.length - words.length;
-    return `${words.join(", ")}${more > 0 ? `, and ${more} more motors` : ""}`;
+  const all = moved(job, axes);
+  if (!all.length) return "everything stands where it began";
+  const words = all.slice(0, NAMED_MOTORS).map(({ motor, now, start }) => {
+    const unit = axes[motor].unit === "deg" ? "°" : " mm";
+    return `${motor} at ${fixed(now, 2)}${unit}, began at ${fixed(start, 2)}${unit}`;
+  });
+  const more = all.length - words.length;
+  return `${words.join(", ")}${more > 0 ? `, and ${more} more motors` : ""}`;
 }

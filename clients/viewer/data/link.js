@@ -1,35 +1,41 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old
 // they are, reconnection.
 import { keep, words } from "./dom.js";
-import { differences, ofData, ofImage, ofNow, } from "./fingerprint.js";
+import { differences, ofData, ofImage, ofNow } from "./fingerprint.js";
+/**
+ * @import { Fingerprint, Quantities, Quantity } from "./fingerprint.js"
+ * @import { Answers, Events, Framing, HelloResult, ImageHead, JobStatus, Messages, Near, Pair,
+ *   Requests, Shown, State } from "../web/viewer.d.ts"
+ */
+
 export const pageId = (window.pageId = [...crypto.getRandomValues(new Uint8Array(12))]
-    .map((b) => b.toString(16).padStart(2, "0"))
-    .join(""));
+  .map((b) => b.toString(16).padStart(2, "0"))
+  .join(""));
 export const store = {
-    state: null,
-    framing: null,
-    across_mm: null,
-    near: null,
-    hello: null,
-    session: null,
-    twin: false,
-    viewer: false,
-    layers: {},
-    opacity: 1,
-    image: null,
-    recorded: null,
-    hidden: false,
-    received: { state: 0, image: 0 },
-    age: 0,
-    fresh: null,
-    now: null,
-    imageAge: 0,
-    imageDiffers: [],
-    job: null,
-    refused: null,
-    problem: null,
-    coneVec: null,
-    drawn: false,
+  /** @type {State | null} */ state: null,
+  /** @type {Framing | null} */ framing: null,
+  /** @type {number | null} */ across_mm: null,
+  /** @type {Near | null} */ near: null,
+  /** @type {HelloResult | null} */ hello: null,
+  /** @type {string | null} */ session: null,
+  twin: false,
+  viewer: false,
+  /** @type {Record<string, boolean>} */ layers: {},
+  opacity: 1,
+  /** @type {Shown | null} */ image: null,
+  /** @type {string | null} */ recorded: null,
+  hidden: false,
+  received: { state: 0, image: 0 },
+  age: 0,
+  /** @type {number | null} */ fresh: null,
+  /** @type {Quantities | null} */ now: null,
+  imageAge: 0,
+  /** @type {Quantity[]} */ imageDiffers: [],
+  /** @type {JobStatus | null} */ job: null,
+  /** @type {string | null} */ refused: null,
+  /** @type {string | null} */ problem: null,
+  /** @type {number[] | null} */ coneVec: null,
+  drawn: false,
 };
 // Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any
 // more.
@@ -38,285 +44,360 @@ const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 
 const LOOK_MS = 200;
 const REST_MS = 500;
 const TRY_AGAIN = 1013;
+/** @typedef {{ [E in keyof Events]?: Array<(...args: Events[E]) => unknown> }} Listeners */
+
+/** @type {Listeners} */
 const listeners = {};
+
+/**
+ * @typedef {object} Waiting
+ * @property {(result: never) => void} resolve
+ * @property {(why: Failure) => void} reject
+ * @property {number} since
+ */
+
+/** @type {Map<number, Waiting>} */
 const waiting = new Map();
-// Why a request was refused; code 0: nobody answered it.
+/** Why a request was refused; code 0: nobody answered it. */
 export class Failure extends Error {
-    code;
-    data;
-    constructor(code, message, data) {
-        super(message);
-        this.code = code;
-        this.data = data;
-    }
+  /** @readonly @type {number} */
+  code;
+  /** @readonly @type {unknown} */
+  data;
+
+  /**
+   * @param {number} code
+   * @param {string} message
+   * @param {unknown} [data]
+   */
+  constructor(code, message, data) {
+    super(message);
+    this.code = code;
+    this.data = data;
+  }
 }
+
+/** @type {WebSocket | null} */
 let socket = null;
 let nextId = 1;
 let pause = 200;
+
+/**
+ * @template {keyof Events} E
+ * @param {E} what
+ * @param {(...args: Events[E]) => unknown} f
+ */
 export function on(what, f) {
-    (listeners[what] ??= []).push(f);
+  (listeners[what] ??= /** @type {NonNullable<Listeners[E]>} */ ([])).push(f);
 }
+
+/**
+ * @template {keyof Events} E
+ * @param {E} what
+ * @param {Events[E]} args
+ */
 export function emit(what, ...args) {
-    for (const f of listeners[what] ?? [])
-        f(...args);
+  for (const f of listeners[what] ?? []) f(...args);
 }
+
+/** @typedef {keyof Requests & keyof Answers} Method */
+
+/**
+ * @template {Method} M
+ * @param {M} method
+ * @param {Partial<Requests[M]>} [params]
+ * @returns {Promise<Answers[M]>}
+ */
 export function call(method, params = {}) {
-    return new Promise((resolve, reject) => {
-        if (!socket || socket.readyState !== WebSocket.OPEN) {
-            reject(new Failure(0, "no connection to the viewer"));
-            return;
-        }
-        const id = nextId++;
-        waiting.set(id, { resolve, reject, since: performance.now() });
-        socket.send(JSON.stringify({ id, method, params }));
-    });
+  return new Promise((resolve, reject) => {
+    if (!socket || socket.readyState !== WebSocket.OPEN) {
+      reject(new Failure(0, "no connection to the viewer"));
+      return;
+    }
+    const id = nextId++;
+    waiting.set(id, { resolve, reject, since: performance.now() });
+    socket.send(JSON.stringify({ id, method, params }));
+  });
 }
-// A command of a person: what goes wrong becomes a note, whose title may depend on the error.
+
+/**
+ * A command of a person: what goes wrong becomes a note, whose title may depend on the error.
+ * @template {Method} M
+ * @param {M} method
+ * @param {Partial<Requests[M]>} [params]
+ * @param {string | ((error: unknown) => string)} [title]
+ * @returns {Promise<Answers[M] | null>}
+ */
 export async function command(method, params = {}, title = "Refused") {
-    try {
-        return await call(method, params);
-    }
-    catch (error) {
-        emit("note", "error", typeof title === "function" ? title(error) : title, words(error));
-        return null;
-    }
+  try {
+    return await call(method, params);
+  } catch (error) {
+    emit("note", "error", typeof title === "function" ? title(error) : title, words(error));
+    return null;
+  }
 }
+
 // Who is there: kept in this browser, and told to the twin with each connection.
 const PERSON = "flexdt-person";
+/** @returns {string} */
 export const person = () => localStorage.getItem(PERSON) ?? "";
+/** @param {string} name */
 export function rename(name) {
-    keep(PERSON, name.trim());
-    socket?.close();
+  keep(PERSON, name.trim());
+  socket?.close();
 }
 export function connect() {
-    const scheme = location.protocol === "https:" ? "wss" : "ws";
-    socket = new WebSocket(`${scheme}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`);
-    socket.binaryType = "arraybuffer";
-    socket.onopen = () => {
-        store.viewer = true;
-        parts = [];
-        heard = least = null;
-        emit("connection");
-        emit("open");
-    };
-    socket.onmessage = (event) => {
-        if (typeof event.data === "string")
-            text(event.data);
-        else
-            part(event.data);
-    };
-    socket.onclose = (event) => {
-        const was = store.viewer || event.code === TRY_AGAIN;
-        store.refused = event.code === TRY_AGAIN ? event.reason : null;
-        store.viewer = false;
-        store.twin = false;
-        store.session = null;
-        for (const { reject } of waiting.values())
-            reject(new Failure(0, "the viewer has gone"));
-        waiting.clear();
-        if (was)
-            emit("connection");
-        setTimeout(connect, pause);
-        pause = Math.min(2 * pause, 2000);
-    };
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
+  socket = new WebSocket(
+    `${scheme}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`,
+  );
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => {
+    store.viewer = true;
+    parts = [];
+    heard = least = null;
+    emit("connection");
+    emit("open");
+  };
+  socket.onmessage = (/** @type {MessageEvent<string | ArrayBuffer>} */ event) => {
+    if (typeof event.data === "string") text(event.data);
+    else part(event.data);
+  };
+  socket.onclose = (event) => {
+    const was = store.viewer || event.code === TRY_AGAIN;
+    store.refused = event.code === TRY_AGAIN ? event.reason : null;
+    store.viewer = false;
+    store.twin = false;
+    store.session = null;
+    for (const { reject } of waiting.values()) reject(new Failure(0, "the viewer has gone"));
+    waiting.clear();
+    if (was) emit("connection");
+    setTimeout(connect, pause);
+    pause = Math.min(2 * pause, 2000);
+  };
 }
+
+/** @type {{ [T in keyof Messages]: (m: Messages[T]) => void }} */
 const handlers = {
-    answer(m) {
-        const w = waiting.get(m.id);
-        waiting.delete(m.id);
-        if (m.error)
-            w?.reject(new Failure(m.error.code, m.error.message, m.error.data));
-        else
-            w?.resolve(m.result);
-    },
-    state(m) {
-        took("state");
-        Object.assign(store, {
-            state: m.state,
-            framing: m.framing,
-            across_mm: m.across_mm,
-            near: m.near,
-            coneVec: m.cone_vec,
-        });
-        store.received.state++;
-        store.now = ofNow(m.state, m.cone_vec, store.hello);
-        if (!store.twin) {
-            store.twin = true;
-            emit("connection");
-        }
-        emit("state", m.state);
-    },
-    link(m) {
-        pause = 200;
-        Object.assign(store, {
-            refused: null,
-            twin: m.connected,
-            problem: m.problem,
-            drawn: m.drawn,
-        });
-        store.hello = m.hello ?? store.hello;
-        if (store.state)
-            store.now = ofNow(store.state, store.coneVec, store.hello);
-        emit("connection");
-    },
-    session(m) {
-        store.session = m.session;
-        emit("connection");
-        if (m.connected)
-            emit("session");
-    },
-    volume(m) {
-        took("volume");
-        emit("volume", m);
-    },
-    layers(m) {
-        store.layers = m.shown;
-        store.opacity = m.opacity;
-        emit("layers");
-    },
-    job(m) {
-        emit("job", m.data);
-    },
-    note(m) {
-        emit("note", m.level, m.title, m.body);
-    },
-    log(m) {
-        emit("log", m.data);
-    },
-    beat(m) {
-        heard = { at: performance.now(), late: late(m.at), silent: m.silent_s };
-        look();
-    },
+  answer(m) {
+    const w = waiting.get(m.id);
+    waiting.delete(m.id);
+    if (m.error) w?.reject(new Failure(m.error.code, m.error.message, m.error.data));
+    else w?.resolve(/** @type {never} */ (m.result));
+  },
+  state(m) {
+    took("state");
+    Object.assign(store, {
+      state: m.state,
+      framing: m.framing,
+      across_mm: m.across_mm,
+      near: m.near,
+      coneVec: m.cone_vec,
+    });
+    store.received.state++;
+    store.now = ofNow(m.state, m.cone_vec, store.hello);
+    if (!store.twin) {
+      store.twin = true;
+      emit("connection");
+    }
+    emit("state", m.state);
+  },
+  link(m) {
+    pause = 200;
+    Object.assign(store, {
+      refused: null,
+      twin: m.connected,
+      problem: m.problem,
+      drawn: m.drawn,
+    });
+    store.hello = m.hello ?? store.hello;
+    if (store.state) store.now = ofNow(store.state, store.coneVec, store.hello);
+    emit("connection");
+  },
+  session(m) {
+    store.session = m.session;
+    emit("connection");
+    if (m.connected) emit("session");
+  },
+  volume(m) {
+    took("volume");
+    emit("volume", m);
+  },
+  layers(m) {
+    store.layers = m.shown;
+    store.opacity = m.opacity;
+    emit("layers");
+  },
+  job(m) {
+    emit("job", m.data);
+  },
+  note(m) {
+    emit("note", m.level, m.title, m.body);
+  },
+  log(m) {
+    emit("log", m.data);
+  },
+  beat(m) {
+    heard = { at: performance.now(), late: late(m.at), silent: m.silent_s };
+    look();
+  },
 };
+
+/** @param {string} content */
 function text(content) {
-    const m = JSON.parse(content);
-    if (m.type in handlers)
-        handlers[m.type](m);
+  const m = /** @type {{ type: keyof Messages }} */ (JSON.parse(content));
+  if (m.type in handlers) handlers[m.type](/** @type {never} */ (m));
 }
+
 // How old what is shown is: since the last heartbeat of the viewer, what that one took, and how
 // long the twin has told the viewer nothing. Of the two clocks' difference the least one seen
 // stands for no delay; it may grow by the error of clocks.
 const DRIFT = 1e-4;
+/** @type {{ at: number; late: number; silent: number } | null} */
 let heard = null;
+/** @type {{ lag: number; at: number } | null} */
 let least = null;
+/** @param {number} sent */
 function late(sent) {
-    const now = performance.now() / 1000;
-    least =
-        least === null
-            ? { lag: now - sent, at: now }
-            : { lag: Math.min(now - sent, least.lag + DRIFT * (now - least.at)), at: now };
-    return now - sent - least.lag;
+  const now = performance.now() / 1000;
+  least =
+    least === null
+      ? { lag: now - sent, at: now }
+      : { lag: Math.min(now - sent, least.lag + DRIFT * (now - least.at)), at: now };
+  return now - sent - least.lag;
 }
+
+/** @type {number | null} */
 let differs = null;
-// What an image that the page has was made of.
+
+/**
+ * What an image that the page has was made of.
+ * @param {Pick<Shown, "recorded" | "origin" | "cone_vec" | "twin">} image
+ * @returns {Fingerprint}
+ */
 export function imageMade(image) {
-    const { recorded } = image;
-    if (recorded)
-        return ofData(recorded.name, recorded.index);
-    return ofImage(image.origin, image.cone_vec, image.twin);
+  const { recorded } = image;
+  if (recorded) return ofData(recorded.name, recorded.index);
+  return ofImage(image.origin, image.cone_vec, image.twin);
 }
 function look() {
-    const now = performance.now();
-    const own = delay(now) / 1000;
-    const age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
-    store.age = Math.max(0, age - own);
-    store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
-    // An image of other things than the state's is old, once none has come for a while.
-    const image = store.image;
-    store.imageDiffers = image && store.now ? differences(imageMade(image), store.now) : [];
-    const apart = image && store.imageDiffers.length && !image.recorded ? image : null;
-    differs = apart ? (differs ?? now) : null;
-    const waited = apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
-    store.imageAge = Math.max(0, waited - own);
-    emit("age");
+  const now = performance.now();
+  const own = delay(now) / 1000;
+  const age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
+  store.age = Math.max(0, age - own);
+  store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
+  // An image of other things than the state's is old, once none has come for a while.
+  const image = store.image;
+  store.imageDiffers = image && store.now ? differences(imageMade(image), store.now) : [];
+  const apart = image && store.imageDiffers.length && !image.recorded ? image : null;
+  differs = apart ? (differs ?? now) : null;
+  const waited = apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
+  store.imageAge = Math.max(0, waited - own);
+  emit("age");
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come
 // meanwhile: the longest delay of its own within REST_MS is no silence of the viewer.
 let looked = performance.now();
 let longest = { ms: 0, at: -Infinity };
+
+/**
+ * @param {number} now
+ * @returns {number}
+ */
 function delay(now) {
-    const due = now - looked - LOOK_MS;
-    return Math.max(0, due, now - longest.at < REST_MS ? longest.ms : 0);
+  const due = now - looked - LOOK_MS;
+  return Math.max(0, due, now - longest.at < REST_MS ? longest.ms : 0);
 }
 setInterval(() => {
-    const now = performance.now();
-    const due = now - looked - LOOK_MS;
-    if (due >= delay(now))
-        longest = { ms: due, at: now };
-    looked = now;
-    look();
-    if (store.age <= SILENT_S)
-        return;
-    for (const [id, w] of waiting)
-        if (now - w.since > 1000 * SILENT_S) {
-            waiting.delete(id);
-            w.reject(new Failure(0, `no answer for ${SILENT_S} s; it may still take effect`));
-        }
+  const now = performance.now();
+  const due = now - looked - LOOK_MS;
+  if (due >= delay(now)) longest = { ms: due, at: now };
+  looked = now;
+  look();
+  if (store.age <= SILENT_S) return;
+  for (const [id, w] of waiting)
+    if (now - w.since > 1000 * SILENT_S) {
+      waiting.delete(id);
+      w.reject(new Failure(0, `no answer for ${SILENT_S} s; it may still take effect`));
+    }
 }, LOOK_MS);
-// What is acknowledged makes room for the next: so nothing old waits in sockets.
+
+/**
+ * What is acknowledged makes room for the next: so nothing old waits in sockets.
+ * @param {string} slot
+ */
 function took(slot) {
-    if (socket?.readyState === WebSocket.OPEN)
-        socket.send(`{"took":"${slot}"}`);
+  if (socket?.readyState === WebSocket.OPEN) socket.send(`{"took":"${slot}"}`);
 }
+
+/** @type {Uint8Array[]} */
 let parts = [];
+/** @param {ArrayBuffer} buffer */
 function part(buffer) {
-    took("image");
-    const bytes = new Uint8Array(buffer);
-    parts.push(bytes.subarray(1));
-    if (bytes[0] === 0)
-        return;
-    const whole = new Uint8Array(parts.reduce((n, p) => n + p.length, 0));
-    parts.reduce((n, p) => {
-        whole.set(p, n);
-        return n + p.length;
-    }, 0);
-    parts = [];
-    void image(whole);
+  took("image");
+  const bytes = new Uint8Array(buffer);
+  parts.push(bytes.subarray(1));
+  if (bytes[0] === 0) return;
+  const whole = new Uint8Array(parts.reduce((n, p) => n + p.length, 0));
+  parts.reduce((n, p) => {
+    whole.set(p, n);
+    return n + p.length;
+  }, 0);
+  parts = [];
+  void image(whole);
 }
+
+/** @typedef {Uint8Array<ArrayBuffer>} Body */
+
+/** @type {Record<ImageHead["code"], (body: Body, shape: Pair) => Promise<Uint16Array>>} */
 const decoders = {
-    async jpeg(body, [rows, cols]) {
-        const picture = await createImageBitmap(new Blob([body], { type: "image/jpeg" }));
-        const canvas = new OffscreenCanvas(cols, rows);
-        const context = canvas.getContext("2d", { willReadFrequently: true });
-        if (!context)
-            throw new Error("this browser draws nothing");
-        context.drawImage(picture, 0, 0);
-        const { data } = context.getImageData(0, 0, cols, rows);
-        const pixels = new Uint16Array(rows * cols);
-        for (let k = 0; k < pixels.length; k++)
-            pixels[k] = 257 * data[4 * k];
-        return pixels;
-    },
-    // Differences from column to column, low bytes before high ones.
-    async deflate(body, [, cols]) {
-        const planes = new Uint8Array(await new Response(new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
-        const pixels = new Uint16Array(planes.length / 2);
-        for (let k = 0; k < pixels.length; k++) {
-            const step = planes[k] | (planes[pixels.length + k] << 8);
-            pixels[k] = k % cols ? pixels[k - 1] + step : step;
-        }
-        return pixels;
-    },
+  async jpeg(body, [rows, cols]) {
+    const picture = await createImageBitmap(new Blob([body], { type: "image/jpeg" }));
+    const canvas = new OffscreenCanvas(cols, rows);
+    const context = canvas.getContext("2d", { willReadFrequently: true });
+    if (!context) throw new Error("this browser draws nothing");
+    context.drawImage(picture, 0, 0);
+    const { data } = context.getImageData(0, 0, cols, rows);
+    const pixels = new Uint16Array(rows * cols);
+    for (let k = 0; k < pixels.length; k++) pixels[k] = 257 * data[4 * k];
+    return pixels;
+  },
+  /** Differences from column to column, low bytes before high ones. */
+  async deflate(body, [, cols]) {
+    const planes = new Uint8Array(
+      await new Response(
+        new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate")),
+      ).arrayBuffer(),
+    );
+    const pixels = new Uint16Array(planes.length / 2);
+    for (let k = 0; k < pixels.length; k++) {
+      const step = planes[k] | (planes[pixels.length + k] << 8);
+      pixels[k] = k % cols ? pixels[k - 1] + step : step;
+    }
+    return pixels;
+  },
 };
 let unpacked = 0;
 let arrived = 0;
+/** @param {Body} whole */
 async function image(whole) {
-    const number = ++arrived;
-    const size = new DataView(whole.buffer).getUint32(4, true);
-    const head = JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size)));
-    const at_ms = performance.now();
-    const all = await decoders[head.code](whole.subarray(8 + size), head.shape);
-    const n = all.length / 2;
-    const got = head.pair
-        ? { ...head, at_ms, pixels: all.subarray(0, n), virtual: all.subarray(n) }
-        : { ...head, at_ms, pixels: all };
-    if (number < unpacked)
-        return; // a newer one was quicker
-    unpacked = number;
-    // Neither a live image while a data set is open, nor the other way round.
-    if ((head.recorded?.name ?? null) !== store.recorded || store.hidden)
-        return;
-    store.image = got;
-    store.received.image++;
-    emit("image", got);
+  const number = ++arrived;
+  const size = new DataView(whole.buffer).getUint32(4, true);
+  const head = /** @type {ImageHead} */ (
+    JSON.parse(new TextDecoder().decode(whole.subarray(8, 8 + size)))
+  );
+  const at_ms = performance.now();
+  const all = await decoders[head.code](whole.subarray(8 + size), head.shape);
+  const n = all.length / 2;
+  /** @type {Shown} */
+  const got = head.pair
+    ? { ...head, at_ms, pixels: all.subarray(0, n), virtual: all.subarray(n) }
+    : { ...head, at_ms, pixels: all };
+  if (number < unpacked) return; // a newer one was quicker
+  unpacked = number;
+  // Neither a live image while a data set is open, nor the other way round.
+  if ((head.recorded?.name ?? null) !== store.recorded || store.hidden) return;
+  store.image = got;
+  store.received.image++;
+  emit("image", got);
 }

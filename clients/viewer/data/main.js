@@ -22,29 +22,30 @@ import "./story.js";
 import { asked } from "./address.js";
 import { listen, toggleHelp } from "./keys.js";
 import { fine, layout } from "./views.js";
+
+/** @param {boolean} dark */
 function theme(dark, tell = true) {
-    document.documentElement.dataset.theme = dark ? "dark" : "light";
-    localStorage.setItem("flexdt-theme", dark ? "dark" : "light");
-    if (tell)
-        call("viewer.theme", { dark, fine }).catch(() => { });
+  document.documentElement.dataset.theme = dark ? "dark" : "light";
+  localStorage.setItem("flexdt-theme", dark ? "dark" : "light");
+  if (tell) call("viewer.theme", { dark, fine }).catch(() => {});
 }
 const dark = () => document.documentElement.dataset.theme === "dark";
 $button("#theme").addEventListener("click", () => theme(!dark()));
 $button("#help").addEventListener("click", toggleHelp);
 on("open", () => theme(dark()));
+
 window.addEventListener("popstate", () => {
-    tab(known(asked("tab")));
-    const view = asked("view");
-    if (view)
-        layout(view);
-    data.restore();
+  tab(known(asked("tab")));
+  const view = asked("view");
+  if (view) layout(view);
+  data.restore();
 });
+
 tab(known(asked("tab")));
 listen(window);
 connect();
 // The scenes' frames say which page they belong to, so the page has been registered before.
 on("connection", () => {
-    if (store.drawn && !$("#views").childElementCount)
-        layout(window.firstView);
+  if (store.drawn && !$("#views").childElementCount) layout(window.firstView);
 });
 window.flexdt = { store, call, scan, data, film, picture, value, volume };

@@ -8,6 +8,8 @@ import { isUnfinished } from "./job_words.js";
 import { across } from "./sample_outline.js";
 import { nearSample } from "./views.js";
 import { reconstruct, watch } from "./volume.js";
+/** @import { Answers, State } from "../web/viewer.d.ts" */
+
 const LEAST_VIEWS = 91;
 const MOST_VIEWS = 151;
 const EXPOSURE_MS = 100;
@@ -24,6 +26,7 @@ const sample = $select("#scan-it-sample");
 const go = $button("#scan-it");
 const note = $("#scan-it-note");
 const EMPTY = "empty";
+/** @type {string | null} */
 let mine = null;
 // From the press of the button until the scan has begun.
 let pressed = false;
@@ -33,169 +36,216 @@ let exchanging = false;
 let busy = false;
 // Until the first image: then the stage stands where it turns, and the camera goes there.
 let far = false;
-// Whether the page's own state is of a sample: only then does it know what is across it.
-const isShown = (some) => some.name === store.state?.sample.name && some.revision === store.state.sample.revision;
-// Size of what turns, across and upright, in mm; null where nobody has said it.
+
+/**
+ * Whether the page's own state is of a sample: only then does it know what is across it.
+ * @param {State["sample"]} some
+ */
+const isShown = (some) =>
+  some.name === store.state?.sample.name && some.revision === store.state.sample.revision;
+
+/**
+ * Size of what turns, across and upright, in mm; null where nobody has said it.
+ * @param {State} state
+ * @returns {[across: number, upright: number] | null}
+ */
 function turning({ sample: some }) {
-    const { x, y, rx, ry } = some.offset;
-    const width = across(some, isShown(some) ? store.across_mm : null);
-    if (!some.size_mm || width === null)
-        return null;
-    return [width + 2 * Math.hypot(x, y), rx || ry ? width : some.size_mm[2]];
+  const { x, y, rx, ry } = some.offset;
+  const width = across(some, isShown(some) ? store.across_mm : null);
+  if (!some.size_mm || width === null) return null;
+  return [width + 2 * Math.hypot(x, y), rx || ry ? width : some.size_mm[2]];
 }
-// The state of the twin, once the page's own is of the same sample or has had time for it.
+
+/**
+ * The state of the twin, once the page's own is of the same sample or has had time for it.
+ * @returns {Promise<State | null>}
+ */
 async function current() {
-    const state = await command("state.get", {}, "No scan");
-    for (let wait = 0; state && !isShown(state.sample) && wait < SHOWN_TRIES; wait++)
-        await new Promise((again) => setTimeout(again, SHOWN_AGAIN_MS));
-    if (state && !isShown(state.sample))
-        emit("note", "warning-note", "Scan it", "the sample’s shape is not here yet: its box counts");
-    return state;
+  const state = await command("state.get", {}, "No scan");
+  for (let wait = 0; state && !isShown(state.sample) && wait < SHOWN_TRIES; wait++)
+    await new Promise((again) => setTimeout(again, SHOWN_AGAIN_MS));
+  if (state && !isShown(state.sample))
+    emit(
+      "note",
+      "warning-note",
+      "Scan it",
+      "the sample’s shape is not here yet: its box counts",
+    );
+  return state;
 }
-// The voxel size [um] at which the sample fills the image.
+
+/**
+ * The voxel size [um] at which the sample fills the image.
+ * @param {State} state
+ * @returns {number | null}
+ */
 export function filling(state) {
-    const size = turning(state);
-    const [rows, columns] = state.camera.shape;
-    if (!size)
-        return null;
-    return (1000 * Math.max(size[0] / columns, size[1] / rows)) / FILL;
+  const size = turning(state);
+  const [rows, columns] = state.camera.shape;
+  if (!size) return null;
+  return (1000 * Math.max(size[0] / columns, size[1] / rows)) / FILL;
 }
-// As many views as keep steps at the rim of the sample within a voxel of what is shown.
+
+/**
+ * As many views as keep steps at the rim of the sample within a voxel of what is shown.
+ * @param {State} state
+ * @param {number} voxel_um
+ * @returns {number}
+ */
 export function viewsFor(state, voxel_um) {
-    const size = turning(state);
-    const shown_mm = (voxel_um / 1000) * Math.max(1, state.camera.shape[1] / SHOWN_VOXELS);
-    const wanted = size ? Math.ceil((Math.PI / 2) * (size[0] / shown_mm)) : MOST_VIEWS;
-    return Math.min(MOST_VIEWS, Math.max(LEAST_VIEWS, wanted)) | 1;
+  const size = turning(state);
+  const shown_mm = (voxel_um / 1000) * Math.max(1, state.camera.shape[1] / SHOWN_VOXELS);
+  const wanted = size ? Math.ceil((Math.PI / 2) * (size[0] / shown_mm)) : MOST_VIEWS;
+  return Math.min(MOST_VIEWS, Math.max(LEAST_VIEWS, wanted)) | 1;
 }
-// A script of one turn that may run, at a voxel size or where the stage stands; else why not.
+
+/**
+ * A script of one turn that may run, at a voxel size or where the stage stands; else why not.
+ * @param {number} frames
+ * @param {number | null} voxel_um
+ * @returns {Promise<Answers["viewer.compose"] | string>}
+ */
 async function composed(frames, voxel_um) {
-    const asked = { kind: "fly", frames, exposure_ms: EXPOSURE_MS };
-    const more = voxel_um === null ? {} : { voxel_um };
-    try {
-        const made = await call("viewer.compose", { ...asked, ...more });
-        const { ok, problems } = await call("script.check", { text: made.text });
-        if (ok)
-            return made;
-        const error = problems.find(({ severity }) => severity === "error");
-        return error?.message ?? "its script is not ready to run";
-    }
-    catch (error) {
-        return words(error);
-    }
+  const asked = { kind: /** @type {const} */ ("fly"), frames, exposure_ms: EXPOSURE_MS };
+  const more = voxel_um === null ? {} : { voxel_um };
+  try {
+    const made = await call("viewer.compose", { ...asked, ...more });
+    const { ok, problems } = await call("script.check", { text: made.text });
+    if (ok) return made;
+    const error = problems.find(({ severity }) => severity === "error");
+    return error?.message ?? "its script is not ready to run";
+  } catch (error) {
+    return words(error);
+  }
 }
-// A script for it: nearer or farther where that is possible, else where the stage stands, which
-// is said; with as many views as follow from the sample, unless they are given.
+
+/**
+ * A script for it: nearer or farther where that is possible, else where the stage stands, which
+ * is said; with as many views as follow from the sample, unless they are given.
+ * @param {State} state
+ * @param {number | null} views
+ * @returns {Promise<Answers["viewer.compose"] | null>}
+ */
 async function script(state, views) {
-    const now_um = 1000 * (state.geometry.voxel_size_mm ?? 0.1);
-    const wanted_um = filling(state);
-    const near = wanted_um !== null && Math.abs(wanted_um / now_um - 1) > SAME ? wanted_um : null;
-    let refused = "";
-    for (const voxel_um of near === null ? [null] : [near, null]) {
-        const frames = views ?? viewsFor(state, voxel_um ?? now_um);
-        const made = await composed(frames, voxel_um);
-        if (typeof made !== "string") {
-            if (refused)
-                emit("note", "warning-note", "Scanned where it stands", refused);
-            return made;
-        }
-        refused = made;
+  const now_um = 1000 * (state.geometry.voxel_size_mm ?? 0.1);
+  const wanted_um = filling(state);
+  const near = wanted_um !== null && Math.abs(wanted_um / now_um - 1) > SAME ? wanted_um : null;
+  let refused = "";
+  for (const voxel_um of near === null ? [null] : [near, null]) {
+    const frames = views ?? viewsFor(state, voxel_um ?? now_um);
+    const made = await composed(frames, voxel_um);
+    if (typeof made !== "string") {
+      if (refused) emit("note", "warning-note", "Scanned where it stands", refused);
+      return made;
     }
-    emit("note", "error", "No scan", refused);
-    return null;
+    refused = made;
+  }
+  emit("note", "error", "No scan", refused);
+  return null;
 }
-// Puts a sample on the stage, unless it stands there, and begins one turn of it that fills the
-// image; its job, or null.
+
+/**
+ * Puts a sample on the stage, unless it stands there, and begins one turn of it that fills the
+ * image; its job, or null.
+ * @param {string} named
+ * @param {number | null} [views]
+ * @returns {Promise<string | null>}
+ */
 export async function turnOf(named, views = null) {
-    const other = named && named !== store.state?.sample.name;
-    if (other && !(await command("sample.set", { name: named }, "The sample stays")))
-        return null;
-    const state = await current();
-    const made = state && (await script(state, views));
-    const asked = made && { text: made.text, speed_up: "max" };
-    const job = asked && (await command("script.submit", asked, "No scan"));
-    return job?.job ?? null;
+  const other = named && named !== store.state?.sample.name;
+  if (other && !(await command("sample.set", { name: named }, "The sample stays"))) return null;
+  const state = await current();
+  const made = state && (await script(state, views));
+  const asked = made && { text: made.text, speed_up: /** @type {const} */ ("max") };
+  const job = asked && (await command("script.submit", asked, "No scan"));
+  return job?.job ?? null;
 }
-// Begins a scan of a sample, of the chosen one unless another is named, whose volume grows and
-// then stands beside its truth; its job, or null.
+
+/**
+ * Begins a scan of a sample, of the chosen one unless another is named, whose volume grows and
+ * then stands beside its truth; its job, or null.
+ * @param {string} [named]
+ * @returns {Promise<string | null>}
+ */
 export async function scanIt(named = sample.value) {
-    pressed = true;
+  pressed = true;
+  allow();
+  try {
+    mine = await turnOf(named);
+    if (!mine) return null;
+    busy = true;
+    far = true;
+    watch();
+    emit("note", "good", "Scan it", `${named || "the sample"}: ${mine} has begun`);
+    return mine;
+  } finally {
+    pressed = false;
     allow();
-    try {
-        mine = await turnOf(named);
-        if (!mine)
-            return null;
-        busy = true;
-        far = true;
-        watch();
-        emit("note", "good", "Scan it", `${named || "the sample"}: ${mine} has begun`);
-        return mine;
-    }
-    finally {
-        pressed = false;
-        allow();
-    }
+  }
 }
-// Nothing is scanned of an empty stage.
+
+/** Nothing is scanned of an empty stage. */
 function allow() {
-    go.disabled = pressed || !store.state?.sample.name;
+  go.disabled = pressed || !store.state?.sample.name;
 }
+
 on("state", (state) => {
-    const offered = [...$select("#sample").options].map((option) => option.value);
-    const stands = state.sample.name ?? EMPTY;
-    const names = [...new Set([stands, ...offered])];
-    const key = names.join("\n");
-    if (!busy && !exchanging)
-        setText(note, told(state));
-    if (sample.dataset.names !== key && document.activeElement !== sample) {
-        sample.dataset.names = key;
-        sample.replaceChildren(...names.map((name) => el("option", { value: name }, name)));
-    }
-    if (!exchanging)
-        sample.value = stands;
-    allow();
+  const offered = [...$select("#sample").options].map((option) => option.value);
+  const stands = state.sample.name ?? EMPTY;
+  const names = [...new Set([stands, ...offered])];
+  const key = names.join("\n");
+  if (!busy && !exchanging) setText(note, told(state));
+  if (sample.dataset.names !== key && document.activeElement !== sample) {
+    sample.dataset.names = key;
+    sample.replaceChildren(...names.map((name) => el("option", { value: name }, name)));
+  }
+  if (!exchanging) sample.value = stands;
+  allow();
 });
-// The list is what stands on the stage, as that of the Setup tab: a choice puts it there.
+
+/** The list is what stands on the stage, as that of the Setup tab: a choice puts it there. */
 async function exchange() {
-    exchanging = true;
-    setText(note, `${sample.value} is put on the stage …`);
-    try {
-        await command("sample.set", { name: sample.value }, "The sample stays");
-    }
-    finally {
-        exchanging = false;
-        sample.value = store.state?.sample.name ?? EMPTY;
-    }
+  exchanging = true;
+  setText(note, `${sample.value} is put on the stage …`);
+  try {
+    await command("sample.set", { name: sample.value }, "The sample stays");
+  } finally {
+    exchanging = false;
+    sample.value = store.state?.sample.name ?? EMPTY;
+  }
 }
+
+/**
+ * @param {State} state
+ * @returns {string}
+ */
 function told(state) {
-    const voxel_um = filling(state);
-    if (!state.sample.name || voxel_um === null)
-        return "The stage is empty: choose a sample.";
-    const views = viewsFor(state, voxel_um);
-    return `One turn, ${views} images; its volume grows in the scene.`;
+  const voxel_um = filling(state);
+  if (!state.sample.name || voxel_um === null) return "The stage is empty: choose a sample.";
+  const views = viewsFor(state, voxel_um);
+  return `One turn, ${views} images; its volume grows in the scene.`;
 }
 on("job", (job) => {
-    if (job.job !== mine)
-        return;
-    if (job.state === "done") {
-        setText(note, "Reconstructing all of it, beside its truth.");
-        mine = null;
-        reconstruct(folder(job), true);
-        return;
-    }
-    if (far && job.frames_done > 0) {
-        far = false;
-        nearSample();
-    }
-    setText(note, `${job.frames_done} of ${job.frames_total} images`);
-    if (isUnfinished(job)) {
-        mine = null;
-        busy = false;
-    }
+  if (job.job !== mine) return;
+  if (job.state === "done") {
+    setText(note, "Reconstructing all of it, beside its truth.");
+    mine = null;
+    reconstruct(folder(job), true);
+    return;
+  }
+  if (far && job.frames_done > 0) {
+    far = false;
+    nearSample();
+  }
+  setText(note, `${job.frames_done} of ${job.frames_total} images`);
+  if (isUnfinished(job)) {
+    mine = null;
+    busy = false;
+  }
 });
 on("volume", (volume) => {
-    const ended = volume.compared || volume.not_compared || volume.problem;
-    if (mine === null && ended)
-        busy = false;
+  const ended = volume.compared || volume.not_compared || volume.problem;
+  if (mine === null && ended) busy = false;
 });
 clicks({ "scan-it": () => scanIt() });
 sample.addEventListener("change", () => void exchange());

@@ -3,55 +3,84 @@
 import { $input, $select } from "./dom.js";
 import { batch, computed, effect, signal } from "./signals.js";
 import { on } from "./link.js";
+/** @import { Compose } from "../web/viewer.d.ts" */
+
 const FRAMES = 73;
 const EXPOSURE_MS = 100;
-const typedExposure_ms = signal(null);
+/** @typedef {NonNullable<Compose["kind"]>} Kind */
+
+const typedExposure_ms = signal(/** @type {number | null} */ (null));
 const cameraExposure_ms = signal(EXPOSURE_MS);
-export const kind = signal("fly");
+export const kind = signal(/** @type {Kind} */ ("fly"));
 export const frames = signal(FRAMES);
 // The camera's, until somebody types another one.
 export const exposure_ms = computed(() => typedExposure_ms.get() ?? cameraExposure_ms.get());
+
 const kindField = $select("#wish-kind");
 const framesField = $input("#wish-frames");
 const exposureField = $input("#wish-exposure");
-// The fields as they stand, whoever has written into them.
+
+/** The fields as they stand, whoever has written into them. */
 function read() {
-    batch(() => {
-        kind.set(kindField.value);
-        frames.set(framesField.valueAsNumber);
-        const typed = exposureField.valueAsNumber;
-        if (!Object.is(typed, exposure_ms.get()))
-            setExposure(typed);
-    });
+  batch(() => {
+    kind.set(/** @type {Kind} */ (kindField.value));
+    frames.set(framesField.valueAsNumber);
+    const typed = exposureField.valueAsNumber;
+    if (!Object.is(typed, exposure_ms.get())) setExposure(typed);
+  });
 }
+
+/** @param {number} ms */
 export function setExposure(ms) {
-    typedExposure_ms.set(ms);
+  typedExposure_ms.set(ms);
 }
 for (const field of [kindField, framesField, exposureField])
-    field.addEventListener("input", read);
+  field.addEventListener("input", read);
 exposureField.addEventListener("keydown", (e) => {
-    if (e.key === "Escape")
-        typedExposure_ms.set(null);
+  if (e.key === "Escape") typedExposure_ms.set(null);
 });
 effect(() => {
-    const ms = exposure_ms.get();
-    const shown = Number(ms.toFixed(3));
-    if (Number.isFinite(ms) && exposureField.valueAsNumber !== shown) {
-        exposureField.value = String(shown);
-    }
-    exposureField.classList.toggle("typed", typedExposure_ms.get() !== null);
+  const ms = exposure_ms.get();
+  const shown = Number(ms.toFixed(3));
+  if (Number.isFinite(ms) && exposureField.valueAsNumber !== shown) {
+    exposureField.value = String(shown);
+  }
+  exposureField.classList.toggle("typed", typedExposure_ms.get() !== null);
 });
 on("state", ({ camera }) => {
-    cameraExposure_ms.set(camera.exposure_ms);
+  cameraExposure_ms.set(camera.exposure_ms);
 });
-export const sameWish = (a, b) => a.kind === b.kind && a.frames === b.frames && a.exposure_ms === b.exposure_ms;
-export const wishWords = ({ kind: way, frames: count, exposure_ms: ms }) => `${count} frames of ${ms} ms (${way})`;
-// The wish; what is no number of images or no exposure is said in words instead.
+
+/**
+ * @typedef {object} Wish
+ * @property {Kind} kind
+ * @property {number} frames
+ * @property {number} exposure_ms
+ */
+
+/**
+ * @param {Wish} a
+ * @param {Wish} b
+ * @returns {boolean}
+ */
+export const sameWish = (a, b) =>
+  a.kind === b.kind && a.frames === b.frames && a.exposure_ms === b.exposure_ms;
+
+/**
+ * @param {Wish} wish
+ * @returns {string}
+ */
+export const wishWords = ({ kind: way, frames: count, exposure_ms: ms }) =>
+  `${count} frames of ${ms} ms (${way})`;
+
+/**
+ * The wish; what is no number of images or no exposure is said in words instead.
+ * @returns {Wish | string}
+ */
 export function wished() {
-    read();
-    if (!Number.isInteger(frames.get()) || frames.get() < 1)
-        return "frames: a whole number above 0";
-    if (!(exposure_ms.get() > 0))
-        return "ms: a number above 0";
-    return { kind: kind.get(), frames: frames.get(), exposure_ms: exposure_ms.get() };
+  read();
+  if (!Number.isInteger(frames.get()) || frames.get() < 1)
+    return "frames: a whole number above 0";
+  if (!(exposure_ms.get() > 0)) return "ms: a number above 0";
+  return { kind: kind.get(), frames: frames.get(), exposure_ms: exposure_ms.get() };
 }

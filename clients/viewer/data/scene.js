@@ -1,4 +1,3 @@
-"use strict";
 // Runs in each viser frame before viser. It tells the page when something has been drawn: an
 // empty scene takes fewer calls than ENOUGH a picture, or all is hidden. Without a graphics
 // processor (`gap` > 0, the page's choice) a picture is drawn at most every `gap` ms and
@@ -6,119 +5,137 @@
 // anew every REST_MS and not, as viser does, every HEARTBEAT_MS: that took half a core. While
 // nobody touches the scene, each picture is followed by a pause of PAUSES times what it took, so
 // that a scan which moves the machine leaves the processor to images and volume.
+"use strict";
 (() => {
-    const ENOUGH = 3;
-    const LATE_MS = 5000;
-    const HEARTBEAT_MS = 1000;
-    const REST_MS = 8000;
-    const PAUSES = 1;
-    const LONGEST_PAUSE_MS = 500;
-    const TOUCHED_MS = 2000;
-    const LOOK_MS = 25;
-    const ask = window.requestAnimationFrame.bind(window);
-    const gl = WebGL2RenderingContext.prototype;
-    // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
-    const draw = gl.drawElements;
-    let calls = 0;
-    let first = Infinity;
-    gl.drawElements = function (...all) {
-        calls++;
-        first = Math.min(first, performance.now());
-        draw.apply(this, all);
-    };
-    const look = () => {
-        if (calls >= ENOUGH || performance.now() > first + LATE_MS) {
-            gl.drawElements = draw;
-            parent.postMessage("drawn", location.origin);
-            return;
-        }
-        calls = 0;
-        ask(look);
-    };
+  const ENOUGH = 3;
+  const LATE_MS = 5000;
+  const HEARTBEAT_MS = 1000;
+  const REST_MS = 8000;
+  const PAUSES = 1;
+  const LONGEST_PAUSE_MS = 500;
+  const TOUCHED_MS = 2000;
+  const LOOK_MS = 25;
+  const ask = window.requestAnimationFrame.bind(window);
+  const gl = WebGL2RenderingContext.prototype;
+  // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
+  const draw = gl.drawElements;
+  let calls = 0;
+  let first = Infinity;
+  gl.drawElements = function (...all) {
+    calls++;
+    first = Math.min(first, performance.now());
+    draw.apply(this, all);
+  };
+  const look = () => {
+    if (calls >= ENOUGH || performance.now() > first + LATE_MS) {
+      gl.drawElements = draw;
+      parent.postMessage("drawn", location.origin);
+      return;
+    }
+    calls = 0;
     ask(look);
-    const gap = Number(new URLSearchParams(location.search).get("gap") ?? 0);
-    if (!(gap > 0))
-        return;
-    // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its canvas
-    const context = HTMLCanvasElement.prototype.getContext;
-    HTMLCanvasElement.prototype.getContext = function (kind, options) {
-        if (!/^webgl/.test(kind))
-            return context.call(this, kind, options);
-        const made = context.call(this, kind, { ...options, antialias: false });
-        if (made instanceof WebGL2RenderingContext)
-            glass = made;
-        return made;
-    };
-    let glass = null;
-    let drawn = false;
-    // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
-    const clear = gl.clear;
-    gl.clear = function (mask) {
-        drawn = true;
-        clear.call(this, mask);
-    };
-    let touched = -Infinity;
-    for (const kind of ["pointerdown", "pointermove", "wheel", "keydown"])
-        window.addEventListener(kind, () => {
-            touched = performance.now();
-        }, { capture: true, passive: true });
-    // The end of the pause after a picture, as soon as the graphics have finished it.
-    let free = -Infinity;
-    const paused = (begun, done) => {
-        if (!glass || !done || glass.isContextLost())
-            return;
-        if (glass.clientWaitSync(done, 0, 0) === glass.TIMEOUT_EXPIRED) {
-            setTimeout(() => paused(begun, done), LOOK_MS);
-            return;
-        }
-        glass.deleteSync(done);
-        const now = performance.now();
-        free = now + Math.min(LONGEST_PAUSE_MS, PAUSES * (now - begun));
-    };
-    const every = window.setInterval.bind(window);
-    const beats = (f, ms) => ms === HEARTBEAT_MS && !String(f).includes("retry");
-    window.setInterval = ((f, ms, ...more) => 
-    // a lost connection is still tried once a second
-    every(f, beats(f, ms) ? REST_MS : ms, ...more));
-    let queue = new Map();
-    let next = 1;
-    let last = -Infinity;
-    let due = false;
-    const run = (time) => {
-        const now = queue;
-        queue = new Map();
-        due = false;
-        last = performance.now();
-        drawn = false;
-        for (const callback of now.values())
-            callback(time);
-        if (!drawn || !glass)
-            return;
-        const done = glass.fenceSync(glass.SYNC_GPU_COMMANDS_COMPLETE, 0);
-        glass.flush();
-        paused(last, done);
-    };
-    const soonest = () => {
-        const watched = performance.now() < touched + TOUCHED_MS;
-        return Math.max(last + gap, watched ? -Infinity : free) - performance.now();
-    };
-    // A touch ends a pause that is under way.
-    const wait = () => {
-        const left = soonest();
-        if (left > 0)
-            setTimeout(wait, Math.min(left, gap));
-        else
-            ask(run);
-    };
-    window.requestAnimationFrame = (callback) => {
-        queue.set(next, callback);
-        if (!due) {
-            due = true;
-            wait();
-        }
-        return next++;
-    };
-    window.cancelAnimationFrame = (id) => {
-        queue.delete(id);
-    };
+  };
+  ask(look);
+  const gap = Number(new URLSearchParams(location.search).get("gap") ?? 0);
+  if (!(gap > 0)) return;
+  // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its canvas
+  const context = HTMLCanvasElement.prototype.getContext;
+  HTMLCanvasElement.prototype.getContext = /** @type {typeof context} */ (
+    function (/** @type {string} */ kind, /** @type {object} */ options) {
+      if (!/^webgl/.test(kind)) return context.call(this, kind, options);
+      const made = context.call(this, kind, { ...options, antialias: false });
+      if (made instanceof WebGL2RenderingContext) glass = made;
+      return made;
+    }
+  );
+  /** @type {WebGL2RenderingContext | null} */
+  let glass = null;
+  let drawn = false;
+  // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
+  const clear = gl.clear;
+  gl.clear = function (mask) {
+    drawn = true;
+    clear.call(this, mask);
+  };
+  let touched = -Infinity;
+  for (const kind of ["pointerdown", "pointermove", "wheel", "keydown"])
+    window.addEventListener(
+      kind,
+      () => {
+        touched = performance.now();
+      },
+      { capture: true, passive: true },
+    );
+  // The end of the pause after a picture, as soon as the graphics have finished it.
+  let free = -Infinity;
+
+  /**
+   * @param {number} begun
+   * @param {WebGLSync | null} done
+   */
+  const paused = (begun, done) => {
+    if (!glass || !done || glass.isContextLost()) return;
+    if (glass.clientWaitSync(done, 0, 0) === glass.TIMEOUT_EXPIRED) {
+      setTimeout(() => paused(begun, done), LOOK_MS);
+      return;
+    }
+    glass.deleteSync(done);
+    const now = performance.now();
+    free = now + Math.min(LONGEST_PAUSE_MS, PAUSES * (now - begun));
+  };
+  const every = window.setInterval.bind(window);
+
+  /**
+   * @param {TimerHandler} f
+   * @param {number} [ms]
+   */
+  const beats = (f, ms) => ms === HEARTBEAT_MS && !String(f).includes("retry");
+  window.setInterval = /** @type {typeof setInterval} */ (
+    (
+      /** @type {TimerHandler} */ f,
+      /** @type {number} */ ms,
+      /** @type {unknown[]} */ ...more
+    ) =>
+      // a lost connection is still tried once a second
+      every(f, beats(f, ms) ? REST_MS : ms, ...more)
+  );
+  /** @type {Map<number, FrameRequestCallback>} */
+  let queue = new Map();
+  let next = 1;
+  let last = -Infinity;
+  let due = false;
+  /** @param {number} time */
+  const run = (time) => {
+    const now = queue;
+    queue = new Map();
+    due = false;
+    last = performance.now();
+    drawn = false;
+    for (const callback of now.values()) callback(time);
+    if (!drawn || !glass) return;
+    const done = glass.fenceSync(glass.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    glass.flush();
+    paused(last, done);
+  };
+  const soonest = () => {
+    const watched = performance.now() < touched + TOUCHED_MS;
+    return Math.max(last + gap, watched ? -Infinity : free) - performance.now();
+  };
+  /** A touch ends a pause that is under way. */
+  const wait = () => {
+    const left = soonest();
+    if (left > 0) setTimeout(wait, Math.min(left, gap));
+    else ask(run);
+  };
+  window.requestAnimationFrame = (callback) => {
+    queue.set(next, callback);
+    if (!due) {
+      due = true;
+      wait();
+    }
+    return next++;
+  };
+  window.cancelAnimationFrame = (id) => {
+    queue.delete(id);
+  };
 })();

@@ -4,33 +4,44 @@ import { $, base64, bytes, downloadBlob, fixed } from "./dom.js";
 import { emit } from "./link.js";
 import { extent, index } from "./slices.js";
 import { picture } from "./film.js";
+/**
+ * @import { Block, VolumeMessage } from "../web/viewer.d.ts"
+ * @import { Slices } from "./slices.js"
+ * @import { Ray } from "./raycast.js"
+ */
+
 const MOST_VOXELS = 1_650_000; // two bytes each, four thirds of that as text: 4.4 MB at most
+/** @param {string} text */
 const safe = (text) => text.replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`);
-// Means over cubes, with no more voxels than a file has room for.
+
+/**
+ * Means over cubes, with no more voxels than a file has room for.
+ * @param {Block} b
+ * @returns {Block}
+ */
 export function coarser(b, most = MOST_VOXELS) {
-    const size = extent(b);
-    let f = 1;
-    while (size.reduce((n, v) => n * Math.floor(v / f), 1) > most)
-        f++;
-    const [nx, ny, nz] = size.map((v) => Math.floor(v / f));
-    const codes = new Uint16Array(nx * ny * nz);
-    for (let z = 0, o = 0; z < nz; z++)
-        for (let y = 0; y < ny; y++)
-            for (let x = 0; x < nx; x++, o++) {
-                let sum = 0;
-                let known = 0;
-                for (let c = 0; c < f; c++)
-                    for (let r = 0; r < f; r++)
-                        for (let k = 0; k < f; k++) {
-                            const v = b.codes[index(b, [x * f + k, y * f + r, z * f + c])];
-                            if (v) {
-                                sum += v;
-                                known++;
-                            }
-                        }
-                codes[o] = known ? Math.round(sum / known) : 0;
+  const size = extent(b);
+  let f = 1;
+  while (size.reduce((n, v) => n * Math.floor(v / f), 1) > most) f++;
+  const [nx, ny, nz] = size.map((v) => Math.floor(v / f));
+  const codes = new Uint16Array(nx * ny * nz);
+  for (let z = 0, o = 0; z < nz; z++)
+    for (let y = 0; y < ny; y++)
+      for (let x = 0; x < nx; x++, o++) {
+        let sum = 0;
+        let known = 0;
+        for (let c = 0; c < f; c++)
+          for (let r = 0; r < f; r++)
+            for (let k = 0; k < f; k++) {
+              const v = b.codes[index(b, [x * f + k, y * f + r, z * f + c])];
+              if (v) {
+                sum += v;
+                known++;
+              }
             }
-    return { ...b, shape: [nz, ny, nx], codes, factor: b.factor * f, voxel_mm: b.voxel_mm * f };
+        codes[o] = known ? Math.round(sum / known) : 0;
+      }
+  return { ...b, shape: [nz, ny, nx], codes, factor: b.factor * f, voxel_mm: b.voxel_mm * f };
 }
 const STYLE = `
 body { font: 14px/1.5 system-ui, sans-serif; margin: 20px auto; max-width: 1100px; }
@@ -70,72 +81,93 @@ const HEAD = `<!doctype html><html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width">`;
 // Id of a canvas -> what it shows.
 const CAPTIONS = {
-    ray: "all of it: drag turns, wheel zooms; axes x, y and z of the object, bar in mm",
-    top: "from above (x to the right, y up)",
-    front: "from the source (x to the right, z up)",
-    side: "from the side (y to the right, z up)",
+  ray: "all of it: drag turns, wheel zooms; axes x, y and z of the object, bar in mm",
+  top: "from above (x to the right, y up)",
+  front: "from the source (x to the right, z up)",
+  side: "from the side (y to the right, z up)",
 };
 const FILM = "radiograph, as windowed when this was shared";
+
+/**
+ * @param {Slices} three
+ * @param {Ray | null} solid
+ * @param {VolumeMessage} m
+ */
 export async function shared(three, solid, m) {
-    if (!three.block)
-        return;
-    const block = coarser(three.block);
-    const { codes, ...head } = block;
-    const scale = (block.voxel_mm || 1) / three.block.voxel_mm;
-    const when = m.started || new Date().toISOString().slice(0, 16).replace("T", " ");
-    const title = `${m.sample || m.name} · ${when} · flexdt`;
-    const camera = solid && {
-        yaw: solid.yaw,
-        pitch: solid.pitch,
-        zoom: solid.zoom,
-        level: solid.level,
-        most: solid.most,
-        cut: solid.cut,
-    };
-    const told = {
-        block: head,
-        codes: base64(codes.buffer),
-        window: three.window,
-        cross: three.cross.map((v) => Math.floor(v / scale)),
-        camera,
-    };
-    const programs = await Promise.all(["/slices.js", "/raycast.js"].map((file) => fetch(file).then((r) => r.text())));
-    const program = programs
-        .join("\n")
-        .replace(/^import .*$/gm, "")
-        .replace(/^export /gm, "");
-    const film = picture();
-    const voxels = (count, mm) => `${count.join(" × ")} voxels of ${fixed(1000 * mm, 1)} µm`;
-    const binning = m.binning ? `; flexdt reconstruct --binning ${m.binning}` : "";
-    const rows = [
-        ["data set", m.name],
-        ["sample", m.sample || "not known"],
-        ["scanned", when],
-        ["views", `${m.views ?? "–"} of ${m.of ?? "–"}`],
-        ["voltage", m.kV ? `${fixed(m.kV, 0)} kV` : "not known"],
-        ["geometry", m.geometry ?? "as scanned"],
-        ["volume", `${voxels(m.size ?? [], m.voxel_mm ?? 0)} along x, y, z${binning}`],
-        ["here", voxels(extent(block), block.voxel_mm)],
-        ["window", `${fixed(three.window[0], 5)} to ${fixed(three.window[1], 5)} per mm`],
-        ["without data", `${fixed(100 * (m.uncovered ?? 0), 2)} % of the voxels, grey`],
-    ];
-    const figures = Object.entries(CAPTIONS).map(([id, words]) => `<figure><figcaption>${words}</figcaption>` +
-        `<canvas id="${id}" tabindex="0" role="img" aria-label="${words}"></canvas></figure>`);
-    const radiograph = film
-        ? `<figure><figcaption>${FILM}</figcaption><img alt="radiograph" src="${film}"></figure>`
-        : "";
-    const lines = rows.map(([name, text]) => `<tr><th>${name}</th><td>${safe(text)}</td></tr>`);
-    const html = `${HEAD}<title>${safe(title)}</title><style>${STYLE}</style></head><body>
+  if (!three.block) return;
+  const block = coarser(three.block);
+  const { codes, ...head } = block;
+  const scale = (block.voxel_mm || 1) / three.block.voxel_mm;
+  const when = m.started || new Date().toISOString().slice(0, 16).replace("T", " ");
+  const title = `${m.sample || m.name} · ${when} · flexdt`;
+  const camera = solid && {
+    yaw: solid.yaw,
+    pitch: solid.pitch,
+    zoom: solid.zoom,
+    level: solid.level,
+    most: solid.most,
+    cut: solid.cut,
+  };
+  const told = {
+    block: head,
+    codes: base64(codes.buffer),
+    window: three.window,
+    cross: three.cross.map((v) => Math.floor(v / scale)),
+    camera,
+  };
+  const programs = await Promise.all(
+    ["/slices.js", "/raycast.js"].map((file) => fetch(file).then((r) => r.text())),
+  );
+  const program = programs
+    .join("\n")
+    .replace(/^import .*$/gm, "")
+    .replace(/^export /gm, "");
+  const film = picture();
+
+  /**
+   * @param {number[]} count
+   * @param {number} mm
+   */
+  const voxels = (count, mm) => `${count.join(" × ")} voxels of ${fixed(1000 * mm, 1)} µm`;
+  const binning = m.binning ? `; flexdt reconstruct --binning ${m.binning}` : "";
+  /** @type {Array<[string, string]>} */
+  const rows = [
+    ["data set", m.name],
+    ["sample", m.sample || "not known"],
+    ["scanned", when],
+    ["views", `${m.views ?? "–"} of ${m.of ?? "–"}`],
+    ["voltage", m.kV ? `${fixed(m.kV, 0)} kV` : "not known"],
+    ["geometry", m.geometry ?? "as scanned"],
+    ["volume", `${voxels(m.size ?? [], m.voxel_mm ?? 0)} along x, y, z${binning}`],
+    ["here", voxels(extent(block), block.voxel_mm)],
+    ["window", `${fixed(three.window[0], 5)} to ${fixed(three.window[1], 5)} per mm`],
+    ["without data", `${fixed(100 * (m.uncovered ?? 0), 2)} % of the voxels, grey`],
+  ];
+  const figures = Object.entries(CAPTIONS).map(
+    ([id, words]) =>
+      `<figure><figcaption>${words}</figcaption>` +
+      `<canvas id="${id}" tabindex="0" role="img" aria-label="${words}"></canvas></figure>`,
+  );
+  const radiograph = film
+    ? `<figure><figcaption>${FILM}</figcaption><img alt="radiograph" src="${film}"></figure>`
+    : "";
+  const lines = rows.map(([name, text]) => `<tr><th>${name}</th><td>${safe(text)}</td></tr>`);
+  const html = `${HEAD}<title>${safe(title)}</title><style>${STYLE}</style></head><body>
 <h1>${safe(title)}</h1>
 <div class="grid">${figures.join("")}
 ${radiograph}</div><p id="at">point at a slice</p>
 <table>${lines.join("")}</table>${$("#volume-compared").innerHTML}
 <script type="application/json" id="told">${JSON.stringify(told)}</script>
 <script type="module">${program}\n${START}</script></body></html>`;
-    const blob = new Blob([html], { type: "text/html" });
-    const bare = (text, apart) => text.replace(apart, "-");
-    const made = `${bare(m.sample || m.name, /[^\w-]+/g)}-${bare(when, /\D+/g)}`;
-    const name = `flexdt-${made}.html`;
-    downloadBlob(blob, name);
-    emit("note", "good", name, bytes(blob.size));
+  const blob = new Blob([html], { type: "text/html" });
+
+  /**
+   * @param {string} text
+   * @param {RegExp} apart
+   */
+  const bare = (text, apart) => text.replace(apart, "-");
+  const made = `${bare(m.sample || m.name, /[^\w-]+/g)}-${bare(when, /\D+/g)}`;
+  const name = `flexdt-${made}.html`;
+  downloadBlob(blob, name);
+  emit("note", "good", name, bytes(blob.size));
 }

@@ -6,65 +6,88 @@ import { toYou } from "./names.js";
 import { command, imageMade, OLD_S, on, person, rename, store } from "./link.js";
 import { isDown, stopped } from "./warnings.js";
 import "./readouts.js";
+/** @import { ClockState, State } from "../web/viewer.d.ts" */
+
+/**
+ * @param {string} kind
+ * @param {string} title
+ */
 export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6000) {
-    const box = $("#notes");
-    $$("#notes > *")
-        .find((n) => n.dataset.key === title + body)
-        ?.remove();
-    const node = el("div", { class: `note ${kind}`, "data-key": title + body }, el("b", {}, title), el("span", {}, body), el("button", { "aria-label": "close", onclick: () => node.remove() }, "×"));
-    box.append(node);
-    while (box.childElementCount > 5)
-        box.firstChild?.remove();
-    setTimeout(() => node.remove(), life);
+  const box = $("#notes");
+  $$("#notes > *")
+    .find((n) => n.dataset.key === title + body)
+    ?.remove();
+  /** @type {HTMLElement} */
+  const node = el(
+    "div",
+    { class: `note ${kind}`, "data-key": title + body },
+    el("b", {}, title),
+    el("span", {}, body),
+    el("button", { "aria-label": "close", onclick: () => node.remove() }, "×"),
+  );
+  box.append(node);
+  while (box.childElementCount > 5) box.firstChild?.remove();
+  setTimeout(() => node.remove(), life);
 }
 on("note", (kind, title, body) => note(kind, title, body));
 on("log", (entry) => {
-    if (["warning", "error"].includes(entry.level))
-        note(entry.level === "error" ? "error" : "warning-note", "Twin", toYou(entry.message, store.session));
+  if (["warning", "error"].includes(entry.level))
+    note(
+      entry.level === "error" ? "error" : "warning-note",
+      "Twin",
+      toYou(entry.message, store.session),
+    );
 });
-// How fast the twin's time runs: as measured, else as asked for.
+
+/**
+ * How fast the twin's time runs: as measured, else as asked for.
+ * @param {ClockState} clock
+ * @returns {string}
+ */
 function pace({ real_time_factor: factor, speed_up }) {
-    if (factor)
-        return `${fixed(factor, factor >= 10 ? 0 : 2)}×`;
-    return speed_up === "max" ? "max" : `${speed_up}×`;
+  if (factor) return `${fixed(factor, factor >= 10 ? 0 : 2)}×`;
+  return speed_up === "max" ? "max" : `${speed_up}×`;
 }
 on("state", (s) => {
-    setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${pace(s.clock)}`);
-    release(s);
-    if (s.safety.estop && s.safety.stop !== pressed?.after) {
-        pressed = null;
-        for (const n of $$("#notes .note"))
-            if (n.dataset.key?.startsWith(UNCONFIRMED))
-                n.remove();
-    }
-    else if (pressed !== null &&
-        store.fresh !== null &&
-        performance.now() - Math.max(pressed.at, store.fresh) > 2000 * OLD_S) {
-        pressed = null;
-        note("error", "The emergency stop did not take effect", "press it again");
-    }
-    holder();
+  setText($("#clock"), `t = ${fixed(s.clock.time_s, 1)} s · ${pace(s.clock)}`);
+  release(s);
+  if (s.safety.estop && s.safety.stop !== pressed?.after) {
+    pressed = null;
+    for (const n of $$("#notes .note")) if (n.dataset.key?.startsWith(UNCONFIRMED)) n.remove();
+  } else if (
+    pressed !== null &&
+    store.fresh !== null &&
+    performance.now() - Math.max(pressed.at, store.fresh) > 2000 * OLD_S
+  ) {
+    pressed = null;
+    note("error", "The emergency stop did not take effect", "press it again");
+  }
+  holder();
 });
+
 function holder() {
-    const pill = $("#holder");
-    const who = store.state?.controller ?? null;
-    const mine = who !== null && who === store.session;
-    // Without the twin nobody knows who may; with it the next state says.
-    pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
-    setText(pill, !store.twin
-        ? "control unknown"
-        : mine
-            ? "you control"
-            : who
-                ? `held by ${who}`
-                : "nobody controls");
-    setText($button("#take"), mine ? "Release" : who ? "Take over" : "Take control");
-    $button("#take").disabled = !store.twin;
+  const pill = $("#holder");
+  const who = store.state?.controller ?? null;
+  const mine = who !== null && who === store.session;
+  // Without the twin nobody knows who may; with it the next state says.
+  pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
+  setText(
+    pill,
+    !store.twin
+      ? "control unknown"
+      : mine
+        ? "you control"
+        : who
+          ? `held by ${who}`
+          : "nobody controls",
+  );
+  setText($button("#take"), mine ? "Release" : who ? "Take over" : "Take control");
+  $button("#take").disabled = !store.twin;
 }
 $button("#take").addEventListener("click", () => {
-    const who = store.state?.controller ?? null;
-    const action = who === null ? "acquire" : who === store.session ? "release" : "force";
-    void command("session.control", { action }, "Control");
+  const who = store.state?.controller ?? null;
+  const action = who === null ? "acquire" : who === store.session ? "release" : "force";
+  void command("session.control", { action }, "Control");
 });
 const me = $input("#person");
 me.value = person();
@@ -72,133 +95,162 @@ me.addEventListener("change", () => rename(me.value));
 $button("#skip").addEventListener("click", () => $("#film-canvas").focus());
 const UNCONFIRMED = "E-stop not confirmed";
 // Pressed when [ms], after which stop, and not confirmed by a newer one yet.
+/** @type {{ at: number; after: number | undefined } | null} */
 let pressed = null;
 export async function estop() {
-    const mine = (pressed = { at: performance.now(), after: store.state?.safety.stop });
-    const answer = await command("safety.estop", {}, UNCONFIRMED);
-    if (answer?.safety.estop && pressed === mine)
-        pressed = null;
+  const mine = (pressed = { at: performance.now(), after: store.state?.safety.stop });
+  const answer = await command("safety.estop", {}, UNCONFIRMED);
+  if (answer?.safety.estop && pressed === mine) pressed = null;
 }
 $button("#estop").addEventListener("click", () => void estop());
+
 // A reset releases the one stop that the page shows, and not before a person has had time to see
 // it.
 const SEEN_MS = 1000;
+/** @type {number | null} */
 let shown = null;
+/** @param {State} s */
 function release(s) {
-    const stop = isDown(s) ? s.safety.stop : null;
-    const reset = $button("#reset");
-    const ask = $dialog("#reset-dialog");
-    reset.hidden = stop === null;
-    $button("#xrays-off").hidden = stop === null || !s.tube.on;
-    if (stop === shown)
-        return;
-    shown = stop;
-    ask.close();
-    reset.disabled = true;
-    setTimeout(() => {
-        if (shown === stop)
-            reset.disabled = false;
-    }, SEEN_MS);
+  const stop = isDown(s) ? s.safety.stop : null;
+  const reset = $button("#reset");
+  const ask = $dialog("#reset-dialog");
+  reset.hidden = stop === null;
+  $button("#xrays-off").hidden = stop === null || !s.tube.on;
+  if (stop === shown) return;
+  shown = stop;
+  ask.close();
+  reset.disabled = true;
+  setTimeout(() => {
+    if (shown === stop) reset.disabled = false;
+  }, SEEN_MS);
 }
 $button("#reset").addEventListener("click", () => {
-    const ask = $dialog("#reset-dialog");
-    const s = store.state;
-    if (ask.open || !s) {
-        ask.close();
-        return;
-    }
-    setText($("#reset-what"), stopped(s));
-    setText($("#reset-tube"), s.tube.on ? "X-rays are on and stay on." : "X-rays are off and stay off.");
-    ask.show();
+  const ask = $dialog("#reset-dialog");
+  const s = store.state;
+  if (ask.open || !s) {
+    ask.close();
+    return;
+  }
+  setText($("#reset-what"), stopped(s));
+  setText(
+    $("#reset-tube"),
+    s.tube.on ? "X-rays are on and stay on." : "X-rays are off and stay off.",
+  );
+  ask.show();
 });
 $button("#reset-no").addEventListener("click", () => $dialog("#reset-dialog").close());
 $button("#reset-yes").addEventListener("click", () => {
-    $dialog("#reset-dialog").close();
-    if (shown !== null)
-        void command("safety.reset", { stop: shown }, "Reset");
+  $dialog("#reset-dialog").close();
+  if (shown !== null) void command("safety.reset", { stop: shown }, "Reset");
 });
-$button("#xrays-off").addEventListener("click", () => void command("tube.set", { on: false }, "X-rays off"));
+$button("#xrays-off").addEventListener(
+  "click",
+  () => void command("tube.set", { on: false }, "X-rays off"),
+);
 const BUTTON = "the machine's own emergency stop button is the one that counts";
 $button("#stop").addEventListener("click", () => void command("axes.stop", {}, "Stop"));
+
+/**
+ * What is missing: nothing, the viewer's room for this page, the viewer, the twin, or news of
+ * either.
+ * @typedef {object} Missing
+ * @property {string} word
+ * @property {string} title
+ * @property {string} why
+ */
+
 const GREETING_S = 3;
 const BACK = "the page comes back by itself";
-const LATE = "viewer or twin do not answer, or the network is slow; " +
-    "what is done here may come late or not at all";
+const LATE =
+  "viewer or twin do not answer, or the network is slow; " +
+  "what is done here may come late or not at all";
+/** @returns {Missing | null} */
 function missing() {
-    if (store.refused) {
-        const title = "The viewer does not serve this page now";
-        return {
-            word: "sent away",
-            title,
-            why: `${store.refused}; the page tries again by itself`,
-        };
-    }
-    if (!store.viewer) {
-        return {
-            word: "no viewer",
-            title: "The viewer is away",
-            why: `it does not answer; ${BACK}`,
-        };
-    }
-    if (!store.twin) {
-        const why = `${store.problem || "waiting for it"}; ${BACK}`;
-        return { word: "no twin", title: "The twin is away", why };
-    }
-    if (store.state && store.age > OLD_S) {
-        const age = `${fixed(store.age, 0)} s old`;
-        return { word: age, title: `What you see is ${age}`, why: LATE };
-    }
-    return null;
+  if (store.refused) {
+    const title = "The viewer does not serve this page now";
+    return {
+      word: "sent away",
+      title,
+      why: `${store.refused}; the page tries again by itself`,
+    };
+  }
+  if (!store.viewer) {
+    return {
+      word: "no viewer",
+      title: "The viewer is away",
+      why: `it does not answer; ${BACK}`,
+    };
+  }
+  if (!store.twin) {
+    const why = `${store.problem || "waiting for it"}; ${BACK}`;
+    return { word: "no twin", title: "The twin is away", why };
+  }
+  if (store.state && store.age > OLD_S) {
+    const age = `${fixed(store.age, 0)} s old`;
+    return { word: age, title: `What you see is ${age}`, why: LATE };
+  }
+  return null;
 }
 // A page that was just opened greets with "connecting": what is not there yet is missing only
 // after GREETING_S. A viewer that refuses the page is told at once.
 let greeting = true;
+
+/**
+ * @param {Missing | null} found
+ * @returns {boolean}
+ */
 function greets(found) {
-    const arrived = found === null && store.state !== null;
-    if (arrived || store.refused || performance.now() > 1000 * GREETING_S)
-        greeting = false;
-    return greeting;
+  const arrived = found === null && store.state !== null;
+  if (arrived || store.refused || performance.now() > 1000 * GREETING_S) greeting = false;
+  return greeting;
 }
 function connection() {
-    const found = missing();
-    const connecting = greets(found);
-    const told = connecting ? null : found;
-    const unconfirmed = pressed !== null && performance.now() - pressed.at > 1000 * OLD_S;
-    bar(told, connecting);
-    document.body.dataset.old = String(told !== null);
-    $("#veil").hidden = told === null && !unconfirmed;
-    const title = told?.title ?? "";
-    setText($("#veil-title"), unconfirmed ? `${UNCONFIRMED}${title && `. ${title}`}` : title);
-    const why = [told?.why, BUTTON].filter(Boolean).join("; ");
-    setText($("#veil-text"), unconfirmed || told ? why : "");
+  const found = missing();
+  const connecting = greets(found);
+  const told = connecting ? null : found;
+  const unconfirmed = pressed !== null && performance.now() - pressed.at > 1000 * OLD_S;
+  bar(told, connecting);
+  document.body.dataset.old = String(told !== null);
+  $("#veil").hidden = told === null && !unconfirmed;
+  const title = told?.title ?? "";
+  setText($("#veil-title"), unconfirmed ? `${UNCONFIRMED}${title && `. ${title}`}` : title);
+  const why = [told?.why, BUTTON].filter(Boolean).join("; ");
+  setText($("#veil-text"), unconfirmed || told ? why : "");
 }
+
+/**
+ * @param {Missing | null} told
+ * @param {boolean} connecting
+ */
 function bar(told, connecting) {
-    const pill = $("#connection");
-    const images = told || connecting ? null : (store.state?.projector ?? null);
-    const word = connecting ? "connecting" : (told?.word ?? (images ? "no images" : "connected"));
-    setText(pill, word);
-    pill.dataset.state = told || images ? "down" : connecting ? "wait" : "up";
-    pill.title = images ?? store.problem ?? "";
+  const pill = $("#connection");
+  const images = told || connecting ? null : (store.state?.projector ?? null);
+  const word = connecting ? "connecting" : (told?.word ?? (images ? "no images" : "connected"));
+  setText(pill, word);
+  pill.dataset.state = told || images ? "down" : connecting ? "wait" : "up";
+  pill.title = images ?? store.problem ?? "";
 }
 on("age", () => {
-    connection();
-    const tag = $("#film-old");
-    tag.hidden = store.imageAge <= OLD_S;
-    if (!tag.hidden)
-        setText(tag, `of another ${old()}: ${fixed(store.imageAge, 0)} s old`);
+  connection();
+  const tag = $("#film-old");
+  tag.hidden = store.imageAge <= OLD_S;
+  if (!tag.hidden) setText(tag, `of another ${old()}: ${fixed(store.imageAge, 0)} s old`);
 });
-// In what the image differs from now; another sample is named.
+
+/**
+ * In what the image differs from now; another sample is named.
+ * @returns {string}
+ */
 function old() {
-    const image = store.image;
-    const words = listed(store.imageDiffers);
-    if (!image || !store.imageDiffers.includes("sample"))
-        return words;
-    return words.replace("sample", `sample (${sampleOf(imageMade(image)) || "none"})`);
+  const image = store.image;
+  const words = listed(store.imageDiffers);
+  if (!image || !store.imageDiffers.includes("sample")) return words;
+  return words.replace("sample", `sample (${sampleOf(imageMade(image)) || "none"})`);
 }
 on("state", connection);
 on("connection", () => {
-    connection();
-    const hello = store.hello;
-    setText($("#machine"), hello ? `${hello.machine} · ${hello.profile ?? ""}` : "");
-    holder();
+  connection();
+  const hello = store.hello;
+  setText($("#machine"), hello ? `${hello.machine} · ${hello.profile ?? ""}` : "");
+  holder();
 });

@@ -7,7 +7,7 @@ all of it passes one sheet of each plane, and keeps half of the background. The 
 around the sample is left out: a radiograph does not show where in it light is lost, and a
 plane through a transparent sample would hide half of it. The cone's sides are its edges
 alone: viser draws a translucent mesh in front of or behind all of the sample, whatever is
-between (`web/translucent.ts`). Units: mm, m for viser.
+between (`data/translucent.js`). Units: mm, m for viser.
 """
 
 from __future__ import annotations

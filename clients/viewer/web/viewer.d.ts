@@ -24,6 +24,9 @@ export type Vector = [number, number, number];
 export type Kind = "line_integral" | "counts";
 export type View = "iso" | "beam" | "side" | "free";
 
+// What quantities are compared by.
+export type Value = string | number | boolean | null | readonly Value[];
+
 export interface Camera {
   position: Vector;
   look_at: Vector;
@@ -261,4 +264,21 @@ export interface Events {
   align: [dataset: string];
   reconstruct: [dataset: string];
   script: [text: string];
+}
+
+declare global {
+  // What is read is not known: a cast says what it should be.
+  interface JSON {
+    parse(text: string): unknown;
+  }
+  interface Window {
+    pageId: string;
+    flexdt: unknown;
+    firstView: string;
+    still: (
+      image: HTMLImageElement,
+      view: string,
+      size: { clientWidth: number; clientHeight: number },
+    ) => void;
+  }
 }
