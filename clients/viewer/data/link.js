@@ -58,6 +58,7 @@ const listeners = {};
 
 /** @type {Map<number, Waiting>} */
 const waiting = new Map();
+
 /** Why a request was refused; code 0: nobody answered it. */
 export class Failure extends Error {
   /** @readonly @type {number} */

@@ -1,8 +1,7 @@
-/**
- * The size of a mesh in the units of its file, read here so that it stands beside the unit
- * before anything is sent. Formats that are not read here have none.
- * @typedef {readonly [x: number, y: number, z: number]} Extent
- */
+// The size of a mesh in the units of its file, read here so that it stands beside the unit before
+// anything is sent. Formats that are not read here have none.
+
+/** @typedef {readonly [x: number, y: number, z: number]} Extent */
 
 const STL_HEAD_BYTES = 84;
 const STL_FACET_BYTES = 50;

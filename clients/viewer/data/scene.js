@@ -41,7 +41,7 @@
   // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its canvas
   const context = HTMLCanvasElement.prototype.getContext;
   HTMLCanvasElement.prototype.getContext = /** @type {typeof context} */ (
-    function (/** @type {string} */ kind, /** @type {object} */ options) {
+    function (/** @type {string} */ kind, /** @type {object | undefined} */ options) {
       if (!/^webgl/.test(kind)) return context.call(this, kind, options);
       const made = context.call(this, kind, { ...options, antialias: false });
       if (made instanceof WebGL2RenderingContext) glass = made;
@@ -93,7 +93,7 @@
   window.setInterval = /** @type {typeof setInterval} */ (
     (
       /** @type {TimerHandler} */ f,
-      /** @type {number} */ ms,
+      /** @type {number | undefined} */ ms,
       /** @type {unknown[]} */ ...more
     ) =>
       // a lost connection is still tried once a second

@@ -1,6 +1,7 @@
+// Values that others follow: a signal is set, a computed value is what its function says of
+// other values, and an effect runs again whenever a value that it has read is another one.
+
 /**
- * Values that others follow: a signal is set, a computed value is what its function says of
- * other values, and an effect runs again whenever a value that it has read is another one.
  * @typedef {object} Follower
  * @property {() => void} run
  * @property {Set<Set<Follower>>} of
@@ -85,7 +86,7 @@ export function effect(work) {
  * @returns {Readable<T>}
  */
 export function computed(f) {
-  const value = signal(/** @type {T} */ (/** @type {T} */ (undefined)));
+  const value = signal(/** @type {T} */ (undefined));
   effect(() => {
     value.set(f());
   });
