@@ -18,9 +18,7 @@ import pytest
 ROOT: Final = Path(__file__).resolve().parents[2]
 FOLDERS: Final = ("tests", "extensions/tests", "examples/research")
 OWN_PROCESS: Final = {
-    "tests/studies/argument_checks.py",
     "tests/studies/device_check.py",
-    "tests/studies/full_size.py",
     "tests/support/device_simulator.py",
     "tests/support/device_stand_in.py",
     "tests/support/driver_stand_in.py",

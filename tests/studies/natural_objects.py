@@ -13,9 +13,6 @@ must be in the column's sigma.
 `--fans` are half turns and the fan of wires that harden the beam.
 `--json` prints a line for each scan.
 
-A gap that is not named has a bound beside it: by how many sigmas the mean of the turn alone
-tells it to anybody (`gap_bound.py`).
-
 Exit code 1 where a scan without a gap is told of one or warned of repeated frames, where a gap
 (but of `--near`) is not named, or where a column is more than 4 sigma off.
 
@@ -640,11 +637,6 @@ def main(words: list[str] | None = None) -> int:
     for k in range(o.count):
         seed = o.seed + k // len(names)
         runs.append(tried(names[k % len(names)], seed, o.gaps, o.fans, o.near))
-        if o.gaps and not runs[-1]["named"]:
-            # It draws scans with this module.
-            from gap_bound import drawn_sigmas
-
-            runs[-1]["mean_sigmas"] = round(drawn_sigmas(runs[-1]["kind"], seed)[1], 1)
         if o.json:
             print(json.dumps(runs[-1]), flush=True)
     return summary(runs, o.gaps, o.near)

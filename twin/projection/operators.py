@@ -76,7 +76,7 @@ RAY_VOXEL_NS = 2.75
 PLAN_VIEW_NS = 5e5
 """Time of a single ray at a voxel, and of planning the fans of a view [ns]. All of
 these were fitted to drawn geometries, each timed all four ways
-(`tests/studies/walks.py`), on two busy cores; only their ratios count."""
+(walks.py of 52ade1c), on two busy cores; only their ratios count."""
 MAX_TIME_SHARE = 0.75
 """Largest share of the time that another axis may take to be worth another layout."""
 MIN_PARALLEL_BYTES = 16 * 2**20

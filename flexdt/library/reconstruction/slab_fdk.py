@@ -39,7 +39,7 @@ VOXEL_WORK = 1.0
 FILTERED_PIXEL_WORK = 25.0
 READ_PIXEL_WORK = 12.0
 """Work of FDK a voxel and view, a pixel that is filtered and one that is read and prepared, in
-units of the first (`tests/studies/full_size.py --costs`)."""
+units of the first (measured by full_size.py --costs of 52ade1c)."""
 
 
 @dataclass(frozen=True, eq=False)
