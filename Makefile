@@ -1,5 +1,5 @@
 # make install | demo | quick | test | test-extensions | slow (studies, page, campaigns) | failed | docs |
-# web | lint | typecheck | house | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
+# web | lint | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -25,7 +25,7 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
 # each worker every test and its assertions, anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo kernels quick test test-extensions slow studies page campaigns failed docs web lint typecheck house lowest newest clean
+.PHONY: install demo kernels quick test test-extensions slow studies page campaigns failed docs web lint typecheck lowest newest clean
 
 install: $(COMPILED)
 
@@ -147,11 +147,6 @@ web: install $(WEB_STAMP)
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
 docs: $(DOCS_STAMP)
 	$(BIN)/python -m sphinx -b html -n -W --keep-going -q docs docs/_build/html
-
-# Lines by room, import circles, copied lists, prose and the like, beside the last release. For looking:
-# never fails. HOUSE="--list circles" prints the findings of a measure, HOUSE="--save 0.4.0" keeps a release's.
-house: $(STAMP)
-	@PYTHONPATH=tests/studies $(BIN)/python -m house $(HOUSE)
 
 # The oldest and the newest dependencies that pyproject.toml allows, in an environment of their own.
 lowest newest:

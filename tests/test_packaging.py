@@ -16,7 +16,6 @@ import venv
 import zipfile
 from collections import Counter
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import yaml
@@ -285,16 +284,6 @@ def test_what_the_interface_names_can_be_imported() -> None:
             assert callable(getattr(found, name))
 
 
-def load(path: Path) -> ModuleType:
-    """A script of the repository that is no part of the package, as a module."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.slow
 @pytest.mark.campaign
 def test_a_users_type_checker_sees_the_types(tmp_path: Path) -> None:
@@ -401,12 +390,6 @@ def test_configurations_for_services_can_be_read(file: Path) -> None:
 def test_the_development_container_can_be_read() -> None:
     container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
     assert container["postCreateCommand"] == "make install"
-
-
-def test_code_lines_are_counted_without_blanks_comments_and_docstrings() -> None:
-    count = load(ROOT / "tests" / "studies" / "code_lines.py").code_lines
-    source = '"""What\nfor."""\n\n# why\nx = [\n    1,\n]\n\ndef f():\n    """Says."""\n    return x\n'  # noqa: E501
-    assert count(source) == len(["x = [", "1,", "]", "def f():", "return x"])
 
 
 def test_a_module_that_is_a_program_begins_below_all_that_it_needs() -> None:
