@@ -231,7 +231,7 @@ def benchmark() -> str:
     return "\n".join([
         "# Projector beside peers",
         "",
-        "Commands: `flexdt bench --out out/bench`, `python examples/research/further_bench.py "
+        "Commands: `flexdt bench --out out/bench`, `python tests/studies/further_bench.py "
         "--out out/further`. Ratios are taken turn by turn in the same run; errors are of the "
         "maximum; cases are those of [the projector's "
         "page](../../performance.md#measure). LEAP is "

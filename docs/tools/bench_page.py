@@ -1,5 +1,5 @@
 """The kept benchmark, from the document that `flexdt bench --out DIR` or
-`examples/research/further_bench.py` writes; the site renders it as a page of the evidence
+`tests/studies/further_bench.py` writes; the site renders it as a page of the evidence
 shelf.
 
     flexdt bench --out out/bench

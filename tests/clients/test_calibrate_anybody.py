@@ -1,6 +1,6 @@
 """Calibration of anybody's data: markers of unknown positions, marked by hand, foreign frames.
 
-Images and annotations come from the rays and planes of `examples/research/prior_coverage.py`,
+Images and annotations come from the rays and planes of `tests/studies/prior_coverage.py`,
 which share nothing with the fit.
 """
 

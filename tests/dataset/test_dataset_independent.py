@@ -19,7 +19,7 @@ from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import plan_script
 
-READER = Path(__file__).with_name("independent_reader.py")
+READER = Path(__file__).parents[1] / "support" / "independent_reader.py"
 EXAMPLES = Path(__file__).parents[2] / "examples" / "scripts"
 POINTS = np.array([[0, 0, 0], [12, -8, 24.9], [-12, 8, -24.9], [9.5, 5.5, 10.0]])
 

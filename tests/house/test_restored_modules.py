@@ -16,7 +16,7 @@ from typing import Final
 import pytest
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-FOLDERS: Final = ("tests", "extensions/tests", "examples/research")
+FOLDERS: Final = ("tests", "extensions/tests")
 OWN_PROCESS: Final = {
     "tests/studies/device_check.py",
     "tests/support/device_simulator.py",

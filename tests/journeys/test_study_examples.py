@@ -1,6 +1,6 @@
 """The studies behind docs/evidence/physics.json and reconstruction.json, with what they must
 show: physics_figures, detector_figures, reference_scan, and, where the peers are installed,
-compare_fdk and compare_gvxr; and silent_errors of tests/studies.
+compare_fdk and compare_gvxr; and silent_errors.
 """
 
 from __future__ import annotations
@@ -10,27 +10,17 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
-
-
-def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+STUDIES = Path(__file__).resolve().parents[1] / "studies"
 
 
 def run(name: str, *words: object) -> dict[str, Any]:
     done = subprocess.run(
-        [sys.executable, str(EXAMPLES / f"{name}.py"), *map(str, words)],
+        [sys.executable, str(STUDIES / f"{name}.py"), *map(str, words)],
         capture_output=True, text=True, timeout=290, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -42,7 +32,7 @@ def run(name: str, *words: object) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.campaign
 def test_drawn_scans_are_right_or_said() -> None:
-    study = EXAMPLES.parent / "tests" / "studies" / "silent_errors.py"
+    study = STUDIES / "silent_errors.py"
     done = subprocess.run(
         [sys.executable, str(study), "--count", "30"],
         capture_output=True, text=True, check=False,
@@ -52,7 +42,8 @@ def test_drawn_scans_are_right_or_said() -> None:
 
 
 def test_physics_figures() -> None:
-    study = load("research/physics_figures")
+    import physics_figures as study
+
     assert study.slabs() < 1e-4
     wedge = study.wedge()
     assert wedge["worst_error"] < 1e-3

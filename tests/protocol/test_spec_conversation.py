@@ -32,7 +32,7 @@ from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.scanner.state import Sample
 
 SPEC = Path(__file__).parents[2] / "protocol" / "SPEC.md"
-READER = Path(__file__).parents[1] / "dataset" / "independent_reader.py"
+READER = Path(__file__).parents[1] / "support" / "independent_reader.py"
 VERSION = "flexdt X.Y.Z"
 """In place of the version, which is another one with each release."""
 INSTANCE = "5d41402abc4b2a76"

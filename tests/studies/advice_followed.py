@@ -25,12 +25,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "research"))
-
 from causes_named import WRONG_SIGMAS, calibrated, worst_error
-from faults_drawn import KINDS, drawn
 
 from flexdt.twin.errors import TwinError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from faults_drawn import KINDS, drawn
 
 BEAD_TOLERANCE_MM: Final = 0.1
 """What is given where `--bead-tolerance` is advised without a value."""

@@ -22,6 +22,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
 from lab import Process, Wire, fly_script, machine, percentile, projector, twin
 
 SIDE = 16

@@ -11,7 +11,7 @@ off at most, in standard deviations; exit code 1 when anything was off by more t
 (default 5). Gaps between tiles and lists of frames that are wrong (one is there twice) have to
 be named, too. `--column` leaves row and shifts, which take most of the time, untold.
 
-Line integrals and kinematics are those of examples/research/align_targets.py.
+Line integrals and kinematics are those of tests/studies/align_targets.py.
 """
 
 from __future__ import annotations
@@ -26,15 +26,10 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Final, NoReturn
 from unittest.mock import patch
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "research"))
-
 from align_targets import (
     OBJECTS,
     PIXEL,
@@ -47,6 +42,7 @@ from align_targets import (
     left_of,
     truncated,
 )
+from scipy.ndimage import gaussian_filter
 
 import flexdt as fx
 from flexdt.twin.calibration.without_phantom import turn_planes

@@ -26,6 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
 from lab import Plain, Refused, Wire, fly_script, machine, projector, twin
 
 Attack = Callable[["Ground"], str]

@@ -38,13 +38,16 @@ import msgpack
 import viser
 import zmq
 import zmq.asyncio
-from lab import machine, percentile, twin
 from latency import Stalls
-from strangers import draw, hello, play, request
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from flexdt.clients.launch.processes import Servers
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from lab import machine, percentile, twin
+from strangers import draw, hello, play, request
 
 CAMERA: dict[str, Any] = {
     "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [3, 3, 3], "fov": 1.0,

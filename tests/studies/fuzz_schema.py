@@ -45,6 +45,9 @@ from typing import Any
 
 import msgpack
 import numpy as np
+
+sys.path.insert(0, str(File(__file__).parents[1] / "support"))
+
 from lab import Process, Refused, Wire, fly_script, machine, projector, twin
 from schemas import NUMBERS, TEXTS, Path, Schema, Schemas
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import random
-import re
 import subprocess
 import sys
 import tempfile
@@ -19,7 +18,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lab import Process, Wire, digests, fly_script, machine, projector, twin
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from lab import Process, Wire, digests, fly_script, machine, projector, timeless, twin
 
 FRAMES = 61
 SEED = 77
@@ -166,23 +167,6 @@ class Round:
     def end(self) -> None:
         self.twin.end()
         self.rays.end()
-
-
-DATES = re.compile(
-    rb"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:\d\d)?|\d{1,2}:\d\d:\d\d( [AP]M)?|"
-    rb"\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{1,2} \w{3} \d{4}"
-)
-
-
-def timeless(text: bytes, name: str) -> bytes:
-    """A text without its dates, durations and the data set's name."""
-    text = DATES.sub(b"<date>", text.replace(name.encode(), b"<name>"))
-    text = re.sub(rb'("duration_s": )[0-9.e+-]+', rb"\1<s>", text)
-    return re.sub(
-        rb"(?im)^(.*(?:duration|elapsed|scan time|total time).*?)[0-9.]+.*$",
-        rb"\1<s>",
-        text,
-    )
 
 
 def ready(wire: Wire) -> None:

@@ -1,6 +1,6 @@
 """Does `flexdt commission` find what laboratories hide? Simulated ones, from folder to report.
 
-    PYTHONPATH=tests/support python tests/studies/laboratories.py [--laboratories 50] [--seed 1]
+    python tests/studies/laboratories.py [--laboratories 50] [--seed 1]
 
 Each laboratory (`past_laboratory.py`) has hidden limits, rates, zero offsets, a drift, a sign
 of one motor in its texts, a family of command times, regions and camera modes, and three
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -18,10 +19,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from past_laboratory import LINEAR, Laboratory
 
 from flexdt.clients.cli.commands.script_files import read_log_file
 from flexdt.library.commission import MACHINE_FILE, Commissioned, commission
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from past_laboratory import LINEAR, Laboratory
 
 
 @dataclass

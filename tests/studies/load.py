@@ -21,6 +21,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
 from lab import Process, Wire, fly_script, machine, percentile, projector, twin
 
 PER_PROCESS = 95

@@ -34,12 +34,15 @@ from typing import Any
 
 import zmq
 import zmq.asyncio
-from lab import Process, machine, percentile, projector, twin
-from strangers import Stranger, draw, play
 from websockets.asyncio.client import connect
 
 from flexdt.protocol import hello_params
 from flexdt.server.projector.wire import ProjectorLink
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from lab import Process, machine, percentile, projector, twin
+from strangers import Stranger, draw, play
 
 TOKEN = "sixteen letters or more"
 PEER, OTHER = "127.0.0.2", "127.0.0.1"

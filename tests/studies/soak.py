@@ -18,6 +18,9 @@ import time
 from pathlib import Path
 
 from attacks import stl
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
 from lab import Refused, Wire, fly_script, machine, percentile, projector, twin
 
 USES_AN_HOUR = 40

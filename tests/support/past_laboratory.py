@@ -1,7 +1,7 @@
 """A laboratory's past: folders of scans with a hidden machine behind them, written byte by
 byte.
 
-Kinematics, X-rays, texts and logs are this file's and `timing_ranges`'s own; of flexdt nothing
+Kinematics, X-rays, texts and logs are this file's and `timed_rigs`'s own; of flexdt nothing
 is used. Motors are the FleX-ray's; the script's tra_det is positive to the left. Contradictions
 are planted, each with what a report has to name.
 """
@@ -16,8 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-import timing_ranges
-from timing_ranges import Rig, Scan
+from timed_rigs import FAMILIES, Rig, Scan
 
 PITCH, COLUMNS, ROWS = 0.0748, 1944, 1536
 SHAPE = (100, 120)
@@ -66,7 +65,7 @@ class Laboratory:
                 `scans`.
         """
         rng = self.rng = random.Random(f"laboratory {seed}")
-        self.family = rng.choice(timing_ranges.FAMILIES)
+        self.family = rng.choice(FAMILIES)
         self.rig = Rig(rng, self.family)
         for axis in LINEAR:
             low, high = sorted((-rng.uniform(300, 400), rng.uniform(1060, 1500)))

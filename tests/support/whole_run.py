@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from in_process import Client, script
-from kills import timeless
+from lab import timeless
 from simulation import Crashed, Fault, Simulation
 
 from flexdt.protocol import RpcError

@@ -1,28 +1,13 @@
-"""The random aimed sweeps of examples/collision_study.py: nothing missed, no false stop."""
+"""The random aimed sweeps of tests/studies/collision_study.py: nothing missed, no false stop."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
-from types import ModuleType
 
+import collision_study as study
 import numpy as np
 import pytest
-
-STUDY = Path(__file__).parents[2] / "examples" / "collision_study.py"
-
-
-@pytest.fixture(scope="module")
-def study() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("collision_study", STUDY)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
 
 
 def check(total: dict) -> None:
@@ -37,7 +22,7 @@ def check(total: dict) -> None:
 
 @pytest.mark.slow
 @pytest.mark.campaign
-def test_short_study(study: ModuleType, tmp_path: Path) -> None:
+def test_short_study(tmp_path: Path) -> None:
     file = tmp_path / "study.json"
     assert study.main(["--sweeps", "200", "--moves", "80", "--json", str(file)]) == 0
     document = json.loads(file.read_text())
@@ -45,7 +30,7 @@ def test_short_study(study: ModuleType, tmp_path: Path) -> None:
     assert document["flexray"]["stops"] > 0
 
 
-def test_the_reference_itself(study: ModuleType) -> None:
+def test_the_reference_itself() -> None:
     """Its separating axis test: cubes of 2 mm at 1.9 and 2.1 mm, and one turned by 45
     degrees."""
     cube = np.array(

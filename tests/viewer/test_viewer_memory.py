@@ -1,6 +1,6 @@
 """A minute of motion leaves no memory behind, in the viewer's process and in the page.
 
-The long form is `python examples/viewer_study.py --minutes 30`. What is compared are the
+The long form is `python tests/studies/viewer_study.py --minutes 30`. What is compared are the
 medians of two halves after a warm-up, the page's heap after a collection, so that a pause or a
 cache that fills once decides nothing.
 """

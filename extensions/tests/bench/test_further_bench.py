@@ -1,4 +1,4 @@
-"""`examples/research/further_bench.py` on small problems: the references, and who takes
+"""`tests/studies/further_bench.py` on small problems: the references, and who takes
 part."""
 
 from __future__ import annotations

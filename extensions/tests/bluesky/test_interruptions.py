@@ -1,6 +1,6 @@
 """Plans that are paused and suspended make valid documents; the whole study is a command.
 
-`python extensions/tests/studies/bluesky_interruptions.py` draws a hundred runs.
+`python tests/studies/bluesky_interruptions.py` draws a hundred runs.
 """
 
 from __future__ import annotations

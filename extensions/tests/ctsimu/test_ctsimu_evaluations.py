@@ -1,6 +1,6 @@
 """Evaluations that `ctsimu` ships, of images of ours, by their own criteria.
 
-`extensions/tests/studies/ctsimu_scenarios.py` simulates and evaluates; 2D-WE-1 and 2D-WE-2,
+`tests/studies/ctsimu_scenarios.py` simulates and evaluates; 2D-WE-1 and 2D-WE-2,
 which take a quarter of an hour, and 2D-SW-1 and 2D-SW-2 are run there only.
 """
 

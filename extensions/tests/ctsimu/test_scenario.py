@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from ctsimu_texts import box, deg, material, mm, point, sample, scenario, vector, write
 from required import required
 
 import flexdt as fx
@@ -22,8 +23,6 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt_extensions.ctsimu.ctsimu_scan import read_scenario
 from flexdt_extensions.ctsimu.scenario import ScenarioImages
-
-from .scenarios import box, deg, material, mm, point, sample, scenario, vector, write
 
 ctsimu = required("ctsimu.scenario")
 

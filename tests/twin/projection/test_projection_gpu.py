@@ -356,7 +356,7 @@ from flexdt.twin.projection import Volume, back, forward, gpu, room_like
 from flexdt.twin.projection.kernels import gpu_kernels
 from flexdt.twin.reconstruction import Grid, fdk
 from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
-from tests.twin.reconstruction.scans import ball, circle
+from tests.support.circular_scans import ball, circle
 
 said = []
 class Keep(logging.Handler):

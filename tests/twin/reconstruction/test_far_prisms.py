@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from circular_scans import circle
 
 from flexdt.twin.projection import Grid, as_volume
 from flexdt.twin.reconstruction.acquisition.truncation import Prism, Truncation
@@ -13,7 +14,6 @@ from flexdt.twin.reconstruction.feldkamp.backprojection import fill_columns
 from flexdt.twin.reconstruction.feldkamp.far_prisms import NearColumns
 from flexdt.twin.reconstruction.feldkamp.fdk_plan import plan_fdk
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
-from tests.twin.reconstruction.scans import circle
 
 MOST_ERROR = 2e-6
 """Of the largest value: transforms of single precision, of up to 600 columns."""

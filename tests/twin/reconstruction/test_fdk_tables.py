@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from circular_scans import circle
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.reconstruction.acquisition.coverage import LostVoxels
@@ -17,7 +18,6 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
     redundancy,
 )
 from flexdt.twin.reconstruction.feldkamp.fdk_plan import weighing
-from tests.twin.reconstruction.scans import circle
 
 
 def drawn(rng: np.random.Generator) -> tuple[ConeVec, tuple[int, int]]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from circular_scans import ball, circle
 
 from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import LimitError
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.detector import Detector
 from flexdt.twin.reconstruction import Grid, fdk, hardening, ring_errors
-from tests.twin.reconstruction.scans import ball, circle
 
 ALUMINIUM = Substance.of("aluminium", "Al", 2.7)
 

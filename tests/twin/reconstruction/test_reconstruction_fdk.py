@@ -13,6 +13,7 @@ from pathlib import Path
 import fan_beam
 import numpy as np
 import pytest
+from circular_scans import CENTRE, MU, RADIUS, ball, circle, measure
 from llvmlite import binding
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.optimize import curve_fit
@@ -54,7 +55,6 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
 )
 from flexdt.twin.reconstruction.feldkamp import fdk_plan
 from flexdt.twin.reconstruction.feldkamp.filtering import filtered, ramp
-from tests.twin.reconstruction.scans import CENTRE, MU, RADIUS, ball, circle, measure
 
 plain_fdk = partial(fdk, errors=False)
 """Values alone."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from circular_scans import ball, circle, measure
 
 from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
 from flexdt.twin.reconstruction.feldkamp.backprojection import device_takes
 from tests.support.device_simulator import run_simulated
-from tests.twin.reconstruction.scans import ball, circle, measure
 
 FOUND = gpu.availability()
 
@@ -22,7 +22,7 @@ from flexdt.twin.reconstruction.feldkamp.backprojection import device_takes
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.reconstruction.acquisition.truncation import Prism, Truncation
 from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
-from tests.twin.reconstruction.scans import ball, circle
+from tests.support.circular_scans import ball, circle
 
 gpu_reconstruction_kernels.THREADS = 8
 assert gpu.availability().present
@@ -90,7 +90,7 @@ from flexdt.twin.projection import gpu
 from flexdt.twin.reconstruction import Grid, fdk
 from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
 from flexdt.twin.reconstruction.feldkamp.backprojection import OnDevice
-from tests.twin.reconstruction.scans import ball, circle
+from tests.support.circular_scans import ball, circle
 
 gpu_reconstruction_kernels.BLOCK = gpu_reconstruction_kernels.PLANE = (4, 2)
 gpu_reconstruction_kernels.THREADS = 8
@@ -215,7 +215,7 @@ from flexdt.twin.reconstruction import Grid, fdk_parts, tv
 from flexdt.twin.reconstruction.feldkamp.fdk import OnDevice, OnProcessor
 from flexdt.twin.reconstruction.kernels import gpu_reconstruction_kernels
 from tests.support.device_simulator import as_on_a_device
-from tests.twin.reconstruction.scans import ball, circle
+from tests.support.circular_scans import ball, circle
 
 as_on_a_device()
 gpu_reconstruction_kernels.THREADS = 8

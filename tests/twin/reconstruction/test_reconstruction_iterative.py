@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from circular_scans import MU, ball, circle, measure
 
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.projection import Volume, forward, gpu
 from flexdt.twin.reconstruction import Grid, cgls, em, fdk, sart, sirt, tv
 from flexdt.twin.reconstruction.linear_system import LinearSystem
-from tests.twin.reconstruction.scans import MU, ball, circle, measure
 
 SCAN = circle(45, pixel=1.4)
 SHAPE = (52, 56)

@@ -4,20 +4,17 @@ what it is for.
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
+import tv_weights
+from circular_scans import circle
 from scipy.optimize import minimize
 
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.plausibility.findings import PlausibilityWarning
 from flexdt.twin.projection import Operator, Volume
 from flexdt.twin.reconstruction import minimise_tv, tv
-from tests.twin.reconstruction.scans import circle
 
-EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 LIKE = Volume(np.zeros((4, 5, 6)), (2.0, 2.5, 3.0))
 SCAN = circle(5, pixel=3.0)
 SHAPE = (6, 8)
@@ -177,13 +174,7 @@ def test_masks_and_signs(small):
 
 def test_few_noisy_views_of_few_materials():
     """What it is for: 20 views of an object of few materials (the study `tv_weights.py`)."""
-    spec = importlib.util.spec_from_file_location(
-        "tv_weights", EXAMPLES / "tv_weights.py"
-    )
-    study = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(study)
-    study.WEIGHTS = (0.01,)
-    by_fdk, by_sirt, default = study.errors(20, 0.03, 32)
+    by_fdk, by_sirt, default = tv_weights.errors(20, 0.03, 32, weights=(0.01,))
     assert default < 0.4 * by_fdk
     assert default < 0.8 * by_sirt
 

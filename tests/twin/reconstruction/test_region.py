@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from circular_scans import circle, lengths
 
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction import Grid, cgls, sart, sirt
 from flexdt.twin.reconstruction.linear_system import LinearSystem
-from tests.twin.reconstruction.scans import circle, lengths
 
 SCAN, SHAPE = circle(9, pixel=2.1), (7, 11)
 FINE, COARSE = (

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from circular_scans import circle, lengths
 
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.physics.chain import Chain, weights_of
 from flexdt.twin.physics.detector import Detector
 from flexdt.twin.reconstruction import Grid, Polychromatic, hardening, sart, sirt
-from tests.twin.reconstruction.scans import circle, lengths
 
 KV, KEV = 90.0, 60.0
 PMMA, STEEL = Substance.of("pmma", "C5H8O2", 1.18), Substance.of("steel", "Fe", 7.87)

@@ -1,6 +1,6 @@
 """The 90 % ranges of a fitted machine, on simulated machines and by hand.
 
-The machines are those of `tests/studies/timing_ranges.py`: their logs, kinematics and times
+The machines are those of `tests/support/timed_rigs.py`: their logs, kinematics and times
 share no code with the fit, and the fit knows nothing of their families.
 """
 
@@ -11,6 +11,7 @@ import random
 
 import pytest
 import timing_ranges
+from timed_rigs import FAMILIES, UNSEEN, Rig
 
 from flexdt.twin.machine.description import Spread, Timing
 from flexdt.twin.script.log_fit import LogRow
@@ -23,7 +24,7 @@ def test_ranges_hold_the_next_scan_of_50_machines() -> None:
     inside = {group: share["percent"] for group, share in found["inside"].items()}
     assert 85.0 <= inside["lines, all"] <= 95.0
     assert 85.0 <= inside["totals, all"] <= 95.0
-    for family in timing_ranges.FAMILIES:
+    for family in FAMILIES:
         assert inside[f"lines, {family}"] >= 85.0
         assert inside[f"totals, {family}"] >= 80.0
     assert found["limits_wrong"] == 0
@@ -33,7 +34,7 @@ def test_ranges_half_as_wide_would_not_hold() -> None:
     """So the bound of the study is one that ranges can miss."""
     held = []
     for index in range(9):
-        rig = timing_ranges.Rig(random.Random(index), timing_ranges.FAMILIES[index % 3])
+        rig = Rig(random.Random(index), FAMILIES[index % 3])
         found, _ = timing_ranges.next_scan(rig, 1 + index % 4)
         for row in found.rows:
             assert row.p5_s is not None
@@ -69,7 +70,7 @@ def test_what_a_total_is_uncertain_by(n: int, count: int, squares: float) -> Non
 @pytest.mark.slow
 def test_rare_kinds_of_families_that_nothing_was_chosen_by() -> None:
     """A kind with one or two lines a scan, known from three to eight times."""
-    found = timing_ranges.study(48, seed=17, families=timing_ranges.UNSEEN)
+    found = timing_ranges.study(48, seed=17, families=UNSEEN)
     rare = ("xrayon", "xray_ready", "xrayoff", "xrayoff_again", "write_settings")
     shares = [found["inside"][f"lines, kind {kind}, n >= 3"] for kind in rare]
     count = sum(share["n"] for share in shares)

@@ -3,7 +3,7 @@
 Needs `pip install itk-rtk`. Prints both times, the mean of each inside the ball over the truth,
 and the largest and the root mean square difference of the two volumes [1/mm].
 
-    python examples/compare_fdk.py --views 360 --voxels 256
+    python tests/studies/compare_fdk.py --views 360 --voxels 256
 """
 
 from __future__ import annotations

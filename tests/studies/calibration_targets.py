@@ -1,6 +1,6 @@
 """Targets of calibration, our figures and the thesis's, in one table.
 
-`python examples/research/calibration_targets.py FOLDER...` reads the documents of `flexdt
+`python tests/studies/calibration_targets.py FOLDER...` reads the documents of `flexdt
 study --out`, `robustness.py --out` and `calibration_speed.py --json` under the folders.
 `--run points` (seconds) or `--run images` (hours) first runs the studies that are missing,
 into the first folder. A figure that is missing is listed with the command that makes it.
@@ -189,9 +189,9 @@ def _study(experiment: str, fidelity: str) -> tuple[str, str]:
     return source, f"flexdt study {experiment} --fidelity {fidelity} --out DIR/{source}"
 
 
-_ROBUST = "python examples/research/robustness.py --out DIR"
+_ROBUST = "python tests/studies/robustness.py --out DIR"
 _BENCH = (
-    "python examples/research/calibration_speed.py DATASET --phantom lego --json > "
+    "python tests/studies/calibration_speed.py DATASET --phantom lego --json > "
     "DIR/bench.json"
 )
 TARGETS: Final = (

@@ -1,6 +1,6 @@
 """Does a spoilt scan get the right name, and is none offered that is wrong?
 
-`python examples/research/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--pairs 0]
+`python tests/studies/causes_named.py [--each 2] [--seed 0] [--kinds a,b] [--pairs 0]
 [--placed] [--panel flexray] [--json]` spoils scans of drawn bead phantoms in the ways of
 `faults_drawn.KINDS`, calibrates each and says whether the cause was named right, vaguely or
 not at all, and how many sigmas the worst of an answer that was offered is off. More than four
@@ -21,14 +21,13 @@ import argparse
 import json
 import math
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
-from faults_drawn import DRAWS, KINDS, PANELS, Faulty, drawn
-from faults_paired import drawn_names, drawn_together
-from placements_drawn import PLACED, PLACEMENTS, Placed, angles_apart, drawn_placed
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
@@ -49,6 +48,12 @@ from flexdt.twin.calibration.pipeline import (
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from faults_drawn import DRAWS, KINDS, PANELS, Faulty, drawn
+from faults_paired import drawn_names, drawn_together
+from placements_drawn import PLACED, PLACEMENTS, Placed, angles_apart, drawn_placed
 
 WRONG_SIGMAS: Final = 4.0
 FAULTLESS: Final = r"frames_|beads_missing|priors_narrow"

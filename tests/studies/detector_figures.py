@@ -2,7 +2,7 @@
 and the scintillator's response beside published curves: figures and plots of
 docs/image-quality.md.
 
-    python examples/research/detector_figures.py [--plots docs/images]
+    python tests/studies/detector_figures.py [--plots docs/images]
 
 Theory is formulas written here: Poisson photons of the tube's spectrum, each leaving a spread
 charge; a Gaussian for the light, a pixel's sinc, and noise folded back at the Nyquist
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import warnings
 from dataclasses import dataclass
 from math import erf, exp, pi, sqrt
@@ -20,13 +21,16 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from image_quality import edge_mtf
 
 import flexdt as fx
 from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.physics.detector import FULL_WELL_E, Detector
 from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import Filter, TubeModel, tube_spectrum
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from image_quality import edge_mtf
 
 KV, POWER_W, TIME_MS, FAR_MM = 90.0, 50.0, 100.0, 1059.0
 PIXELS_MM = {"unbinned": 0.0748, "binned 2 x 2": 0.1496}

@@ -1,6 +1,6 @@
 """Do calibrations state the sigmas that were forecast?
 
-`python examples/research/forecasts.py [--scans 40] [--seed 0] [--draws N] [--unidentified]
+`python tests/studies/forecasts.py [--scans 40] [--seed 0] [--draws N] [--unidentified]
 [--json]` draws scans of 8 to 240 frames, 4 to 8 balls, magnifications 1.3 to 6 and panels of 190
 to 1912 columns, with scanners and phantoms within their assumed tolerances, calibrates their
 spots with all causes, and divides each stated sigma by that of `identifiability` at the true
@@ -23,12 +23,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
-from faults_drawn import SHAPE, SIX, UNSEEN, World, shadows
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
@@ -39,6 +40,10 @@ from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFra
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from faults_drawn import SHAPE, SIX, UNSEEN, World, shadows
 
 PANELS: Final = (
     (190, 239, 0.2992),

@@ -1,9 +1,9 @@
 """CTSimU scenarios beside images that BAM published, and by the evaluations that `ctsimu`
 ships.
 
-    python extensions/tests/studies/ctsimu_scenarios.py published CHECKOUT
-    python extensions/tests/studies/ctsimu_scenarios.py evaluate FOLDER [TEST...]  # needs ctsimu
-    python extensions/tests/studies/ctsimu_scenarios.py wedges FOLDER       # likewise
+    python tests/studies/ctsimu_scenarios.py published CHECKOUT
+    python tests/studies/ctsimu_scenarios.py evaluate FOLDER [TEST...]  # needs ctsimu
+    python tests/studies/ctsimu_scenarios.py wedges FOLDER       # likewise
 
 `published` simulates the examples of a checkout of github.com/BAMresearch/ctsimu-scenarios and
 compares every projection with the one that aRTist made of it. `evaluate` simulates scenarios

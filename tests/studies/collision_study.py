@@ -6,7 +6,7 @@ sweep is compared with dense sampling along the same trajectories (a step of at 
 distances by fcl without any of the sweep's code, and for boxes the separating axis test written
 here). Then random motions of the whole FleX-ray and checks of whole scripts are timed.
 
-    python examples/collision_study.py --sweeps 10000 --moves 2000 --json study.json
+    python tests/studies/collision_study.py --sweeps 10000 --moves 2000 --json study.json
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ AXES = ("ax", "ay", "az", "a_turn", "bx", "by", "bz", "b_turn")
 KINDS = ("translation", "rotation", "both", "several axes")
 MARGIN, TOLERANCE = 1.0, 0.01
 STEP_MM = 0.25
+SCRIPTS = Path(__file__).parents[2] / "examples" / "scripts"
 NOISE = 1e-3
 """Error allowed to the reference's own distances [mm]: fcl's cylinders reach it."""
 
@@ -472,7 +473,7 @@ def study_scripts() -> dict[str, object]:
     near = compose_script(
         ScanRequest("step", frames=1440, sdd_mm=757.0), machine, profile
     )
-    shipped = [f.read_bytes() for f in (Path(__file__).parent / "scripts").glob("*.txt")]
+    shipped = [f.read_bytes() for f in SCRIPTS.glob("*.txt")]
     hundred = [text for _, text in zip(range(100), cycle(shipped), strict=False)]
     cases = {
         "fly_1440": ([fly], lego),

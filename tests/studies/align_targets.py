@@ -1,10 +1,10 @@
 """`flexdt align` on scans of known geometry: errors, sigmas and refusals beside the
 targets.
 
-    python examples/research/align_targets.py [--views 180] [--binning 2] [--geometries 10]
-    [--json] python examples/research/align_targets.py --spoilt
-    python examples/research/align_targets.py --jitter 1
-    python examples/research/align_targets.py --edge
+    python tests/studies/align_targets.py [--views 180] [--binning 2] [--geometries 10]
+    [--json] python tests/studies/align_targets.py --spoilt
+    python tests/studies/align_targets.py --jitter 1
+    python tests/studies/align_targets.py --edge
 
 `--jitter` shifts every frame at random and prints the rest of the shifts after
 `align(per_frame=True)`. `--edge` reconstructs a ball (FDK) with the data set's geometry, the

@@ -1,7 +1,7 @@
 """Faults of detector and beam in the images: are they named, and is no answer confidently
 wrong?
 
-`python examples/research/beam_faults.py [--each 5] [--seed 0] [--kinds a,b] [--json]` makes
+`python tests/studies/beam_faults.py [--each 5] [--seed 0] [--kinds a,b] [--json]` makes
 radiographs of balls in a body, with all seventeen offsets drawn from their priors, and
 calibrates from them. Light of three energies, a detector's blur, lag, distortion, tiles, dead
 pixels and scattered light are written out here, with the rays and planes of `prior_coverage`;

@@ -8,7 +8,7 @@ direction of its rows and columns is found with one ball whose shadow is worked 
 a mirrored image of ours would not pass. Prints the differences of the transmissions
 of all pixels and of those off the edges.
 
-    python examples/compare_gvxr.py
+    python tests/studies/compare_gvxr.py
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Is a scan that is exposed while the stage turns told as that, and nothing false?
 
-`python examples/research/arcs_drawn.py [--count 40] [--seed 0] [--least 0.1] [--most 1.5]
+`python tests/studies/arcs_drawn.py [--count 40] [--seed 0] [--least 0.1] [--most 1.5]
 [--json]` makes radiographs of balls with all seventeen offsets drawn from their priors, each
 exposed over an arc of `--least` to `--most` steps in a turn of 24 to 120 frames, every second
 one in an acrylic tube, and calibrates from them without a word on the exposure. `--most 0`

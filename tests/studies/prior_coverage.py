@@ -1,6 +1,6 @@
 """Do the intervals hold when the detector is not where the machine file has it?
 
-`python examples/research/prior_coverage.py [--scans 1000] [--wider 2] [--skewed] [--json]`
+`python tests/studies/prior_coverage.py [--scans 1000] [--wider 2] [--skewed] [--json]`
 makes bead tracks with detector shifts, tilts and axis tilts drawn from the priors and counts
 how often the truth lies in the 95 % intervals and in the joint 95 % region. `--wider 2` draws
 them twice as wide as the fit believes, `--skewed` from a one-sided distribution of the same

@@ -1,6 +1,6 @@
 """Two long studies: scans spoilt on purpose, and the coverage of the joint 95 % region.
 
-`python examples/research/robustness.py --sets 1000 --out DIR` writes `robustness.json` and
+`python tests/studies/robustness.py --sets 1000 --out DIR` writes `robustness.json` and
 prints a table of kinds (`--kinds scanner_off held_right`: of these); run again after an
 interruption, it continues where it stopped. So does `--coverage 1000 [--camera demo]`, which
 writes `coverage_demo.json`. The scans are made and judged by `spoilt_scans` and
@@ -11,18 +11,21 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ellipsoid_coverage import CAMERAS, Draw, draw
-from spoilt_scans import WRONG_SIGMAS, Outcome, corrupt, judge
-from ways_of_spoiling import KINDS
-
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt_extensions.executors import executor
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from ellipsoid_coverage import CAMERAS, Draw, draw
+from spoilt_scans import WRONG_SIGMAS, Outcome, corrupt, judge
+from ways_of_spoiling import KINDS
 
 PHANTOMS = ("lego", "normal-5", "normal-4", "square-5")
 """Scanned in turn; with three beads or fewer it is undecidable which of them is off."""

@@ -1,7 +1,7 @@
 """Ten dialects of message servers: is every fault told in time, and a healthy day without
 alarms?
 
-    python tests/studies/dialects.py [--conversations 10000] [--hours 24] [--seed 0]
+    python tests/studies/drawn_dialects.py [--conversations 10000] [--hours 24] [--seed 0]
 
 Conversations are drawn from all dialects in turns, each with a fault of the machine, of the
 server, of both or of neither; the days are healthy, once on a machine whose times are assumed

@@ -1,7 +1,7 @@
 """Measure the messages to a browser: rates, latency, memory (docs/evidence/viewer.json).
 
-    python examples/viewer_study.py                   # rates and latency, about a minute
-    python examples/viewer_study.py --minutes 30      # and memory under half an hour of motion
+    python tests/studies/viewer_study.py                   # rates and latency, about a minute
+    python tests/studies/viewer_study.py --minutes 30      # and memory under half an hour of motion
 
 Starts its own servers on free ports. The browser parts need Debian's chromium and playwright
 and are left out, with a word, where either is missing.

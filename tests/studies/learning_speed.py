@@ -1,6 +1,6 @@
 """Steps a second of the learning environments, one at a time and many at once.
 
-    python extensions/tests/studies/learning_speed.py [--envs N] [--seconds S]
+    python tests/studies/learning_speed.py [--envs N] [--seconds S]
 
 Actions are drawn from a seed; steps that only begin a new episode are timed but not counted.
 """

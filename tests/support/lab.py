@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import select
 import signal
 import socket
@@ -283,6 +284,23 @@ def digests(folder: Path, pattern: str = "*.tif") -> dict[str, str]:
     return {
         f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.glob(pattern)
     }
+
+
+DATES = re.compile(
+    rb"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:\d\d)?|\d{1,2}:\d\d:\d\d( [AP]M)?|"
+    rb"\d{1,2}[-/.]\d{1,2}[-/.]\d{2,4}|\d{1,2} \w{3} \d{4}"
+)
+
+
+def timeless(text: bytes, name: str) -> bytes:
+    """A text without its dates, durations and the data set's name."""
+    text = DATES.sub(b"<date>", text.replace(name.encode(), b"<name>"))
+    text = re.sub(rb'("duration_s": )[0-9.e+-]+', rb"\1<s>", text)
+    return re.sub(
+        rb"(?im)^(.*(?:duration|elapsed|scan time|total time).*?)[0-9.]+.*$",
+        rb"\1<s>",
+        text,
+    )
 
 
 def percentile(values: list[float], q: float) -> float:

@@ -1,6 +1,6 @@
 """How many frames and minutes `flexdt job watch` saves, and whether what is left is worth it.
 
-    python extensions/tests/studies/adaptive_stopping.py [--scans 20] [--seed 0]
+    python tests/studies/adaptive_stopping.py [--scans 20] [--seed 0]
 
 Each drawn scan is 60 to 120 images of the LEGO phantom at golden-section angles, of a twin
 process that hides a drawn misalignment; the watcher asks for drawn sigmas of tau_x and tau_z.
@@ -22,13 +22,13 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[3] / "tests" / "studies"))
-
-from lab import Process, machine, projector, twin
-
 import flexdt as fx
 from flexdt.clients import TwinClient
 from flexdt_extensions.watch import watch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from lab import Process, machine, projector, twin
 
 MOST = {"dO_x": 1.0, "dO_y": 1.0, "dO_z": 2.0, "alpha": 5.0, "tau_x": 0.5, "tau_z": 0.5}
 """Largest offsets that are hidden [mm, deg]."""

@@ -1,6 +1,6 @@
 """Anybody's calibration: markers of unknown positions, and markers that were marked by hand.
 
-`python examples/research/unknown_markers.py [--scans 10] [--drawn 200] [--hand 200] [--write
+`python tests/studies/unknown_markers.py [--scans 10] [--drawn 200] [--hand 200] [--write
 DIR]` renders scans of 5 to 20 balls (rays and planes of `prior_coverage`, nothing of the fit's
 model), finds and links their spots without knowing how many there are, and compares the
 positions found with the true ones up to place, turn and scale. `--drawn` does the same with 36

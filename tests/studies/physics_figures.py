@@ -1,14 +1,15 @@
 """Measure the figures of docs/evidence/physics.json and reconstruction.json that need no peer.
 
-python examples/research/physics_figures.py
+python tests/studies/physics_figures.py
 """
 
 from __future__ import annotations
 
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
-from image_quality import edge_mtf, photon_transfer, region
 
 from flexdt.phantoms import material
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -21,6 +22,10 @@ from flexdt.twin.physics.readout import read_out
 from flexdt.twin.projection import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 from flexdt.twin.reconstruction import Grid, fdk, sirt
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from image_quality import edge_mtf, photon_transfer, region
 
 VIEW = np.array([0, -600, 0, 0, 459, 0, 0.1496, 0, 0, 0, 0, -0.1496], dtype=np.float64)
 LISTING_1 = ExposureSettings(90.0, 50.0, 100.0)

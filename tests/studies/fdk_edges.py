@@ -1,4 +1,4 @@
-"""FDK at the edges of the panel: `python examples/research/fdk_edges.py`.
+"""FDK at the edges of the panel: `python tests/studies/fdk_edges.py`.
 
 Four tables. A detector moved aside, level and turned about the vertical, with an object out to
 0.95 of the field of view: mean error of flat regions. Objects wider than the panel (cylinders,

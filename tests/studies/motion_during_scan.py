@@ -1,6 +1,6 @@
 """Is motion during a scan found, and are the sigmas true that are given with it?
 
-`python examples/research/motion_during_scan.py [--scans 20] [--images 1] [--seed 1] [--json]`
+`python tests/studies/motion_during_scan.py [--scans 20] [--images 1] [--seed 1] [--json]`
 makes scans of five balls in which something moves: a runout (harmonics 2 to 5 of the turn, 20
 um), a screw (1 mm along the axis), a drift of the focal spot (0.1 mm, exponential), jitter (20
 um, every frame by itself), or nothing; by tracks with 0.02 px noise, and by radiographs. Tracks

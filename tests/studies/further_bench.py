@@ -1,7 +1,7 @@
 """Measurements beyond `flexdt bench`: the adjoint, scenes and meshes, FDK, growth, cold start,
 memory, sizes that memory allows, and the way through the projector server.
 
-    python examples/research/further_bench.py --out out/further [--only FDK growth] [--no-peers]
+    python tests/studies/further_bench.py --out out/further [--only FDK growth] [--no-peers]
 
 writes `bench.json`, of the form that `flexdt bench` writes: `docs/tools/bench_page.py` takes
 both. `--list` names the cases.

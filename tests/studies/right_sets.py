@@ -1,6 +1,6 @@
 """Do the intervals of right scans hold, with everything that a calibration looks for?
 
-`python examples/research/right_sets.py [--scans 500] [--seed 0] [--kind as_assumed] [--json]`
+`python tests/studies/right_sets.py [--scans 500] [--seed 0] [--kind as_assumed] [--json]`
 draws scanners and phantoms from their assumed tolerances (`RIGHT` of `faults_drawn`: all
 offsets of detector and axis, stretches and shears of the phantom), calibrates their spots with
 all causes, and counts refusals, truths inside the 95 % intervals, and those of all parameters
@@ -19,15 +19,20 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from causes_named import WRONG_SIGMAS, calibrated
-from faults_drawn import RIGHT, drawn
 
 from flexdt.twin.errors import TwinError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+
+from faults_drawn import RIGHT, drawn
 
 MOST_REFUSED: Final = 0.02
 """Largest share of right scans that may be refused."""

@@ -7,7 +7,7 @@ times and peak memory: of the largest process, and of all together (sampled twic
 pages that processes share counted once). About 4 GB of disk; `--frames 240 --voxel 0.2` is a
 quick one.
 
-    python examples/reference_scan.py --out /tmp/reference --physics poly
+    python tests/studies/reference_scan.py --out /tmp/reference --physics poly
 """
 
 from __future__ import annotations

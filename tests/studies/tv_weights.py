@@ -1,6 +1,6 @@
 """How strong total variation should be: errors of FDK, SIRT and TV for some weights.
 
-    python examples/tv_weights.py [--voxels 48]
+    python tests/studies/tv_weights.py [--voxels 48]
 
 An ellipsoid with a hole and two inclusions: line integrals of the analytic solids, with noise.
 Prints one line a case: views, noise, and the rms error [1/mm] of FDK, SIRT and TV with each
@@ -10,6 +10,7 @@ weight. docs/evidence/reconstruction.json has the table.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -42,17 +43,20 @@ def truth(count: int, fine: int = 3) -> np.ndarray:
     )
 
 
-def errors(views: int, noise: float, count: int) -> list[float]:
-    """Reconstruct a noisy scan by FDK, SIRT and TV with each of WEIGHTS.
+def errors(
+    views: int, noise: float, count: int, weights: Sequence[float] = WEIGHTS
+) -> list[float]:
+    """Reconstruct a noisy scan by FDK, SIRT and TV with each weight.
 
     Args:
         views: of the turn.
         noise: standard deviation of the line integrals.
         count: voxels a side.
+        weights: of TV.
 
     Returns:
         Root mean square error of each volume [1/mm]: FDK, SIRT, then TV in the order of
-        WEIGHTS.
+        the weights.
     """
     grid, wanted = fx.Grid((count,) * 3, SIZE_MM / count), truth(count)
     scan = fx.ConeVec.circular(
@@ -63,7 +67,7 @@ def errors(views: int, noise: float, count: int) -> list[float]:
     data += noise * np.random.default_rng(0).normal(size=data.shape).astype(np.float32)
     volumes = [fdk(data, scan, grid, errors=False)]
     volumes += [sirt(data, scan, grid, iterations=60, nonnegative=True)]
-    volumes += [tv(data, scan, grid, weight=w, iterations=200) for w in WEIGHTS]
+    volumes += [tv(data, scan, grid, weight=w, iterations=200) for w in weights]
     return [float(np.sqrt(np.mean((v.data - wanted) ** 2))) for v in volumes]
 
 

@@ -1,6 +1,6 @@
 """Bluesky plans paused and suspended at drawn moments, and a check of every document they made.
 
-    python extensions/tests/studies/bluesky_interruptions.py [--runs 100] [--seed 1]
+    python tests/studies/bluesky_interruptions.py [--runs 100] [--seed 1]
 
 A real RunEngine, a real twin. Each run is one of five plans with one to four interruptions:
 pauses at once, pauses at the next checkpoint, and trips of a suspender, before or while a drawn

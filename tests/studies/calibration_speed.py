@@ -1,4 +1,4 @@
-"""How fast calibration is: `python examples/research/calibration_speed.py DATASET --phantom
+"""How fast calibration is: `python tests/studies/calibration_speed.py DATASET --phantom
 lego`.
 
 Three figures, best and median of several runs with kernels compiled and files in the page
