@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from looking import KNOWN_HERE, USUAL, seen, until
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol.state_model import State
-from tests.viewer.looking import KNOWN_HERE, USUAL, seen, until
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = [

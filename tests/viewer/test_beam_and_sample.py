@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import Picture, arrived, frames, picture
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import Picture, arrived, frames, picture
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -14,12 +14,8 @@ from typing import Any
 
 import pytest
 from lab import fly_script
-
-from flexdt.clients.client.client import TwinClient
-from flexdt.protocol import RpcError
-from tests.viewer.conftest import Lab, Process, at_rest
-from tests.viewer.looking import until
-from tests.viewer.page_statements import (
+from looking import until
+from page_statements import (
     UNENDED,
     Checked,
     asked,
@@ -28,6 +24,10 @@ from tests.viewer.page_statements import (
     of_old_picture,
     pictured_of,
 )
+
+from flexdt.clients.client.client import TwinClient
+from flexdt.protocol import RpcError
+from tests.viewer.conftest import Lab, Process, at_rest
 
 pytestmark = pytest.mark.browser
 SEEDS = 500

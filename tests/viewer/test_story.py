@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from looking import USUAL
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import USUAL
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.campaign]
 WRONG = {"dO_x": 0.6, "det_roll": 1.5, "det_pitch": 0.0, "dS_x": 0.0}

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import begun, film, point_at
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.library.reading.folders import load_dataset
@@ -18,7 +19,6 @@ from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import ScanRequest
-from tests.viewer.looking import begun, film, point_at
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from looking import answered, released, seen
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import answered, released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

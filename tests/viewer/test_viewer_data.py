@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import tifffile
 from lab import fly_script
+from looking import USUAL, seen, until
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import USUAL, seen, until
 
 pytestmark = pytest.mark.browser
 FRAMES = 9

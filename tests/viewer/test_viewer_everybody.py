@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from looking import KNOWN_HERE, begun, seen
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import KNOWN_HERE, begun, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from looking import changed, picture, settled, until
 from PIL import Image
 from scipy.spatial import ConvexHull
 
@@ -33,7 +34,6 @@ from flexdt.clients.viewer.scenes.world import World, placed
 from flexdt.protocol.state_model import SampleState
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import builtin_machine, profile_of
-from tests.viewer.looking import changed, picture, settled, until
 
 HOME = {
     "ver_tube": 26.29,

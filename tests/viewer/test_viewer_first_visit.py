@@ -20,11 +20,11 @@ from typing import Any
 
 import pytest
 import trimesh
+from looking import drawn, picture, point_at, settled, until
 
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import ScanRequest
-from tests.viewer.looking import drawn, picture, point_at, settled, until
 
 pytestmark = pytest.mark.browser
 HEAD = "| task | clicks | what is seen then |\n|---|---|---|\n"

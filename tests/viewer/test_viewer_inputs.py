@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import answered, point_at, released, seen
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import answered, point_at, released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

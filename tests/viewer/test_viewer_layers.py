@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import Picture, changed, drawn, settled, still
 
 from flexdt.clients.viewer.page_cameras import SceneClients, Who
 from flexdt.clients.viewer.scenes.layers import Nodes
-from tests.viewer.looking import Picture, changed, drawn, settled, still
 
 
 class OneFrame:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import film, point_at, seen
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import film, point_at, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 from lab import fly_script
+from looking import begun, seen
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import begun, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

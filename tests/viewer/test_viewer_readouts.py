@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from looking import released, seen
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

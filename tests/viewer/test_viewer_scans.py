@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import trimesh
 import zstandard
+from looking import begun, changed, drawn, film, picture, point_at, seen
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.scenes.views import FREE
 from flexdt.library.reading.folders import load_dataset
-from tests.viewer.looking import begun, changed, drawn, film, picture, point_at, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

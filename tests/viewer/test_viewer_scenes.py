@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from looking import changed, drawn, frames, picture, seen, settled, still
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import ConvexHull
@@ -24,7 +25,6 @@ from flexdt.clients.viewer.scenes.views import Standpoint, presets
 from flexdt.clients.viewer.scenes.world import world_of
 from flexdt.protocol.state_model import State
 from flexdt.twin.machine.description import builtin_machine, profile_of
-from tests.viewer.looking import changed, drawn, frames, picture, seen, settled, still
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from looking import answered, released, seen
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import answered, released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import picture, until
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import picture, until
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

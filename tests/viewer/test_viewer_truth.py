@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import released, seen
 from PIL import Image
 from websockets.sync.client import connect
 
 from flexdt.clients.client.client import TwinClient
-from tests.viewer.looking import released, seen
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]

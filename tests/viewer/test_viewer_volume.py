@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from looking import USUAL, picture
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.phantoms import load_phantom
-from tests.viewer.looking import USUAL, picture
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 BLOCK = "flexdt.volume().three.block"
