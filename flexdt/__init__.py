@@ -52,7 +52,7 @@ from flexdt.twin import long_work as _long_work
 
 def _show_work(
     what: str, progress: _long_work.Progress = None
-) -> _typing.ContextManager[_long_work.Advance]:
+) -> _typing.ContextManager[_long_work.Report]:
     """Show the work that goes on inside the context, from when it takes seconds, as a
     line with a bar; see `shown_work`, which is imported at the first use.
 
@@ -65,7 +65,7 @@ def _show_work(
         The context; it gives the function that takes the fraction done, 0 to 1.
     """
     # Here, because logging and threads take a third of the import of flexdt.
-    from flexdt.runtime.progress_lines import shown_work
+    from flexdt.runtime.progress import shown_work
 
     return shown_work(what, progress)
 

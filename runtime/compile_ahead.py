@@ -20,8 +20,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from flexdt.runtime.progress_lines import SILENT_S
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.long_work import Rhythm, time_span
 from flexdt.twin.projection import Grid
 from flexdt.twin.projection.analytic import warm_up_back, warm_up_forward
 
@@ -138,24 +138,26 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
 
     Args:
         groups: names, of `GROUPS`.
-        note: called with a line at the beginning, when groups are done, and after each
-            `SILENT_S` without one.
+        note: called with a line at the beginning, when groups are done, and meanwhile ever
+            more rarely (`Rhythm`).
     """
     missing = [group for group in groups if not is_compiled(group)]
     if not missing:
         return
     note(f"compiling kernels (once): {', '.join(missing)}")
     begun = time.monotonic()
+    rhythm = Rhythm.begun(begun)
     with ThreadPoolExecutor(min(os.cpu_count() or 1, len(missing))) as pool:
         left = {pool.submit(elsewhere, group): group for group in missing}
         while left:
-            done = wait(left, SILENT_S, return_when="FIRST_COMPLETED").done
-            now = [left.pop(each) for each in done] or ["still"]
-            compiled = len(missing) - len(left)
-            seconds = time.monotonic() - begun
-            note(
-                f"compiled {compiled} of {len(missing)} ({', '.join(now)}, {seconds:.0f} s)"
-            )
+            until_line = max(rhythm.due_s - time.monotonic(), 0.0)
+            done = wait(left, until_line, return_when="FIRST_COMPLETED").done
+            ended = [left.pop(each) for each in done]
+            now = time.monotonic()
+            if ended or rhythm.write(now):
+                compiled = len(missing) - len(left)
+                words = ", ".join([*(ended or ["still"]), time_span(now - begun)])
+                note(f"compiled {compiled} of {len(missing)} ({words})")
 
 
 def elsewhere(group: str) -> None:

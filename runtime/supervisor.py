@@ -27,11 +27,10 @@ from dataclasses import dataclass, field
 
 from flexdt.runtime.process import SUPERVISED, session_seconds, stop_signal
 from flexdt.runtime.process_settings import Address
+from flexdt.twin.long_work import Rhythm
 
 STALLED_S = 300.0
 """Time without processor use after which a service that is not ready is ended [s]."""
-SILENT_S = 2.0
-"""Interval of progress lines about a start, with its processor time so far [s]."""
 STOP_GRACE_S = 10.0
 FIRST_PAUSE_S = 0.5
 """Pause between the second end in a row and the next start [s]; it doubles from there."""
@@ -258,7 +257,8 @@ class Supervisor:
         return process
 
     async def _wait_until_ready(self, process: Process, start: _Start) -> None:
-        """Wait until a service is ready; note the wait every `SILENT_S`.
+        """Wait until a service is ready; note the wait ever more rarely
+        (`Rhythm`), with the processor time so far.
 
         It is given up after `STALLED_S` without processor time; where that cannot be
         measured it is never given up.
@@ -277,7 +277,7 @@ class Supervisor:
         # Of the whole session: a compiler that it starts counts as its work.
         used_s = session_seconds(process.pid)
         since = clock()
-        note_at = clock() + SILENT_S
+        rhythm = Rhythm.begun(clock())
         note = f"waiting for the {service.name}" + (service.slow and f": {service.slow}")
         try:
             while not (ready.done() or end.done()):
@@ -287,11 +287,13 @@ class Supervisor:
                     since = clock()
                 if clock() - since >= STALLED_S:
                     raise _Ended(f"it did nothing for {STALLED_S:g} s")
-                if clock() >= note_at and (note or used_s is not None):
-                    work = f"{used_s or 0:.0f} s of work so far"
-                    self.note(note or f"the {service.name} is still starting: {work}")
+                if (note or used_s is not None) and rhythm.write(clock()):
+                    work = (
+                        f"the {service.name} is still starting: {used_s or 0:.0f} s of "
+                        "work so far"
+                    )
+                    self.note(note or work)
                     note = ""
-                    note_at = clock() + SILENT_S
                 await asyncio.wait(
                     {ready, end}, timeout=CHECK_INTERVAL_S, return_when=FIRST_COMPLETED
                 )

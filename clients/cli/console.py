@@ -2,7 +2,8 @@
 
 With `--json` standard output carries exactly one JSON document.
 
-Progress of a long job is a bar with the time left on a terminal and plain lines elsewhere.
+Progress of a long job is shown by `flexdt.runtime.progress`: a bar on a terminal, which makes
+room for each line printed here, and log lines elsewhere.
 """
 
 from __future__ import annotations
@@ -12,17 +13,11 @@ import json
 import math
 import os
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, Final, TextIO
+from contextlib import contextmanager
+from typing import Any, Final, TextIO
 
-from flexdt.twin import long_work
-from flexdt.twin.long_work import Pace
-
-if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
+from flexdt.twin.long_work import time_span
 
 COMPLETION_VARIABLE: Final = "_FLEXDT_COMPLETE"
 """Variable of the environment by which a shell requests completions."""
@@ -32,8 +27,6 @@ PROCESS_COMMANDS: Final = ("twin", "projector", "viewer", "gateway")
 """Commands that pass their words on to a process, `--help` among them."""
 SERVERS: Final = ("up", *PROCESS_COMMANDS)
 """Commands that run until they are stopped."""
-_quiet = False
-"""Whether progress is not shown."""
 
 
 def speak(quiet: bool, verbose: bool) -> None:
@@ -46,8 +39,6 @@ def speak(quiet: bool, verbose: bool) -> None:
         quiet: no progress.
         verbose: slow steps with their duration, and messages of libraries.
     """
-    global _quiet
-    _quiet = quiet
     if quiet or verbose:
         import logging
 
@@ -78,10 +69,15 @@ _silences: list[Callable[[], None]] = []
 """Called once, with the first words of a command."""
 
 
-def _end_silence() -> None:
-    """End the display of a command without output."""
+def _make_room() -> None:
+    """End the display of a command without output, and take bars off the line to be
+    printed on.
+    """
     while _silences:
         _silences.pop()()
+    progress = sys.modules.get("flexdt.runtime.progress")  # which costs time to import
+    if progress is not None:
+        progress.make_room()
 
 
 @contextmanager
@@ -102,7 +98,7 @@ def waited_for(words: Sequence[str]) -> Iterator[None]:
     if words[0].startswith("-") or words[0] in SERVERS or QUIET & {*words}:
         yield
         return
-    from flexdt.runtime.progress_lines import silence_shown
+    from flexdt.runtime.progress import silence_shown
 
     with silence_shown(f"at flexdt {words[0]}") as end:
         _silences.append(end)
@@ -115,7 +111,7 @@ def say(text: str = "", end: str = "\n") -> None:
 
     It also ends the display of a silent command. Other errors of writing are raised.
     """
-    _end_silence()
+    _make_room()
     try:
         print(text, end=end, flush=True)
     except BrokenPipeError:
@@ -128,7 +124,7 @@ def note(text: str) -> None:
 
     It also ends the display of a silent command.
     """
-    _end_silence()
+    _make_room()
     try:
         print(text, file=sys.stderr, flush=True)
     except BrokenPipeError:
@@ -200,11 +196,7 @@ def duration(seconds: float) -> str:
         return "unknown"
     if seconds < 60:
         return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min"
+    return time_span(seconds)
 
 
 def size(count: float) -> str:
@@ -219,127 +211,3 @@ def size(count: float) -> str:
             return f"{count:.1f} {unit}"
         count /= 1000
     return f"{count:.1f} TB"
-
-
-PLAIN_INTERVAL_S = 2.0
-
-
-class ProgressBar:
-    """A context manager; call `update` as often as you like.
-
-    Args:
-        title: of the work.
-        unit: of the count, e.g. "frames".
-        clock: seconds, monotonic (an argument for tests).
-        terminal: draw a bar; None looks whether standard error is a terminal.
-    """
-
-    def __init__(
-        self,
-        title: str,
-        unit: str = "frames",
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        terminal: bool | None = None,
-    ) -> None:
-        """Prepare a bar, which nothing draws yet.
-
-        None for `terminal` finds that out. Entering draws it.
-
-        Args:
-            title: of the work.
-            unit: of `done` and `total`.
-            clock: [s].
-            terminal: standard error is one; found out without.
-        """
-        self._title = title
-        self._unit = unit
-        self._clock = clock
-        if terminal is None:
-            self._terminal = sys.stderr.isatty()
-        else:
-            self._terminal = terminal
-        self._bar: Progress | None = None
-        self._task: TaskID | None = None
-        self._spoken = clock()
-        self._pace = Pace()
-        self._last: tuple[float, float] | None = None
-        self._alone = ExitStack()
-
-    def __enter__(self) -> ProgressBar:
-        """Start the bar on a terminal, else print the title; do nothing where output is
-        quiet. Returns the bar.
-        """
-        if _quiet:
-            return self
-        _end_silence()
-        if self._terminal:
-            from rich.console import Console
-            from rich.progress import MofNCompleteColumn, Progress, TextColumn
-
-            usual = (
-                Progress.get_default_columns()
-            )  # description, bar, percentage, time left
-            counted = MofNCompleteColumn(), TextColumn(self._unit)
-            self._bar = Progress(*usual, *counted, console=Console(stderr=True))
-            self._bar.start()
-            # Kernels that are compiled meanwhile draw no bar of their own over this one.
-            self._alone.enter_context(long_work.during(self._title, long_work.ignore))
-            self._task = self._bar.add_task(self._title, total=None)
-        else:
-            note(f"{self._title} ...")
-        return self
-
-    def update(self, done: float, total: float | None, text: str | None = None) -> None:
-        """Show progress: in the bar, or without a terminal as a line at most every
-        PLAIN_INTERVAL_S.
-
-        As a line: never in quiet mode, and not if neither `done` nor `total` has changed.
-        In the bar `done` and `total` replace the former ones. A total that is None or 0
-        gives neither share nor time left.
-
-        Args:
-            done: units.
-            total: units, or None if unknown.
-            text: replaces the title.
-        """
-        if self._bar is not None and self._task is not None:
-            self._bar.update(
-                self._task, completed=done, total=total, description=text or self._title
-            )
-            return
-        if _quiet:
-            return
-        now = self._clock()
-        if total:
-            self._pace.advance(done / total, now)
-        if now - self._spoken < PLAIN_INTERVAL_S or (done, total or 0.0) == self._last:
-            return
-        self._spoken = now
-        self._last = (done, total or 0.0)
-        note(self._line(text or self._title, done, total, now))
-
-    def _line(self, text: str, done: float, total: float | None, now: float) -> str:
-        """Make a line of text with the amount done, its share [%] and an estimate of the
-        time left.
-
-        Without a total only the amount done; amounts that are not whole are left out; no
-        estimate at the beginning and end. `now` is the time [s]; the time left assumes the
-        pace since the first unit.
-        """
-        if not total:
-            return f"{text}: {done:g} {self._unit}"
-        if float(done).is_integer():
-            counted = f"{done:g} of {total:g} {self._unit} "
-        else:
-            counted = ""
-        line = f"{text}: {counted}({100 * done / total:.0f} %)"
-        left_s = self._pace.left_s(done / total, now)
-        if left_s is not None:
-            line += f", about {duration(left_s)} left"
-        return line
-
-    def __exit__(self, *_: object) -> None:
-        self._alone.close()
-        if self._bar is not None:
-            self._bar.stop()

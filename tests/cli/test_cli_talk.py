@@ -4,6 +4,7 @@ after."""
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import pytest
 
 from flexdt.clients.cli import console
 from flexdt.clients.cli.command_tree import run
-from flexdt.runtime.progress_lines import LOG
+from flexdt.runtime.progress import LOG, shown_work
+from flexdt.twin import long_work
 
 LISTING = str(Path(__file__).parents[2] / "examples" / "scripts" / "listing1.txt")
 
@@ -26,19 +28,29 @@ def as_before() -> Iterator[None]:
     logging.getLogger().handlers[:] = root
 
 
+def work_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in units, with lines after 20 ms where lines are written."""
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.02, 60.0))
+    # As in a program that handles no records: they go to standard error.
+    monkeypatch.setattr(LOG, "hasHandlers", lambda: False)
+    monkeypatch.setattr(LOG, "propagate", False)
+    with shown_work("scanning") as report:
+        long_work.in_units(report, "frames")(1, 3)
+        time.sleep(0.3)
+
+
 @pytest.mark.parametrize(
     "words", [["-q", "check", LISTING], ["check", LISTING, "--quiet"]]
 )
 def test_quiet_keeps_warnings_and_shows_no_progress(
-    words: list[str], capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert run(words) == 0
     assert "mag_det target 1060 mm is outside" in capsys.readouterr().err
     assert not LOG.isEnabledFor(logging.WARNING)
-    with console.ProgressBar(
-        "scanning", terminal=False, clock=iter(range(0, 900, 9)).__next__
-    ) as bar:
-        bar.update(1, 3)
+    work_for_a_while(monkeypatch)
     assert capsys.readouterr().err == ""
 
 
@@ -50,10 +62,10 @@ def test_verbose_logs_how_long_works_took(words: list[str]) -> None:
     assert LOG.isEnabledFor(logging.INFO)
 
 
-def test_without_either_progress_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_either_progress_is_shown(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert run(["check", LISTING]) == 0
-    with console.ProgressBar(
-        "scanning", terminal=False, clock=iter(range(0, 900, 9)).__next__
-    ) as bar:
-        bar.update(1, 3)
-    assert "scanning: 1 of 3 frames" in capsys.readouterr().err
+    work_for_a_while(monkeypatch)
+    err = capsys.readouterr().err
+    assert "flexdt: still scanning (1 of 3 frames, 33 %, 0 s)\n" in err

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexdt.clients.cli import console, option_values, twin_connection
-from flexdt.clients.cli.console import PLAIN_INTERVAL_S, ProgressBar
 from flexdt.runtime import process_settings
 
 
@@ -74,36 +73,6 @@ def test_speed_up() -> None:
     for word in ("0", "-1", "inf", "fast"):
         with pytest.raises(typer.BadParameter):
             process_settings.speed_up(word)
-
-
-def test_plain_progress_counts_and_estimates(capsys: pytest.CaptureFixture[str]) -> None:
-    now = [0.0]
-    with ProgressBar("scanning", clock=lambda: now[0], terminal=False) as bar:
-        bar.update(0, 100)
-        now[0] = 5000 * PLAIN_INTERVAL_S  # preparation, such as a kernel that is compiled
-        bar.update(1, 100)
-        now[0] += 2 * PLAIN_INTERVAL_S
-        bar.update(26, 100)
-        bar.update(27, 100)
-        now[0] += PLAIN_INTERVAL_S
-        bar.update(26, 100)
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.splitlines() == [
-        "scanning ...",
-        "scanning: 1 of 100 frames (1 %)",
-        f"scanning: 26 of 100 frames (26 %), about {5.92 * PLAIN_INTERVAL_S:.1f} s left",
-    ]
-
-
-def test_terminal_progress_stays_off_standard_output(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    with ProgressBar("scanning", terminal=True) as bar:
-        bar.update(3, 10)
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert "scanning" in captured.err
 
 
 def test_plain_json_has_no_nan_and_no_arrays() -> None:

@@ -6,7 +6,9 @@ from __future__ import annotations
 import inspect
 import io
 import logging
+import re
 import sys
+import threading
 import time
 import types
 from collections.abc import Callable
@@ -17,9 +19,8 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli import console
-from flexdt.runtime import progress_bars, progress_lines
+from flexdt.runtime import progress as sink
 from flexdt.twin import long_work
-from flexdt.twin.long_work import Pace
 
 LONG = (
     fx.sirt, fx.tv, fx.cgls, fx.fdk, fx.calibrate, fx.align, fx.project, fx.reconstruct,
@@ -39,16 +40,34 @@ class Terminal(io.StringIO):
 def screen(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     """A terminal; nobody handles the log; what takes 50 ms is long."""
     shown = Terminal()
-    seen = types.SimpleNamespace(stderr=shown, modules=sys.modules)
-    monkeypatch.setattr(
-        progress_bars, "sys", seen
-    )  # pytest sets its own in `sys` once more
-    monkeypatch.setattr(progress_lines, "SILENT_S", 0.05)
-    monkeypatch.setattr(progress_lines, "DRAWN_S", 0.02)
-    monkeypatch.setattr(progress_lines, "_last", {})
-    monkeypatch.setattr(progress_bars, "in_notebook", lambda: False)
-    monkeypatch.setattr(progress_lines.LOG, "hasHandlers", lambda: False)
+    # pytest sets its own in `sys` once more
+    monkeypatch.setattr(sink, "standard_error", lambda: shown)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.05,))
+    monkeypatch.setattr(sink, "DRAWN_S", 0.02)
+    monkeypatch.setattr(sink, "_past", {})
+    monkeypatch.setattr(sink, "in_notebook", lambda: False)
+    monkeypatch.setattr(sink.LOG, "hasHandlers", lambda: False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
     return shown
+
+
+def on_screen(text: str) -> str:
+    """What a terminal shows in the end after this output, its empty lines left out."""
+    rows, at = [""], 0
+    for control, printed in re.findall(
+        r"(\x1b\[[0-9;?]*[A-Za-z]|[\r\n])|([^\x1b\r\n]+)", text
+    ):
+        if printed:
+            rows[at] += printed
+        elif control == "\n":
+            at += 1
+            rows += [""] * (at == len(rows))
+        elif control == "\x1b[2K":
+            rows[at] = ""
+        elif control.endswith("A"):
+            at -= int(control[2:-1])
+    return "\n".join(filter(None, rows))
 
 
 def until(happened: Callable[[], object]) -> None:
@@ -75,21 +94,125 @@ def test_a_bar_is_drawn_after_a_while_and_goes(screen: Terminal) -> None:
             until(lambda: "measuring: compiling a kernel" in screen.getvalue())
         with long_work.during("measuring") as same:
             same(0.75)
-        until(lambda: "[##################......] 75 %" in screen.getvalue())
-    assert screen.getvalue().endswith("\r\x1b[2K")
+        until(lambda: "75 %" in screen.getvalue())
+    assert on_screen(screen.getvalue()) == ""
     drawn = screen.getvalue()
     time.sleep(0.1)
     assert screen.getvalue() == drawn
 
 
+def test_works_of_two_threads_have_a_row_each(screen: Terminal) -> None:
+    go_on = threading.Event()
+
+    def other() -> None:
+        with long_work.during("searching [b]"):
+            go_on.wait(30.0)
+
+    beside = threading.Thread(target=other)
+    with long_work.during("measuring") as advance:
+        beside.start()
+        advance(0.5, "1 of 2 images")
+        until(lambda: len(on_screen(screen.getvalue()).splitlines()) == 2)
+        until(lambda: "1 of 2 images, 50 %" in on_screen(screen.getvalue()))
+        assert "searching [b]" in on_screen(screen.getvalue())
+        go_on.set()
+        beside.join()
+        until(lambda: len(on_screen(screen.getvalue()).splitlines()) == 1)
+        assert "measuring" in on_screen(screen.getvalue())
+    assert on_screen(screen.getvalue()) == ""
+
+
+def test_a_bar_makes_room_for_a_line_and_comes_back(
+    screen: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The line goes where its stream goes: standard output has no bar."""
+    with long_work.during("measuring"):
+        until(lambda: "measuring" in screen.getvalue())
+        monkeypatch.setattr(sink, "DRAWN_S", 30.0)
+        time.sleep(0.1)
+        console.say("a result")
+        assert on_screen(screen.getvalue()) == ""
+    assert capsys.readouterr().out == "a result\n"
+
+
+def test_the_whole_is_shown_at_the_end_only(screen: Terminal) -> None:
+    with long_work.during("measuring") as advance:
+        advance(1.0)
+        until(lambda: "99 %" in screen.getvalue())
+    assert "100" not in screen.getvalue()
+
+
+def test_a_terminal_that_cannot_draw_gets_lines(
+    screen: Terminal, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    with long_work.during("measuring"):
+        until(lambda: caplog.messages)
+    assert caplog.messages[0] == "flexdt: still measuring (0 s)"
+    assert screen.getvalue() == ""
+
+
+def test_a_terminal_that_went_away_ends_no_work(
+    screen: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with long_work.during("measuring"):
+        until(lambda: "measuring" in screen.getvalue())
+        screen.close()
+        time.sleep(0.1)
+
+
+def test_no_estimate_while_another_thread_compiles(
+    screen: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(long_work, "LEAST_LEFT_S", 0.0)
+    with long_work.during("measuring") as advance:
+        for done in (0.1, 0.2, 0.3):
+            time.sleep(0.2)
+            advance(done)
+        until(lambda: "30 %, 1 s, about 1 s left" in screen.getvalue())
+        compiles = threading.Event()
+
+        def other() -> None:
+            with long_work.during("compiling a kernel"):
+                compiles.wait(30.0)
+
+        beside = threading.Thread(target=other)
+        beside.start()
+        until(lambda: "compiling a kernel" in screen.getvalue())
+        drawn = len(screen.getvalue())
+        time.sleep(0.2)
+        assert "30 %" in screen.getvalue()[drawn:]
+        assert "left" not in screen.getvalue()[drawn:]
+        compiles.set()
+        beside.join()
+
+
+def test_work_that_fails_is_taken_off(screen: Terminal) -> None:
+    told: list[float] = []
+
+    def fail(progress: Any) -> None:
+        with long_work.during("measuring", progress) as report:
+            report(1.0)
+            until(lambda: "measuring" in screen.getvalue())
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail(None)
+    assert on_screen(screen.getvalue()) == ""
+    with pytest.raises(ZeroDivisionError):
+        fail(told.append)
+    assert told == []
+
+
 def test_a_program_is_shown_until_its_first_words(screen: Terminal) -> None:
     """Imports and plans of a command are no silence; its own work is shown in its place."""
-    with progress_lines.silence_shown("at flexdt check") as first_words:
+    with sink.silence_shown("at flexdt check") as first_words:
         until(lambda: "at flexdt check" in screen.getvalue())
         with long_work.during("measuring") as advance:
             advance(0.25)
             until(lambda: "25 %" in screen.getvalue())
-            drawn = screen.getvalue().rindex("measuring")
+            until(lambda: "at flexdt check" not in on_screen(screen.getvalue()))
+            drawn = len(screen.getvalue())
             time.sleep(0.1)
             assert "at flexdt check" not in screen.getvalue()[drawn:]
         first_words()
@@ -126,7 +249,7 @@ def test_commands_show_their_silence_but_for_servers_help_and_quiet_ones(
 def test_short_work_shows_nothing(
     screen: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress_lines, "SILENT_S", 30.0)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (30.0,))
     with long_work.during("measuring") as advance:
         advance(0.5)
         time.sleep(0.1)
@@ -139,8 +262,8 @@ def test_silence(
 ) -> None:
     told: list[float] = []
     if progress == "level":
-        monkeypatch.setattr(progress_lines.LOG, "level", logging.ERROR)
-        progress_lines.LOG.manager._clear_cache()  # type: ignore[attr-defined]
+        monkeypatch.setattr(sink.LOG, "level", logging.ERROR)
+        sink.LOG.manager._clear_cache()  # type: ignore[attr-defined]
         progress = None
     chosen = told.append if progress == "function" else progress
     with long_work.during("measuring", chosen) as advance, long_work.during("compiling"):
@@ -148,19 +271,19 @@ def test_silence(
         time.sleep(0.2)
     assert screen.getvalue() == ""
     assert told == ([0.5, 1.0] if progress == "function" else [])
-    progress_lines.LOG.manager._clear_cache()  # type: ignore[attr-defined]
+    sink.LOG.manager._clear_cache()  # type: ignore[attr-defined]
 
 
 def test_a_program_that_handles_the_log_gets_lines(
     screen: Terminal, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.undo()
-    monkeypatch.setattr(progress_lines, "SILENT_S", 0.05)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.05,))
     with long_work.during("measuring") as advance:
         advance(0.25)
         advance(0.5)
         until(lambda: caplog.messages)
-    assert caplog.messages[0].startswith("flexdt: still measuring (50 %, 0 s, about ")
+    assert caplog.messages[0] == "flexdt: still measuring (50 %, 0 s)"
     assert caplog.records[0].name == "flexdt.progress"
 
 
@@ -168,7 +291,7 @@ def test_works_that_follow_each_other_are_one_wait(
     screen: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Thirty kernels of a second each are half a minute; other work begins at 0 s."""
-    monkeypatch.setattr(progress_lines, "SILENT_S", 0.3)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.3,))
     for _ in range(6):
         with long_work.during("compiling one of many"):
             time.sleep(0.1)
@@ -183,29 +306,11 @@ def test_the_same_call_once_more_begins_at_0_s(
     screen: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second call of four neither shows what the first took nor is shown sooner."""
-    monkeypatch.setattr(progress_lines, "SILENT_S", 0.3)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.3,))
     for _ in range(4):
         with long_work.during("calibrating"):
             time.sleep(0.1)
     assert screen.getvalue() == ""
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_time_left_follows_the_pace_and_not_the_preparation(seed: int) -> None:
-    """A kernel compiles for a drawn time, then each percent takes as long as the others."""
-    rng = np.random.default_rng(6400 + seed)
-    prepared, percent_s = rng.uniform(5.0, 60.0), rng.uniform(0.05, 2.0)
-    pace = Pace()
-    pace.advance(0.0, 0.0)
-    assert pace.left_s(0.0, 0.0) is None
-    for percent in range(1, 101):
-        now = prepared + percent * percent_s
-        pace.advance(percent / 100.0, now)
-        left = pace.left_s(percent / 100.0, now)
-        if percent <= 10 or percent == 100:
-            assert left is None
-        else:
-            assert left == pytest.approx((100 - percent) * percent_s)
 
 
 def test_a_notebook_s_bar_is_one_display(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,9 +323,9 @@ def test_a_notebook_s_bar_is_one_display(monkeypatch: pytest.MonkeyPatch) -> Non
 
     fake = types.SimpleNamespace(HTML=str, display=display)
     monkeypatch.setitem(sys.modules, "IPython.display", fake)  # type: ignore[arg-type]
-    bar = progress_bars.NotebookBar()
-    bar.show("a < b", 0.5, 3.0, 3.0)
-    bar.show("a < b", None, 4.0, None)
+    bar = sink.NotebookBar()
+    bar.show("a < b", 0.5, "50 %, 3 s, about 3 s left")
+    bar.show("a < b", None, "4 s")
     bar.close()
     assert shown == [
         '<progress max="1" value="0.500" aria-label="a &lt; b"></progress> '

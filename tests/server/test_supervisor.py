@@ -28,6 +28,7 @@ from flexdt.runtime import supervisor as module
 from flexdt.runtime.process_settings import Address, UpSettings
 from flexdt.runtime.settings import parse
 from flexdt.runtime.supervisor import Addresses, Service, ServiceError, Supervisor
+from flexdt.twin import long_work
 
 pytestmark = pytest.mark.slow
 
@@ -85,9 +86,8 @@ while True:
 def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Service]:
     (tmp_path / "fake_service.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(
-        module, "SILENT_S", 1e6
-    )  # a loaded machine adds no notes of its own
+    # A loaded machine adds no notes of its own.
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (1e6,))
 
     def make(mode: str) -> Service:
         def command(known: Addresses) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ def test_services_start_in_order_and_stop_without_orphans(
 def test_who_waits_is_told_for_what(
     fake: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "SILENT_S", 0.0)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.0,))
     slow = replace(fake("one"), slow="it compiles")
     notes = supervise([slow, fake("two")], None)[1]
     assert [note for note in notes if "still starting" not in note] == [
@@ -333,7 +333,7 @@ def test_a_start_may_take_as_long_as_it_works(
 ) -> None:
     """Four seconds of work where one second of nothing would end it."""
     monkeypatch.setattr(module, "STALLED_S", 1.0)
-    monkeypatch.setattr(module, "SILENT_S", 0.5)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.5,))
     _, notes = supervise([fake("working")], None)
     assert len(started(tmp_path, "working")) == 1
     told = [note for note in notes if "is still starting" in note]

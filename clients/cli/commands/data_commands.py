@@ -17,12 +17,13 @@ import typer
 
 from flexdt.clients.cli import option_values, options
 from flexdt.clients.cli.command_settings import ReconstructSettings
-from flexdt.clients.cli.console import ProgressBar, duration, note, size, warn
+from flexdt.clients.cli.console import duration, note, size, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import chosen
 from flexdt.library.datasets.exchange_formats import FORMATS, exported, imported
 from flexdt.library.failure import CommandError
 from flexdt.runtime.files.whole_files import bytes_of
+from flexdt.twin import long_work
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT
 
 if TYPE_CHECKING:
@@ -148,16 +149,17 @@ def reconstruct(
         )
     workers = _workers(scheduler, slurm)
     unit = _unit_of_progress(request.algorithm, shared)
-    with ProgressBar(f"{request.algorithm} of {dataset.name}", unit) as bar:
+    with long_work.during(f"{request.algorithm} of {dataset.name}") as advance:
+        counted = long_work.in_units(advance, unit)
         if preview:
-            document = quick_look(data, out, parameters=parameters, progress=bar.update)
+            document = quick_look(data, out, parameters=parameters, progress=counted)
         else:
             document = reconstruct_dataset(
                 data,
                 out,
                 request,
                 parameters=parameters,
-                progress=bar.update,
+                progress=counted,
                 workers=workers,
                 memory=chosen(ReconstructSettings).memory,
             )

@@ -17,10 +17,11 @@ from flexdt.clients.cli.boundary import (
 )
 from flexdt.clients.cli.commands.scanner_commands import warn_of_exposure
 from flexdt.clients.cli.commands.script_files import ScriptFile
-from flexdt.clients.cli.console import ProgressBar, duration, note, table, warn
+from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, option
 from flexdt.library.failure import CommandError
 from flexdt.runtime import process_settings
+from flexdt.twin import long_work
 
 if TYPE_CHECKING:
     from flexdt.clients.client.client import TwinClient
@@ -121,18 +122,15 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
     def show(status: JobStatus) -> None:
         """Update the progress bar, and report why a job is paused.
 
-        A reason is shown once; only an own job raises. In any state but running the bar's
-        text names it.
+        A reason is shown once; only an own job raises. Any state but running is named
+        beside the bar.
 
         Raises:
             CommandError: the job is paused, and only this command could resume it.
         """
         nonlocal shown
-        if status.state != "running":
-            text = f"{job}: {status.state}"
-        else:
-            text = None
-        bar.update(status.frames_done, status.frames_total or None, text)
+        state = "" if status.state == "running" else status.state
+        counted(status.frames_done, status.frames_total, state)
         if status.error:
             reason = str(status.error.get("message", ""))
         else:
@@ -144,7 +142,8 @@ def follow(client: TwinClient, job: str, *, own: bool = False) -> JobStatus:
             note(f"{job} is paused: {reason}; `flexdt job resume {job}` goes on")
 
     try:
-        with ProgressBar(f"{job}: scanning") as bar:
+        with long_work.during(job) as report:
+            counted = long_work.in_units(report, "frames")
             return client.wait_job(job, show)
     except KeyboardInterrupt:
         if own:

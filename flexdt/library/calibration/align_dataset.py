@@ -132,7 +132,7 @@ def align_dataset(data: Images, per_frame: bool = False) -> Aligned[Images]:
         base = data.correction.parameters
     frames, poses = _at_rest(data)
     passes = long_work.Passes(len(data))
-    with long_work.during("aligning") as passes.advance:
+    with long_work.during("aligning") as passes.report:
         alignment = align_turn(
             passes.counting(frames),
             poses,

@@ -371,7 +371,7 @@ def _calibrate_images(
         for d in datasets
     ]
     with (
-        long_work.during("calibrating") as passes.advance,
+        long_work.during("calibrating") as passes.report,
         saturation_named(saturated),
     ):
         return calibrate(scans, phantom, request, detector=detector)

@@ -15,7 +15,7 @@ from flexdt.library.notebook.notebook_pages import (
     volume_page,
 )
 from flexdt.library.notebook.notebook_slices import AXES, grey_of, layer_of, window_of
-from flexdt.runtime.progress_bars import in_notebook
+from flexdt.runtime.progress import in_notebook
 
 if TYPE_CHECKING:
     from flexdt.twin.geometry.cone_vec import ConeVec

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.runtime import compile_ahead, progress_lines
+from flexdt.runtime import compile_ahead
+from flexdt.twin import long_work
 from flexdt.twin.projection.kernels import compiling
 from flexdt.twin.projection.kernels.siddon_kernels import clip
 
@@ -84,7 +85,7 @@ def test_who_waits_for_one_kernel_is_told_which(
     def sum_of_squares(n: int) -> int:
         return sum([i * i for i in range(n)])
 
-    monkeypatch.setattr(progress_lines, "SILENT_S", 0.01)
+    monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.01,))
     assert compiling.serial(sum_of_squares, cache=False)(4) == 14
     told = [record.getMessage() for record in caplog.records]
     assert any(
