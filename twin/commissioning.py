@@ -20,7 +20,7 @@ import numpy as np
 
 from flexdt.twin.calibration.fit.fit import axis_in_image
 from flexdt.twin.calibration.fit.priors import prior_widths
-from flexdt.twin.calibration.without_phantom.alignment import Alignment
+from flexdt.twin.calibration.without_phantom.alignment import AlignEstimate, Alignment
 from flexdt.twin.dataset import rebuild, scan_settings, stated_geometry
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
@@ -334,55 +334,102 @@ def contradictions(
         fitted: machine with the signs and limits that the scans show; by it the scans are
             read.
     """
-    statements: dict[str, list[tuple[Any, list[str]]]] = {}
     lengths = {*fitted.axes, *(f"{name} of the texts" for name in OFFSETS)}
-    every = [
-        (f"{name} in {scan.name}", value, who, name)
+    opinions: dict[str, list[_Opinion]] = {}
+    for about, value, who, name in _statements(scans, shipped, fitted):
+        slack = (0.0, rebuild.MATCH_MM) if name in lengths else (RELATIVE_TOLERANCE, 0.0)
+        _join(opinions.setdefault(about, []), value, who, slack)
+    for about, different in opinions.items():
+        if len(different) > 1:
+            words = [f"{_plain(x.value)} in {_some(x.held_by)}" for x in different]
+            yield Finding(about, "; ".join(words))
+    for scan in scans:
+        problem = _camera_problem(scan, shipped)
+        if problem:
+            yield Finding(f"camera in {scan.name}", f"machine {shipped.name}: {problem}")
+
+
+class _Statement(NamedTuple):
+    """A value that somebody states.
+
+    Attributes:
+        about: what it is compared as: a quantity, of one scan or of all.
+        value: of the quantity.
+        who: states it.
+        name: of the quantity, without the scan.
+    """
+
+    about: str
+    value: Any
+    who: str
+    name: str
+
+
+class _Opinion(NamedTuple):
+    """A value, and who states one that agrees with it."""
+
+    value: Any
+    held_by: list[str]
+
+
+def _join(
+    opinions: list[_Opinion], value: Any, who: str, slack: tuple[float, float]
+) -> None:
+    """Add a statement to the first opinion with which it agrees within `slack` (relative,
+    absolute), else as an opinion of its own.
+    """
+    for opinion in opinions:
+        if _agree(value, opinion.value, slack):
+            if who not in opinion.held_by:
+                opinion.held_by.append(who)
+            return
+    opinions.append(_Opinion(value, [who]))
+
+
+def _statements(
+    scans: Sequence[PastScan], shipped: Machine, fitted: Machine
+) -> list[_Statement]:
+    """List what scans state of themselves, what of the scanner, and what the shipped
+    machine states of the same; then the signs of all axes.
+
+    Args:
+        scans, shipped, fitted: as for `contradictions`.
+    """
+    own = [
+        _Statement(f"{name} in {scan.name}", value, who, name)
         for scan in scans
         for name, value, who in _own_statements(scan, fitted)
     ]
-    every += [
-        (name, value, scan.name, name)
+    common = [
+        _Statement(name, value, scan.name, name)
         for scan in scans
         for name, value in _common_statements(scan, fitted)
     ]
-    known = {about for about, *_ in every}
-    every += [
-        (name, value, f"machine {shipped.name}", name)
+    known = {statement.about for statement in (*own, *common)}
+    machine = f"machine {shipped.name}"
+    stated = [
+        _Statement(name, value, machine, name)
         for name, value in _of_machine(shipped)
         if name in known
     ]
-    every += [
-        (f"sign of {name}", axis.settings_sign, who, name)
-        for m, who in ((fitted, "the scans' texts"), (shipped, f"machine {shipped.name}"))
-        for name, axis in m.axes.items()
+    signs = [
+        _Statement(f"sign of {name}", axis.settings_sign, who, name)
+        for of, who in ((fitted, "the scans' texts"), (shipped, machine))
+        for name, axis in of.axes.items()
     ]
-    for about, value, who, name in every:
-        if name in lengths:
-            slack = (0.0, rebuild.MATCH_MM)
-        else:
-            slack = (RELATIVE_TOLERANCE, 0.0)
-        values = statements.setdefault(about, [])
-        names = next((n for other, n in values if _agree(value, other, slack)), None)
-        if names is None:
-            values.append((value, [who]))
-        elif who not in names:
-            names.append(who)
-    for about, values in statements.items():
-        if len(values) > 1:
-            yield Finding(
-                about, "; ".join(f"{_plain(v)} in {_some(n)}" for v, n in values)
-            )
-    for scan in scans:
-        try:
-            if scan.settings is not None and scan.settings.mode is not None:
-                shipped.detector.check_mode(scan.settings.mode)
-            if scan.camera is not None:
-                check_roi(scan.camera.roi, shipped.detector.pixels, scan.camera.binning)
-        except TwinError as error:
-            yield Finding(
-                f"camera in {scan.name}", f"machine {shipped.name}: {error.message}"
-            )
+    return [*own, *common, *stated, *signs]
+
+
+def _camera_problem(scan: PastScan, machine: Machine) -> str:
+    """Say why a machine does not allow a scan's camera mode or region; "" if it does."""
+    try:
+        if scan.settings is not None and scan.settings.mode is not None:
+            machine.detector.check_mode(scan.settings.mode)
+        if scan.camera is not None:
+            check_roi(scan.camera.roi, machine.detector.pixels, scan.camera.binning)
+    except TwinError as error:
+        return error.message
+    return ""
 
 
 def _own_statements(scan: PastScan, machine: Machine) -> Iterator[tuple[str, Any, str]]:
@@ -543,86 +590,175 @@ def zero_offsets(
     base = next(
         (scan.profile for scan in reversed(scans) if scan.profile is not None), usual
     )
+    last = max((scan.date for scan in scans if scan.date is not None), default=None)
+    width = prior_widths(machine, usual)["dD_x"]
+    aligned = _aligned(scans, last)
     lines = {name: Line(getattr(base, name)) for name in OFFSETS}
     findings = list[Finding]()
     columns = dict[str, tuple[float, float, float]]()
-    last = max((scan.date for scan in scans if scan.date is not None), default=None)
-    aligned = [
-        s for s in scans if s.aligned is not None and "det_roll" in s.aligned.parameters
-    ]
-    drifts = len({s.date for s in aligned if s.date is not None}) >= FOR_A_LINE
-    aligned = [s for s in aligned if s.date is not None or not drifts]
-    width = prior_widths(machine, usual)["dD_x"]
+    if aligned.scans:
+        roll = _fit_roll(aligned, base)
+        lines["det_roll_deg"] = aligned.line(roll, 0, base.det_roll_deg)
+        axis, sides, nominal = _fit_axis(aligned, machine, base, width)
+        lines["axs_tan"] = aligned.line(axis, 0, base.axs_tan)
+        lines["det_tan"] = aligned.line(axis, 2, base.det_tan)
+        findings = [
+            *aligned.contradictions(roll, "det_roll_deg"),
+            *aligned.contradictions(axis, "axs_tan"),
+        ]
+        columns = _columns(aligned, axis, sides, nominal)
+    profile = _profile(machine, lines, last)
+    questions = _open_questions(lines, aligned.drifts, width)
+    return ZeroOffsets(profile, lines, columns, findings, questions)
 
-    def fitted(
-        sides: FloatArray, rest: list[float], sigmas: list[float], *names: str
-    ) -> tuple[FloatArray, FloatArray]:
-        """Fit offsets to all aligned scans, put them into `lines`, and add a finding for
-        each scan that contradicts.
 
-        A drift is stored only for the first name, and only where there are enough dates;
-        contradictions are above `MAX_SIGMAS`.
+class _Fit(NamedTuple):
+    """Offsets fitted to all aligned scans.
+
+    Attributes:
+        at: (k,) values, the second one the drift of the first.
+        covariance: (k, k).
+        pulls: residual of each scan, also of one left out [sigmas].
+    """
+
+    at: FloatArray
+    covariance: FloatArray
+    pulls: FloatArray
+
+
+class _AlignedScans(NamedTuple):
+    """The scans whose images tell where the axis is.
+
+    Attributes:
+        scans: in the order of their dates.
+        years: (scans,) since the last date, so at most 0; 0 without a date.
+        drifts: whether they are of enough dates to tell a drift.
+    """
+
+    scans: Sequence[PastScan]
+    years: FloatArray
+    drifts: bool
+
+    def estimates(self, name: str) -> list[AlignEstimate]:
+        """Each scan's estimate of a parameter of its alignment."""
+        return [s.aligned.parameters[name] for s in self.scans if s.aligned is not None]
+
+    def line(self, fit: _Fit, i: int, before: float) -> Line:
+        """Make the line of a fitted offset.
 
         Args:
-            sides: (scans + priors, k) design matrix; rows beyond those of the scans are
-                priors, of the drift first.
-            rest: right-hand sides.
-            sigmas: of these.
-            *names: of one or two offsets.
-
-        Returns:
-            Values (k,) and covariance (k, k).
+            fit: of the offset.
+            i: number of the offset in it; the first one has the drift.
+            before: value to which the fit is a correction.
         """
-        at, covariance, pulls = _fit(
-            sides, np.array(rest), np.array(sigmas), len(aligned)
-        )
-        widths = np.sqrt(np.diag(covariance)).tolist()
-        for name, i in zip(names, (0, 2), strict=False):
-            slope = {"per_year": float(at[1]), "drift_sigma": widths[1]}
-            value = lines[name].value + float(at[i])
-            more = slope if drifts and i == 0 else {}
-            lines[name] = Line(value, widths[i], scans=len(aligned), **more)
-        for scan, pull in zip(aligned, pulls.tolist(), strict=True):
-            if abs(pull) > MAX_SIGMAS:
-                text = f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans"
-                findings.append(Finding(names[0], text))
-        return at, covariance
+        sigmas = np.sqrt(np.diag(fit.covariance)).tolist()
+        line = Line(before + float(fit.at[i]), sigmas[i], scans=len(self.scans))
+        if i or not self.drifts:
+            return line
+        return line._replace(per_year=float(fit.at[1]), drift_sigma=sigmas[1])
 
-    if aligned:
-        years = np.array(
-            [
-                (s.date - last).total_seconds() / YEAR_S if s.date and last else 0.0
-                for s in aligned
-            ]
-        )
-        estimates = [s.aligned.parameters for s in aligned if s.aligned]
-        rolls = [p["det_roll"] for p in estimates]
-        sides = np.vstack([np.column_stack([np.ones(len(aligned)), years]), [0.0, 1.0]])
-        rest = [*(r.value - base.det_roll_deg for r in rolls), 0.0]
-        fitted(
-            sides, rest, [*(r.sigma for r in rolls), DRIFT_PRIOR_PER_YEAR], "det_roll_deg"
-        )
-        seen = np.array(
-            [
-                _axis(machine, s, base, r.value)
-                for s, r in zip(aligned, rolls, strict=True)
-            ]
-        )
-        sides = np.column_stack([seen[:, 1], seen[:, 1] * years, seen[:, 2]])
-        measured = [p["axis_column_px"] for p in estimates]
-        rest = [
-            *(m.value - at for m, at in zip(measured, seen[:, 0], strict=True)),
-            0.0,
-            0.0,
+    def contradictions(self, fit: _Fit, name: str) -> list[Finding]:
+        """Make a finding of each scan beyond `MAX_SIGMAS` from the line of an offset."""
+        return [
+            Finding(
+                name, f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans"
+            )
+            for scan, pull in zip(self.scans, fit.pulls.tolist(), strict=True)
+            if abs(pull) > MAX_SIGMAS
         ]
-        sigmas = [*(m.sigma for m in measured), DRIFT_PRIOR_PER_YEAR, width]
-        known = np.vstack([sides, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        at, covariance = fitted(known, rest, sigmas, "axs_tan", "det_tan")
-        spread = np.sqrt(np.einsum("ij,jk,ik->i", sides, covariance, sides))
-        for s, m, *more in zip(
-            aligned, measured, seen[:, 0] + sides @ at, spread, strict=True
-        ):
-            columns[s.name] = (m.value, float(more[0]), float(more[1]))
+
+
+def _aligned(scans: Sequence[PastScan], last: datetime | None) -> _AlignedScans:
+    """Choose the scans whose images give roll and axis column; undated ones only where
+    the others have too few dates for a drift.
+
+    Args:
+        scans: all past scans.
+        last: the last date; None without one.
+    """
+    told = [
+        s for s in scans if s.aligned is not None and "det_roll" in s.aligned.parameters
+    ]
+    drifts = len({s.date for s in told if s.date is not None}) >= FOR_A_LINE
+    told = [s for s in told if s.date is not None or not drifts]
+    years = [
+        (s.date - last).total_seconds() / YEAR_S if s.date and last else 0.0 for s in told
+    ]
+    return _AlignedScans(told, np.array(years), drifts)
+
+
+def _fit_roll(aligned: _AlignedScans, base: Profile) -> _Fit:
+    """Fit the roll of the detector beyond that of `base`, and its drift [deg, a year]."""
+    rolls = aligned.estimates("det_roll")
+    ones = np.ones(len(aligned.scans))
+    return _fit(
+        np.vstack([np.column_stack([ones, aligned.years]), [0.0, 1.0]]),
+        np.array([*(r.value - base.det_roll_deg for r in rolls), 0.0]),
+        np.array([*(r.sigma for r in rolls), DRIFT_PRIOR_PER_YEAR]),
+        len(aligned.scans),
+    )
+
+
+def _fit_axis(
+    aligned: _AlignedScans, machine: Machine, base: Profile, width: float
+) -> tuple[_Fit, FloatArray, FloatArray]:
+    """Fit axs_tan, its drift and det_tan beyond those of `base` to the columns of the axis.
+
+    Args:
+        aligned: at least one scan.
+        machine: that made them.
+        base: offsets of the texts.
+        width: sigma of det_tan's prior [mm].
+
+    Returns:
+        The fit [mm, a year]; how each scan's column changes with its values, (scans, 3)
+        [px/mm]; and the columns with the offsets of `base`, (scans,) [px].
+    """
+    rolls = aligned.estimates("det_roll")
+    measured = aligned.estimates("axis_column_px")
+    seen = np.array(
+        [
+            _axis(machine, s, base, r.value)
+            for s, r in zip(aligned.scans, rolls, strict=True)
+        ]
+    )
+    nominal = seen[:, 0]
+    sides = np.column_stack([seen[:, 1], seen[:, 1] * aligned.years, seen[:, 2]])
+    rest = [m.value - at for m, at in zip(measured, nominal, strict=True)]
+    fit = _fit(
+        np.vstack([sides, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+        np.array([*rest, 0.0, 0.0]),
+        np.array([*(m.sigma for m in measured), DRIFT_PRIOR_PER_YEAR, width]),
+        len(aligned.scans),
+    )
+    return fit, sides, nominal
+
+
+def _columns(
+    aligned: _AlignedScans, axis: _Fit, sides: FloatArray, nominal: FloatArray
+) -> dict[str, tuple[float, float, float]]:
+    """Collect each scan's column of the axis: measured, fitted, and sigma of the fitted one
+    [px].
+
+    Args:
+        aligned: the scans.
+        axis, sides, nominal: of `_fit_axis`.
+    """
+    fitted = nominal + sides @ axis.at
+    spread = np.sqrt(np.einsum("ij,jk,ik->i", sides, axis.covariance, sides))
+    measured = aligned.estimates("axis_column_px")
+    return {
+        s.name: (m.value, float(at), float(sigma))
+        for s, m, at, sigma in zip(aligned.scans, measured, fitted, spread, strict=True)
+    }
+
+
+def _profile(
+    machine: Machine, lines: Mapping[str, Line], last: datetime | None
+) -> Profile:
+    """Make the profile of the lines' values, rounded to six decimals, whose source says how
+    many scans each is from; it is named after the last date.
+    """
     day = "undated"
     if last is not None:
         day = f"{last:%Y-%m-%d}"
@@ -635,9 +771,20 @@ def zero_offsets(
         "date": day,
         "source": source,
     }
-    profile = Profile.model_validate(
-        head | {n: round(x.value, 6) for n, x in lines.items()}
-    )
+    return Profile.model_validate(head | {n: round(x.value, 6) for n, x in lines.items()})
+
+
+def _open_questions(
+    lines: Mapping[str, Line], drifts: bool, width: float
+) -> list[Question]:
+    """List the offsets that scans do not tell, and whether scans of further magnifications
+    or dates would.
+
+    Args:
+        lines: of all offsets.
+        drifts: whether scans tell a drift.
+        width: of det_tan's prior [mm].
+    """
     questions = [
         Question(n, "no scan's images tell it; it is the texts'", by)
         for n, by in TELLS.items()
@@ -649,7 +796,7 @@ def zero_offsets(
     if not drifts:
         why = f"it takes scans of {FOR_A_LINE} dates whose images tell the axis"
         questions.append(Question("drift", why, "later"))
-    return ZeroOffsets(profile, lines, columns, findings, questions)
+    return questions
 
 
 def _axis(
@@ -687,9 +834,7 @@ def _axis(
     return column[0], column[1] - column[0], column[2] - column[0]
 
 
-def _fit(
-    sides: FloatArray, values: FloatArray, sigmas: FloatArray, scans: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _fit(sides: FloatArray, values: FloatArray, sigmas: FloatArray, scans: int) -> _Fit:
     """Fit by weighted least squares of rows, of which the first `scans` belong to a scan
     each.
 
@@ -703,9 +848,6 @@ def _fit(
         sigmas: (m,) of the values.
         scans: number of rows that belong to scans.
 
-    Returns:
-        Values (k,), covariance (k, k), and the residuals of all scans, also of those left
-        out, in sigmas.
     """
     a, b = sides / sigmas[:, None], values / sigmas
     used = np.ones(len(b), dtype=bool)
@@ -719,9 +861,6 @@ def _fit(
         freedom = int(used.sum()) - a.shape[1]
         far = np.where(used[:scans], np.abs(pulls), 0.0)
         if freedom < FOR_A_LINE or far.max() <= MAX_SIGMAS:
-            return (
-                at,
-                max(1.0, float(rest[used] @ rest[used]) / max(freedom, 1)) * inverse,
-                pulls,
-            )
+            scatter = float(rest[used] @ rest[used]) / max(freedom, 1)
+            return _Fit(at, max(1.0, scatter) * inverse, pulls)
         used[int(far.argmax())] = False
