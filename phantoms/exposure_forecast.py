@@ -20,6 +20,7 @@ from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
+from flexdt.twin.findings import Findings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings, Roi
@@ -51,7 +52,6 @@ from flexdt.twin.script.planning.sample_findings import (
     sample_problems,
     shares_behind,
 )
-from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.script.scan_request import Kind, ScanRequest
 from flexdt.twin.signatures import public
 
@@ -552,7 +552,7 @@ class _SeenDetail:
         return replace(whole, exposure_ms=time_ms / reads, averages=reads)
 
 
-def exposure_problems(plan: ScanPlan, phantom: Phantom) -> tuple[ScriptProblem, ...]:
+def exposure_problems(plan: ScanPlan, phantom: Phantom) -> Findings:
     """Warn of a plan's projections whose pixels will be saturated or starved.
 
     Without scatter, by the machine's detector and tube. Problems that the open beam has

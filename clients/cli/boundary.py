@@ -38,9 +38,6 @@ WIRE_EXIT_CODES: Final[Mapping[object, int]] = {
 
 UNREACHABLE: Final = (errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.ENETUNREACH)
 
-LIMIT_CODES: Final = ("limit", "collision")
-"""Codes of a script's problems that mean exit code 3."""
-
 
 def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     """Return the lines to print for an error, and its exit code.
@@ -157,8 +154,10 @@ def verdict(errors: Iterable[str]) -> int:
 
     No errors give 0. Collision and limit alone give LIMIT.
     """
+    from flexdt.twin.script.problems import ScriptCode
+
     codes = set(errors)
-    if codes - set(LIMIT_CODES):
+    if codes - {ScriptCode.LIMIT, ScriptCode.COLLISION}:
         return INVALID
     return LIMIT if codes else DONE
 

@@ -29,6 +29,7 @@ from flexdt.clients.following.recording import (
 )
 from flexdt.protocol.acquila import AcquilaError
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import WARNING
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Alarm, Mirror
 from flexdt.twin.machine.description import ZERO, Machine, Profile
@@ -225,7 +226,7 @@ class FollowSession:
                 self.mirror = self.mirror.cleared("frames")
             except (TwinError, OSError) as error:
                 alarm = Alarm(
-                    self.clock(), "warning", "frame", "frames", f"{path.name}: {error}"
+                    self.clock(), WARNING, "frame", "frames", f"{path.name}: {error}"
                 )
                 self._take(self.mirror.alarmed(alarm))
 

@@ -22,12 +22,12 @@ from flexdt.library.report_page import (
     table,
 )
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import Finding
 from flexdt.twin.script.dry_run_report import against_summary, between, summary
 from flexdt.twin.script.log_fit import LogComparison
 from flexdt.twin.script.planning.check_findings import Clearance
 from flexdt.twin.script.planning.plan import CheckReport
 from flexdt.twin.script.planning.time_ranges import step_range
-from flexdt.twin.script.problems import ScriptProblem
 
 
 def html_report(report: CheckReport, name: str = "script") -> str:
@@ -104,7 +104,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else "·" for c in lines)
 
 
-def _problems(problems: Sequence[ScriptProblem]) -> list[str]:
+def _problems(problems: Sequence[Finding]) -> list[str]:
     """Make HTML parts on a script's problems: heading and table of line, severity, code
     and message; [] without any."""
     if not problems:

@@ -26,7 +26,6 @@ from flexdt.twin.script import (
 )
 from flexdt.twin.script.dry_run import CollisionCheck, check_plan
 from flexdt.twin.script.planning.plan_values import StartState
-from flexdt.twin.script.problems import in_order
 from flexdt.twin.signatures import File, public
 
 machine = public(find_machine)
@@ -107,7 +106,7 @@ def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
     from flexdt.phantoms.exposure_forecast import exposure_problems
 
     more = exposure_problems(report.plan, phantom)
-    return replace(report, problems=in_order((*report.problems, *more)))
+    return replace(report, problems=report.problems.and_also(more).by_place())
 
 
 def size_of(phantom: Phantom | None) -> SampleSize | None:

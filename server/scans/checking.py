@@ -29,6 +29,7 @@ from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.collision.plan_report import collision_check
+from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.predicted_beam import Physics
@@ -36,7 +37,6 @@ from flexdt.twin.script import (
     CheckReport,
     Clearance,
     ScanPlan,
-    ScriptProblem,
     StartState,
     dry_run,
     plan_poses,
@@ -49,7 +49,7 @@ from flexdt.twin.script.planning.sample_findings import (
     sample_probes,
     sample_problems,
 )
-from flexdt.twin.script.problems import in_order
+from flexdt.twin.script.problems import ScriptCode
 
 MAX_PARALLEL_CHECKS: Final = 2
 """Largest number of checks in worker processes at a time; others wait."""
@@ -287,7 +287,7 @@ def planned(check_input: CheckInput) -> tuple[ScanPlan, list[str]]:
     """
     report = check_input.report()
     require_runnable(report)
-    warnings = [p.where_and_what for p in report.warnings[:MAX_PROBLEMS]]
+    warnings = [p.placed_text for p in report.warnings[:MAX_PROBLEMS]]
     left = len(report.warnings) - MAX_PROBLEMS
     return report.plan, [*warnings, f"and {left} more"] if left > 0 else warnings
 
@@ -344,7 +344,7 @@ def _encoded(
     found = check_input.report(most)
     if seen is not None and not found.errors:
         more = sample_problems(seen, found.problems)
-        found = replace(found, problems=in_order((*found.problems, *more)))
+        found = replace(found, problems=found.problems.and_also(more).by_place())
     report = found.to_dict()
     match codec:
         case Codec.JSON:
@@ -402,9 +402,9 @@ def require_runnable(report: CheckReport) -> None:
     """
     if report.ok:
         return
-    problems: list[ScriptProblem] = list(report.problems)
-    errors = [p for p in problems if p.severity == "error"]
-    other = [p for p in errors if p.code != "collision"]
+    problems = report.problems
+    errors = problems.errors
+    other = errors.without(ScriptCode.COLLISION)
     if other:
         first = other[0]
         more = ""
@@ -434,11 +434,11 @@ def require_runnable(report: CheckReport) -> None:
     )
 
 
-def _worst(problems: list[ScriptProblem]) -> Sequence[ScriptProblem]:
+def _worst(problems: Findings) -> Sequence[Finding]:
     """Select as many problems as may be listed, errors before warnings, in their order."""
     if len(problems) <= MAX_PROBLEMS:
         return problems
-    return [p for p in problems if p.severity == "error"][:MAX_PROBLEMS]
+    return problems.errors[:MAX_PROBLEMS]
 
 
 # A plan in pieces ---------------------------------------------------------------------------------

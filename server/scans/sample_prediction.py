@@ -15,9 +15,10 @@ from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.imaging.radiography import Radiography
 from flexdt.server.scans.scan_record import StartConditions
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import Findings
 from flexdt.twin.physics.predicted_beam import PredictedExposure
 from flexdt.twin.scanner.state import Sample
-from flexdt.twin.script import ScanPlan, ScriptProblem
+from flexdt.twin.script import ScanPlan
 from flexdt.twin.script.planning.open_beam_findings import open_beam_problems
 from flexdt.twin.script.planning.sample_findings import (
     SampleForecast,
@@ -38,7 +39,7 @@ class Prediction:
     """
 
     exposures: tuple[PredictedExposure, ...]
-    problems: tuple[ScriptProblem, ...]
+    problems: Findings
 
 
 async def predict_counts(

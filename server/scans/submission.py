@@ -358,7 +358,7 @@ class Submissions:
         await asyncio.to_thread(self._require_room, checked.plan.bytes, name)
         await self.radiography.require_room(begin.sample)
         predicted = await predict_counts(self.radiography, begin, checked.plan)
-        warnings = [*checked.warnings, *(p.where_and_what for p in predicted.problems)]
+        warnings = [*checked.warnings, *(p.placed_text for p in predicted.problems)]
         if resume:
             warnings = [*self._warnings_of_resuming(name, begin.sample), *warnings]
         ensure_allowed()

@@ -15,11 +15,12 @@ one alarm.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, assert_never
 
+from flexdt.twin.findings import ERROR, WARNING, Finding, FindingCode, Severity
 from flexdt.twin.following.mirror import MAX_WAITING, Alarm, Heard, Mirror, Waiting
 from flexdt.twin.machine.description import Machine, Profile, unknown_axis
 from flexdt.twin.motion.profiles import Trajectory
@@ -32,7 +33,7 @@ from flexdt.twin.script.planning.plan_values import PlanStep, SampleSize
 from flexdt.twin.script.planning.planner import plan_script, simulated
 from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
-from flexdt.twin.script.problems import ScriptProblem, Severity
+from flexdt.twin.script.problems import ScriptCode
 
 NEAR_LIMIT_DISTANCE: Final = 0.5
 """Distance of a target from a limit below which a warning is given [mm or deg]."""
@@ -65,12 +66,12 @@ _KINDS_OF_A_MOVE: Final = (
     "moved",
 )
 """Kinds of alarms about an axis's last move, cleared by the next."""
-_KIND_OF_PROBLEM: Final = {
-    "limit": "limit",
-    "limit_clamped": "limit",
-    "mode": "mode",
-    "roi": "roi",
-    "xray_never_ready": "xray_never_ready",
+_KIND_OF_PROBLEM: Final[Mapping[FindingCode, str]] = {
+    ScriptCode.LIMIT: "limit",
+    ScriptCode.LIMIT_CLAMPED: "limit",
+    ScriptCode.MODE: "mode",
+    ScriptCode.ROI: "roi",
+    ScriptCode.XRAY_NEVER_READY: "xray_never_ready",
 }
 """Codes of problems that the plan of one command can find, and their kinds of alarm.
 
@@ -183,7 +184,7 @@ class Follower:
         if mirror.due_s is not None and now > mirror.due_s + SLACK_S:
             due = f"{self._next(mirror)} was due {now - mirror.due_s:.1f} s ago"
             mirror = _alarm(
-                mirror, now, "error", "late", "script", f"the script is late: {due}"
+                mirror, now, ERROR, "late", "script", f"the script is late: {due}"
             )
         return mirror
 
@@ -209,7 +210,7 @@ class Follower:
             f"{waiting.heard.text!r} is under way and has said nothing for {quiet:.1f} s"
         )
         about = waiting.heard.words[0]
-        mirror = _alarm(mirror, now, "warning", "silent", about, message)
+        mirror = _alarm(mirror, now, WARNING, "silent", about, message)
         return replace(mirror, speaks=mirror.speaks or False)
 
     def _arrivals(self, mirror: Mirror, now: float) -> Mirror:
@@ -242,7 +243,7 @@ class Follower:
         axes = {n: a.at_rest for n, a in mirror.axes.items()}
         mirror = replace(mirror, connected=False, waiting={}, axes=axes, due_s=None)
         message = f"the link is lost: {why}; positions are those heard last"
-        return _alarm(mirror, now, "error", "lost", "link", message)
+        return _alarm(mirror, now, ERROR, "lost", "link", message)
 
     def with_ahead(self, mirror: Mirror, alarms: Iterable[Alarm]) -> Mirror:
         """Return the mirror with the alarms of `ahead`: new ones are added, and those
@@ -296,20 +297,20 @@ class Follower:
         if mirror.assumed:
             assumed = f" ({', '.join(mirror.assumed)} assumed at home)"
         alarms: dict[tuple[str, int], Alarm] = {}
-        exposures = [p for p in report.warnings if p.code in OPEN_BEAM_CODES]
+        exposures = report.warnings.of(*OPEN_BEAM_CODES)
         for p in (*report.errors, *exposures):  # of the contacts of one line, the first
             where = "the move under way"
             if p.line:
                 where = f"line {p.line}"
             message = f"{where}: {p.message}{assumed}"
-            alarm = Alarm(now, p.severity, p.code, f"ahead, {where}", message)
+            alarm = Alarm(now, p.severity, p.code.value, f"ahead, {where}", message)
             alarms.setdefault((p.code, p.line), alarm)
         near = report.clearance
         bound = self.machine.safety_margin_mm + NEAR_PART_MM
         if near and not near.collisions and (near.min_clearance_mm or bound) < bound:
             parts = " and ".join(near.min_clearance_pair or ())
             message = f"{parts} come within {near.min_clearance_mm:.2f} mm{assumed}"
-            alarms["clearance", 0] = Alarm(now, "warning", "clearance", "ahead", message)
+            alarms["clearance", 0] = Alarm(now, WARNING, "clearance", "ahead", message)
         return tuple(alarms.values())
 
     # -- commands ----------------------------------------------------------------------------
@@ -347,7 +348,7 @@ class Follower:
             and find(name, argument) is not None
         ):
             message = f"{heard.text!r} is not followed: {unknown_axis(name, self.machine).message}"
-            mirror = _alarm(mirror, now, "error", "unknown_axis", name, message)
+            mirror = _alarm(mirror, now, ERROR, "unknown_axis", name, message)
         if argument.lower() == "stop":
             mirror = replace(mirror, axes={n: a.at_rest for n, a in mirror.axes.items()})
         waiting = Waiting(heard, now, now)
@@ -452,7 +453,7 @@ class Follower:
         if left >= NEAR_LIMIT_DISTANCE or ("limit", name) in mirror.active:
             return mirror
         message = f"{name} goes to {target:g} {axis.unit}, {left:g} from a limit"
-        return _alarm(mirror, now, "warning", "limit_near", name, message)
+        return _alarm(mirror, now, WARNING, "limit_near", name, message)
 
     def _follow_script(self, mirror: Mirror, command: c.Command, now: float) -> Mirror:
         """Compare a command with the script's next line: advance and compute when the
@@ -497,7 +498,7 @@ class Follower:
         if mirror.began_s is None or at >= len(lines):
             return mirror
         message = f"{describe(command)!r} is not {self._next(mirror)}"
-        return _alarm(mirror, now, "warning", "off_script", "script", message)
+        return _alarm(mirror, now, WARNING, "off_script", "script", message)
 
     @cached_property
     def _bare(self) -> tuple[c.Command, ...]:
@@ -554,7 +555,7 @@ class Follower:
         mirror = replace(mirror.finished(command, unheard), ends=True)
         if heard.what == "ERR":
             message = f"{heard.text}: the machine says {heard.reply[:200]!r}"
-            mirror = _alarm(mirror, now, "error", "failed", heard.words[0], message)
+            mirror = _alarm(mirror, now, ERROR, "failed", heard.words[0], message)
             return _rests(mirror, waiting)
         mirror = mirror.cleared(heard.words[0], "failed")
         if waiting is None:
@@ -628,7 +629,7 @@ class Follower:
             return mirror
         unit = self.machine.axes[name].unit
         message = f"{name} stands at {there:.6g} {unit} after a move to {meant:.6g}"
-        return _alarm(mirror, now, "error", "offset", name, message)
+        return _alarm(mirror, now, ERROR, "offset", name, message)
 
     def _compare_limits(
         self, mirror: Mirror, name: str, motor: MotorReply, now: float
@@ -666,7 +667,7 @@ class Follower:
                     f"{theirs[1]:g}, machine "
                     f"{self.machine.name} has {ours[0]:g} and {ours[1]:g}"
                 )
-                mirror = _alarm(mirror, now, "error", kind, name, text)
+                mirror = _alarm(mirror, now, ERROR, kind, name, text)
         return mirror.with_axis(name, speed=motor.speed, acceleration=motor.acceleration)
 
     def _compare_reading(
@@ -734,7 +735,7 @@ class Follower:
             f"{waiting.heard.text} has taken {took:.2f} s, "
             f"{longer} than its range of {bounds}"
         )
-        return _alarm(mirror, now, "warning", "range", waiting.heard.words[0], message)
+        return _alarm(mirror, now, WARNING, "range", waiting.heard.words[0], message)
 
 
 @dataclass(frozen=True)
@@ -784,7 +785,7 @@ def _compare_at_rest(mirror: Mirror, reading: _Reading, explained: bool) -> Mirr
         return mirror
     stood = f"not at {seen.position:.6g}, and no move of it was heard"
     message = f"{name} stands at {reading.x:.6g} {reading.unit}, {stood}"
-    return _alarm(mirror, reading.now, "error", "moved", name, message)
+    return _alarm(mirror, reading.now, ERROR, "moved", name, message)
 
 
 def _compare_on_path(mirror: Mirror, reading: _Reading, path: Trajectory) -> Mirror:
@@ -805,7 +806,7 @@ def _compare_on_path(mirror: Mirror, reading: _Reading, path: Trajectory) -> Mir
         message = (
             f"{name} is at {reading.x:.6g} {reading.unit}, on no way to {path.target:.6g}"
         )
-        return _alarm(here, reading.now, "error", "off_path", name, message)
+        return _alarm(here, reading.now, ERROR, "off_path", name, message)
     seen = mirror.axes[name]
     if reading.of_move and passes < seen.passed_s:
         # Feedback can be overtaken by later feedback: then it is no news. It counts where
@@ -839,16 +840,16 @@ def _compare_delay(mirror: Mirror, reading: _Reading, passes: float) -> Mirror:
     at = f"the predicted path at {reading.x:.6g} {reading.unit}"
     if least > axis.delay_s + SLACK_S or least - first[1] > MAX_DRIFT_S:
         message = f"{name} is slow: {least:.2f} s behind {at}"
-        mirror = _alarm(mirror, reading.now, "error", "slow", name, message)
+        mirror = _alarm(mirror, reading.now, ERROR, "slow", name, message)
     elif most + axis.begun_s < -SLACK_S or (most < 0.0 and first[0] - most > MAX_DRIFT_S):
         message = f"{name} is fast: {-most:.2f} s ahead of {at}"
-        mirror = _alarm(mirror, reading.now, "error", "fast", name, message)
+        mirror = _alarm(mirror, reading.now, ERROR, "fast", name, message)
     promptest = min(first, (least, most), key=lambda behind: behind[1])
     return mirror.with_axis(name, behind_s=promptest, passed_s=passes)
 
 
 def _with_problems(
-    mirror: Mirror, problems: Iterable[ScriptProblem], about: str, now: float
+    mirror: Mirror, problems: Iterable[Finding], about: str, now: float
 ) -> Mirror:
     """Return the mirror with alarms for the problems of one command's plan.
 
@@ -856,7 +857,7 @@ def _with_problems(
     unknown whether they are on.
     """
     for p in problems:
-        unsure = mirror.xrays_on is None and "xray" in p.code
+        unsure = mirror.xrays_on is None and p.code is ScriptCode.XRAY_NEVER_READY
         if p.code in _KIND_OF_PROBLEM and not unsure:
             kind = _KIND_OF_PROBLEM[p.code]
             mirror = _alarm(mirror, now, p.severity, kind, about, p.message)

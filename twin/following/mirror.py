@@ -11,12 +11,12 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
+from flexdt.twin.findings import Severity
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.planning.plan_values import StartState
-from flexdt.twin.script.problems import Severity
 
 MAX_ALARMS: Final = 100
 """Number of alarms that a mirror keeps, the newest; all are counted."""

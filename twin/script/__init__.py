@@ -15,7 +15,7 @@ from flexdt.twin.script.planning.plan_values import (
 )
 from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.planning.pose_plan import plan_poses
-from flexdt.twin.script.problems import ScriptError, ScriptProblem
+from flexdt.twin.script.problems import ScriptCode, ScriptError
 from flexdt.twin.script.scan_request import ScanRequest
 
 __all__ = [
@@ -28,8 +28,8 @@ __all__ = [
     "ScanPlan",
     "ScanRequest",
     "Script",
+    "ScriptCode",
     "ScriptError",
-    "ScriptProblem",
     "StartState",
     "Wait",
     "check_plan",

@@ -10,14 +10,14 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Annotated, Any, Literal, dataclass_transform
 
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
+from flexdt.twin.findings import Findings
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.script.problems import ScriptProblem
 from flexdt.twin.values import adapter_of
 
 Binary = Annotated[
@@ -264,7 +264,7 @@ class Script:
     """
 
     commands: tuple[Command, ...]
-    warnings: tuple[ScriptProblem, ...] = ()
+    warnings: Findings = field(default_factory=Findings)
     lines: int = 0
 
     @classmethod
@@ -273,4 +273,4 @@ class Script:
         greatest line of a command, 0 without any.
         """
         made = tuple(commands)
-        return cls(made, (), max((c.line for c in made), default=0))
+        return cls(made, Findings(), max((c.line for c in made), default=0))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from flexdt.twin.findings import Finding, Findings, Place, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.predicted_beam import Physics
@@ -22,7 +23,7 @@ from flexdt.twin.script.planning.open_beam_findings import open_beam_problems
 from flexdt.twin.script.planning.plan import CheckReport, ScanPlan
 from flexdt.twin.script.planning.plan_values import SampleSize, StartState
 from flexdt.twin.script.planning.planner import plan_script
-from flexdt.twin.script.problems import ScriptProblem, in_order
+from flexdt.twin.script.problems import ScriptCode
 
 CollisionCheck = Callable[[ScanPlan, Machine, Profile, SampleSize | None], Clearance]
 """Reports the collisions of a plan; the function holds the scene and the sample's body."""
@@ -60,7 +61,7 @@ def check_script(
         >>> check_script(script).ok
         True
     """
-    problems: tuple[ScriptProblem, ...]
+    problems: Findings
     if isinstance(text, c.Script):
         script = text
         problems = text.warnings
@@ -72,14 +73,14 @@ def check_script(
             shown = text
         else:
             shown = text.decode("utf-8", "replace")
-    bare = c.Script(script.commands, (), script.lines)
+    bare = c.Script(script.commands, Findings(), script.lines)
     plan = plan_script(bare, machine, profile, start=start, sample=sample)
     return check_plan(plan, problems, collision, shown, start is not None, physics)
 
 
 def check_plan(
     plan: ScanPlan,
-    problems: Sequence[ScriptProblem] = (),
+    problems: Sequence[Finding] = (),
     collision: CollisionCheck | None = None,
     text: str = "",
     start_known: bool = True,
@@ -118,13 +119,19 @@ def check_plan(
                 f"{x.pair[0]} and {x.pair[1]} come within the safety margin at "
                 f"{x.time_s:.3f} s"
             )
-            findings.append(ScriptProblem("error", "collision", x.line, 1, message))
+            findings.append(error(ScriptCode.COLLISION, message, place=Place(x.line)))
     return CheckReport(
-        plan, in_order(findings), clearance, optics, _dose(plan), text, start_known
+        plan,
+        Findings(findings).by_place(),
+        clearance,
+        optics,
+        _dose(plan),
+        text,
+        start_known,
     )
 
 
-def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
+def _start_problems(plan: ScanPlan) -> list[Finding]:
     """Warn if motors that nothing has moved stand at an assumed place when the first
     projection is taken.
 
@@ -152,7 +159,7 @@ def _start_problems(plan: ScanPlan) -> list[ScriptProblem]:
     message = (
         f"nothing moves {', '.join(left)} before this image; home is assumed: {where}"
     )
-    return [ScriptProblem("warning", "default_assumed", first.line, 1, message)]
+    return [warning(ScriptCode.DEFAULT_ASSUMED, message, place=Place(first.line))]
 
 
 def _optics(view: View) -> Optics:
@@ -199,7 +206,7 @@ def _extent(values: FloatArray) -> tuple[float, float]:
     return float(np.min(values)), float(np.max(values))
 
 
-def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
+def _truncation_problems(seen: Sequence[View]) -> list[Finding]:
     """Warn if no image of the scan shows some side of the sample's width or height.
 
     Each side counts by the image that cuts off least of it, so positions of several scans
@@ -224,7 +231,7 @@ def _truncation_problems(seen: Sequence[View]) -> list[ScriptProblem]:
         if parts := cut_off(dict(zip(names, least, strict=True))):
             message = f"the sample is cut off over the rotation: {parts}"
             warnings.append(
-                ScriptProblem("warning", "truncated", min(view.lines), 1, message)
+                warning(ScriptCode.TRUNCATED, message, place=Place(min(view.lines)))
             )
     return warnings
 

@@ -13,11 +13,12 @@ import struct
 from dataclasses import dataclass, replace
 from typing import Final
 
+from flexdt.twin.findings import Finding, Findings, Place, error, warning
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, shorten
 from flexdt.twin.script.parse import LOG_STAMP, read_row, rows
-from flexdt.twin.script.problems import ScriptProblem, in_order
+from flexdt.twin.script.problems import ScriptCode
 
 _WAIT = re.compile(rb"\t(?:ACK|no[ ]wait|POS|RCV)(?=\t)", re.IGNORECASE)
 COLUMNS: Final = (
@@ -76,7 +77,7 @@ class Executed:
         return self.command.line
 
 
-def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ...]]:
+def read_log(data: bytes) -> tuple[tuple[Executed, ...], Findings]:
     r"""Read the lines of an executed script.
 
     Args:
@@ -89,27 +90,27 @@ def read_log(data: bytes) -> tuple[tuple[Executed, ...], tuple[ScriptProblem, ..
 
     Example:
         >>> (line,), found = read_log(b"tube\txrayoff\t\t\tACK\t\t\t501\t\t09:36:31.952")
-        >>> line.own_s, type(line.command).__name__, found
-        (0.501, 'XrayOff', ())
+        >>> line.own_s, type(line.command).__name__, len(found)
+        (0.501, 'XrayOff', 0)
     """
     executed: list[Executed] = []
-    problems: list[ScriptProblem] = []
+    problems: list[Finding] = []
     number = 0
     start = 0
     for number, stamp in enumerate(LOG_STAMP.finditer(data), 1):
         try:
             executed.append(_line(data[start : stamp.start()], stamp, number, problems))
-        except ArgumentError as error:
-            problems.append(ScriptProblem("error", error.code, number, 1, str(error)))
+        except ArgumentError as wrong:
+            problems.append(error(wrong.code, str(wrong), place=Place(number)))
         start = stamp.end()
     if data[start:].strip(b"\0 \t\r\n\x1a"):
         message = f"the last line is cut off before its moment and left out; {COLUMNS}"
-        problems.append(ScriptProblem("warning", "cut_off", number + 1, 1, message))
-    return tuple(executed), in_order(problems)
+        problems.append(warning(ScriptCode.CUT_OFF, message, place=Place(number + 1)))
+    return tuple(executed), Findings(problems).by_place()
 
 
 def _line(
-    record: bytes, stamp: re.Match[bytes], number: int, problems: list[ScriptProblem]
+    record: bytes, stamp: re.Match[bytes], number: int, problems: list[Finding]
 ) -> Executed:
     """Read one line of a log; add a warning `reply` if a motor's reply does not fit its
     move.
@@ -173,7 +174,7 @@ def _line(
                 f"out: it must begin with {_REPLY_DOUBLES} big-endian doubles (position "
                 "near the target, limits twice)"
             )
-            problems.append(ScriptProblem("warning", "reply", number, 1, message))
+            problems.append(warning(ScriptCode.REPLY, message, place=Place(number)))
     return Executed(command, own_s, 3600 * hour + 60 * minute + second, reply, motor)
 
 

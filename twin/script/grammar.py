@@ -21,6 +21,7 @@ from flexdt.twin.machine.camera import Roi
 from flexdt.twin.motion.profiles import MIN_RATE
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.commands import ImageKind
+from flexdt.twin.script.problems import ScriptCode
 
 MAX_FRAMES: Final = 1_000_000
 MAX_AVERAGES: Final = 100_000
@@ -51,7 +52,9 @@ class ArgumentError(ValueError):
     """An argument that does not read; `code` names the problem and `index` (0
     or 1) the argument."""
 
-    def __init__(self, message: str, code: str = "value", index: int = 0) -> None:
+    def __init__(
+        self, message: str, code: ScriptCode = ScriptCode.VALUE, index: int = 0
+    ) -> None:
         """Make the error of an argument: message, code of the problem, index of the argument
         (0 or 1).
         """
@@ -94,7 +97,7 @@ def number(text: str, what: str, index: int = 0) -> float:
         index: place of the argument, 0 or 1.
 
     Raises:
-        ArgumentError: missing, no number, or beyond `MAX_NUMBER`; code "value".
+        ArgumentError: missing, no number, or beyond `MAX_NUMBER`; code VALUE.
     """
     if _NUMBER.fullmatch(text):
         value = float(text)
@@ -240,18 +243,18 @@ def _roi(a: str, _b: str) -> dict[str, object]:
     their order is not checked.
 
     Raises:
-        ArgumentError: another number of them, or one that is none of these; code "roi".
+        ArgumentError: another number of them, or one that is none of these; code ROI.
     """
     parts = a.replace(",", " ").replace(";", " ").split()
     if len(parts) != 4:
         raise ArgumentError(
             f"ROI {shorten(a)!r} has {len(parts)} numbers; allowed: left top right bottom",
-            "roi",
+            ScriptCode.ROI,
         )
     try:
         return {"roi": Roi(*(whole(p, "ROI edge", 0, 1_000_000) for p in parts))}
     except ArgumentError as error:
-        raise ArgumentError(str(error), "roi") from None
+        raise ArgumentError(str(error), ScriptCode.ROI) from None
 
 
 def _sequence(a: str, b: str) -> dict[str, object]:

@@ -24,13 +24,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import fmean, median, mode, variance
 from typing import ClassVar, Final
 
 import numpy as np
 
 from flexdt.twin.errors import MachineFileError
+from flexdt.twin.findings import Finding, Findings, Place, warning
 from flexdt.twin.machine.description import MAX_TIME_S, Axis, Machine, Spread, Timing
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.executed_log import Executed, MotorReply
@@ -39,7 +40,7 @@ from flexdt.twin.script.planning.plan_values import StartState
 from flexdt.twin.script.planning.planner import simulated
 from flexdt.twin.script.planning.simulated_script import Simulation
 from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
-from flexdt.twin.script.problems import ScriptProblem
+from flexdt.twin.script.problems import ScriptCode
 
 BORROWED_TIMES: Final = 4.0
 """Weight of the deviations of all kinds, in number of a kind's own times."""
@@ -176,7 +177,7 @@ class LogComparison:
 
     machine: Machine
     rows: tuple[LogRow, ...]
-    problems: tuple[ScriptProblem, ...] = ()
+    problems: Findings = field(default_factory=Findings)
 
     HEADER: ClassVar = ("line", "real [s]", "predicted [s]", "90 %", "error [s]", "what")
 
@@ -340,7 +341,7 @@ def against_log(log: Log, machine: Machine) -> list[LogRow]:
     return rows
 
 
-def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
+def unlike(log: Log, machine: Machine) -> Findings:
     """Warn of each axis of a log that the machine lacks, or whose motor has other limits
     there.
 
@@ -351,7 +352,7 @@ def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
     Returns:
         One warning, `other_machine`, for each such axis, at its first line.
     """
-    warnings: dict[str, ScriptProblem] = {}
+    warnings: dict[str, Finding] = {}
     for x in log:
         name = _axis_of(x.command, machine)
         reply = x.motor
@@ -370,9 +371,9 @@ def unlike(log: Log, machine: Machine) -> tuple[ScriptProblem, ...]:
             )
         if message:
             warnings.setdefault(
-                name, ScriptProblem("warning", "other_machine", x.line, 1, message)
+                name, warning(ScriptCode.OTHER_MACHINE, message, place=Place(x.line))
             )
-    return tuple(warnings.values())
+    return Findings(warnings.values())
 
 
 def _plan(log: Log, machine: Machine) -> Simulation:

@@ -20,10 +20,11 @@ from typing import Final
 
 from flexdt.twin.backends import backend
 from flexdt.twin.errors import nearest_name
+from flexdt.twin.findings import Finding, Findings, Place, error, warning
 from flexdt.twin.script import commands as c
 from flexdt.twin.script import grammar
 from flexdt.twin.script.grammar import ArgumentError, Spec, shorten
-from flexdt.twin.script.problems import ScriptError, ScriptProblem, in_order
+from flexdt.twin.script.problems import ENTIRE, ScriptCode, ScriptError
 from flexdt.twin.signatures import PathLike
 
 BINARY_HEAD_BYTES: Final = 64 << 10
@@ -37,7 +38,11 @@ CONTROL_BYTES: Final = bytes(k for k in range(32) if k not in b"\t\n\r")
 """Control characters that separate neither columns nor lines."""
 FEW_PROBLEMS: Final = 20
 """Number of problems that are listed of a text without any command."""
-FOREIGN_CODES: Final = ("syntax", "unknown_component", "unknown_command")
+FOREIGN_CODES: Final = (
+    ScriptCode.SYNTAX,
+    ScriptCode.UNKNOWN_COMPONENT,
+    ScriptCode.UNKNOWN_COMMAND,
+)
 """Codes of the problems of a text that is no script at all."""
 LIGHT_BYTES: Final = 8 << 10
 """Longest script, or list of poses, that any thread may plan [bytes]."""
@@ -321,12 +326,12 @@ def parse_script(text: Source) -> c.Script:
         (90.0, 1)
     """
     script, problems = read_script(text)
-    if any(p.severity == "error" for p in problems):
+    if problems.errors:
         raise ScriptError(problems)
     return script
 
 
-def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
+def read_script(text: Source) -> tuple[c.Script, Findings]:
     r"""Read the commands of a script and every problem of its text, in line order;
     problems are not raised.
 
@@ -347,20 +352,18 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
     text = content(text)
     if is_utf16(text):
         message = "the script is UTF-16 text; save it as UTF-8 or plain ASCII"
-        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, message),)
-    problems: list[ScriptProblem] = []
+        return _nothing(error(ScriptCode.SYNTAX, message, place=Place(1)))
+    problems: list[Finding] = []
     if is_log(text):
         message = (
             "this is an executed script, a log: `flexdt machine fit` learns the machine "
             "from it, and `flexdt check SCRIPT --against` it compares; to run, "
             "a script has seven columns"
         )
-        return c.Script((), (), 0), (
-            ScriptProblem("error", "executed_log", 0, 1, message),
-        )
+        return _nothing(error(ScriptCode.EXECUTED_LOG, message, place=ENTIRE))
     if is_binary(text):  # a log, above, holds binary replies
         message = "the file holds binary data; allowed: the text of a scan script"
-        return c.Script((), (), 0), (ScriptProblem("error", "syntax", 1, 1, message),)
+        return _nothing(error(ScriptCode.SYNTAX, message, place=Place(1)))
     commands: list[c.Command] = []
     for row in rows(text):
         command = read_row(row, problems)
@@ -372,18 +375,22 @@ def read_script(text: Source) -> tuple[c.Script, tuple[ScriptProblem, ...]]:
             f"no line is a command of a scan script; {FEW_PROBLEMS} of {len(problems)} "
             "problems are listed"
         )
-        first = [*in_order(problems)[:FEW_PROBLEMS]]
-        problems = [ScriptProblem("error", "syntax", 0, 1, message), *first]
+        first = Findings(problems).by_place()[:FEW_PROBLEMS]
+        problems = [error(ScriptCode.SYNTAX, message, place=ENTIRE), *first]
     if not commands and not problems:
         problems.append(
-            ScriptProblem("error", "syntax", 0, 1, "the script holds no command")
+            error(ScriptCode.SYNTAX, "the script holds no command", place=ENTIRE)
         )
-    ordered = in_order(problems)
-    warnings = tuple(p for p in ordered if p.severity == "warning")
-    return c.Script(tuple(commands), warnings, line_count(text)), ordered
+    ordered = Findings(problems).by_place()
+    return c.Script(tuple(commands), ordered.warnings, line_count(text)), ordered
 
 
-def read_row(row: CodeLine, problems: list[ScriptProblem]) -> c.Command | None:
+def _nothing(problem: Finding) -> tuple[c.Script, Findings]:
+    """Return the script of a text that is none, and the error that says so."""
+    return c.Script(()), Findings((problem,))
+
+
+def read_row(row: CodeLine, problems: list[Finding]) -> c.Command | None:
     """Read the command of one row; add its problems to `problems` and return None
     after an error."""
     return _Line(row, problems).command()
@@ -412,7 +419,7 @@ class _Parts:
 class _Refused(Exception):
     """A line that cannot be read at all, and where."""
 
-    def __init__(self, code: str, column: int, message: str) -> None:
+    def __init__(self, code: ScriptCode, column: int, message: str) -> None:
         """Make the error of a line with its code, its column (from 1) and message."""
         super().__init__(message)
         self.code = code
@@ -422,7 +429,7 @@ class _Refused(Exception):
 class _Line:
     """Reads one row and reports its problems."""
 
-    def __init__(self, row: CodeLine, problems: list[ScriptProblem]) -> None:
+    def __init__(self, row: CodeLine, problems: list[Finding]) -> None:
         """Take one row to be parsed; problems found in it are appended to `problems`.
 
         The component is the first column, in a row without tabs the first word.
@@ -435,15 +442,13 @@ class _Line:
             self.component = row.words()[0]
         self.end = Field("", len(row.text) + 1)
 
-    def error(self, code: str, column: int, message: str) -> None:
+    def error(self, code: ScriptCode, column: int, message: str) -> None:
         """Add an error about this line."""
-        self.problems.append(ScriptProblem("error", code, self.row.line, column, message))
+        self.problems.append(error(code, message, place=Place(self.row.line, column)))
 
-    def warn(self, code: str, column: int, message: str) -> None:
+    def warn(self, code: ScriptCode, column: int, message: str) -> None:
         """Add a warning about this line, at a column (from 1)."""
-        self.problems.append(
-            ScriptProblem("warning", code, self.row.line, column, message)
-        )
+        self.problems.append(warning(code, message, place=Place(self.row.line, column)))
 
     def command(self) -> c.Command | None:
         """Read the row's command; add an error to `problems` and return None if it cannot
@@ -453,7 +458,9 @@ class _Line:
         """
         try:
             if not self.component.text:
-                raise _Refused("syntax", 1, "the component (first column) is missing")
+                raise _Refused(
+                    ScriptCode.SYNTAX, 1, "the component (first column) is missing"
+                )
             if self.row.columns is None:
                 parts = self._padded()
             else:
@@ -496,7 +503,7 @@ class _Line:
                 f"column 8 holds {shorten(extra.text)!r}; a line has seven columns: component, "
                 "command, argument 1, argument 2, wait, timeout, expected"
             )
-            raise _Refused("syntax", extra.column, message)
+            raise _Refused(ScriptCode.SYNTAX, extra.column, message)
         return _Parts(spec, *rest[:5])
 
     def _padded(self) -> _Parts | None:
@@ -571,7 +578,9 @@ class _Line:
             ]
             message = f"{shorten(extra.text)!r} is not expected here: the command takes {allowed}"
             raise _Refused(
-                "syntax", extra.column, f"{message}, then ACK, no wait, POS or RCV"
+                ScriptCode.SYNTAX,
+                extra.column,
+                f"{message}, then ACK, no wait, POS or RCV",
             )
         return body[0], body[1] if len(body) > 1 else none
 
@@ -602,14 +611,14 @@ class _Line:
             knows = f"; it knows: {', '.join(allowed)}"
             if not fields:
                 raise _Refused(
-                    "syntax", self.end.column, f"{name} without a command{knows}"
+                    ScriptCode.SYNTAX, self.end.column, f"{name} without a command{knows}"
                 )
             if self.row.columns:
                 unknown = fields[0].text
             else:
                 unknown = " ".join(f.text for f in fields[:3])
             message = f"{name} does not know {shorten(unknown)!r}{_meant(unknown, allowed)}{knows}"
-            raise _Refused("unknown_command", fields[0].column, message)
+            raise _Refused(ScriptCode.UNKNOWN_COMMAND, fields[0].column, message)
         if not self._custom_form(fields):
             message = (
                 f"{shorten(name)!r} is not a component of the "
@@ -617,12 +626,12 @@ class _Line:
                 "a name, a command and a wait"
             )
             raise _Refused(
-                "unknown_component" if fields else "syntax",
+                ScriptCode.UNKNOWN_COMPONENT if fields else ScriptCode.SYNTAX,
                 self.component.column,
                 message,
             )
         message = f"{shorten(name)!r} is a custom component: allowed, without effect here"
-        self.warn("custom_component", self.component.column, message)
+        self.warn(ScriptCode.CUSTOM_COMPONENT, self.component.column, message)
         words = tuple(f.text for f in fields)
         return c.Custom(
             line=self.row.line, column=self.component.column, component=name, words=words
@@ -673,7 +682,7 @@ class _Line:
             if argument.text and i >= parts.spec.arguments:
                 takes = ("no argument", "1 argument")[parts.spec.arguments]
                 message = f"{shorten(argument.text)!r} is not expected: the command takes {takes}"
-                self.error("syntax", argument.column, message)
+                self.error(ScriptCode.SYNTAX, argument.column, message)
         try:
             fields.update(parts.spec.read(parts.first.text, parts.second.text))
         except ArgumentError as error:
@@ -690,8 +699,8 @@ class _Line:
                 else:
                     fields[key] = None
             except ArgumentError as error:
-                self.error("value", field.column, str(error))
-        if any(p.severity == "error" for p in self.problems[before:]):
+                self.error(ScriptCode.VALUE, field.column, str(error))
+        if any(p.forbids for p in self.problems[before:]):
             return None
         return parts.spec.type(**fields)  # type: ignore[arg-type]
 
@@ -716,23 +725,25 @@ class _Line:
         if not text:
             assumed = c.Wait.NO_WAIT if is_move else c.Wait.ACK
             message = f"no wait is written (ACK, no wait, POS or RCV); {assumed.value!r} is assumed"
-            self.warn("wait_missing", column, message)
+            self.warn(ScriptCode.WAIT_MISSING, column, message)
             return assumed
         wait = grammar.WAITS.get(" ".join(text.lower().split()))
         if wait is None:
             message = f"wait is {shorten(text)!r}; allowed: ACK, no wait, POS, RCV"
-            self.error("wait", column, message)
+            self.error(ScriptCode.WAIT, column, message)
             return c.Wait.ACK
         if wait is c.Wait.POS and not is_move:
-            self.error("wait", column, "POS is for moves only: it waits for a position")
+            self.error(
+                ScriptCode.WAIT, column, "POS is for moves only: it waits for a position"
+            )
         elif wait is c.Wait.POS and not trigger.text:
             message = "POS needs the trigger position as argument 2 of the move"
-            self.error("trigger", trigger.column, message)
+            self.error(ScriptCode.TRIGGER, trigger.column, message)
         elif is_move and trigger.text and wait is not c.Wait.POS:
             message = (
                 f"the trigger position is used with POS only; the wait is {wait.value!r}"
             )
-            self.warn("trigger_unused", trigger.column, message)
+            self.warn(ScriptCode.TRIGGER_UNUSED, trigger.column, message)
         return wait
 
 

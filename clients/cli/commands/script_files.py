@@ -14,8 +14,9 @@ from flexdt.library.failure import CommandError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from flexdt.twin.findings import Finding
     from flexdt.twin.machine.description import Machine
-    from flexdt.twin.script import CheckReport, ScriptProblem
+    from flexdt.twin.script import CheckReport
     from flexdt.twin.script.executed_log import Executed
 
 ScriptFile = Annotated[
@@ -53,12 +54,12 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
         )
     lines, problems = read_log(data)
     tell(problems, str(log))
-    if any(p.severity == "error" for p in problems):
+    if problems.errors:
         raise CommandError(f"{log}: the log does not hold; nothing was done", INVALID)
     return lines
 
 
-def tell(problems: Sequence[ScriptProblem], file: str) -> None:
+def tell(problems: Sequence[Finding], file: str) -> None:
     """Print problems with their places to standard error."""
     for p in problems:
         place = ":".join([file, *(str(n) for n in (p.line, p.column) if p.line)])
@@ -67,4 +68,4 @@ def tell(problems: Sequence[ScriptProblem], file: str) -> None:
 
 def exit_code(report: CheckReport) -> int:
     """Determine the exit code of a check."""
-    return verdict(p.code for p in report.problems if p.severity == "error")
+    return verdict(p.code for p in report.errors)

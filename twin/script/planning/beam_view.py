@@ -14,6 +14,7 @@ from typing import assert_never
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.findings import Finding, Findings, Place, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
@@ -21,7 +22,7 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.planning.plan import ScanPlan
-from flexdt.twin.script.problems import ScriptProblem
+from flexdt.twin.script.problems import ScriptCode
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -112,7 +113,7 @@ def views(plan: ScanPlan) -> Iterator[View]:
         yield _view(plan, camera, kind, tuple(lines), positions)
 
 
-def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
+def beam_problems(plan: ScanPlan) -> Findings:
     """Warn of projections with the sample wholly outside the image, and of flats that
     show it.
 
@@ -122,17 +123,17 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
     Returns:
         Warnings `sample_out_of_beam` and `sample_in_flat`, in the order of the views.
     """
-    warnings: list[ScriptProblem] = []
+    warnings: list[Finding] = []
     for view in views(plan):
         outside = view.outside
         match view.kind:
             case "projection":
                 bad = outside
-                code = "sample_out_of_beam"
+                code = ScriptCode.SAMPLE_OUT_OF_BEAM
                 text = _outside_text
             case "flat":
                 bad = ~outside
-                code = "sample_in_flat"
+                code = ScriptCode.SAMPLE_IN_FLAT
                 text = _inside_text
             case "dark" | "preview":
                 continue
@@ -140,10 +141,10 @@ def beam_problems(plan: ScanPlan) -> tuple[ScriptProblem, ...]:
                 assert_never(view.kind)
         if bad.any():
             warnings.append(_aggregate(view, bad, code, text(view)))
-    return tuple(warnings)
+    return Findings(warnings)
 
 
-def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProblem:
+def _aggregate(view: View, bad: BoolArray, code: ScriptCode, text: str) -> Finding:
     """Make one warning for all `bad` images of a view, at the first of their lines.
 
     The text ends with the number of further lines, if there are any.
@@ -158,7 +159,7 @@ def _aggregate(view: View, bad: BoolArray, code: str, text: str) -> ScriptProble
     more = ""
     if len(lines) > 1:
         more = f" (and at {len(lines) - 1} more lines)"
-    return ScriptProblem("warning", code, lines[0], 1, text + more)
+    return warning(code, text + more, place=Place(lines[0]))
 
 
 def _outside_text(view: View) -> str:

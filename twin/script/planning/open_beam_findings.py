@@ -8,6 +8,7 @@ from typing import Final, get_args
 
 import numpy as np
 
+from flexdt.twin.findings import Finding, Findings, Place, warning
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.kinematics import motor_poses
@@ -20,18 +21,19 @@ from flexdt.twin.physics.predicted_beam import (
 )
 from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.planning.plan import ScanPlan
-from flexdt.twin.script.problems import ScriptProblem
+from flexdt.twin.script.problems import ScriptCode
 
 SAMPLED_IMAGES = 5
 """Images of one setting whose distances are examined."""
-OPEN_BEAM_CODES: Final = ("saturated_open_beam", "starved_open_beam")
+OPEN_BEAM_CODES: Final = (
+    ScriptCode.SATURATED_OPEN_BEAM,
+    ScriptCode.STARVED_OPEN_BEAM,
+)
 """Codes of the warnings of `open_beam_problems`."""
 Setting = tuple[ExposureSettings, CameraSettings]
 
 
-def open_beam_problems(
-    plan: ScanPlan, physics: Physics = "poly"
-) -> tuple[ScriptProblem, ...]:
+def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> Findings:
     """Warn once for each setting of tube and camera whose open beam is saturated or
     starved.
 
@@ -45,7 +47,7 @@ def open_beam_problems(
         Warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that
         would do, at the first line that uses the setting.
     """
-    problems: list[ScriptProblem] = []
+    problems: list[Finding] = []
     for (exposure, camera), (line, indices) in lit_settings(plan).items():
         beam = brightest_beam(plan, exposure, camera, indices, physics)
         if beam is None:
@@ -53,8 +55,8 @@ def open_beam_problems(
         doubt = open_beam_doubt(plan.machine, exposure, beam)
         if doubt is not None:
             code = OPEN_BEAM_CODES[0 if beam.saturated else 1]
-            problems.append(ScriptProblem("warning", code, line, 1, doubt))
-    return tuple(problems)
+            problems.append(warning(code, doubt, place=Place(line)))
+    return Findings(problems)
 
 
 def lit_settings(

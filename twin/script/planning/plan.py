@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.backends import backend
+from flexdt.twin.findings import Findings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
@@ -35,7 +36,7 @@ from flexdt.twin.script.planning.plan_values import (
     StartState,
 )
 from flexdt.twin.script.planning.time_ranges import Range, step_range, total_range
-from flexdt.twin.script.problems import ScriptProblem, WithProblems
+from flexdt.twin.script.problems import Problems, WithProblems
 from flexdt.twin.values import ArrayValue, JsonValue
 
 _OF_STEP = (
@@ -79,7 +80,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     settings: Settings | None
     beam: tuple[BeamOn, ...]
     sample: SampleSize | None
-    problems: tuple[ScriptProblem, ...]
+    problems: Problems
     duration_s: float
 
     def __repr__(self) -> str:
@@ -281,7 +282,7 @@ class CheckReport(WithProblems):
     """The complete report; `to_dict` is the document of `flexdt check --json`."""
 
     plan: ScanPlan
-    problems: tuple[ScriptProblem, ...]
+    problems: Findings
     clearance: Clearance | None
     optics: tuple[Optics, ...]
     dose: Dose

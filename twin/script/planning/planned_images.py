@@ -25,7 +25,7 @@ from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.grammar import image_name, kind_of, sequence_names, shorten
 from flexdt.twin.script.planning import planned_scanner as planned
 from flexdt.twin.script.planning.plan_values import ExposureGroup
-from flexdt.twin.script.problems import Findings
+from flexdt.twin.script.problems import Collector, ScriptCode
 
 MARGIN_IMAGES: Final = 4.0
 """Images' worth of constant speed before the first and after the last image."""
@@ -194,7 +194,7 @@ class ImageCollector:
         motors: planned.Motors,
         tube: planned.PlannedTube,
         camera: planned.PlannedCamera,
-        findings: Findings,
+        findings: Collector,
         averages: int | None,
     ) -> None:
         """Begin to collect a script's images; findings are added to `findings`.
@@ -264,11 +264,12 @@ class ImageCollector:
         name = image_name(command.path)
         if name is None:
             self.findings.error(
-                "path", f"{shorten(command.path)!r} does not end with a file name"
+                ScriptCode.PATH,
+                f"{shorten(command.path)!r} does not end with a file name",
             )
         elif self.last is None:
             self.findings.error(
-                "nothing_to_save", "no image has been taken since the start"
+                ScriptCode.NOTHING_TO_SAVE, "no image has been taken since the start"
             )
         else:
             taken = self.images[self.last]
@@ -282,7 +283,7 @@ class ImageCollector:
             self._check_saved(saved)
             if self.moved:
                 message = f"{', '.join(self.moved)} still moves while {name} is taken"
-                self.findings.warn("moving", f"{message} (line {saved.line})")
+                self.findings.warn(ScriptCode.MOVING, f"{message} (line {saved.line})")
         return self._keep_busy(now, 0.0, "save_image")
 
     def sequence(self, command: c.TakeSequence, start: float, step: int) -> planned.Span:
@@ -316,13 +317,15 @@ class ImageCollector:
                 f"{', '.join(moving)} moves during the sequence without a trigger (POS)"
             )
             which = "where each image lies depends on the timing of commands"
-            self.findings.warn("no_trigger", f"{message}: {which}")
+            self.findings.warn(ScriptCode.NO_TRIGGER, f"{message}: {which}")
         files = sequence_names(command.prefix, command.first, frames)
         draft = self._add_images(
             starts, start, step, command.line, kind_of(files[0]), files, exact
         )
         if draft.kind == "projection" and frames > 1 and not moving:
-            self.findings.warn("static_sequence", "nothing moves during this sequence")
+            self.findings.warn(
+                ScriptCode.STATIC_SEQUENCE, "nothing moves during this sequence"
+            )
         self._check_saved(draft)
         self.trigger = None
         length = float(starts[-1] - start) + period
@@ -440,14 +443,16 @@ class ImageCollector:
             camera.assume("averages", inferred.averages)
             how = f"{inferred.averages} inferred ({inferred.notes['averages']})"
             message = f"the number of averages is not set; {how}, and taken for images before this"
-            self.findings.warn("averages_unsaid", f"{message} line too")
+            self.findings.warn(ScriptCode.AVERAGES_UNSAID, f"{message} line too")
             self._reported.add("averages")
         if frames is None:
             count = 1 if inferred is None else inferred.frames
             how = "1 is assumed"
             if inferred is not None:
                 how = f"inferred from {inferred.notes['frames']}"
-            self.findings.warn("frames_unsaid", f"the number of frames is not set; {how}")
+            self.findings.warn(
+                ScriptCode.FRAMES_UNSAID, f"the number of frames is not set; {how}"
+            )
             camera.assume("frames", count)
         return inferred
 
@@ -484,13 +489,13 @@ class ImageCollector:
         if late > _TIME_TOLERANCE_S:
             message = f"the sequence starts {late:.3g} s after {trigger.axis} passed its trigger"
             where = f"{trajectory.position(start):.6g}, not {trigger.position:g} {unit}"
-            self.findings.warn("late_start", f"{message}: image 0 is at {where}")
+            self.findings.warn(ScriptCode.LATE_START, f"{message}: image 0 is at {where}")
         if (
             abs(found.mismatch) > _MISMATCH_STEPS * found.increment
             and "frames" not in found.notes
         ):
             self.findings.warn(
-                "frame_angles",
+                ScriptCode.FRAME_ANGLES,
                 f"{found.frames} frames of {period * 1000:g} ms at {speed:.9g} {unit}/s "
                 f"cover {found.mismatch:+.4g} {unit} more than whole turns; images "
                 f"are put at steps of {found.increment:.9g} {unit}",
@@ -506,11 +511,11 @@ class ImageCollector:
         if off.any():
             velocity = abs(trajectory.velocity(trigger.time))
             if velocity < speed * (1 - 1e-9):
-                code = "run_up"
+                code = ScriptCode.RUN_UP
                 short = f"the run-up of {trigger.run_up:.4g} {unit} is too short"
                 message = f"passes the trigger at {velocity:.4g} of {speed:.4g} {unit}/s: {short}"
             else:
-                code = "scan_overrun"
+                code = ScriptCode.SCAN_OVERRUN
                 which = f"(from image {int(np.argmax(off))} on)"
                 message = f"slows down before the last of {len(off)} images {which}"
             self.findings.warn(
@@ -532,14 +537,16 @@ class ImageCollector:
         clash = next((f for f in draft.files if f in self.names), None)
         if clash is not None:
             self.findings.warn(
-                "overwrites", f"{clash} is saved twice; the last one stays"
+                ScriptCode.OVERWRITES, f"{clash} is saved twice; the last one stays"
             )
         self.names.update(draft.files)
         self._warn_of_defaults(draft)
         match draft.kind:
             case "dark":
                 if draft.xrays_on:
-                    self.findings.warn("xrays_on", "a dark image is taken with X-rays on")
+                    self.findings.warn(
+                        ScriptCode.XRAYS_ON, "a dark image is taken with X-rays on"
+                    )
                 return
             case "flat":
                 message = "a flat image is"
@@ -548,7 +555,7 @@ class ImageCollector:
             case _:
                 assert_never(draft.kind)
         if not draft.xrays_on:
-            self.findings.warn("xrays_off", f"{message} taken with X-rays off")
+            self.findings.warn(ScriptCode.XRAYS_OFF, f"{message} taken with X-rays off")
 
     def _warn_of_defaults(self, draft: ExposureGroup) -> None:
         """Warn, once each, of the settings that a saved image takes from the machine's
@@ -566,7 +573,8 @@ class ImageCollector:
         if not known and "averages" not in self._reported:
             self._reported.add("averages")
             self.findings.warn(
-                "averages_unsaid", "the number of averages is not set; 1 is assumed"
+                ScriptCode.AVERAGES_UNSAID,
+                "the number of averages is not set; 1 is assumed",
             )
         if draft.xrays_on:
             self._default("kV", "the tube voltage", f"{draft.kV:g} kV")
@@ -584,6 +592,6 @@ class ImageCollector:
         if name not in self.camera.said | self.tube.said | self._reported:
             self._reported.add(name)
             self.findings.warn(
-                "default_assumed",
+                ScriptCode.DEFAULT_ASSUMED,
                 f"{what} is not set; {value} of the machine file is assumed",
             )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from flexdt.twin.findings import Findings
 from flexdt.twin.machine.description import (
     Machine,
     Profile,
@@ -20,7 +21,6 @@ from flexdt.twin.script.planning.beam_view import beam_problems
 from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.plan_values import SampleSize, StartState
 from flexdt.twin.script.planning.simulated_script import Simulation
-from flexdt.twin.script.problems import in_order
 
 
 def plan_script(
@@ -79,12 +79,13 @@ def plan_script(
         settings=s.settings,
         beam=s.tube.intervals(end),
         sample=sample if sample is not None else s.sample,
-        problems=in_order((*script.warnings, *s.findings.problems)),
+        problems=Findings((*script.warnings, *s.findings.problems)).by_place(),
         duration_s=end,
     )
     extra = beam_problems(plan)
     return replace(
-        plan, problems=in_order((*script.warnings, *extra, *s.findings.problems))
+        plan,
+        problems=Findings((*script.warnings, *extra, *s.findings.problems)).by_place(),
     )
 
 

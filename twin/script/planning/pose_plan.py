@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from flexdt.twin.findings import Finding, Findings, warning
 from flexdt.twin.machine.description import (
     Machine,
     Profile,
@@ -18,7 +19,7 @@ from flexdt.twin.script.planning.plan import ScanPlan
 from flexdt.twin.script.planning.plan_values import SampleSize, StartState
 from flexdt.twin.script.planning.planned_scanner import Motors
 from flexdt.twin.script.planning.planner import plan_script
-from flexdt.twin.script.problems import ScriptProblem, in_order
+from flexdt.twin.script.problems import ENTIRE, ScriptCode
 from flexdt.twin.script.scan_request import REFERENCES
 
 Pose = Mapping[str, float]
@@ -85,12 +86,12 @@ def plan_poses(
         if not machine.has(axis):
             raise unknown_axis(axis, machine)
     begin = StartState.of(machine) if start is None else start
-    problems: list[ScriptProblem] = []
+    problems: list[Finding] = []
     back: Sequence[Pose] = ()
     commands = _settings(begin, exposure_ms)
     references = [*_image("di000000.tif"), c.XrayOn(), c.WaitXrayReady()]
     if flat is False or not poses:
-        problems = [ScriptProblem("warning", "no_flat", 0, 1, _NO_FLAT)]
+        problems = [warning(ScriptCode.NO_FLAT, _NO_FLAT, place=ENTIRE)]
     else:
         first = _arrival(begin.positions, poses[0], machine, begin)
         if flat is True:
@@ -101,7 +102,7 @@ def plan_poses(
             places = [_arrival(begin.positions, asked, machine, begin)]
         way = _way_to_flat(begin.positions, places, first, route)
         if not way.free:
-            problems = [ScriptProblem("warning", "flat_path", 0, 1, _NO_PATH)]
+            problems = [warning(ScriptCode.FLAT_PATH, _NO_PATH, place=ENTIRE)]
         back = way.back
         for leg in (*way.out, asked):
             commands += _moves(leg)
@@ -119,7 +120,7 @@ def plan_poses(
     plan = plan_script(
         c.Script.of(commands), machine, profile, start=begin, sample=sample
     )
-    return replace(plan, problems=in_order((*problems, *plan.problems)))
+    return replace(plan, problems=Findings((*problems, *plan.problems)).by_place())
 
 
 def _settings(begin: StartState, exposure_ms: float | None) -> list[c.Command]:

@@ -6,12 +6,13 @@ along them into a `SampleForecast`, and `predicted_exposures` judges the counts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from flexdt.twin.findings import Finding, Findings, Place, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.machine.camera import CameraSettings
@@ -28,7 +29,7 @@ from flexdt.twin.physics.predicted_beam import (
 from flexdt.twin.physics.readout import saturating_counts
 from flexdt.twin.script.planning.open_beam_findings import brightest_beam, lit_settings
 from flexdt.twin.script.planning.plan import ScanPlan
-from flexdt.twin.script.problems import ScriptProblem
+from flexdt.twin.script.problems import ScriptCode
 
 PROBE_VIEWS: Final = 3
 """Number of views of each setting that are examined."""
@@ -36,8 +37,11 @@ PROBE_SETTINGS: Final = 4
 """Number of settings of tube and camera that are examined, the first ones."""
 PROBE_RAYS: Final = 128
 """Least number of rays along the longer side of a panel, if it has so many pixels."""
-SHARE_NAMES: Final = ("saturated", "starved")
-"""Members of `CountShares`; warnings have codes such as `starved_pixels`."""
+CODE_OF_SHARE: Final = {
+    "saturated": ScriptCode.SATURATED_PIXELS,
+    "starved": ScriptCode.STARVED_PIXELS,
+}
+"""Member of `CountShares` -> code of the warning about it."""
 UNPREDICTED: Final = "saturated and starved pixels behind the sample are not predicted"
 """Beginning of the warning that gives the reason."""
 
@@ -182,9 +186,7 @@ def _predicted(
     return replace(made, doubts=(*made.doubts, *doubts))
 
 
-def sample_problems(
-    forecast: SampleForecast, known: Sequence[ScriptProblem] = ()
-) -> tuple[ScriptProblem, ...]:
+def sample_problems(forecast: SampleForecast, known: Iterable[Finding] = ()) -> Findings:
     """Warn of settings whose projections have saturated or starved pixels.
 
     Args:
@@ -197,25 +199,26 @@ def sample_problems(
         on; one `unpredicted_pixels` with the reason, at the first probe's line, if pixels
         are not predicted.
     """
-    explained = {(p.code, p.line) for p in known}
-    warnings = [
-        ScriptProblem("warning", f"{name}_pixels", probe.line, 1, text)
+    found = Findings(
+        warning(CODE_OF_SHARE[name], text, place=Place(probe.line))
         for probe, seen in zip(forecast.probes, forecast.shares, strict=True)
         for name, text in _sentences(seen)
-        if (f"{name}_open_beam", probe.line) not in explained
-    ]
+    )
+    warnings = [*found.unexplained_by(known)]
     if forecast.unpredicted:
         line = min(probe.line for probe in forecast.probes)
         message = f"{UNPREDICTED}: {forecast.unpredicted}"
-        warnings.append(ScriptProblem("warning", "unpredicted_pixels", line, 1, message))
-    return tuple(warnings)
+        warnings.append(
+            warning(ScriptCode.UNPREDICTED_PIXELS, message, place=Place(line))
+        )
+    return Findings(warnings)
 
 
 def _sentences(seen: CountShares | None) -> list[tuple[str, str]]:
     """List (name, sentence) for each share of pixels of `WARNING_SHARE` or more; [] for None."""
     if seen is None:
         return []
-    shares = [(name, getattr(seen, name)) for name in SHARE_NAMES]
+    shares = [(name, getattr(seen, name)) for name in CODE_OF_SHARE]
     return [
         (name, f"about {100 * share:.3g} % of the projections' pixels will be {name}")
         for name, share in shares

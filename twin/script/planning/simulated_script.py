@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any, Final, assert_never
 
 from flexdt.twin.errors import LimitError
+from flexdt.twin.findings import Place
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.machine.travel import Arrival, Rate, arrival, rate
 from flexdt.twin.motion.profiles import Trajectory
@@ -35,7 +36,7 @@ from flexdt.twin.script.planning.plan_values import (
     StartState,
 )
 from flexdt.twin.script.planning.planned_images import ImageCollector
-from flexdt.twin.script.problems import Findings
+from flexdt.twin.script.problems import Collector, ScriptCode
 
 # The binary argument of `scanner set sample info`: the sample's size and names.
 #
@@ -98,7 +99,7 @@ class Simulation:
             start.kV, start.power_W, on is True, on is not None, ready_at
         )
         self.camera = planned.PlannedCamera(start.camera)
-        self.findings = Findings()
+        self.findings = Collector()
         self.imaging = ImageCollector(
             machine, self.motors, self.tube, self.camera, self.findings, averages
         )
@@ -125,7 +126,7 @@ class Simulation:
         for command in commands:
             if isinstance(command, c.MotorCommand | c.Custom):
                 command = replace(command, component=own_name(command.component, axes))
-            self.findings.place = (command.line, command.column)
+            self.findings.place = Place(command.line, command.column)
             before = self.now
             if isinstance(
                 command, _CAMERA
@@ -193,7 +194,7 @@ class Simulation:
         """
         if command.component in self.machine.axes:
             self.findings.warn(
-                "custom_component",
+                ScriptCode.CUSTOM_COMPONENT,
                 f"{command.component}: the twin does not know this command "
                 "of the axis; no effect",
             )
@@ -275,7 +276,7 @@ class Simulation:
                 "waits until the X-rays are ready, but they are off: "
                 "the script would hang here"
             )
-            self.findings.error("xray_never_ready", message)
+            self.findings.error(ScriptCode.XRAY_NEVER_READY, message)
             return self.timed("command")
         left = self.tube.ready_at - self.now
         if left <= 0.0:
@@ -296,7 +297,7 @@ class Simulation:
         try:
             changed_tube(self.machine.tube, now, change.get("kV"), change.get("power_W"))
         except LimitError as error:
-            self.findings.error("limit", error.message)
+            self.findings.error(ScriptCode.LIMIT, error.message)
             value = getattr(now, name)
         self.tube.set(self.now, name, value)
         return self.timed("set_tube")
@@ -318,9 +319,9 @@ class Simulation:
             changed_camera(self.machine.detector, now, change)
         except LimitError as error:
             region = "edge" in error.data or "binning" in error.data
-            code = "limit"
+            code = ScriptCode.LIMIT
             if "setting" not in error.data:
-                code = "roi" if region else "mode"
+                code = ScriptCode.ROI if region else ScriptCode.MODE
             self.findings.error(code, error.message)
             value = getattr(now, name)
         self.camera.set(name, value)
@@ -341,11 +342,11 @@ class Simulation:
             return True
         if is_reserved(name):
             self.findings.error(
-                "unknown_component", unknown_axis(name, self.machine).message
+                ScriptCode.UNKNOWN_COMPONENT, unknown_axis(name, self.machine).message
             )
         else:
             self.findings.warn(
-                "custom_component",
+                ScriptCode.CUSTOM_COMPONENT,
                 f"{name!r} is a custom component: allowed, without effect here",
             )
         return False
@@ -386,9 +387,11 @@ class Simulation:
         """Report a target beyond a limit: a warning if the machine clamps it, else an error."""
         for message in found.messages:
             if found.is_clamped(self.machine):
-                self.findings.warn("limit_clamped", f"{message}; set to the limit")
+                self.findings.warn(
+                    ScriptCode.LIMIT_CLAMPED, f"{message}; set to the limit"
+                )
             else:
-                self.findings.error("limit", message)
+                self.findings.error(ScriptCode.LIMIT, message)
 
     def _move(self, command: c.MoveAbsolute) -> planned.Span:
         """Start a move of an axis within its travel; register its trigger, and report
@@ -473,7 +476,7 @@ class Simulation:
         if time is None:
             unit = self.machine.axes[motor].unit
             self.findings.error(
-                "unreachable_trigger",
+                ScriptCode.UNREACHABLE_TRIGGER,
                 f"{command.component} never passes the trigger {trigger:g} {unit} on "
                 f"its way from {begin[motor]:g} to {trajectory.target:g} {unit}: "
                 "the script would hang here",
