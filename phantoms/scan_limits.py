@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import Phantom
+from flexdt.twin.findings import ERROR
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine, profile_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.predicted_beam import Physics, open_beam_doubt, open_beam_of
-from flexdt.twin.plausibility import Severity, settled
+from flexdt.twin.plausibility import PlausibilityCode, settled
 from flexdt.twin.plausibility.examination import Operation, examine
 from flexdt.twin.scanner.state import TubeSettings, changed_tube
 from flexdt.twin.script.compose import compose_script
@@ -23,11 +24,11 @@ from flexdt.twin.script.scan_request import ScanRequest
 __all__ = ["check_distances", "check_placement", "check_tube", "open_beam_doubts"]
 
 USELESS_PLACEMENTS: Final = (
-    "source in the sample",
-    "panel in the sample",
-    "sample not seen",
+    PlausibilityCode.SOURCE_IN_THE_SAMPLE,
+    PlausibilityCode.PANEL_IN_THE_SAMPLE,
+    PlausibilityCode.SAMPLE_NOT_SEEN,
 )
-"""Findings about placements whose images are useless."""
+"""Codes of placements whose images are useless."""
 
 
 def check_tube(machine: Machine, exposure: ExposureSettings) -> None:
@@ -91,13 +92,7 @@ def check_placement(phantom: Phantom, cone_vec: ConeVec, shape: tuple[int, int])
     """
     half = np.array(phantom.size_mm) / 2.0
     findings = examine(Operation.SIMULATE, cone_vec, shape, boxes=[[-half, half]])
-    settled(
-        [
-            replace(one, severity=Severity.REFUSAL)
-            for one in findings
-            if one.kind in USELESS_PLACEMENTS
-        ]
-    )
+    settled(replace(one, severity=ERROR) for one in findings.of(*USELESS_PLACEMENTS))
 
 
 def open_beam_doubts(

@@ -42,10 +42,11 @@ from flexdt.twin.dataset.flexdt_json import (
 )
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.errors import LimitError, TwinError
+from flexdt.twin.findings import Severity
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.description import Machine, Profile
-from flexdt.twin.plausibility import Operation, Severity, examine
+from flexdt.twin.plausibility import Operation, examine
 
 MAX_WORKERS: Final = 2
 """Number of worker processes."""
@@ -703,7 +704,7 @@ def _doubts(scan: _Scan, shape: tuple[int, int] | None) -> list[str]:
         found = examine(Operation.OPEN, ConeVec(np.array(known)), shape)
     except TwinError as error:
         return [str(error)]
-    return [one.said for one in found if one.severity > Severity.NOTE]
+    return [one.text for one in found if one.severity is not Severity.NOTE]
 
 
 def _same_machine(scan: _Scan, context: TwinContext) -> bool:

@@ -25,12 +25,13 @@ from flexdt.twin.findings import (
     error,
     warning,
 )
+from flexdt.twin.plausibility import PlausibilityCode
 from flexdt.twin.script.problems import ScriptCode
 from tests.support.codes_as_text import ROOMS as FOLDERS
 from tests.support.codes_as_text import found_in
 
 ROOT = Path(__file__).parents[2]
-ROOMS: tuple[type[FindingCode], ...] = (ScriptCode,)
+ROOMS: tuple[type[FindingCode], ...] = (ScriptCode, PlausibilityCode)
 CODES = [code for room in ROOMS for code in room]
 DOCUMENTED = {ScriptCode: "docs/reference/script-problems.md"}
 RANK = [Severity.NOTE, Severity.WARNING, Severity.ERROR]

@@ -6,20 +6,16 @@ whether the entry point raises an error, warns or does nothing.
 
 from flexdt.twin.plausibility.examination import Operation, examine
 from flexdt.twin.plausibility.findings import (
-    KINDS,
-    Finding,
+    PlausibilityCode,
     PlausibilityWarning,
-    Severity,
     settled,
     warn_of,
 )
 
 __all__ = [
-    "KINDS",
-    "Finding",
     "Operation",
+    "PlausibilityCode",
     "PlausibilityWarning",
-    "Severity",
     "examine",
     "settled",
     "warn_of",

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.plausibility.findings import Finding
 from flexdt.twin.plausibility.pixel_values import integral_findings, volume_findings
 from flexdt.twin.plausibility.sample_placement import placement_findings
 from flexdt.twin.plausibility.scan_geometry import (
@@ -47,7 +47,7 @@ def examine(
     volume: npt.NDArray[Any] | None = None,
     boxes: npt.ArrayLike | None = None,
     grid: FloatArray | None = None,
-) -> tuple[Finding, ...]:
+) -> Findings:
     """Find contradictions in the input of an operation.
 
     Warns and raises nothing itself; see `settled`. Without a geometry only values are
@@ -70,13 +70,13 @@ def examine(
 
     Example:
         >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=np.linspace(0, 6.28, 90), pixel=0.1)
-        >>> [one.kind for one in examine(Operation.OPEN, scan, (76, 96))]
-        ['angles in radians']
+        >>> examine(Operation.OPEN, scan, (76, 96))
+        <Findings: 0 errors, 1 warnings: angles in radians>
     """
-    values = tuple(_values(images, volume))
+    values = Findings(_values(images, volume))
     if geometry is None:
         return values
-    return (*_found(operation, geometry, shape, boxes, grid), *values)
+    return Findings(_found(operation, geometry, shape, boxes, grid)).and_also(values)
 
 
 def _found(

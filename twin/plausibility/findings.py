@@ -1,85 +1,83 @@
-"""A contradiction that was found: its kind, cause, figure, remedy and severity."""
+"""Codes of the contradictions in input, and how an entry point reacts to them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from enum import IntEnum
-from typing import Final
+from collections.abc import Iterable
 
 from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import ERROR, WARNING, Finding, FindingCode
 
 
-class Severity(IntEnum):
-    """Reaction of an entry point to a finding."""
+class PlausibilityCode(FindingCode):
+    """Kinds of contradictions between two parts of the input."""
 
-    NOTE = 0
-    """No reaction; the finding explains others."""
-    WARNING = 1
-    """Warn and continue."""
-    REFUSAL = 2
-    """Raise an error."""
-
-
-KINDS: Final[Mapping[str, str]] = {
-    "units": "lengths of one argument are in another unit than those of another",
-    "source in the sample": "the focal spot lies in the box around the sample",
-    "panel in the sample": "the panel of an exposure stands before or in the sample",
-    "sample not seen": "no ray that reaches the panel meets the sample",
-    "impossible distances": "distances or pixels that no scanner has",
-    "angles in radians": "radians where degrees belong",
-    "angles in degrees": "degrees where radians belong",
-    "limited arc": "planes that no ray of the scan runs along",
-    "laminography": "a beam inclined to the plane of rotation, given to FDK",
-    "not finite": "values that are no numbers",
-    "Hounsfield": "Hounsfield units or grey values where attenuation belongs",
-    "counts": "counts of a detector where line integrals belong",
-    "transmission": "transmission where line integrals belong",
-    "whole numbers": "line integrals whose fractions are cut off",
-    "negative": "line integrals or attenuation of the other sign",
-    "scaled": "line integrals that no panel can measure",
-    "flats disagree": "flat images of different beams",
-    "grid not seen": "voxels beside the field of view",
-    "voxel size": "voxels too large for the field of view",
-    "angles disagree": "the angles of a file and those of the geometry",
-    "order": "the file's angles are the geometry's in another order",
-    "pixel size disagrees": "the pixel of a file and that of the geometry",
-    "unknown unit": "a figure of a file in a unit that is not known",
-    "duplicate": "two files with one number",
-    "gap": "a number missing between those of other files",
-    "other name": "a file named otherwise than the other images",
-    "no data": "images in which nothing was recorded",
-}
-"""Kind of contradiction -> its meaning."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A contradiction between two parts of the input.
-
-    Attributes:
-        kind: one of `KINDS`.
-        cause: the contradiction, with its figure and unit.
-        remedy: possible action of the user.
-        severity: reaction of an entry point.
-        figure: the figure by which it was found, in the unit given in `cause`.
-    """
-
-    kind: str
-    cause: str
-    remedy: str
-    severity: Severity
-    figure: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise KeyError(self.kind)
-
-    @property
-    def said(self) -> str:
-        """Cause and remedy in one sentence."""
-        return f"{self.cause}; {self.remedy}"
+    UNITS = (
+        "units",
+        WARNING,
+        "lengths of one argument are in another unit than those of another",
+    )
+    SOURCE_IN_THE_SAMPLE = (
+        "source in the sample",
+        WARNING,
+        "the focal spot lies in the box around the sample",
+    )
+    PANEL_IN_THE_SAMPLE = (
+        "panel in the sample",
+        WARNING,
+        "the panel of an exposure stands before or in the sample",
+    )
+    SAMPLE_NOT_SEEN = (
+        "sample not seen",
+        WARNING,
+        "no ray that reaches the panel meets the sample",
+    )
+    IMPOSSIBLE_DISTANCES = (
+        "impossible distances",
+        ERROR,
+        "distances or pixels that no scanner has",
+    )
+    ANGLES_IN_RADIANS = "angles in radians", WARNING, "radians where degrees belong"
+    ANGLES_IN_DEGREES = "angles in degrees", WARNING, "degrees where radians belong"
+    LIMITED_ARC = "limited arc", WARNING, "planes that no ray of the scan runs along"
+    LAMINOGRAPHY = (
+        "laminography",
+        ERROR,
+        "a beam inclined to the plane of rotation, given to FDK",
+    )
+    NOT_FINITE = "not finite", WARNING, "values that are no numbers"
+    HOUNSFIELD = (
+        "Hounsfield",
+        ERROR,
+        "Hounsfield units or grey values where attenuation belongs",
+    )
+    COUNTS = "counts", ERROR, "counts of a detector where line integrals belong"
+    TRANSMISSION = "transmission", WARNING, "transmission where line integrals belong"
+    WHOLE_NUMBERS = "whole numbers", WARNING, "line integrals whose fractions are cut off"
+    NEGATIVE = "negative", WARNING, "line integrals or attenuation of the other sign"
+    SCALED = "scaled", ERROR, "line integrals that no panel can measure"
+    FLATS_DISAGREE = "flats disagree", WARNING, "flat images of different beams"
+    GRID_NOT_SEEN = "grid not seen", ERROR, "voxels beside the field of view"
+    VOXEL_SIZE = "voxel size", ERROR, "voxels too large for the field of view"
+    ANGLES_DISAGREE = (
+        "angles disagree",
+        WARNING,
+        "the angles of a file and those of the geometry",
+    )
+    ORDER = "order", WARNING, "the file's angles are the geometry's in another order"
+    PIXEL_SIZE_DISAGREES = (
+        "pixel size disagrees",
+        WARNING,
+        "the pixel of a file and that of the geometry",
+    )
+    UNKNOWN_UNIT = (
+        "unknown unit",
+        WARNING,
+        "a figure of a file in a unit that is not known",
+    )
+    DUPLICATE = "duplicate", ERROR, "two files with one number"
+    GAP = "gap", WARNING, "a number missing between those of other files"
+    OTHER_NAME = "other name", WARNING, "a file named otherwise than the other images"
 
 
 class PlausibilityWarning(UserWarning):
@@ -90,8 +88,9 @@ def warn_of(
     findings: Iterable[Finding],
     error: type[TwinError] = TwinError,
 ) -> None:
-    """Raise an error for a refusal as `settled` does; otherwise give a Python warning
-    (`PlausibilityWarning`, at the caller's line) for each finding that is a warning.
+    """Raise an error for an error among the findings as `settled` does; otherwise give a
+    Python warning (`PlausibilityWarning`, at the caller's line) for each finding that is a
+    warning.
 
     Args:
         findings: of one entry point.
@@ -104,9 +103,10 @@ def warn_of(
 def settled(
     findings: Iterable[Finding], error: type[TwinError] = TwinError, where: str = ""
 ) -> list[str]:
-    """Raise an error for the first refusal, or return the texts of all warnings.
+    """Raise an error for the first error, or return the texts of all warnings.
 
-    Findings of severity NOTE are ignored. Nothing is printed or warned; see `warn_of`.
+    Notes are ignored; what follows an error is not asked for. Nothing is printed or warned;
+    see `warn_of`.
 
     Args:
         findings: of one entry point.
@@ -114,23 +114,24 @@ def settled(
         where: prefix of each sentence, such as a path; none if empty.
 
     Returns:
-        Texts "cause; remedy" of the warnings, in order.
+        Texts "message; remedy" of the warnings, in order.
 
     Raises:
-        TwinError: of the type `error`, with the facts `check` (kind), `asked` (figure)
+        TwinError: of the type `error`, with the facts `check` (code), `asked` (figure)
             and `allowed` (remedy).
 
     Example:
-        >>> doubt = Finding("gap", "no image 17", "give 359 views", Severity.WARNING)
+        >>> from flexdt.twin.findings import warning
+        >>> doubt = warning(PlausibilityCode.GAP, "no image 17", "give 359 views")
         >>> settled([doubt], where="scans")
         ['scans: no image 17; give 359 views']
     """
     before = f"{where}: " if where else ""
     texts = []
     for one in findings:
-        if one.severity is Severity.REFUSAL:
-            facts = {"check": one.kind, "asked": one.figure, "allowed": one.remedy}
-            raise error(before + one.said, facts)
-        if one.severity is Severity.WARNING:
-            texts.append(before + one.said)
+        if one.severity is ERROR:
+            facts = {"check": one.code.value, "asked": one.figure, "allowed": one.remedy}
+            raise error(before + one.text, facts)
+        if one.severity is WARNING:
+            texts.append(before + one.text)
     return texts

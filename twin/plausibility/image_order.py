@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Final
 
 import numpy as np
 
-from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.findings import Finding, Findings, error, warning
+from flexdt.twin.plausibility.findings import PlausibilityCode
 
 NUMBER: Final = re.compile(r"(?P<sign>[-+]?)(?P<whole>\d+)(?P<part>\.\d+)?")
 SCIENTIFIC: Final = re.compile(r"\d\.\d+[eE][-+]\d{2}(?!\d)")
@@ -46,7 +47,7 @@ class Ordered:
     """
 
     names: tuple[str, ...]
-    findings: tuple[Finding, ...] = ()
+    findings: Findings = field(default_factory=Findings)
     others: tuple[str, ...] = ()
 
 
@@ -75,7 +76,7 @@ def ordered(names: Sequence[str]) -> Ordered:
     others = _written_otherwise(sorted_names, keys)
     rest = [name for name in sorted_names if name not in others]
     found = [*_duplicates(sorted_names, keys), *_gaps(rest, keys)]
-    return Ordered(sorted_names, tuple(found), others)
+    return Ordered(sorted_names, Findings(found), others)
 
 
 def _numbered(names: list[str]) -> Ordered | None:
@@ -167,7 +168,7 @@ def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
     listed = ", ".join(others[:MAX_NAMES_SHOWN])
     cause = f"{listed} {_is(others)} named otherwise than the rest, such as {like}"
     remedy = "frames=PATTERN says which are projections"
-    return Finding("other name", cause, remedy, Severity.WARNING, float(len(others)))
+    return warning(PlausibilityCode.OTHER_NAME, cause, remedy, figure=float(len(others)))
 
 
 def duplicate(one: str, other: str) -> Finding:
@@ -175,8 +176,8 @@ def duplicate(one: str, other: str) -> Finding:
     the meant one is unknown; its figure is 2.
     """
     cause = f"{one} and {other} have one number: which of them is meant is not known"
-    return Finding(
-        "duplicate", cause, "allowed: one file a number", Severity.REFUSAL, 2.0
+    return error(
+        PlausibilityCode.DUPLICATE, cause, "allowed: one file a number", figure=2.0
     )
 
 
@@ -366,4 +367,4 @@ def _gaps(names: Sequence[str], keys: dict[str, Key]) -> Iterator[Finding]:
             f"{names[at + 1]}{' and elsewhere' if len(wide) > 1 else ''}"
         )
         remedy = "views are taken in the order of the images that are there"
-        yield Finding("gap", cause, remedy, Severity.WARNING, float(lost))
+        yield warning(PlausibilityCode.GAP, cause, remedy, figure=float(lost))

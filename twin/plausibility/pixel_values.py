@@ -9,7 +9,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.findings import Finding, error, warning
+from flexdt.twin.plausibility.findings import PlausibilityCode
 
 EDGE_PART: Final = 0.06
 """Share of an image's columns, or rows, that count as its edges."""
@@ -59,15 +60,15 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
         return
     if values.dtype.kind in "ui" and int(values.max()) > MAX_LINE_INTEGRAL:
         cause = f"line integrals of {values.dtype} up to {values.max()}, as counts have"
-        yield Finding(
-            "counts", cause, _FROM_COUNTS, Severity.REFUSAL, float(values.max())
+        yield error(
+            PlausibilityCode.COUNTS, cause, _FROM_COUNTS, figure=float(values.max())
         )
         return
     if values.dtype.kind in "bui" and values.any():
         cause = f"line integrals of {values.dtype} have no fractions"
         remedy = "give floating-point numbers"
-        yield Finding(
-            "whole numbers", cause, remedy, Severity.WARNING, float(values.max())
+        yield warning(
+            PlausibilityCode.WHOLE_NUMBERS, cause, remedy, figure=float(values.max())
         )
         return
     largest = float(np.abs(values).max())
@@ -79,7 +80,7 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
             "line integrals are -np.log of the transmission; allowed: up to "
             f"{MAX_COMPUTED_INTEGRAL:g}"
         )
-        yield Finding("scaled", cause, remedy, Severity.REFUSAL, largest)
+        yield error(PlausibilityCode.SCALED, cause, remedy, figure=largest)
         return
     beam = _beam(values)
     if beam is None or not beam > OPEN[0]:
@@ -91,7 +92,7 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
         cause = (
             f"line integrals of {beam:.4g} at the images' edges, less behind the object"
         )
-        yield Finding("counts", cause, _FROM_COUNTS, Severity.REFUSAL, beam)
+        yield error(PlausibilityCode.COUNTS, cause, _FROM_COUNTS, figure=beam)
     elif beam < OPEN[1] and darker > TAIL and brighter < MAX_BRIGHT_SHARE:
         open_share = float(((values > OPEN[0] * beam) & (values < OPEN[1] * beam)).mean())
         lowest = float(np.quantile(values, TAIL))
@@ -101,7 +102,7 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
                 "transmission is"
             )
             remedy = "line integrals are -np.log of it"
-            yield Finding("transmission", cause, remedy, Severity.WARNING, beam)
+            yield warning(PlausibilityCode.TRANSMISSION, cause, remedy, figure=beam)
     else:
         yield from _range_findings(values)
 
@@ -118,11 +119,11 @@ def _range_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
     if low < MIN_NEGATIVE_INTEGRAL and high < MAX_POSITIVE_SHARE * -low:
         cause = f"line integrals from {low:.4g} to {high:.4g} are negative"
         remedy = "line integrals are -np.log of the transmission, from 0 on"
-        yield Finding("negative", cause, remedy, Severity.WARNING, low)
+        yield warning(PlausibilityCode.NEGATIVE, cause, remedy, figure=low)
     elif high > MAX_GIVEN_INTEGRAL:
         cause = f"line integrals of up to {high:.4g}, at which no photon passes"
         remedy = "are they grey values, or scaled?"
-        yield Finding("scaled", cause, remedy, Severity.WARNING, high)
+        yield warning(PlausibilityCode.SCALED, cause, remedy, figure=high)
 
 
 _FROM_COUNTS: Final = (
@@ -171,7 +172,7 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
                 "of view: neither are line integrals through them"
             )
             remedy = "give them a value first, such as np.nan_to_num(volume.data)"
-            yield Finding("not finite", cause, remedy, Severity.WARNING, share)
+            yield warning(PlausibilityCode.NOT_FINITE, cause, remedy, figure=share)
         if not bad.all():
             low = float(np.nanmin(np.where(bad, np.nan, data)))
         else:
@@ -186,14 +187,14 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
     if low < MIN_ATTENUATION:
         cause = f"attenuation from {low:.5g} to {high:.5g} /mm, as Hounsfield units are"
         remedy = "attenuation is mu_water * (1 + HU / 1000), some 0.02 /mm of water"
-        yield Finding("Hounsfield", cause, remedy, Severity.REFUSAL, low)
+        yield error(PlausibilityCode.HOUNSFIELD, cause, remedy, figure=low)
     elif high > MAX_PER_MM:
         cause = f"attenuation of up to {high:.5g} /mm, more than any element has"
         remedy = "grey values need a scale to 1/mm, labels material={1: NAME}"
-        yield Finding("Hounsfield", cause, remedy, Severity.WARNING, high)
+        yield warning(PlausibilityCode.HOUNSFIELD, cause, remedy, figure=high)
     elif low < 0.0 and high <= MAX_POSITIVE_SHARE * -low:
         cause = f"attenuation from {low:.5g} to {high:.5g} /mm is negative"
         remedy = (
             "is its sign right? of Hounsfield units / 1000 it is mu_water * (1 + value)"
         )
-        yield Finding("negative", cause, remedy, Severity.WARNING, low)
+        yield warning(PlausibilityCode.NEGATIVE, cause, remedy, figure=low)

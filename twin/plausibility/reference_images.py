@@ -8,8 +8,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.plausibility.findings import PlausibilityCode
 
 MAX_FLAT_DIFFERENCE: Final = 0.015
 """Largest relative difference of flat images' levels by a tube's own variation."""
@@ -58,7 +59,7 @@ def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[F
             f"{level.max():.3g} of their mean"
         )
         remedy = "was the current changed between them? use those that belong to the scan"
-        yield Finding("flats disagree", cause, remedy, Severity.WARNING, apart)
+        yield warning(PlausibilityCode.FLATS_DISAGREE, cause, remedy, figure=apart)
 
 
 def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
@@ -86,7 +87,7 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
     span = " to ".join(dict.fromkeys(f"{level:.3g}" for level in (levels.min(), high)))
     cause = f"the open beam beside the object is {span} times the flat image"
     remedy = "another current (or scatter): a flat image of the scan's own beam is needed"
-    yield Finding("flats disagree", cause, remedy, Severity.WARNING, high)
+    yield warning(PlausibilityCode.FLATS_DISAGREE, cause, remedy, figure=high)
 
 
 def _drifts(levels: FloatArray) -> bool:

@@ -9,10 +9,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.virtual_panel import stretches
-from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.plausibility.findings import PlausibilityCode
 
 MOST_MAGNIFIED: Final = 1000.0
 """Largest magnification for which a tube's focal spot is small enough."""
@@ -48,7 +49,7 @@ def placement_findings(
     Example:
         >>> scan = ConeVec.circular(sod=0.6, sdd=1.06, angles=4, pixel=1.5e-4)
         >>> found = placement_findings(scan, (760, 956), [[[-5, -5, -5], [5, 5, 5]]])
-        >>> [one.said for one in found]
+        >>> [one.text for one in found]
         ['the source is inside the box around the sample in 4 of 4 views; are all lengths in mm?']
     """
     parts = np.asarray(boxes, dtype=np.float64)
@@ -62,8 +63,11 @@ def placement_findings(
     if inside.any():
         count = f"{inside.sum()} of {len(inside)} views"
         cause = f"the source is inside the box around the sample in {count}"
-        yield Finding(
-            "source in the sample", cause, UNITS, Severity.WARNING, float(inside.mean())
+        yield warning(
+            PlausibilityCode.SOURCE_IN_THE_SAMPLE,
+            cause,
+            UNITS,
+            figure=float(inside.mean()),
         )
         return
     toward = cone_vec.normal * np.sign(cone_vec.source_detector_distance)[:, None]
@@ -74,7 +78,7 @@ def placement_findings(
     seen = _seen(places, depths > 0.0, shape)
     if not seen.any():
         cause = "the sample is outside every view: no ray that reaches the panel meets it"
-        yield Finding("sample not seen", cause, UNITS, Severity.WARNING, 0.0)
+        yield warning(PlausibilityCode.SAMPLE_NOT_SEEN, cause, UNITS)
         return
     cut = stretches(cone_vec, corners) > 1.0
     if exposed and cut.any():
@@ -82,27 +86,27 @@ def placement_findings(
             f"the panel stands before or in the box around the sample in {cut.sum()} "
             f"of {len(cut)} views: rays run through it, as through a virtual one"
         )
-        yield Finding(
-            "panel in the sample", cause, UNITS, Severity.WARNING, float(cut.mean())
+        yield warning(
+            PlausibilityCode.PANEL_IN_THE_SAMPLE, cause, UNITS, figure=float(cut.mean())
         )
         return
     magnified = float((distance / np.maximum(depths.mean(axis=1), 1e-9)).max())
     pixel = float(np.linalg.norm(cone_vec.u, axis=1).max())
     if magnified > MOST_MAGNIFIED:
         cause = f"the magnification is {magnified:.4g}, above {MOST_MAGNIFIED:g}"
-        yield Finding("units", cause, UNITS, Severity.WARNING, magnified)
+        yield warning(PlausibilityCode.UNITS, cause, UNITS, figure=magnified)
     if (largest := float((high - low).max())) * magnified < pixel:
         cause = (
             f"the sample measures {largest:.3g} mm, magnified {magnified:.3g} times less "
             f"than a pixel of {pixel:.3g} mm"
         )
-        yield Finding("units", cause, UNITS, Severity.WARNING, largest)
+        yield warning(PlausibilityCode.UNITS, cause, UNITS, figure=largest)
     ahead = (depths > 0.0).all(axis=1)
     if ahead.all() and min(shape) >= FEWEST_PIXELS:
         times = float((np.ptp(places, axis=1) / shape[::-1]).min(axis=1).min())
         if times > MOST_OVERSIZE:
             cause = f"the sample's shadow is {times:.3g} times as large as the panel in every view"
-            yield Finding("units", cause, UNITS, Severity.WARNING, times)
+            yield warning(PlausibilityCode.UNITS, cause, UNITS, figure=times)
 
 
 def _seen(

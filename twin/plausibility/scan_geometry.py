@@ -11,9 +11,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.findings import ERROR, WARNING, Finding, error, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, cross
-from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.plausibility.findings import PlausibilityCode
 
 SOME_VIEWS: Final = 16
 """Number of views whose panels are examined."""
@@ -68,22 +69,21 @@ def distance_findings(
     if not (math.isfinite(sod) and math.isfinite(sdd) and 0.0 < sod <= sdd):
         cause = f"{names[0]} is {sod:g} mm and {names[1]} {sdd:g} mm"
         allowed = f"allowed: 0 < {names[0]} <= {names[1]}"
-        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, sod)
+        yield error(PlausibilityCode.IMPOSSIBLE_DISTANCES, cause, allowed, figure=sod)
         return
     if not (np.isfinite(pitches).all() and (pitches > 0.0).all()):
         cause = f"the pixel is {' x '.join(f'{p:g}' for p in pitches)} mm"
-        yield Finding(
-            "impossible distances",
+        yield error(
+            PlausibilityCode.IMPOSSIBLE_DISTANCES,
             cause,
             "allowed: above 0",
-            Severity.REFUSAL,
-            float(pitches[0]),
+            figure=float(pitches[0]),
         )
         return
     if float(pitches.max()) > MOST_PITCH * sdd:
         cause = f"{names[1]} is {sdd:g} mm with pixels of {pitches.max():g} mm"
         allowed = f"allowed: pixels below {MOST_PITCH:g} times {names[1]}; are all lengths in mm?"
-        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, sdd)
+        yield error(PlausibilityCode.IMPOSSIBLE_DISTANCES, cause, allowed, figure=sdd)
 
 
 def geometry_findings(
@@ -118,12 +118,12 @@ def geometry_findings(
         )
         allowed = f"allowed: pixels below {MOST_PITCH:g} times the distance; are all lengths in mm?"
         figure = float(pitch[worst] / max(distance[worst], 1e-300))
-        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, figure)
+        yield error(PlausibilityCode.IMPOSSIBLE_DISTANCES, cause, allowed, figure=figure)
         return
     if _still_source(cone_vec, distance):
         cause = "the source stands still while the panel turns about it: SOD is 0"
         allowed = "allowed: a source before the axis"
-        yield Finding("impossible distances", cause, allowed, Severity.REFUSAL, 0.0)
+        yield error(PlausibilityCode.IMPOSSIBLE_DISTANCES, cause, allowed)
         return
     if shape is None:
         return
@@ -140,7 +140,7 @@ def geometry_findings(
             f"the source sees the panel of {wide:.4g} mm under {fan:.3g} deg, pixels of "
             f"{pitch.max():.3g} mm at {distance.min():.4g} mm"
         )
-        yield Finding("units", cause, "are all lengths in mm?", Severity.WARNING, fan)
+        yield warning(PlausibilityCode.UNITS, cause, "are all lengths in mm?", figure=fan)
 
 
 def _still_source(cone_vec: ConeVec, distance: FloatArray) -> bool:
@@ -177,7 +177,7 @@ def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
         angles: (n,) in any order.
 
     Example:
-        >>> [one.kind for one in radian_findings(np.arange(0, 360, 2))]
+        >>> [str(one.code) for one in radian_findings(np.arange(0, 360, 2))]
         ['angles in degrees']
         >>> list(radian_findings(np.deg2rad(np.arange(0, 360, 2))))
         []
@@ -197,7 +197,7 @@ def radian_findings(angles: npt.ArrayLike) -> Iterator[Finding]:
     if turns > MOST_TURNS or few:
         cause = f"the angles span {span:.4g} rad, {turns:.3g} turns of {len(given)} views"
         remedy = "were degrees given? ASTRA's are radians: np.deg2rad(angles)"
-        yield Finding("angles in degrees", cause, remedy, Severity.WARNING, span)
+        yield warning(PlausibilityCode.ANGLES_IN_DEGREES, cause, remedy, figure=span)
 
 
 def _round_degrees(span: float, step: float) -> bool:
@@ -260,7 +260,7 @@ def span_findings(cone_vec: ConeVec) -> Iterator[Finding]:
         remedy = (
             f"were radians given as degrees? np.rad2deg makes them {np.rad2deg(span):.4g}"
         )
-        yield Finding("angles in radians", cause, remedy, Severity.WARNING, span)
+        yield warning(PlausibilityCode.ANGLES_IN_RADIANS, cause, remedy, figure=span)
 
 
 def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
@@ -296,7 +296,7 @@ def arc_findings(cone_vec: ConeVec) -> Iterator[Finding]:
         remedy = (
             "views over half a turn and the fan are needed for a volume that is right"
         )
-        yield Finding("limited arc", cause, remedy, Severity.WARNING, widest)
+        yield warning(PlausibilityCode.LIMITED_ARC, cause, remedy, figure=widest)
 
 
 def _plane_findings(cone_vec: ConeVec) -> Iterator[Finding]:
@@ -321,7 +321,7 @@ def _plane_findings(cone_vec: ConeVec) -> Iterator[Finding]:
         "those are blurred or missing, and values off"
     )
     remedy = "views from more sides are needed for a volume that is right"
-    yield Finding("limited arc", cause, remedy, Severity.WARNING, apart)
+    yield warning(PlausibilityCode.LIMITED_ARC, cause, remedy, figure=apart)
 
 
 def _normals(count: int) -> FloatArray:
@@ -368,7 +368,9 @@ def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[F
         )
         refused = inclined > INCLINED_DEG[1]
         if refused:
-            severity = Severity.REFUSAL
+            severity = ERROR
         else:
-            severity = Severity.WARNING
-        yield Finding("laminography", cause, FDK_TOO, severity, inclined)
+            severity = WARNING
+        yield Finding(
+            PlausibilityCode.LAMINOGRAPHY, severity, cause, FDK_TOO, figure=inclined
+        )

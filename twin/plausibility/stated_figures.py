@@ -10,9 +10,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.plausibility.findings import PlausibilityCode
 from flexdt.twin.plausibility.scan_geometry import about_z, azimuths
 
 ANGLE_TOLERANCE_DEG: Final = 0.1
@@ -43,7 +44,7 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
     if lost:
         cause = f"{lost} of the file's {len(stated)} angles are not finite"
         remedy = "they are not compared with the geometry"
-        yield Finding("angles disagree", cause, remedy, Severity.WARNING, float(lost))
+        yield warning(PlausibilityCode.ANGLES_DISAGREE, cause, remedy, figure=float(lost))
         return
     if not about_z(geometry) or np.ptp(stated) == 0.0:
         return
@@ -62,21 +63,21 @@ def angle_findings(geometry: ConeVec, stated_rad: npt.ArrayLike) -> Iterator[Fin
             )
             remedy = "does the file state the right unit?"
             if words == "degrees":
-                kind = "angles in degrees"
+                kind = PlausibilityCode.ANGLES_IN_DEGREES
             else:
-                kind = "angles in radians"
-            yield Finding(kind, cause, remedy, Severity.WARNING, figure)
+                kind = PlausibilityCode.ANGLES_IN_RADIANS
+            yield warning(kind, cause, remedy, figure=figure)
             return
     if _same_set(own, stated, allowed):
         cause = f"the file's angles are the geometry's in another order, up to {figure:.3g} deg off"
         remedy = "give the views in the order of the images"
-        yield Finding("order", cause, remedy, Severity.WARNING, figure)
+        yield warning(PlausibilityCode.ORDER, cause, remedy, figure=figure)
         return
     cause = (
         f"the file's angles and those of the geometry differ by up to {figure:.3g} deg"
     )
     remedy = "is it the geometry of this scan?"
-    yield Finding("angles disagree", cause, remedy, Severity.WARNING, figure)
+    yield warning(PlausibilityCode.ANGLES_DISAGREE, cause, remedy, figure=figure)
 
 
 def pixel_findings(geometry: ConeVec, stated_mm: float) -> Iterator[Finding]:
@@ -101,7 +102,7 @@ def pixel_findings(geometry: ConeVec, stated_mm: float) -> Iterator[Finding]:
         return
     cause = f"the file's pixel is {stated_mm:.4g} mm, the geometry's {pitch:.4g} mm"
     remedy = "is it the geometry of this scan, binned as its images are, and in mm?"
-    yield Finding("pixel size disagrees", cause, remedy, Severity.WARNING, ratios[0])
+    yield warning(PlausibilityCode.PIXEL_SIZE_DISAGREES, cause, remedy, figure=ratios[0])
 
 
 def _wrapped(angle: FloatArray) -> FloatArray:

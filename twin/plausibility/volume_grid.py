@@ -7,9 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.plausibility.findings import Finding, Severity
+from flexdt.twin.plausibility.findings import PlausibilityCode
 
 SOME_VIEWS: Final = 60
 POINTS: Final = 7
@@ -84,7 +85,7 @@ def grid_findings(
         middle = ", ".join(f"{(a + b) / 2:.4g}" for a, b in zip(low, high, strict=True))
         cause = f"no view sees any of the grid of {size} mm about ({middle}) mm (x, y, z)"
         remedy = "allowed: a grid in the field of view; are all lengths in mm?"
-        yield Finding("grid not seen", cause, remedy, Severity.REFUSAL, 0.0)
+        yield error(PlausibilityCode.GRID_NOT_SEEN, cause, remedy)
         return
     if (
         np.ptp(cone_vec.source[:, 2])
@@ -100,7 +101,7 @@ def grid_findings(
             "values are not determined"
         )
         remedy = "a smaller grid, such as field_of_view gives, holds what was seen"
-        yield Finding("grid not seen", cause, remedy, Severity.WARNING, unseen)
+        yield warning(PlausibilityCode.GRID_NOT_SEEN, cause, remedy, figure=unseen)
 
 
 def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
@@ -130,4 +131,4 @@ def voxel_findings(voxel_mm: float, view_mm: float) -> Iterator[Finding]:
     if voxel_mm * FEWEST_VOXELS > view_mm:
         cause = f"voxels of {voxel_mm:g} mm in a field of view of {view_mm:.4g} mm across"
         remedy = f"allowed: below {view_mm / FEWEST_VOXELS:.3g} mm; is the voxel in mm?"
-        yield Finding("voxel size", cause, remedy, Severity.REFUSAL, voxel_mm)
+        yield error(PlausibilityCode.VOXEL_SIZE, cause, remedy, figure=voxel_mm)

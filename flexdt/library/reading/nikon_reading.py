@@ -26,7 +26,7 @@ from flexdt.runtime.files.dataset_folder import Folder, list_folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
-from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility import PlausibilityCode, settled
 from flexdt.twin.plausibility.image_order import ordered
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
@@ -133,7 +133,7 @@ def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
     images = [name for name in folder.names if name.lower().endswith((".tif", ".tiff"))]
     found = ordered(images)
     told = settled(
-        [one for one in found.findings if one.kind != "gap"],
+        found.findings.without(PlausibilityCode.GAP),
         DatasetFormatError,
         str(folder.path),
     )

@@ -15,9 +15,10 @@ from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, INVALID, PROJECTI
 from flexdt.library.extras import package
 from flexdt.library.reading.foreign_parsing import require_memory
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.length_units import UNITS_RAD, angle_rad, length_mm
-from flexdt.twin.plausibility import Finding, Severity, settled
+from flexdt.twin.plausibility import PlausibilityCode, settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
 
@@ -439,7 +440,7 @@ def _stated_figures(
 def _not_compared(error: DatasetFormatError) -> Finding:
     """Make the warning of a figure in an unknown unit, of its error."""
     remedy = "it is not compared with the geometry"
-    return Finding("unknown unit", error.message, remedy, Severity.WARNING, 0.0)
+    return warning(PlausibilityCode.UNKNOWN_UNIT, error.message, remedy)
 
 
 def _scale(

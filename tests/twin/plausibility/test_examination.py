@@ -7,8 +7,9 @@ import pytest
 
 import flexdt as fx
 from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.findings import Severity
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.plausibility import Operation, Severity, examine
+from flexdt.twin.plausibility import Operation, examine
 from flexdt.twin.plausibility.pixel_values import integral_findings, volume_findings
 from flexdt.twin.plausibility.scan_geometry import distance_findings, radian_findings
 from flexdt.twin.projection import Grid, Volume
@@ -24,7 +25,7 @@ def scan(angles=60, **more):
 
 
 def kinds(findings):
-    return [one.kind for one in findings]
+    return [one.code for one in findings]
 
 
 @pytest.mark.parametrize("end", [2 * np.pi, np.pi, 3.49, 1.5 * np.pi])
@@ -91,7 +92,7 @@ def test_laminography_is_sent_to_an_iterative_method(inclined):
     )
     found = examine(Operation.FDK, tilted, SHAPE, grid=np.array([[-4.0] * 3, [4.0] * 3]))
     assert kinds(found) == ["laminography"]
-    assert (found[0].severity is Severity.REFUSAL) == (inclined > 20)
+    assert (found[0].severity is Severity.ERROR) == (inclined > 20)
     assert "iterative" in found[0].remedy
     assert not examine(Operation.ITERATE, tilted, SHAPE)
 
@@ -103,7 +104,7 @@ def test_laminography_is_sent_to_an_iterative_method(inclined):
 )  # fmt: skip
 def test_impossible_distances(sod, sdd, pixel):
     assert [one.severity for one in distance_findings(sod, sdd, pixel)] == [
-        Severity.REFUSAL
+        Severity.ERROR
     ]
 
 

@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from flexdt.twin.plausibility import Severity
+from flexdt.twin.findings import Severity
 from flexdt.twin.plausibility.image_order import ordered
 
 TRUE = {
@@ -47,17 +47,15 @@ def test_order(kind):
 )  # fmt: skip
 def test_two_files_of_one_number_are_named(names):
     found = ordered(names).findings
-    assert [(one.kind, one.severity) for one in found] == [
-        ("duplicate", Severity.REFUSAL)
-    ]
-    assert sum(name in found[0].cause for name in names) == 2
+    assert [(one.code, one.severity) for one in found] == [("duplicate", Severity.ERROR)]
+    assert sum(name in found[0].message for name in names) == 2
 
 
 @pytest.mark.parametrize("lost", [1, 4, 7])
 @pytest.mark.parametrize("step", [1, 3])
 def test_gaps_are_said(lost, step):
     names = [f"scan_{step * i:03d}.tif" for i in range(12) if i != lost]
-    assert [one.kind for one in ordered(names).findings] == ["gap"]
+    assert [one.code for one in ordered(names).findings] == ["gap"]
 
 
 def test_one_that_is_named_otherwise():
