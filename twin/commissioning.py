@@ -23,6 +23,15 @@ from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.without_phantom.alignment import AlignEstimate, Alignment
 from flexdt.twin.dataset import rebuild, scan_settings, stated_geometry
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import (
+    ERROR,
+    WARNING,
+    Finding,
+    FindingCode,
+    Findings,
+    Place,
+    warning,
+)
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt.twin.machine.camera import CameraSettings, check_roi
@@ -59,11 +68,13 @@ TELLS: Final = {
 """Offset -> the kind of scan that tells it."""
 
 
-class Finding(NamedTuple):
-    """A contradiction: about what, and who says what."""
+class CommissionCode(FindingCode):
+    """Codes of what contradicts what among past scans; a finding's place is the quantity."""
 
-    about: str
-    text: str
+    DISAGREEMENT = "disagreement", WARNING, "sources state different values of a quantity"
+    CAMERA = "camera", WARNING, "a camera's mode or region that the shipped machine lacks"
+    OFF_THE_LINE = "off_the_line", WARNING, "a scan far from the line of all scans"
+    MACHINE_REFUSED = "machine_refused", ERROR, "the machine file does not hold"
 
 
 class Question(NamedTuple):
@@ -342,11 +353,16 @@ def contradictions(
     for about, different in opinions.items():
         if len(different) > 1:
             words = [f"{_plain(x.value)} in {_some(x.held_by)}" for x in different]
-            yield Finding(about, "; ".join(words))
+            text = "; ".join(words)
+            yield warning(CommissionCode.DISAGREEMENT, text, place=Place(name=about))
     for scan in scans:
         problem = _camera_problem(scan, shipped)
         if problem:
-            yield Finding(f"camera in {scan.name}", f"machine {shipped.name}: {problem}")
+            yield warning(
+                CommissionCode.CAMERA,
+                f"machine {shipped.name}: {problem}",
+                place=Place(name=f"camera in {scan.name}"),
+            )
 
 
 class _Statement(NamedTuple):
@@ -561,7 +577,7 @@ class ZeroOffsets(NamedTuple):
     profile: Profile
     lines: Mapping[str, Line]
     columns: Mapping[str, tuple[float, float, float]]
-    findings: Sequence[Finding]
+    findings: Findings
     questions: Sequence[Question]
 
 
@@ -609,7 +625,7 @@ def zero_offsets(
         columns = _columns(aligned, axis, sides, nominal)
     profile = _profile(machine, lines, last)
     questions = _open_questions(lines, aligned.drifts, width)
-    return ZeroOffsets(profile, lines, columns, findings, questions)
+    return ZeroOffsets(profile, lines, columns, Findings(findings), questions)
 
 
 class _Fit(NamedTuple):
@@ -660,8 +676,10 @@ class _AlignedScans(NamedTuple):
     def contradictions(self, fit: _Fit, name: str) -> list[Finding]:
         """Make a finding of each scan beyond `MAX_SIGMAS` from the line of an offset."""
         return [
-            Finding(
-                name, f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans"
+            warning(
+                CommissionCode.OFF_THE_LINE,
+                f"{scan.name} is {abs(pull):.1f} sigma from the line of all scans",
+                place=Place(name=name),
             )
             for scan, pull in zip(self.scans, fit.pulls.tolist(), strict=True)
             if abs(pull) > MAX_SIGMAS

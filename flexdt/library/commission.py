@@ -30,6 +30,7 @@ from flexdt.twin.commissioning import PastScan, Question
 from flexdt.twin.dataset import rebuild
 from flexdt.twin.dataset.xre_reading import parse_xre
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import ERROR, Finding, Findings, Place
 from flexdt.twin.machine import description as d
 from flexdt.twin.machine.fitted_machine import fitted_text
 from flexdt.twin.script.executed_log import Executed
@@ -75,7 +76,7 @@ class Commissioned(NamedTuple):
     fit: Fit | None
     scans: Sequence[PastScan]
     offsets: tells.ZeroOffsets
-    findings: Sequence[tells.Finding]
+    findings: Findings
     questions: Sequence[Question]
 
     def tables(self, out: Path) -> dict[str, Table]:
@@ -137,7 +138,10 @@ class Commissioned(NamedTuple):
                 ("offset", *tells.Line._fields),
                 [(name, *line) for name, line in self.offsets.lines.items()],
             ),
-            "disagreements": (tells.Finding._fields, [*self.findings]),
+            "disagreements": (
+                ("about", "text"),
+                [(str(one.place), one.text) for one in self.findings],
+            ),
             "not_judged": (Question._fields, [*self.questions]),
             "next": (
                 ("scan", "settles", "command"),
@@ -256,24 +260,29 @@ def commission(
         *offsets.questions,
         *(Question(subject, why, "recorded") for subject in unseen),
     ]
-    findings = [
-        *_machine_errors(machine, offsets.profile),
-        *tells.contradictions(scans, shipped, machine),
-        *offsets.findings,
-    ]
+    findings = Findings(
+        (
+            *_machine_errors(machine, offsets.profile),
+            *tells.contradictions(scans, shipped, machine),
+            *offsets.findings,
+        )
+    )
     questions = [*open_questions, *rest]
     return Commissioned(machine, text, fit, scans, offsets, findings, questions)
 
 
-def _machine_errors(machine: d.Machine, profile: d.Profile) -> Iterator[tells.Finding]:
+def _machine_errors(machine: d.Machine, profile: d.Profile) -> Iterator[Finding]:
     """Yield the error that `flexdt machine check` would raise on the machine (it cannot
     stand at home), if there is one.
     """
     try:
         check_home(machine, profile, MACHINE_FILE)
     except TwinError as error:
-        yield tells.Finding(
-            MACHINE_FILE, f"`flexdt machine check` refuses it: {error.message}"
+        yield Finding(
+            tells.CommissionCode.MACHINE_REFUSED,
+            ERROR,
+            f"`flexdt machine check` refuses it: {error.message}",
+            place=Place(name=MACHINE_FILE),
         )
 
 

@@ -77,15 +77,15 @@ def judged(lab: Laboratory, found: Commissioned) -> Outcome:
     named = set[int]()
     for about, who in lab.planted:
         hits = {k for k, f in enumerate(found.findings)
-                if f.about.startswith(about) and who in f"{f.about} {f.text}"}  # fmt: skip
+                if str(f.place).startswith(about) and who in f"{f.place} {f.text}"}  # fmt: skip
         named |= hits
         if not hits:
             out.missed.append((about, who))
     # Limits are drawn without bodies, so most drawn machines could not stand at home.
     out.false = [
-        tuple(f)
+        (str(f.place), f.text)
         for k, f in enumerate(found.findings)
-        if k not in named and f.about != MACHINE_FILE and "machine flexray" not in f.text
+        if k not in named and not f.forbids and "machine flexray" not in f.text
     ]
     return out
 

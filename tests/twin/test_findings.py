@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexdt.protocol.methods.job_messages import Problem
+from flexdt.twin.commissioning import CommissionCode
 from flexdt.twin.findings import (
     ERROR,
     Finding,
@@ -31,7 +32,7 @@ from tests.support.codes_as_text import ROOMS as FOLDERS
 from tests.support.codes_as_text import found_in
 
 ROOT = Path(__file__).parents[2]
-ROOMS: tuple[type[FindingCode], ...] = (ScriptCode, PlausibilityCode)
+ROOMS: tuple[type[FindingCode], ...] = (ScriptCode, PlausibilityCode, CommissionCode)
 CODES = [code for room in ROOMS for code in room]
 DOCUMENTED = {ScriptCode: "docs/reference/script-problems.md"}
 RANK = [Severity.NOTE, Severity.WARNING, Severity.ERROR]
@@ -57,6 +58,17 @@ def sources() -> tuple[ast.Module, ...]:
         for folder in FOLDERS
         for file in sorted((ROOT / folder).rglob("*.py"))
     )
+
+
+def member(node: ast.Attribute) -> FindingCode | None:
+    """Return the code that an expression such as `ScriptCode.LIMIT` names; None for others."""
+    rooms = {room.__name__: room for room in ROOMS}
+    match node:
+        case ast.Attribute(
+            value=ast.Name(id=room) | ast.Attribute(attr=room), attr=name
+        ) if room in rooms:
+            return rooms[room][name]
+    return None
 
 
 @pytest.mark.parametrize("code", CODES, ids=lambda code: f"{type(code).__name__}-{code}")
@@ -91,18 +103,16 @@ def test_every_enum_of_codes_is_tested_here() -> None:
 
 
 def test_each_code_is_used_and_no_finding_is_graver_than_its_code() -> None:
-    rooms = {room.__name__: room for room in ROOMS}
     used: set[FindingCode] = set()
     for tree in sources():
         for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and (code := member(node)) is not None:
+                used.add(code)
             match node:
-                case ast.Attribute(value=ast.Name(id=room), attr=name) if room in rooms:
-                    used.add(rooms[room][name])
                 case ast.Call(
                     func=ast.Name(id=made) | ast.Attribute(attr=made),
-                    args=[ast.Attribute(value=ast.Name(id=room), attr=name), *_],
-                ) if room in rooms and made in MADE_BY:
-                    code = rooms[room][name]
+                    args=[ast.Attribute() as first, *_],
+                ) if made in MADE_BY and (code := member(first)) is not None:
                     assert RANK.index(MADE_BY[made]) <= RANK.index(code.gravest), code
     assert not set(CODES) - used, "no check finds these"
 

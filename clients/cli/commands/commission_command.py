@@ -37,8 +37,5 @@ def commission(
     for title, (head, rows) in found.tables(out).items():
         yield f"{title}\n{table(([cell_text(x) for x in row] for row in rows), head)}\n"
     yield f"{out}: machine.toml, profile.toml, commission.json and report.html written"
-    refused = [
-        finding.text for finding in found.findings if finding.about == MACHINE_FILE
-    ]
-    if refused:
-        raise CommandError(f"{out / MACHINE_FILE}: {refused[0]}")
+    if refused := found.findings.errors:
+        raise CommandError(f"{out / MACHINE_FILE}: {refused[0].text}")
