@@ -4,13 +4,13 @@ Every entry point of the library calls `examine`; the severity of its findings d
 whether the entry point raises an error, warns or does nothing.
 """
 
-from flexdt.twin.plausibility.examination import Operation, examine
-from flexdt.twin.plausibility.findings import (
+from flexdt.twin.plausibility.contradictions import (
     PlausibilityCode,
     PlausibilityWarning,
     settled,
     warn_of,
 )
+from flexdt.twin.plausibility.examination import Operation, examine
 
 __all__ = [
     "Operation",

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.findings import Finding, Findings, error, warning
-from flexdt.twin.plausibility.findings import PlausibilityCode
+from flexdt.twin.plausibility.contradictions import PlausibilityCode
 
 NUMBER: Final = re.compile(r"(?P<sign>[-+]?)(?P<whole>\d+)(?P<part>\.\d+)?")
 SCIENTIFIC: Final = re.compile(r"\d\.\d+[eE][-+]\d{2}(?!\d)")

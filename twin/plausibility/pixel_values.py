@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.findings import Finding, error, warning
-from flexdt.twin.plausibility.findings import PlausibilityCode
+from flexdt.twin.plausibility.contradictions import PlausibilityCode
 
 EDGE_PART: Final = 0.06
 """Share of an image's columns, or rows, that count as its edges."""

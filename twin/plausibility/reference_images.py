@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.plausibility.findings import PlausibilityCode
+from flexdt.twin.plausibility.contradictions import PlausibilityCode
 
 MAX_FLAT_DIFFERENCE: Final = 0.015
 """Largest relative difference of flat images' levels by a tube's own variation."""

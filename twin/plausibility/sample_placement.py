@@ -13,7 +13,7 @@ from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.virtual_panel import stretches
-from flexdt.twin.plausibility.findings import PlausibilityCode
+from flexdt.twin.plausibility.contradictions import PlausibilityCode
 
 MOST_MAGNIFIED: Final = 1000.0
 """Largest magnification for which a tube's focal spot is small enough."""

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from flexdt.twin.findings import ERROR, WARNING, Finding, error, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, cross
-from flexdt.twin.plausibility.findings import PlausibilityCode
+from flexdt.twin.plausibility.contradictions import PlausibilityCode
 
 SOME_VIEWS: Final = 16
 """Number of views whose panels are examined."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.plausibility.findings import PlausibilityCode
+from flexdt.twin.plausibility.contradictions import PlausibilityCode
 from flexdt.twin.plausibility.scan_geometry import about_z, azimuths
 
 ANGLE_TOLERANCE_DEG: Final = 0.1

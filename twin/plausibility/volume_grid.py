@@ -10,7 +10,7 @@ import numpy as np
 from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.plausibility.findings import PlausibilityCode
+from flexdt.twin.plausibility.contradictions import PlausibilityCode
 
 SOME_VIEWS: Final = 60
 POINTS: Final = 7

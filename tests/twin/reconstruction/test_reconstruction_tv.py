@@ -11,7 +11,7 @@ from circular_scans import circle
 from scipy.optimize import minimize
 
 from flexdt.twin.errors import GeometryError, LimitError
-from flexdt.twin.plausibility.findings import PlausibilityWarning
+from flexdt.twin.plausibility.contradictions import PlausibilityWarning
 from flexdt.twin.projection import Operator, Volume
 from flexdt.twin.reconstruction import minimise_tv, tv
 
