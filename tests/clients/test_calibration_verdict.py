@@ -15,7 +15,7 @@ from flexdt.clients.cli.command_tree import build
 from flexdt.clients.cli.commands.calibrate_commands import show
 from flexdt.library.calibration.calibrate import digits, ranges, rounded_up
 from flexdt.library.calibration.proposed_commands import NEXT, Typed, settling_commands
-from flexdt.twin.calibration.diagnose import error
+from flexdt.twin.findings import FindingCode, error
 
 SCAN = fx.ConeVec.circular(sod=600, sdd=1059, angles=24, shape=(380, 478), pixel=0.2992)
 
@@ -100,7 +100,7 @@ def test_frames_that_are_all_dark_leave_no_others() -> None:
 
 
 @pytest.mark.parametrize("code", sorted(NEXT))
-def test_proposed_commands_exist(code: str) -> None:
+def test_proposed_commands_exist(code: FindingCode) -> None:
     finding = error(code, "another phantom")
     for line in settling_commands(finding, Typed(("scan",), "lego"), ()):
         known(line)

@@ -22,7 +22,8 @@ from flexdt.clients.cli.boundary import NOT_IDENTIFIABLE
 from flexdt.clients.cli.command_tree import run
 from flexdt.library.calibration.proposed_commands import NEXT, Typed, settling_commands
 from flexdt.library.datasets.exchange import with_geometry
-from flexdt.twin.calibration.diagnose import error
+from flexdt.twin.calibration.diagnose import CalibrationCode
+from flexdt.twin.findings import error
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
 
@@ -254,7 +255,7 @@ def test_every_command_of_the_table_has_a_case() -> None:
 
 def test_advice_of_a_finding_becomes_a_command() -> None:
     said = error(
-        "held_parameter",
+        CalibrationCode.HELD_PARAMETER,
         "dD_z is held at 0 mm: free dD_z, det_roll too, or hold it",
         free=("dD_z", "det_roll"),
     )
@@ -266,7 +267,7 @@ def test_advice_of_a_finding_becomes_a_command() -> None:
     )
     (line,) = settling_commands(
         error(
-            "drift",
+            CalibrationCode.DRIFT,
             "dO_x moves: --per-frame dO_x,dO_y follows it",
             per_frame=("dO_x", "dO_y"),
         ),
@@ -274,5 +275,7 @@ def test_advice_of_a_finding_becomes_a_command() -> None:
         (),
     )
     assert line.endswith(" --per-frame dO_x,dO_y")
-    (line,) = settling_commands(error("one_bead", "a single shadow"), typed, ())
+    (line,) = settling_commands(
+        error(CalibrationCode.ONE_BEAD, "a single shadow"), typed, ()
+    )
     assert line.endswith(" --report report.html")

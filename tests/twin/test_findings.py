@@ -14,10 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexdt.protocol.methods.calibration_messages import CalibrationProblem
 from flexdt.protocol.methods.job_messages import Problem
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.commissioning import CommissionCode
 from flexdt.twin.findings import (
     ERROR,
+    Advice,
     Finding,
     FindingCode,
     Findings,
@@ -32,9 +35,17 @@ from tests.support.codes_as_text import ROOMS as FOLDERS
 from tests.support.codes_as_text import found_in
 
 ROOT = Path(__file__).parents[2]
-ROOMS: tuple[type[FindingCode], ...] = (ScriptCode, PlausibilityCode, CommissionCode)
+ROOMS: tuple[type[FindingCode], ...] = (
+    ScriptCode,
+    PlausibilityCode,
+    CommissionCode,
+    CalibrationCode,
+)
 CODES = [code for room in ROOMS for code in room]
-DOCUMENTED = {ScriptCode: "docs/reference/script-problems.md"}
+DOCUMENTED = {
+    ScriptCode: "docs/reference/script-problems.md",
+    CalibrationCode: "docs/calibration-method.md",
+}
 RANK = [Severity.NOTE, Severity.WARNING, Severity.ERROR]
 MADE_BY = {"error": ERROR, "warn": Severity.WARNING, "warning": Severity.WARNING}
 """Function or method that makes a finding -> its severity."""
@@ -126,6 +137,8 @@ def test_each_code_is_documented_with_its_severity(room: type[FindingCode]) -> N
         assert len(told) == 1, f"{code} stands in {len(told)} rows of {DOCUMENTED[room]}"
         if room is ScriptCode:
             assert told[0][2].strip() == code.gravest, code
+        elif code.gravest is not ERROR:
+            assert told[0][3].strip().startswith("offered"), code
 
 
 @given(collections, st.sets(st.sampled_from(CODES), max_size=4))
@@ -202,6 +215,17 @@ def test_a_code_that_is_no_member_is_refused() -> None:
         error("limt", "too far")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("code", CalibrationCode)
+def test_findings_of_a_calibration_are_documents_of_the_wire(
+    code: CalibrationCode,
+) -> None:
+    found = Finding(code, code.gravest, "said", advice=Advice(("dO_x",), ("dO_y",)))
+    document = {"code": code.value, "severity": code.gravest.value, "text": "said"}
+    assert list(found.to_dict().items()) == list(document.items())
+    assert {type(value) for value in found.to_dict().values()} == {str}
+    assert CalibrationProblem.model_validate(found.to_dict()).model_dump() == document
+
+
 @pytest.mark.parametrize("code", ScriptCode)
 def test_problems_of_scripts_are_documents_of_the_wire(code: ScriptCode) -> None:
     found = Finding(code, code.gravest, "said", place=Place(2, 5))
@@ -245,4 +269,4 @@ def test_no_module_compares_a_code_with_text(tmp_path: Path) -> None:
     (tmp_path / "server" / "planted.py").write_text(PLANTED)
     lines = [n for n, line in enumerate(PLANTED.splitlines(), 1) if line[1:4] == " = "]
     assert found_in(tmp_path) == [f"server/planted.py:{n}" for n in lines]
-    assert [place for place in found_in(ROOT) if "calibration" not in place] == []
+    assert found_in(ROOT) == []

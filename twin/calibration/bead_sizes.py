@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from flexdt.twin.calibration.bead_model import spot_radii
-from flexdt.twin.calibration.diagnose import Finding, listed
+from flexdt.twin.calibration.diagnose import listed
 from flexdt.twin.calibration.diagnose.measured_spots import judge_first_size, judge_size
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.findings import Finding
 
 OTHER_BEADS = 1.0 / 6.0
 """Deviation of the first radii from which beads are others."""

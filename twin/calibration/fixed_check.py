@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose import Finding, listed
+from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.fitted import (
     OF_MOTION,
@@ -51,6 +51,7 @@ from flexdt.twin.calibration.request import (
     strain_prior,
     with_free,
 )
+from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.offsets import NAMES
 
 OF_FRAME = ("dO_y", "alpha", "tau_x", "tau_z")
@@ -147,7 +148,7 @@ def check_fixed(
     loose_fit = fit_with_loose_priors(state, usual, fit)
     verdict = judge_priors(loose_fit, exact)
     errors = {f.code for f in explained if f.forbids}
-    if verdict.finding is not None and errors <= OF_RESIDUALS | {"misfit"}:
+    if verdict.finding is not None and errors <= OF_RESIDUALS | {CalibrationCode.MISFIT}:
         left = _left_by_priors(state, usual, loose_fit, explained)
         return fit, _with_priors_off(state, asked, fit, left, verdict.finding)
     found = []
@@ -163,7 +164,7 @@ def check_fixed(
     fit = _doubted(fit, free_fit, fixed)
     if exact:
         found += listed(_exact_judged(state, usual, fit, exact))
-    if any(f.forbids and f.code != "misfit" for f in explained):
+    if Findings(explained).errors.without(CalibrationCode.MISFIT):
         # What spoils the fit moves it as a scanner elsewhere would.
         return fit, [*explained, *(f for f in found if f.forbids)]
 
@@ -192,10 +193,10 @@ def _with_priors_off(
     """Return the findings where images contradict priors: those left, and that one; or
     instead the motion that explains all there is beside the stated priors.
     """
-    if any(f.code in OF_MOTION for f in left):
+    if Findings(left).of(*OF_MOTION):
         moved = moving(fit, lambda motion: refit_scans(state, asked, fit, motion=motion))
         if moved is not None:
-            return [*(f for f in left if f.code not in OF_MOTION), moved]
+            return [*Findings(left).without(*OF_MOTION), moved]
     return [*left, off]
 
 
@@ -305,15 +306,15 @@ def _left_by_priors(
     """
     priors = loosened({**usual.priors, **priors_of(state.scans, usual)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
-    moved = [
-        f for f in explained if f.code == "bead_tolerance" and loose_fit.bead_prior_mm
-    ]
-    return [*(f for f in left if f.code != "misfit"), *moved]
+    moved = Findings()
+    if loose_fit.bead_prior_mm:
+        moved = Findings(explained).of(CalibrationCode.BEAD_TOLERANCE)
+    return [*Findings(left).without(CalibrationCode.MISFIT), *moved]
 
 
 def _moves(findings: Sequence[Finding]) -> bool:
     """Check whether a motion forbids the use of a fit."""
-    return any(f.forbids and f.code in OF_MOTION for f in findings)
+    return bool(Findings(findings).errors.of(*OF_MOTION))
 
 
 def _doubted(

@@ -13,7 +13,7 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.diagnose import Finding, listed
+from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.data import (
     GOOD_RMS_PX,
     GOOD_SHARE,
@@ -30,6 +30,7 @@ from flexdt.twin.calibration.identify import Identification, Search, attempt, id
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
 from flexdt.twin.calibration.second_measurement import seen_arc
+from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.offsets import Offsets
 
 MAX_BEAD_SHARE: Final = 0.6
@@ -85,7 +86,11 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         finding = explain_identification(
             found, detections, state.model, scan.poses, scan.name, request.start
         )
-        if found is not None and finding is not None and finding.code == "wrong_phantom":
+        if (
+            found is not None
+            and finding is not None
+            and finding.code is CalibrationCode.WRONG_PHANTOM
+        ):
             finding = _by_exposure(finding, found, state.model, scan, request)
         if request.per_frame and finding is not None and finding.code in OF_MOTION:
             # It may move, so its spots may be far from where one geometry has them.
@@ -96,11 +101,9 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         if found is None:
             break
         out.append(found)
-    if any(f.code == "bead_displaced" for f in findings):
-        # In other scans of the same phantom the spots of that bead are no others.
-        findings = [f for f in findings if f.code != "extra_spots"]
     found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
-    return found_so_far.with_findings(*findings)
+    # In other scans of the same phantom the spots of a displaced bead are no others.
+    return found_so_far.with_findings(*Findings(findings).reduced())
 
 
 def _by_exposure(

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.named_motion import MOTION_WORDS, open_motions
 from flexdt.twin.calibration.fit.evidence import OPEN_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -22,6 +22,7 @@ from flexdt.twin.calibration.fixed_check import explain
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import Finding, error, warning
 
 MOST_TURNS: Final = 3
 """Times that motion and the causes of residuals are estimated beside each other."""
@@ -137,7 +138,7 @@ def settle_motion(
     if worst > 1.0:
         out.append(
             warning(
-                "motion_unsettled",
+                CalibrationCode.MOTION_UNSETTLED,
                 f"the motion differs by up to {worst:.1f} sigma from what the last fit "
                 "would make of it; its sigmas contain that",
             )
@@ -150,7 +151,7 @@ def settle_motion(
     if wide:
         out.append(
             error(
-                "motion_hides",
+                CalibrationCode.MOTION_HIDES,
                 f"as {', '.join(request.per_frame)} may differ from frame to frame, "
                 f"{', '.join(wide)} is all that can be said; allowed: {request.bound:g}",
             )
@@ -173,7 +174,7 @@ def _what_moves(held: MotionFit) -> list[Finding]:
         how = "instead of" if set(held.moving).isdisjoint(held.asked) else "beside"
         out.append(
             warning(
-                "other_motion",
+                CalibrationCode.OTHER_MOTION,
                 f"{words} ({', '.join(others)}) {how} {asked}: that explains the images far "
                 "better, and was followed",
             )
@@ -182,7 +183,7 @@ def _what_moves(held: MotionFit) -> list[Finding]:
     if alike:
         out.append(
             warning(
-                "motion_open",
+                CalibrationCode.MOTION_OPEN,
                 f"the images do not tell for certain what moves, {', '.join(held.moving)} or "
                 f"otherwise: {' or '.join(alike)}; the intervals contain what they differ by",
             )

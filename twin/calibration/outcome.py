@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +10,6 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
-from flexdt.twin.calibration.diagnose import Finding
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import (
     MotionFit,
@@ -21,6 +19,7 @@ from flexdt.twin.calibration.frame_source import (
     Scan,
 )
 from flexdt.twin.calibration.identify import Identification
+from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.motion import Motion
 from flexdt.twin.geometry.panel import Panel
 
@@ -44,7 +43,7 @@ class Calibration:
 
     fit: FitResult | None
     identifications: tuple[Identification, ...]
-    findings: tuple[Finding, ...]
+    findings: Findings
     looks: tuple[tuple[FrameSpots, ...], ...]
     measured: tuple[Refined, ...]
     scans: tuple[Scan, ...]
@@ -77,9 +76,9 @@ class Calibration:
         )
 
     @property
-    def errors(self) -> tuple[Finding, ...]:
+    def errors(self) -> Findings:
         """Findings that forbid using the numbers."""
-        return tuple(f for f in self.findings if f.forbids)
+        return self.findings.errors
 
     @property
     def identifiable(self) -> bool:
@@ -88,14 +87,9 @@ class Calibration:
 
     def with_findings(self, *more: Finding) -> Calibration:
         """Add findings."""
-        return replace(self, findings=worst_first([*self.findings, *more]))
+        return replace(self, findings=self.findings.and_also(more).worst_first())
 
     @property
     def detections(self) -> int:
         """Spots found in all frames."""
         return sum(len(look.detections) for looks in self.looks for look in looks)
-
-
-def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Sort findings: those that forbid using the numbers come first."""
-    return tuple(sorted(findings, key=lambda f: not f.forbids))

@@ -19,7 +19,7 @@ from flexdt.twin.calibration.bead_model import (
 from flexdt.twin.calibration.bead_sizes import judge_first_sizes, judge_sizes
 from flexdt.twin.calibration.detect.bead_contrast import detector_for
 from flexdt.twin.calibration.detect.detection import SpotFinder
-from flexdt.twin.calibration.diagnose import Finding, listed
+from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.data import judge_emptiness, judge_frames
 from flexdt.twin.calibration.diagnose.fitted import OF_RESIDUALS, judge_offsets
 from flexdt.twin.calibration.diagnose.frame_places import judge_places
@@ -45,6 +45,7 @@ from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, with_free
 from flexdt.twin.calibration.scans_to_calibrate import require_different, require_scans
 from flexdt.twin.calibration.second_measurement import measure_again
+from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.projection.analytic_solids import Scene
 
 __all__ = [
@@ -176,7 +177,7 @@ def _detected(
     ]
     if detector is None and any(finding.forbids for finding in findings):
         findings = [*judge_emptiness(scans, looks, model), *findings]
-    state = Calibration(None, (), (), looks, (), tuple(scans), model)
+    state = Calibration(None, (), Findings(), looks, (), tuple(scans), model)
     return state.with_findings(*findings)
 
 
@@ -262,7 +263,9 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
         state = state.with_findings(*unsettled)
         # A deviation in every frame takes up part of what its beads share, and the rest looks
         # shared, too: the sigmas stay wide, but nothing vibrates. What explains a misfit stays.
-        explained = [f for f in explained if f.code != "vibration" or f.forbids]
+        explained = [
+            f for f in explained if f.code is not CalibrationCode.VIBRATION or f.forbids
+        ]
     if any(light.seen for light in state.missing_light):
         explained = [beside_missing_light(f) for f in explained]
     fit = with_start(fit, asked.start, fitted.iterations)
@@ -284,15 +287,11 @@ def _judged_places(
         The state with at most one further finding a scan, and without `extra_spots` where a
         displaced bead explains them.
     """
-    if not any(f.forbids and f.code != "misfit" for f in explained):
+    if not Findings(explained).errors.without(CalibrationCode.MISFIT):
         # Of what moves, or turns otherwise than is said, all frames are elsewhere.
         state = state.with_findings(*judge_places(fit, state.looks))
-    if any(
-        f.code == "bead_displaced" for f in explained
-    ):  # the other spots are that bead's
-        findings = tuple(f for f in state.findings if f.code != "extra_spots")
-        state = replace(state, findings=findings)
-    return state
+    # Spots beside the phantom's are those of a bead that is displaced.
+    return replace(state, findings=state.findings.unexplained_by(explained))
 
 
 def _fixed_as_asked(
@@ -325,4 +324,4 @@ def _fixed_as_asked(
     # Motion took up what is fixed now, or the other way round.
     state, fixed = fit_with_motion(state, asked, fixed)
     fixed, again = explain(state, asked, fixed)
-    return state, fixed, [*again, *(f for f in explained if f.code not in OF_RESIDUALS)]
+    return state, fixed, [*again, *Findings(explained).without(*OF_RESIDUALS)]

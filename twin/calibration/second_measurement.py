@@ -21,7 +21,7 @@ from flexdt.twin.calibration.detect.windows import (
     plan_windows,
     ways,
 )
-from flexdt.twin.calibration.diagnose import Finding, error
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.data import GOOD_SHARE
 from flexdt.twin.calibration.diagnose.measured_spots import shadows_drawn_out
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -30,6 +30,7 @@ from flexdt.twin.calibration.fits_of_scans import fit_scans
 from flexdt.twin.calibration.frame_source import FrameState, Scan
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest
+from flexdt.twin.findings import Finding, error
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.projection.analytic_solids import Scene
 
@@ -230,7 +231,7 @@ def _judge_confirmation(state: Calibration) -> list[Finding]:
             continue
         out.append(
             error(
-                "spots_unconfirmed",
+                CalibrationCode.SPOTS_UNCONFIRMED,
                 f"{scan.name}: {confirmed} of {int(before.sum())} spots are, "
                 "where the first fit expects them, shadows of balls of the phantom's "
                 "size; are the images saturated or clipped, and are phantom, geometry "

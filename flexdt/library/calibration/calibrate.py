@@ -49,7 +49,7 @@ from flexdt.phantoms.files.phantom_files import read_phantom_file
 from flexdt.twin import long_work
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import SpotFinder
-from flexdt.twin.calibration.diagnose import Finding, Severity, error
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import FitResult, image_quantities
 from flexdt.twin.calibration.fit.priors import prior_widths
@@ -62,6 +62,7 @@ from flexdt.twin.calibration.pipeline import (
 )
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.findings import Finding, Findings, error, warning
 from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import NamedCorrection
@@ -424,16 +425,11 @@ def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
         raise TwinError(f"{causes} ({error})", error.data) from error
 
 
-def explained_by(
-    saturated: Sequence[Finding], findings: Sequence[Finding]
-) -> tuple[Finding, ...]:
+def explained_by(saturated: Sequence[Finding], findings: Findings) -> Findings:
     """List findings on saturated images first, and leave out those that saturation
-    falsifies (`OF_SATURATION`); unchanged, as a tuple, if none is saturated.
+    falsifies (`explains` of its code); unchanged if none is saturated.
     """
-    if not saturated:
-        return tuple(findings)
-    others = (finding for finding in findings if finding.code not in OF_SATURATION)
-    return (*saturated, *others)
+    return Findings(saturated).and_also(findings.unexplained_by(saturated))
 
 
 def with_undetermined(result: Calibration) -> Calibration:
@@ -443,7 +439,9 @@ def with_undetermined(result: Calibration) -> Calibration:
     if result.identifiable or result.errors:
         return result
     weak = () if result.fit is None else result.fit.certificate.weak
-    return result.with_findings(error(UNDETERMINED, "; ".join(weak) or "there is no fit"))
+    return result.with_findings(
+        error(CalibrationCode.UNDETERMINED, "; ".join(weak) or "there is no fit")
+    )
 
 
 def saturation(dataset: ImageSet) -> Finding | None:
@@ -460,9 +458,8 @@ def saturation(dataset: ImageSet) -> Finding | None:
     share = float(np.mean(dataset.flat[::4, ::4] >= 0.999 * full))
     if share < 0.01:
         return None
-    return Finding(
-        "saturated",
-        Severity.WARNING,
+    return warning(
+        CalibrationCode.SATURATED,
         f"{dataset.name}: {100 * share:.0f} % of the flat field is saturated: "
         "lower the exposure or the power",
     )
@@ -494,10 +491,6 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
     return target
 
 
-UNDETERMINED: Final = "undetermined"
-"""Code of the finding that the images do not determine the requested parameters."""
-OF_SATURATION: Final = ("bead_size",)
-"""Codes of findings that saturated images cause."""
 NUMBERS: Final = ("value", "sigma", "low", "high", "images")
 """Members of an estimate that are null where they must not be used."""
 
@@ -534,10 +527,7 @@ def calibration_document(result: Calibration, seconds: float) -> dict[str, objec
         "expected": frames * len(result.model),
         "outliers": [],
         "seconds": round(seconds, 4),
-        "problems": [
-            {"code": f.code, "severity": f.severity.value, "text": f.text}
-            for f in result.findings
-        ],
+        "problems": [f.to_dict() for f in result.findings],
     }
     if fit is not None:
         document |= _fit_members(result, fit)
@@ -559,7 +549,7 @@ def _fit_members(result: Calibration, fit: FitResult) -> dict[str, object]:
     """
     certificate = fit.certificate
     off = np.hypot(*np.moveaxis(certificate.residuals_px, 2, 0))
-    offered = all(finding.code == UNDETERMINED for finding in result.errors)
+    offered = not result.errors.without(CalibrationCode.UNDETERMINED)
     return {
         "parameters": {
             name: _estimate_member(e, offered)
@@ -696,9 +686,9 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         use = "Safe to reconstruct"
     else:
         use = "Too uncertain for a sharp volume"
-    if any(f.code == "panel_distorted" for f in result.findings):
+    if result.findings.of(CalibrationCode.PANEL_DISTORTED):
         use += " with this correction, which undoes the panel's distortion"
-    if any(f.code == "saturated" for f in result.findings):
+    if result.findings.of(CalibrationCode.SATURATED):
         use = "Geometry to be used, images not to be reconstructed (the flat field is saturated)"
     first = f"{use}: the rotation axis is known to {rounded_up(column.sigma)} px."
     lengths = {
@@ -744,7 +734,7 @@ def next_commands(result: Calibration, typed: Typed) -> list[str]:
     # Names of several scans end in @SCAN.
     asked = [name for name, e in estimates.items() if e.asked]
     free = list(dict.fromkeys(name.split("@")[0] for name in asked))
-    if result.errors and result.errors[0].code != UNDETERMINED:
+    if result.errors and result.errors[0].code is not CalibrationCode.UNDETERMINED:
         return list(settling_commands(result.errors[0], typed, free))
     limited = any(_by_priors(estimates[name]) for name in asked)
     sharp = result.fit is not None and result.identifiable and _is_sharp(result.fit)
@@ -752,7 +742,7 @@ def next_commands(result: Calibration, typed: Typed) -> list[str]:
         return [typed.use()]
     if not sharp:
         for moving in result.findings:
-            if moving.per_frame:
+            if moving.advice.per_frame:
                 return list(settling_commands(moving, typed, free))
     sod = float(result.scans[0].poses.sod.mean())
     both = typed.command(data=("PLACE-1", "PLACE-2"))

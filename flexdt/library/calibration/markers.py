@@ -28,7 +28,7 @@ from flexdt.phantoms import Phantom
 from flexdt.runtime.files.dataset_folder import read_text
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
-from flexdt.twin.calibration.diagnose import error
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.calibration.fit.priors import prior_widths
 from flexdt.twin.calibration.fit.problem import SIX
@@ -52,6 +52,7 @@ from flexdt.twin.calibration.unknown_markers import (
     triangulate,
 )
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import Findings, error
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -638,11 +639,11 @@ def _turning_back(
     )
     if moved < 6.0 * float(np.median(markers.sigma)):
         off = error(
-            "not_turning",
+            CalibrationCode.NOT_TURNING,
             f"the markers move by {moved:.2g} px at most in all frames: the "
             "object does not turn although the angles say so",
         )
-        return replace(calibration, findings=(off, *calibration.findings))
+        return replace(calibration, findings=Findings((off, *calibration.findings)))
     poses = replace(data.poses, angle=-data.poses.angle)
     at = centred(markers.tracks, poses, data.shape, NOMINAL)
     places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
@@ -661,12 +662,12 @@ def _turning_back(
     if not fit.certificate.rms_px < 0.5 * calibration.fit.certificate.rms_px:
         return calibration
     off = error(
-        "angle_reversed",
+        CalibrationCode.ANGLE_REVERSED,
         f"the markers fit to {fit.certificate.rms_px:.2g} px instead "
         f"of {calibration.fit.certificate.rms_px:.2g} if the stage turns the other way "
         "than the angles say, or if the images are mirrored",
     )
-    return replace(calibration, findings=(off, *calibration.findings))
+    return replace(calibration, findings=Findings((off, *calibration.findings)))
 
 
 def _calibrated(

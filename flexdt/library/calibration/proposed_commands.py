@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from flexdt.library.calibration.calibration_options import CalibrationOptions
-from flexdt.twin.calibration.diagnose import Finding
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
+from flexdt.twin.findings import Finding, FindingCode
 
 IN_MEMORY: Final = "DATASET"
 """Stands for a scan in memory, which has no folder to type."""
@@ -24,9 +25,9 @@ STANDS_FOR: Final = {
 """Word of a command -> what its reader replaces it by."""
 OPTION_OF: Final[Mapping[str, str]] = {"priors": "prior"}
 """Option of the library -> option of the command, where the names differ."""
-NEXT: Final[Mapping[str, tuple[str, str]]] = {
-    "wrong_phantom": ("flexdt phantom list", "NAME"),
-    "bead_size": ("flexdt phantom list", "NAME"),
+NEXT: Final[Mapping[FindingCode, tuple[str, str]]] = {
+    CalibrationCode.WRONG_PHANTOM: ("flexdt phantom list", "NAME"),
+    CalibrationCode.BEAD_SIZE: ("flexdt phantom list", "NAME"),
 }
 """Code of a finding that forbids a result -> command to run first, and the word that stands
 for another phantom; other findings advise options, or have a report that shows the shadows."""
@@ -137,26 +138,28 @@ def settling_commands(
         yield typed.command(phantom=other)
         return
     options = typed.options or {}
-    if finding.code == "ambiguous":
+    if finding.code is CalibrationCode.AMBIGUOUS:
         frames = {name: options[name] for name in ("frames",) if name in options}
         yield replace(typed, options=frames).command(phantom=UNKNOWN)
         return
-    if finding.per_frame:
+    if finding.advice.per_frame:
         moving = [name for name in options.get("per-frame", "").split(",") if name]
         yield typed.command(
-            per_frame=",".join(dict.fromkeys((*moving, *finding.per_frame)))
+            per_frame=",".join(dict.fromkeys((*moving, *finding.advice.per_frame)))
         )
-    if finding.free:
-        more = {"free": ",".join(dict.fromkeys((*free, *finding.free)))}
+    if finding.advice.free:
+        more = {"free": ",".join(dict.fromkeys((*free, *finding.advice.free)))}
         held = options.get("prior", "")
         if held not in ("", "none"):
             # A parameter has a prior or is free.
-            kept = [w for w in held.split(",") if w.split("=")[0] not in finding.free]
+            kept = [
+                w for w in held.split(",") if w.split("=")[0] not in finding.advice.free
+            ]
             if kept:
                 more["prior"] = ",".join(kept)
             else:
                 left = {n: value for n, value in options.items() if n != "prior"}
                 typed = replace(typed, options=left)
         yield typed.command(**more)
-    if not (finding.per_frame or finding.free):
+    if not (finding.advice.per_frame or finding.advice.free):
         yield typed.command(report="report.html")

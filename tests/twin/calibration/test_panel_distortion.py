@@ -24,6 +24,7 @@ from flexdt.twin.calibration.pipeline import (
     calibrate,
 )
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import Findings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.panel import Border, Panel, PanelModel
 from flexdt.twin.geometry.poses import Poses
@@ -153,7 +154,7 @@ def test_lag_that_is_seen_is_of_the_panel() -> None:
         Scan(ArrayFrames([np.zeros(SMALL, np.float32)], SMALL), poses) for _ in range(3)
     )
     model = BeadModel(np.zeros((1, 3)), np.ones(1))
-    found = Calibration(None, (), (), (), (), scans, model)
+    found = Calibration(None, (), Findings(), (), (), scans, model)
     assert found.panel is None
     lags = (Lag(0.03, 0.001), Lag(0.05, 0.001), Lag(0.2, 0.1))  # the last may be none
     panel = dataclasses.replace(found, lags=lags).panel

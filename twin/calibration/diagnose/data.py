@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
-from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.named_motion import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
@@ -25,6 +25,7 @@ from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan
 from flexdt.twin.calibration.identify import Identification, Search, attempt
+from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
@@ -50,7 +51,7 @@ TURN_FACTORS = (0.5, 0.56, 0.62, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 1.6, 1.8, 2.0)
 """Trial factors of the angles; values between them are fitted."""
 LEAST_TURN = 0.04
 """Least relative error of a turn for that; smaller ones are found in other ways."""
-TURN_WIDTH = {"angle_scale": 0.1}
+TURN_WIDTH = {CalibrationCode.ANGLE_SCALE: 0.1}
 """Standard deviation of the factor about a trial value."""
 SAMPLED_FRAMES = 8
 """Number of frames that are examined one by one."""
@@ -64,9 +65,9 @@ UNITS_MM = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
 SAME_SIZE = 1.3
 """Largest ratio of two radii that are the same, measured roughly."""
 _STATES = {
-    FrameState.MISSING: ("frames_missing", "missing"),
-    FrameState.DARK: ("frames_dark", "dark"),
-    FrameState.REPEATED: ("frames_repeated", "copies of the frame before"),
+    FrameState.MISSING: (CalibrationCode.FRAMES_MISSING, "missing"),
+    FrameState.DARK: (CalibrationCode.FRAMES_DARK, "dark"),
+    FrameState.REPEATED: (CalibrationCode.FRAMES_REPEATED, "copies of the frame before"),
 }
 
 
@@ -110,13 +111,18 @@ def judge_frames(
     if usable and empty == len(usable):
         out.append(
             error(
-                "no_beads",
+                CalibrationCode.NO_BEADS,
                 f"{name}: no bead was found in any of {n} frames"
                 f"{_of_intensities(scan, sought) or _looked_for(sought)}",
             )
         )
     elif empty:
-        out.append(warning("frames_empty", f"{name}: {empty} of {n} frames show no bead"))
+        out.append(
+            warning(
+                CalibrationCode.FRAMES_EMPTY,
+                f"{name}: {empty} of {n} frames show no bead",
+            )
+        )
     return out
 
 
@@ -178,7 +184,7 @@ def judge_emptiness(
         seen = float(np.median(np.concatenate(radii)))
         out.append(
             error(
-                "wrong_phantom",
+                CalibrationCode.WRONG_PHANTOM,
                 f"{scan.name}: the images show round shadows of radius {seen:.1f} px where the "
                 f"beads of {model.name!r} would cast {expected:.3g} px: another phantom"
                 f"{_of_unit(seen / expected)}",
@@ -230,7 +236,7 @@ def explain_identification(
         else:
             judged = error
         return judged(
-            "one_bead",
+            CalibrationCode.ONE_BEAD,
             f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
             "scale nor the angle",
         )
@@ -238,7 +244,7 @@ def explain_identification(
         angles = [p.to_edge()["alpha"] % 360.0 for p in (found.parameters, *found.rivals)]
         listed = ", ".join(f"{a:.1f}" for a in angles)
         return error(
-            "ambiguous",
+            CalibrationCode.AMBIGUOUS,
             f"{name}: the beads cannot be told apart: start angles {listed} deg explain the "
             "shadows equally well: state how the phantom stands, --start alpha=DEG --prior "
             "alpha=5, or take its beads for markers, --phantom unknown",
@@ -250,12 +256,12 @@ def explain_identification(
             return judged_beads
     explanation = _alternative(found, detections, model, poses, start)
     if explanation is not None:
-        return replace(explanation, text=f"{name}: {explanation.text}")
+        return replace(explanation, message=f"{name}: {explanation.message}")
     if found is not None and _plausible(found):
         return None
     why = _why_wrong(found, detections, model, poses)
     return error(
-        "wrong_phantom",
+        CalibrationCode.WRONG_PHANTOM,
         f"{name}: the shadows do not fit the phantom {model.name!r}: {why}; wrong phantom, or "
         "wrong frame angles",
     )
@@ -275,12 +281,12 @@ def _beads_or_spots(
         )
         if found.explained >= SOME_SPOTS:
             return warning(
-                "beads_missing",
+                CalibrationCode.BEADS_MISSING,
                 f"{whose} in any frame, and all spots fit the others: it is lost or out of "
                 "view; the others are used",
             )
         return warning(
-            "bead_displaced",
+            CalibrationCode.BEAD_DISPLACED,
             f"{whose} where it should be, and in each frame {rest:.1f} spots are no "
             "bead: it is elsewhere, or lost; the others are used",
         )
@@ -289,7 +295,7 @@ def _beads_or_spots(
     if found.explained > SOME_SPOTS or not _extra(found, counts):
         return None
     return warning(
-        "extra_spots",
+        CalibrationCode.EXTRA_SPOTS,
         f"{name}: in each frame {rest:.1f} of the spots are none of the beads of "
         f"{model.name!r}: other balls, or something round; not used",
     )
@@ -423,14 +429,14 @@ def _flipped(detections: Sequence[Detections], axis: int) -> list[Detections]:
     return out
 
 
-_Mistake = tuple[str, str, dict[str, Any]]
+_Mistake = tuple[CalibrationCode, str, dict[str, Any]]
 """Code and text of a mistake, and what is different if it was made: arguments of `attempt`."""
 
 
 class _Tried(NamedTuple):
     """A mistake, and the assignment of spots to beads as if it was made."""
 
-    code: str
+    code: CalibrationCode
     text: str
     found: Identification
 
@@ -453,7 +459,7 @@ def _bead_elsewhere(fit_well: Sequence[_Tried], found: Identification) -> Findin
     less = [
         one
         for one in fit_well
-        if one.code == "bead_displaced" and _leaves_less(one.found, found)
+        if one.code is CalibrationCode.BEAD_DISPLACED and _leaves_less(one.found, found)
     ]
     return min(less, key=lambda one: one.off).finding if less else None
 
@@ -475,44 +481,44 @@ def _mistakes(
             f"the angles are off by a factor {factor:.5f}: the frames turn by 360 / "
             f"{true}, not 360 / {stated} (endpoint error)"
         )
-        trials.append(("angle_endpoint", text, {"poses": turned}))
+        trials.append((CalibrationCode.ANGLE_ENDPOINT, text, {"poses": turned}))
     across, along = (_flipped(detections, axis) for axis in (0, 1))
     trials += [
         (
-            "mirrored_phantom",
+            CalibrationCode.MIRRORED_PHANTOM,
             "the phantom is the mirror image of its model, or the images are mirrored "
             "left to right and the stage turns the other way, which looks alike",
             {"model": model.mirrored()},
         ),
         (
-            "angle_reversed",
+            CalibrationCode.ANGLE_REVERSED,
             "the stage turns the other way than the angles say: negate the angles "
             "of the settings or of the geometry",
             {"poses": replace(poses, angle=-poses.angle)},
         ),
         (
-            "image_mirrored",
+            CalibrationCode.IMAGE_MIRRORED,
             "the images are mirrored left to right",
             {"detections": across},
         ),
         (
-            "image_upside_down",
+            CalibrationCode.IMAGE_UPSIDE_DOWN,
             "the images are upside down, or each z of the phantom has the wrong "
             "sign, which looks alike",
             {"detections": along},
         ),
         (
-            "image_turned",
+            CalibrationCode.IMAGE_TURNED,
             "the images are upside down and mirrored: turned by 180 deg",
             {"detections": _flipped(across, 1)},
         ),
         (
-            "phantom_upside_down",
+            CalibrationCode.PHANTOM_UPSIDE_DOWN,
             "the phantom stands on its head",
             {"model": model.turned_over()},
         ),
         (
-            "not_turning",
+            CalibrationCode.NOT_TURNING,
             "the object does not turn although the angles say so",
             {"poses": replace(poses, angle=np.zeros(n))},
         ),
@@ -524,7 +530,7 @@ def _mistakes(
         text = (
             f"without bead {j} the others fit: it is not where the phantom's model has it"
         )
-        trials.append(("bead_displaced", text, {"model": others}))
+        trials.append((CalibrationCode.BEAD_DISPLACED, text, {"model": others}))
     return trials
 
 
@@ -660,7 +666,7 @@ def _in_parts(
     if len(ends) == 1:
         ((part, _),) = ends.values()
         return error(
-            "frame_numbers",
+            CalibrationCode.FRAME_NUMBERS,
             f"frames {part.start} to {part.stop - 1} by themselves fit the phantom, all of "
             "them do not: frames are missing, their numbers or angles are wrong, or beads move "
             "against the others",
@@ -672,7 +678,7 @@ def _in_parts(
         return error(code, f"between the first and the last frames {text}")
     name = max(("dO_x", "dO_y", "dO_z"), key=lambda n: abs(last[n] - first[n]))
     return error(
-        "drift",
+        CalibrationCode.DRIFT,
         f"the first and the last frames fit the phantom, but {name} changes by "
         f"{last[name] - first[name]:+.3g} mm between them",
     )
@@ -707,7 +713,7 @@ def _other_turn(
     if abs(best[1] - 1.0) < LEAST_TURN:
         return None
     return error(
-        "angle_turn",
+        CalibrationCode.ANGLE_TURN,
         f"the first {n} frames fit the phantom if the stage turns {best[1]:.3f} times "
         f"as far as the angles say: {abs(math.degrees(float(turned[-1]))) * best[1]:.0f} "
         "deg from the first to the last frame",
@@ -741,7 +747,7 @@ def _one_by_one(
     if good < 0.7 * len(chosen):
         return None
     return error(
-        "frame_numbers",
+        CalibrationCode.FRAME_NUMBERS,
         f"{good} of {len(chosen)} frames that were tried fit the phantom each "
         "by itself, together they do not: the frames are in another order, "
         "or their angles are wrong",

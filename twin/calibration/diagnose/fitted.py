@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose import Finding, error, listed, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.causes import (
     LEAST_BEADS,
     Found,
@@ -36,15 +36,16 @@ from flexdt.twin.calibration.fit.fitted_motion import (
     MotionFit,
 )
 from flexdt.twin.calibration.fit.residual_structure import MOVING
+from flexdt.twin.findings import Finding, Findings, error, warning
 
 OF_RESIDUALS = frozenset(
     (
-        "drift",
-        "vibration",
-        "bead_errors",
-        "bead_displaced",
-        "too_many_outliers",
-        "bead_tolerance",
+        CalibrationCode.DRIFT,
+        CalibrationCode.VIBRATION,
+        CalibrationCode.BEAD_ERRORS,
+        CalibrationCode.BEAD_DISPLACED,
+        CalibrationCode.TOO_MANY_OUTLIERS,
+        CalibrationCode.BEAD_TOLERANCE,
     )
 )
 """Codes of findings about residuals: they hold for that fit alone."""
@@ -60,7 +61,13 @@ PLAUSIBLE_SHARE = 0.12
 """Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
 scaled together with its beads looks like the right one at another distance, so that this offset
 is its only sign."""
-OF_MOTION: Final = frozenset(("drift", "vibration", "angles_wrong"))
+OF_MOTION: Final = frozenset(
+    (
+        CalibrationCode.DRIFT,
+        CalibrationCode.VIBRATION,
+        CalibrationCode.ANGLES_WRONG,
+    )
+)
 """Codes of findings on motion that may be followed from frame to frame."""
 UNEXPLAINED_MOTION: Final = ("dO_x", "dO_y", "alpha")
 """Parameters that are advised to differ between frames where no cause explains a misfit."""
@@ -76,7 +83,7 @@ def judge_offsets(fit: FitResult) -> Finding | None:
     for parameters in fit.group_parameters:
         if abs(parameters.dO_z) > PLAUSIBLE_SHARE * sod:
             return error(
-                "implausible_offset",
+                CalibrationCode.IMPLAUSIBLE_OFFSET,
                 f"dO_z comes out as {parameters.dO_z:.1f} mm at SOD {sod:.0f} mm: a phantom of "
                 "another scale, or wrong nominal distances",
             )
@@ -142,7 +149,7 @@ def explain_residuals(
     if not bad:
         return fit, out
     misfit = error(
-        "misfit",
+        CalibrationCode.MISFIT,
         f"the fit leaves residuals of {certificate.rms_px:.2f} px, and no cause that is "
         "looked for explains them: check that nothing is loose, or let frames differ, "
         f"--per-frame {','.join(UNEXPLAINED_MOTION)}",
@@ -189,7 +196,7 @@ def _moving_beside(
     for base, others in beside:
         found = moving(base, partial(_refit_moving, base, refit)) or wobble(base)
         if found is not None:
-            return [found, *(f for f in others if f.code != "causes_open")]
+            return [found, *Findings(others).without(CalibrationCode.CAUSES_OPEN)]
     # A motion takes up such a factor, but a lean does not.
     return listed(wobble(refit(extra=("angle_scale",))))
 
@@ -239,7 +246,7 @@ def _drifts(fit: FitResult) -> list[Finding]:
             how += f" of scan {drift.scan + 1}"
         out.append(
             warning(
-                "drift",
+                CalibrationCode.DRIFT,
                 f"{drift.column} changes by {drift.size:+.3g} {unit} {how} ({drift.score:.0f} "
                 f"sigma){_looks_alike(drift.column)}; its interval contains the change, and "
                 f"--per-frame {','.join(MOVING)} would follow it",
@@ -249,12 +256,12 @@ def _drifts(fit: FitResult) -> list[Finding]:
     for there, code, what in (
         (
             certificate.shared,
-            "vibration",
+            CalibrationCode.VIBRATION,
             "the beads of a frame err together (vibration or angle jitter)",
         ),
         (
             certificate.turning > BEAD_ERROR_SIGMAS,
-            "bead_errors",
+            CalibrationCode.BEAD_ERRORS,
             f"single beads err by about {certificate.turning * certificate.rms_px:.2g} px, "
             "smoothly as the object turns (bead positions, background, distortion)",
         ),
@@ -287,11 +294,11 @@ def _lost_beads(fit: FitResult) -> list[Finding]:
             judged = warning
         else:
             judged = error
-        return [judged("bead_displaced", f"{text} left out")]
+        return [judged(CalibrationCode.BEAD_DISPLACED, f"{text} left out")]
     share = 1.0 - used.sum() / max(int(problem.seen.sum()), 1)
     text = f"{100 * share:.0f} % of the positions had to be left out"
     if share > 0.35:
-        return [error("too_many_outliers", text)]
+        return [error(CalibrationCode.TOO_MANY_OUTLIERS, text)]
     return []
 
 
@@ -334,7 +341,7 @@ def _angle_scale(fit: FitResult, refit: Refit) -> Finding | None:
         if abs(estimate.value / factor - 1.0) < 0.1 / n:
             known = f": the steps are {text} (endpoint error)"
     return error(
-        "angle_endpoint" if known else "angle_scale",
+        CalibrationCode.ANGLE_ENDPOINT if known else CalibrationCode.ANGLE_SCALE,
         f"the frame angles are off by a factor {estimate.value:.5f}{known}; correct "
         "them, or free angle_scale",
         free=("angle_scale",),

@@ -17,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri, fdtrc
 
-from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.fit.certificate import Estimate, widened
 from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import to_edge
 
@@ -106,7 +107,7 @@ def judge_held(free: FitResult, held: Mapping[str, float]) -> Finding | None:
         for e in (free.certificate.estimates[n],)
     )
     text = f"{listed}: free {', '.join(named)} too, or hold it where it is"
-    return error("held_parameter", text, free=named)
+    return error(CalibrationCode.HELD_PARAMETER, text, free=named)
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ def judge_exact(
     )
     assumed = ", ".join(f"{n} = {exact[n]:g}" for n in causes)
     return warning(
-        "held_unchecked",
+        CalibrationCode.HELD_UNCHECKED,
         f"{assumed} is taken as exact, and the images cannot tell whether it is: with "
         f"the usual prior sigmas grow: {listed}; give prior 0 only to what was measured",
     )
@@ -303,7 +304,7 @@ def _priors_off(
     text = f"{'; or '.join(texts)}: free {', '.join(names)} too, or give the prior it has"
     # Those of one scan are no option.
     offered = [name for name in names if "@" not in name]
-    return error("held_parameter", text, free=offered)
+    return error(CalibrationCode.HELD_PARAMETER, text, free=offered)
 
 
 def _without_each(
@@ -393,7 +394,7 @@ def narrow_priors(judged: PriorsJudged) -> Finding:
     else:
         cause = ""
     return warning(
-        "priors_narrow",
+        CalibrationCode.PRIORS_NARROW,
         f"the images have detector and axis {judged.factor:.1f} times as far "
         f"from where they are known to be as their priors say{cause}: all priors "
         "are widened by that factor",

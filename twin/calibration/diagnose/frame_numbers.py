@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode
+from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -109,7 +110,7 @@ class FrameNumbers:
                 for i in again[:MAX_SHOWN]
             )
             return warning(
-                "frames_inconsistent",
+                CalibrationCode.FRAMES_INCONSISTENT,
                 f"{name}: in {len(again)} of {len(self.shift)} frames the shadows are "
                 f"not where the others put them: {described}; those frames are not used",
             )
@@ -124,7 +125,7 @@ class FrameNumbers:
         else:
             more = f" (and {len(changes) - MAX_SHOWN} more)"
         return error(
-            "frame_numbers",
+            CalibrationCode.FRAME_NUMBERS,
             f"{name}: {described}{more}: the frames' angles are those of other frames; number them "
             "anew, or scan again",
         )

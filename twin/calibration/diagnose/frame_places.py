@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.diagnose import Finding, error, listed, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.frame_numbers import frame_numbers
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, nothing
+from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
 
 BLOCK_SHARE = 0.7
@@ -103,7 +104,7 @@ def _judged_scan(
     if block and (aside := _aside(fit, np.flatnonzero(own)[bad].tolist())) is not None:
         column, row = aside.tolist()
         return error(
-            "frames_inconsistent",
+            CalibrationCode.FRAMES_INCONSISTENT,
             f"in frames {places_of} of {n}{of_scan} all shadows stand {column:+.1f} columns "
             f"and {row:+.1f} rows aside: the panel, the source or the object moved, or what "
             f"the camera reads of the panel: --per-frame {','.join(ASIDE)} follows it",
@@ -112,13 +113,13 @@ def _judged_scan(
     # A drift of something else leaves its ends out, too.
     if block and all(d.column.split("@")[0] == "alpha" for d in fit.certificate.drifts):
         return error(
-            "angle_step",
+            CalibrationCode.ANGLE_STEP,
             f"in frames {places_of} of {n}{of_scan} the shadows are not where the others put "
             "them: frames are missing there, or the phantom slipped",
         )
     many = len(bad) > MOST_LEFT_OUT * n
     return (error if many else warning)(
-        "frames_inconsistent",
+        CalibrationCode.FRAMES_INCONSISTENT,
         f"in {len(bad)} of {n} frames{of_scan} ({places_of}) the shadows are not where the "
         "others put them" + ("" if many else "; those frames are not used"),
     )

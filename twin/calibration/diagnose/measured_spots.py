@@ -12,9 +12,10 @@ from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.detect.smear import Smear
-from flexdt.twin.calibration.diagnose import Finding, error, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.frame_source import FrameSpots
 from flexdt.twin.calibration.identify import Identification
+from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
 
 MAX_SIZE_ERROR = 0.04
@@ -80,7 +81,7 @@ def judge_size(measured: Refined, radius_px: float) -> Finding | None:
         return None
     if off < MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2:
         return warning(
-            "blurred",
+            CalibrationCode.BLURRED,
             f"the images are blurred by {measured.blur_px:.1f} px and the shadows are "
             f"{radius_px:.1f} px wide: the beads' size is known to "
             f"{100 * (MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2):.0f} % only, "
@@ -96,7 +97,7 @@ def _other_size(ratio: float) -> Finding:
         ratio: measured over predicted size.
     """
     return error(
-        "bead_size",
+        CalibrationCode.BEAD_SIZE,
         f"the shadows are {100 * abs(ratio - 1):.0f} % "
         f"{'larger' if ratio > 1 else 'smaller'} than those that the phantom's "
         "beads cast at the fitted geometry: beads of another size, "
@@ -117,7 +118,7 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
     bodies = [m.body for m in measured if np.isfinite(m.body.factor)]
     if any(body.factor == 0.0 for body in bodies):
         return warning(
-            "body_elsewhere",
+            CalibrationCode.BODY_ELSEWHERE,
             "the images do not show the phantom's body where it is described, so it was not "
             "subtracted: another body, or one that is turned or shifted against the beads; "
             "edges of the real one may pull shadows, which the intervals contain as far as "
@@ -127,7 +128,7 @@ def judge_body(measured: Sequence[Refined]) -> Finding | None:
         x, y, z = body.shift_mm
         if abs(math.log(body.factor)) > MAX_BODY_LOG or math.hypot(x, y, z) > MAX_BODY_MM:
             return warning(
-                "body_differs",
+                CalibrationCode.BODY_DIFFERS,
                 f"the phantom's body attenuates {body.factor:.2f} times what is described and "
                 f"stands {x:+.2f}, {y:+.2f}, {z:+.2f} mm from there; it was subtracted so",
             )
@@ -139,7 +140,7 @@ def judge_lag(lag: Lag) -> Finding:
     with the part [%], whatever its size.
     """
     return warning(
-        "lag",
+        CalibrationCode.LAG,
         f"the camera still shows {100 * lag.part:.2g} % of the frame before: "
         "it was taken out of what was measured here; a volume is blurred by it along "
         "the turn, but with the correction reconstruct takes it out, of scans with as "
@@ -157,7 +158,7 @@ def judge_missing_light(light: MissingLight) -> Finding:
         "as the light behind the beads shows: the dark image is too bright, or the detector "
         "is not linear; "
     )
-    code = "dark_too_bright"
+    code = CalibrationCode.DARK_TOO_BRIGHT
     if light.dark > 0.0:
         lost = f"{100 * light.dark:.0f} % of the spots have no light left"
         return error(code, f"{said}{lost}: take new dark images")
@@ -174,10 +175,10 @@ def beside_missing_light(finding: Finding) -> Finding:
     Args:
         finding: of any code; others than `phantom_strained` are returned as they are.
     """
-    if finding.code != "phantom_strained":
+    if finding.code is not CalibrationCode.PHANTOM_STRAINED:
         return finding
     return warning(
-        "causes_open",
+        CalibrationCode.CAUSES_OPEN,
         "the residuals have a cause that the images do not tell for certain: what remains of "
         f"the light that is missing, or else {finding.text}",
     )
@@ -211,7 +212,7 @@ def exposure_arc(arc_deg: float, share: float, done: str) -> Finding:
         done: how the calibration took it into account.
     """
     return warning(
-        "exposure_arc",
+        CalibrationCode.EXPOSURE_ARC,
         f"the object turns while a frame is exposed, by {arc_deg:.2g} deg, {share:.2f} of a "
         f"step: {done}; volumes are blurred along the turn, and angles are those of the "
         "middle of each exposure",
@@ -228,7 +229,7 @@ def shadows_drawn_out(name: str, share: float, step_rad: float, found: float) ->
         found: share of the beads in view with a round shadow.
     """
     return error(
-        "exposure_arc",
+        CalibrationCode.EXPOSURE_ARC,
         f"{name}: the object turns while a frame is exposed, by about "
         f"{share * math.degrees(step_rad):.2g} deg, {share:.1f} of a step: shadows are drawn "
         f"out along the turn, and {100 * found:.0f} % of the beads in view have a round one; "

@@ -7,12 +7,13 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose import Finding, listed, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.causes import SHAPES, Found, border_name
 from flexdt.twin.calibration.diagnose.measured_spots import exposure_arc
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import STRAINS, usual_step
 from flexdt.twin.calibration.fit.residual_structure import SIGNIFICANT
+from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.conventions import FloatArray
 
 CAUSE_WORDS: Final = {
@@ -110,7 +111,7 @@ def named_causes(fit: FitResult, found: Found) -> list[Finding]:
         alternatives = " or ".join(rivals)
         out.append(
             warning(
-                "causes_open",
+                CalibrationCode.CAUSES_OPEN,
                 "the residuals have a cause that the images do not tell for certain: "
                 f"{alternatives}; the intervals contain what they differ by",
             )
@@ -210,7 +211,7 @@ def _strained(found: Found) -> Finding | None:
     else:
         rival = ""
     return warning(
-        "phantom_strained",
+        CalibrationCode.PHANTOM_STRAINED,
         f"{', and '.join(said)}{rival}. Its shape was fitted, its size is not in the images: "
         "lengths, dO_z and the magnification hold as far as its millimetre; "
         + ("measure it, or give --bead-tolerance MM" if strains else "mount it upright"),
@@ -241,7 +242,7 @@ def _read_in_turn(fit: FitResult) -> Finding:
     step = np.degrees(usual_step(fit.problem.poses.angle))
     first, last = ("first", "last") if share > 0.0 else ("last", "first")
     return warning(
-        "rows_in_turn",
+        CalibrationCode.ROWS_IN_TURN,
         "a frame's rows are read one after another while the object turns: by "
         f"{abs(share) * step:.2g} deg, {abs(share):.2f} of a step, from the {first} row to the "
         f"{last} (or the phantom is twisted so, which looks alike). It was fitted, and angles "
@@ -256,7 +257,7 @@ def _elsewhere(fit: FitResult) -> Finding:
     """
     moved = np.linalg.norm(fit.beads - fit.problem.model.beads, axis=1)
     return warning(
-        "bead_tolerance",
+        CalibrationCode.BEAD_TOLERANCE,
         f"the beads lie {1000 * float(moved.max()):.0f} um off their model at most; their "
         f"positions were fitted too (prior {1000 * fit.bead_prior_mm:.0f} um): wider intervals",
     )
@@ -279,7 +280,7 @@ def _distorted(fit: FitResult) -> Finding:
         for b in panel.model.borders
     )
     return warning(
-        "panel_distorted",
+        CalibrationCode.PANEL_DISTORTED,
         f"the panel distorts its picture by up to {size:.2f} px{tiles}: this was "
         "estimated along with the geometry, its uncertainty is in every sigma, "
         "and reconstruct undoes it with the correction",

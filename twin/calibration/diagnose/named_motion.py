@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose import Finding, error
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.residual_limit import largest_residual
 from flexdt.twin.calibration.fit.evidence import NAMED_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -20,6 +20,7 @@ from flexdt.twin.calibration.fit.fitted_motion import (
 )
 from flexdt.twin.calibration.fit.residual_structure import MOVING
 from flexdt.twin.errors import TwinError
+from flexdt.twin.findings import Finding, error
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import UNITS, to_edge
 
@@ -129,9 +130,9 @@ def moving(fit: FitResult, refit: Callable[[MotionFit], FitResult]) -> Finding |
         angles = problem.poses.angle[problem.group == scan]
         return _turned(curve, jump, angles, ", ".join(motions[1:]), of_scan)
     if how.startswith("from frame"):
-        code = "vibration"
+        code = CalibrationCode.VIBRATION
     else:
-        code = "drift"
+        code = CalibrationCode.DRIFT
     alike = open_motions(found, math.exp(NAMED_LOG_ODDS))
     if name == "dO_z":
         alike += ALIKE_MOTION[name]
@@ -185,20 +186,20 @@ def _turned(
     share = float(turn @ curve) / max(float(turn @ turn), 1e-300)
     if float(np.std(curve - share * turn)) < MAX_CURVED * float(np.std(curve)):
         return error(
-            "angle_scale",
+            CalibrationCode.ANGLE_SCALE,
             f"the frame angles{of_scan} are off by a factor {1.0 + share:.5f}; correct "
             f"them, or free angle_scale{beside}",
             free=("angle_scale",),
         )
     off = np.array([to_edge("alpha", v) for v in curve - np.median(curve)])
     return error(
-        "angles_wrong",
+        CalibrationCode.ANGLES_WRONG,
         f"the frames' angles{of_scan} differ from the stated ones by {np.std(off):.3f} deg "
         f"rms (up to {np.abs(off).max():.3f}){beside}",
     )
 
 
-def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
+def named_turn(turn_deg: float, angles: FloatArray) -> tuple[CalibrationCode, str]:
     """Name the likely cause where an object turns further or less far than stated: lost or
     doubled frames if by a whole number of steps (within 0.05 step), else a slip.
 
@@ -214,11 +215,11 @@ def named_turn(turn_deg: float, angles: FloatArray) -> tuple[str, str]:
     if whole and abs(turn_deg - whole * step) < 0.05 * abs(step):
         count = "1 frame is" if abs(whole) == 1 else f"{abs(whole)} frames are"
         what = "lost" if whole > 0 else "doubled"
-        return "frame_numbers", (
+        return CalibrationCode.FRAME_NUMBERS, (
             f"the object turns by {turn_deg:+.3f} deg beyond what is stated: {count} {what} "
             "there, or the frames' numbers are wrong"
         )
-    return "angle_step", (
+    return CalibrationCode.ANGLE_STEP, (
         f"the object turns by {turn_deg:+.3f} deg beyond what is stated: it slipped, or frames "
         "are missing there"
     )

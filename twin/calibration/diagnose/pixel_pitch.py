@@ -16,11 +16,12 @@ from typing import Final
 import numpy as np
 from scipy.special import softmax
 
-from flexdt.twin.calibration.diagnose import Finding, warning
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.evidence import Judged, Table
 from flexdt.twin.calibration.fit.fit import FitResult, RivalPitch
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factor
+from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import to_internal
 
@@ -64,7 +65,7 @@ def with_rival_pitch(
         if _is_distance(n)
     )
     return fit, warning(
-        "pixel_pitch",
+        CalibrationCode.PIXEL_PITCH,
         f"{found} is further off than the scanner's +- {widths[DISTANCE]:g} mm; pixels "
         f"{pixel * (1.0 + rival.growth):.4g} mm wide instead of {pixel:.4g} mm look alike, so the "
         "intervals contain both: measure the panel's distance, or correct the pixel size",

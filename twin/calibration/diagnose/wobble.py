@@ -16,11 +16,12 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.diagnose import Finding, error
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.fit.evidence import NAMED_LOG_ODDS
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.fitted_motion import derivative
 from flexdt.twin.calibration.fit.residual_structure import MOVING
+from flexdt.twin.findings import Finding, error
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import UNITS, to_edge
 
@@ -92,7 +93,7 @@ def wobble(fit: FitResult) -> Finding | None:
         # A part of it that turns with the stage is the phantom's own lean: it is not known.
         size = ""
     return error(
-        "wobble",
+        CalibrationCode.WOBBLE,
         f"the rotation axis leans to and fro {size}{TIMES[lean.harmonic]} a turn: the stage "
         f"wobbles; the residuals are {after_px:.2g} px without it",
     )

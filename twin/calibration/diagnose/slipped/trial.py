@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.diagnose import Finding, error
+from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.causes.cause import (
     REPEATING,
 )
@@ -26,6 +26,7 @@ from flexdt.twin.calibration.diagnose.slipped.piece import SHARES, Model, Piece
 from flexdt.twin.calibration.diagnose.slipped.residuals import Residuals
 from flexdt.twin.calibration.diagnose.slipped.search import Search
 from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, NAMED_LOG_ODDS, Judged
+from flexdt.twin.findings import Finding, error
 from flexdt.twin.geometry.conventions import FloatArray
 
 MOST_PIECES: Final = 4
@@ -85,7 +86,7 @@ class Verdict:
                 f"move{'s' * one} by {size:.2g} mm {when}"
             )
         return error(
-            "beads_moved",
+            CalibrationCode.BEADS_MOVED,
             "beads move against the others during the scan: "
             f"{'; '.join(parts)}. Something is loose or slips in the phantom: fix its beads, "
             "and measure again",
