@@ -357,7 +357,7 @@ def _script(
                 return replace(scan, log=log, commands=tuple(x.command for x in log))
             except CommandError as error:
                 script, problems = read_script(path.read_bytes())
-                if not script.commands or any(p.severity == "error" for p in problems):
+                if not script.commands or problems.errors:
                     ask(Question(scan.name, "; ".join(error.lines)))
                 else:
                     scan = replace(scan, commands=script.commands)
