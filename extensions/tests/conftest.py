@@ -3,6 +3,7 @@
 from suite import (
     data_dir,
     pytest_collection_modifyitems,
+    pytest_make_collect_report,
     pytest_runtest_makereport,
     pytest_runtest_setup,
     rays,
@@ -13,6 +14,7 @@ from suite import (
 __all__ = [
     "data_dir",
     "pytest_collection_modifyitems",
+    "pytest_make_collect_report",
     "pytest_runtest_makereport",
     "pytest_runtest_setup",
     "rays",

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from compound_file import compound_file
 from four_balls import COLS, PIXEL, ROWS, SDD, SOD, VIEWS, found, images
-from required import required
 
 import flexdt as fx
 from flexdt.twin.dataset.dataset_errors import DatasetError
@@ -21,7 +20,7 @@ KINDS = {3: (np.uint8, 250), 5: (np.uint16, 50_000), 10: (np.float32, 3.7e5)}
 
 @pytest.fixture(autouse=True)
 def _reader() -> None:
-    required("olefile")
+    pytest.importorskip("olefile")
 
 
 def numbers(values: object, kind: str = "<f4") -> bytes:
@@ -109,7 +108,7 @@ def test_what_the_tests_write_is_an_ole2_file(seed: int, tmp_path: Path) -> None
         for k, size in enumerate(sizes)
     }
     (tmp_path / "file").write_bytes(compound_file(streams))
-    olefile = required("olefile")
+    olefile = pytest.importorskip("olefile")
     with olefile.OleFileIO(
         tmp_path / "file", raise_defects=olefile.DEFECT_POTENTIAL
     ) as file:

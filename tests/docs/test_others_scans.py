@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 from four_balls import BALLS, COLS, MU, PIXEL, ROWS, SDD, SOD, VIEWS, found, images
 from loaded_script import load
-from required import required
 
 import flexdt as fx
 from flexdt.twin.geometry.conventions import FloatArray
@@ -44,20 +43,20 @@ def nikon(folder: Path) -> None:
 
 
 def zeiss(folder: Path) -> None:
-    required("olefile")
+    pytest.importorskip("olefile")
     load(ROOT / "tests" / "dataset" / "test_zeiss.py").balls(folder / "tooth.txrm", 3)
 
 
 def nxtomo(folder: Path) -> None:
     frames = np.r_[np.full((1, ROWS, COLS), 5e4), 5e4 * images(0.0, 0.0)]
-    with required("h5py").File(folder / "scan.nxs", "w") as file:
+    with pytest.importorskip("h5py").File(folder / "scan.nxs", "w") as file:
         file["entry/detector/data"] = frames.round().astype(np.uint16)
         file["entry/detector/image_key"] = [1] + [0] * VIEWS
 
 
 def rtk(folder: Path) -> None:
     """As RTK's own programs leave a circle: positive distances, rows from the lowest."""
-    required("itk")
+    pytest.importorskip("itk")
     angles = np.rad2deg(START) + 360.0 / VIEWS * np.arange(VIEWS)
     views = "".join(VIEW.format(angle % 360.0, SOD, SDD) for angle in angles)
     (folder / "geometry.xml").write_text(
@@ -281,7 +280,7 @@ def test_rtk_sees_the_balls_where_they_are(
     scan: str, scans: dict[str, fx.DataSet], tmp_path: Path
 ) -> None:
     """What RTK's reader makes of the file, with the images that ITK wrote."""
-    required("itk")
+    pytest.importorskip("itk")
     scans[scan].save(tmp_path / "scan")
     code = f"import flexdt as fx\ndata = fx.open('scan')\n{BLOCKS['To RTK']}" + (
         "reader = itk.RTK.ThreeDCircularProjectionGeometryXMLFileReader.New()\n"

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -102,3 +105,32 @@ def test_measured_tests_exist() -> None:
     known = json.loads(suite.MEASURED.read_text())
     assert len(known) > 100
     assert [test for test in known if not durations.is_there(test)] == []
+
+
+def test_ci_skips_what_it_may_lack_and_nothing_else(tmp_path: Path) -> None:
+    hooks = "pytest_make_collect_report, pytest_runtest_makereport, pytest_runtest_setup"
+    (tmp_path / "conftest.py").write_text(f"from suite import {hooks}\n")
+    for name, reason in (
+        ("lacks", "itk-rtk is not installed"),
+        ("may", "no CUDA device"),
+    ):
+        skip = f"pytest.skip({reason!r}, allow_module_level=True)"
+        (tmp_path / f"test_{name}.py").write_text(
+            f"import pytest\ndef test_one(): {skip}\n"
+        )
+        (tmp_path / f"test_{name}_all.py").write_text(f"import pytest\n{skip}\n")
+
+    def told(ci: str, *words: str) -> str:
+        return subprocess.run(
+            [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words],
+            cwd=tmp_path, capture_output=True, text=True, check=False,
+            env=os.environ | {"CI": ci, "PYTHONPATH": os.pathsep.join(sys.path)},
+        ).stdout  # fmt: skip
+
+    in_ci = told("true", "--continue-on-collection-errors")
+    assert "2 skipped" in in_ci
+    assert "1 failed" in in_ci
+    assert "1 error" in in_ci
+    for name in ("test_lacks.py::test_one", "test_lacks_all.py"):
+        assert f"CI must not skip {name}: Skipped: itk-rtk is not installed" in in_ci
+    assert "4 skipped" in told("false")

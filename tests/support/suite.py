@@ -7,15 +7,17 @@ import os
 import shutil
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from skips import judged
 
-from flexdt.clients.launch.processes import Servers
+if TYPE_CHECKING:
+    from flexdt.clients.launch.processes import Servers
 
 # Idle threads of OpenMP (numba's loops) and OpenBLAS spin until there is more to do. Beside
 # another process they take the cores from it: FDK's tests took 138 s of processor time instead
@@ -145,14 +147,25 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     item.stash[BEGUN] = processor_s()
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """What a test takes of the processor, fixtures included, goes into the file of
-    durations."""
+    durations; a skip that CI does not allow is a failure."""
     if call.when == "teardown":
         item.user_properties.append(
             ("processor_s", round(processor_s() - item.stash[BEGUN], 2))
         )
+    return judged((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[
+    None, pytest.CollectReport, pytest.CollectReport
+]:
+    """A module that is skipped where CI does not allow it is an error."""
+    return judged((yield))
 
 
 @dataclass
@@ -193,6 +206,7 @@ class SharedServers:
 def shared_servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedServers]:
     """Start a twin and a projector for all modules of a worker; they stop at its end."""
     from flexdt.clients import TwinClient
+    from flexdt.clients.launch.processes import Servers
 
     data = tmp_path_factory.mktemp("shared") / "data"
     with Servers(

@@ -7,10 +7,10 @@ import json
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_scans import CHIRAL, SHAPE, some_parameters, some_poses, worst
-from required import required
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
@@ -18,7 +18,7 @@ from flexdt.twin.geometry.offsets import NOMINAL
 from flexdt_extensions.ctsimu.ctsimu_read import read_ctsimu
 from flexdt_extensions.ctsimu.ctsimu_write import Scenario, scenario_document
 
-ctsimu = required("ctsimu.scenario")
+ctsimu = pytest.importorskip("ctsimu.scenario")
 
 
 def frames(document: Any, real: bool) -> list[Any]:

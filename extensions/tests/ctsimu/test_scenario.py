@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import tifffile
 from ctsimu_texts import box, deg, material, mm, point, sample, scenario, vector, write
-from required import required
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
@@ -24,7 +23,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt_extensions.ctsimu.ctsimu_scan import read_scenario
 from flexdt_extensions.ctsimu.scenario import ScenarioImages
 
-ctsimu = required("ctsimu.scenario")
+ctsimu = pytest.importorskip("ctsimu.scenario")
 
 Put = Callable[..., Path]
 
@@ -201,7 +200,7 @@ def test_the_command_writes_images_and_metadata_that_ctsimu_reads(
     assert sorted(p.name for p in folder.iterdir()) == names
     assert run(["simulate", str(path)]) == 1
     assert "allowed: a new folder" in capsys.readouterr().err
-    metadata = required("ctsimu.scenario.metadata").Metadata()
+    metadata = pytest.importorskip("ctsimu.scenario.metadata").Metadata()
     metadata.set_from_json(json.loads((folder / "case_metadata.json").read_text()))
     shown = metadata.output.projections
     assert [shown.get(k) for k in ("filename", "number", "max_intensity", "datatype")] == [

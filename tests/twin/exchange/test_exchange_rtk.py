@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_scans import CHIRAL, PITCH, SHAPE, some_parameters, some_poses, worst
-from required import required
 from rtk_process import ANGLES, Rtk, Seen, joseph, read, rtk_process, write_circle
 
 from flexdt.twin.exchange.geometry import ScanGeometry
@@ -24,7 +23,7 @@ from flexdt.twin.projection import Volume, forward
 pytestmark = pytest.mark.slow
 
 if find_spec("itk") is None:  # it is used in a process of its own, not imported here
-    required("itk")
+    pytest.skip("itk-rtk is not installed", allow_module_level=True)
 
 
 @pytest.fixture(scope="module")
