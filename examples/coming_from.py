@@ -8,7 +8,8 @@ device) is reported and the others go on, so that a peer's geometry is compared 
 cannot project. Prints JSON: for each block its lines, the peer's version, how many statements
 ran, the first error, and how far its result is from ours.
 
-gvxr needs Mesa's software OpenGL where there is no graphics card: see tests/studies/compare_gvxr.py.
+gvxr needs Mesa's software OpenGL where there is no graphics card: see
+tests/studies/compare_gvxr.py.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from flexdt.clients.cli.commands.script_files import read_log_file
-from flexdt.library.commission import MACHINE_FILE, Commissioned, commission
+from flexdt.library.commission import Commissioned, commission
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
