@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import weekly
 import yaml
 from doc_pages import pages
 
@@ -138,27 +139,19 @@ def test_every_step_of_the_workflows_is_a_sound_command() -> None:
             assert file in made or (ROOT / file).exists(), (where, file)
 
 
-@pytest.mark.slow
-def test_programs_of_the_weekly_workflow_take_their_options() -> None:
-    lines = "\n".join(commands(workflow("weekly.yml")["jobs"]["others"]))
-    called = re.findall(r"\.venv/bin/(?:python )?(\S+\.py|flexdt \w+)(.*)", lines)
-    assert len({program for program, _ in called}) >= 3
-    for program, words in called:
-        begin = [program] if program.endswith(".py") else ["-m", "flexdt.clients.cli"]
-        begin += program.split()[1:]
-        told = subprocess.run(
-            [sys.executable, *begin, "--help"],
-            cwd=ROOT, capture_output=True, text=True, check=True,
-        ).stdout  # fmt: skip
-        for option in re.findall(r"--[a-z-]+", words):
-            assert re.search(rf"{option}\b", told), (program, option)
-        first = words.split()[0]
-        choices = re.match(r"usage: \S+ .*\{([\w,]+)\}", told)
-        if choices and not first.startswith("--"):
-            assert first in choices[1].split(","), (program, first)
+def test_each_table_of_programs_is_a_weekly_job() -> None:
+    loaded = workflow("weekly.yml")["jobs"]
+    assert any(
+        "$(python3 tests/studies/weekly.py)" in c for c in commands(loaded["table"])
+    )
+    matrix = loaded["programs"]["strategy"]["matrix"]
+    assert matrix == {"job": "${{ fromJSON(needs.table.outputs.jobs) }}"}
+    assert ".venv/bin/python tests/studies/weekly.py ${{ matrix.job }}" in commands(
+        loaded["programs"]
+    )
 
 
-NEEDS = re.compile(r"`[^`\n]*(?:CHECKOUT|evidence --data|--leap )[^`\n]*`")
+NEEDS = re.compile(r"`[^`\n]*(?: others/|evidence --data)[^`\n]*`")
 """A command that needs what CI lacks: others' data or programs."""
 DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 
@@ -180,12 +173,12 @@ def others_commands() -> list[tuple[str, str, str]]:
 def test_figures_that_ci_cannot_make_are_dated_and_made_weekly() -> None:
     known = others_commands()
     assert len({command for _, command, _ in known}) >= 4
-    weekly = "\n".join(commands(workflow("weekly.yml")["jobs"]["others"]))
+    made_weekly = "\n".join(weekly.jobs()["others"]["commands"])
     for page, command, block in known:
         assert DATE.search(block), (page, command)
         program = re.search(r"\S+\.py|flexdt evidence", command)
         assert program is not None, command
-        assert program[0] in weekly, (page, command)
+        assert program[0] in made_weekly, (page, command)
         assert program[0] == "flexdt evidence" or (ROOT / program[0]).is_file()
 
 
