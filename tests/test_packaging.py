@@ -55,12 +55,7 @@ def sources(folder: str) -> list[Path]:
 def test_a_file_name_means_one_thing_and_no_room_is_crowded() -> None:
     """Only the entry points of the processes share their names."""
     modules = [path for folder in FOLDERS for path in sources(folder)]
-    own = [
-        p
-        for p in modules
-        if p.stem not in ("__init__", "__main__", "main")
-        and not p.read_text().startswith('"""Deprecated import path')
-    ]
+    own = [p for p in modules if p.stem not in ("__init__", "__main__", "main")]
     assert sorted({p.name for p in own if sum(q.name == p.name for q in own) > 1}) == []
     rooms = Counter(path.parent for path in modules)
     assert {room.name: n for room, n in rooms.items() if n > 17} == {}

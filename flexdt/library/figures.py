@@ -19,11 +19,6 @@ import numpy.typing as npt
 
 from flexdt.library.extras import package
 
-# Earlier import path of these names.
-from flexdt.library.report_page import cell_text as cell_text
-from flexdt.library.report_page import page as page
-from flexdt.library.report_page import table as table
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure

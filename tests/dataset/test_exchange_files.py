@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from flexdt.clients.cli.command_tree import run
-from flexdt.library.datasets import exchange
 from flexdt.library.datasets.exchange import (
     ExchangeError,
     Given,
@@ -83,17 +82,6 @@ def test_there_and_back(
     assert np.abs(found.cone_vec.rows - expected.rows).max() < 1e-9
     assert found.shape == data.shape
     assert not list(tmp_path.glob("*.part"))
-
-
-def test_the_tables_of_before_are_deprecated(folder: Path, tmp_path: Path) -> None:
-    with pytest.warns(DeprecationWarning, match="FORMATS"):
-        assert exchange.ENDINGS["nxtomo"] == FORMATS["nxtomo"].endings
-    with pytest.warns(DeprecationWarning, match="FORMATS"):
-        written = exchange.WRITERS["csv"](geometry_of(load_dataset(folder)))
-    export_dataset(load_dataset(folder), tmp_path / "g.csv", "csv")
-    assert (tmp_path / "g.csv").read_text() == written
-    with pytest.raises(AttributeError, match="READERS"):
-        _ = exchange.READERS
 
 
 @pytest.mark.parametrize(

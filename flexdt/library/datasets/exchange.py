@@ -7,13 +7,10 @@ detector's size, are arguments.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 from flexdt.library.datasets.exchange_formats import (
     FORMATS,
@@ -53,31 +50,6 @@ __all__ = [
     "with_geometry",
     "write_geometry",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """Return the deprecated names `ENDINGS` and `WRITERS`, made from `FORMATS`, with a
-    DeprecationWarning.
-
-    Args:
-        name: ENDINGS, format -> file endings; WRITERS, format -> function of a geometry
-            that makes the file's content, of formats that are written.
-
-    Raises:
-        AttributeError: any other name.
-    """
-    if name == "ENDINGS":
-        value: dict[str, Any] = {form.name: form.endings for form in FORMATS.values()}
-    elif name == "WRITERS":
-        value = {
-            form.name: partial(_content, form=form, out=Path(form.name + form.endings[0]))
-            for form in FORMATS.values()
-            if form.write
-        }
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warnings.warn(f"{name}: use FORMATS[name]", DeprecationWarning, stacklevel=2)
-    return value
 
 
 def geometry_of(dataset: ImageSet, parameters: Offsets | None = None) -> ScanGeometry:
