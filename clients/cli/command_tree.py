@@ -83,7 +83,7 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
             "show": machines.show,
             "check": machines.check,
             "new": new_machine.new,
-            "fit": machines.fit,
+            "fit": commissioning.fit,
         },
     ),
 }

@@ -9,6 +9,7 @@ from typing import Any
 MOVED = {
     "how-to": "use",
     "explanation": "understand",
+    "machine-fit": "commission",
 }
 """Old page -> page that has its subject now, without the ending."""
 

@@ -1,9 +1,10 @@
-"""`flexdt commission` without its command line: a machine and a profile from folders of
-past scans, with their contradictions.
+"""`flexdt commission` without its command line: a machine and a profile from past scans,
+with their contradictions.
 
-The machine is the shipped one that the texts name, with the signs and rates of the texts,
-fitted to the executed scripts; see `flexdt.twin.commissioning`. A scan that cannot be
-read is no error: it is listed as a question.
+A past scan is a folder, an executed script or a recording of one. The machine is the one that
+was named, or the shipped one that the texts name, with the signs and rates of the texts, fitted
+to the executed scripts; see `flexdt.twin.commissioning`. A folder that cannot be read is no
+error: it is listed as a question.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from flexdt.library import machines
 from flexdt.library.calibration.align_dataset import align_dataset
@@ -33,6 +34,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.findings import ERROR, Finding, Findings, Place
 from flexdt.twin.machine import description as d
 from flexdt.twin.machine.fitted_machine import fitted_text
+from flexdt.twin.script.commands import Command
 from flexdt.twin.script.executed_log import Executed
 from flexdt.twin.script.grammar import own_name
 from flexdt.twin.script.log_fit import Fit, fit_machine
@@ -41,7 +43,7 @@ from flexdt.twin.script.parse import read_script
 MAX_NEXT_SCANS: Final = 3
 """Largest number of proposed scans."""
 MIN_DURATIONS: Final = 3
-"""Durations of a kind of command from which its range is estimated (`docs/machine-fit.md`)."""
+"""Durations of a kind of command from which its range is estimated (`docs/commission.md`)."""
 NEXT_SCANS: Final = {
     "ordinary": ("a full turn of any object with structure", "fly --frames 721"),
     "magnified": (
@@ -62,22 +64,98 @@ different, and the sample still clears the source in most scanners."""
 MACHINE_FILE: Final = "machine.toml"
 PROFILE_FILE: Final = "profile.toml"
 ReadLog = Callable[[Path, d.Machine], tuple[Executed, ...]]
-Table = tuple[Sequence[str], list[Sequence[Any]]]
+Table = tuple[Sequence[str], Sequence[Sequence[Any]]]
+T = TypeVar("T")
 
 
-class Commissioned(NamedTuple):
-    """The result of commissioning: the fitted machine and its file, `fit` of the executed
-    scripts (None without any), the scans with the oldest first, zero offsets,
-    contradictions and questions.
+class Base(NamedTuple):
+    """The machine that a fit begins with.
+
+    Attributes:
+        machine: gives what scans do not tell.
+        text: of its file.
+        file: where its meshes are.
+        named: whether a person named it; then a motor that it lacks is an error.
     """
 
     machine: d.Machine
     text: str
+    file: str
+    named: bool
+
+    @classmethod
+    def of(cls, word: str | None, named: bool = True) -> Base:
+        """Read a machine by shipped name or file; None is the FleX-ray.
+
+        Raises:
+            MachineFileError: the file is invalid.
+            UnknownNameError: neither a file nor a shipped name.
+        """
+        name = word or machines.DEFAULT_MACHINE
+        machine = machines.machine(name)
+        if machines.is_file(name):
+            text = Path(name).read_text("utf-8")
+        else:
+            text = d.builtin_machine_text(name)
+        return cls(machine, text, name, named)
+
+
+class Fitted(NamedTuple):
+    """A machine, the text of its file, and its fit to executed scripts (None without any)."""
+
+    machine: d.Machine
+    text: str
     fit: Fit | None
+
+    def tables(self) -> dict[str, Table]:
+        """Make the report's tables of the machine: title -> head and rows of axes and times."""
+        limits = ("axis", "lower", "upper", "max_speed", "max_acceleration")
+        axes = [
+            (
+                name,
+                axis.lower,
+                axis.upper,
+                axis.max_speed,
+                axis.max_acceleration,
+                axis.unit,
+                axis.source or "as shipped",
+            )
+            for name, axis in self.machine.axes.items()
+        ]
+        timing = self.machine.timing
+        times: list[Sequence[Any]] = []
+        for kind in timing.kinds:
+            spread = timing.spread.get(kind)
+            measured: tuple[Any, ...] = (None, None, None, "assumed")
+            if spread is not None:
+                measured = (spread.p5_s, spread.p95_s, spread.n, "measured")
+            times.append((kind, timing.seconds(kind), *measured))
+        return {
+            "axes": ((*limits, "unit", "source"), axes),
+            "times": (("command", "median_s", "p5_s", "p95_s", "n", "source"), times),
+        }
+
+
+class Commissioned(NamedTuple):
+    """The result of commissioning: the fitted machine, the scans with the oldest first, zero
+    offsets, contradictions and questions.
+    """
+
+    fitted: Fitted
     scans: Sequence[PastScan]
     offsets: tells.ZeroOffsets
     findings: Findings
     questions: Sequence[Question]
+
+    @property
+    def machine(self) -> d.Machine:
+        """The fitted machine."""
+        return self.fitted.machine
+
+    @property
+    def fit(self) -> Fit | None:
+        """Its fit to executed scripts; None without any."""
+        return self.fitted.fit
 
     def tables(self, out: Path) -> dict[str, Table]:
         """Make the report's tables.
@@ -86,54 +164,24 @@ class Commissioned(NamedTuple):
             out: the folder that the commands in them name.
 
         Returns:
-            Title -> head and rows: scans, axes, zero_offsets, disagreements, not_judged,
-            and next, the at most `MAX_NEXT_SCANS` scans that settle most questions, with
-            their commands.
+            Title -> head and rows: scans, axes, times, zero_offsets, disagreements,
+            not_judged, and next.
         """
-        votes = Counter(q.settled_by for q in self.questions if q.settled_by)
-        sod = (
-            next((s.settings.sod_mm for s in self.scans[::-1] if s.settings), None)
-            or 1000.0
-        )
-        files = f"--machine {out / 'machine.toml'} --profile {out / 'profile.toml'}"
-        make = f"flexdt script new {files} --out next.txt --kind "
         columns = self.offsets.columns
+        scans = [
+            (
+                s.name,
+                s.date and s.date.isoformat(),
+                len(s.log),
+                s.images,
+                *columns.get(s.name, (None,) * 3),
+            )
+            for s in self.scans
+        ]
+        head = ("scan", "date", "executed_lines", "images")
         return {
-            "scans": (
-                (
-                    "scan",
-                    "date",
-                    "executed_lines",
-                    "images",
-                    "axis_column_px",
-                    "fitted",
-                    "sigma",
-                ),
-                [
-                    (
-                        s.name,
-                        s.date and s.date.isoformat(),
-                        len(s.log),
-                        s.images,
-                        *columns.get(s.name, (None,) * 3),
-                    )
-                    for s in self.scans
-                ],
-            ),
-            "axes": (
-                ("axis", "lower", "upper", "max_speed", "max_acceleration", "source"),
-                [
-                    (
-                        n,
-                        a.lower,
-                        a.upper,
-                        a.max_speed,
-                        a.max_acceleration,
-                        a.source or "as shipped",
-                    )
-                    for n, a in self.machine.axes.items()
-                ],
-            ),
+            "scans": ((*head, "axis_column_px", "fitted", "sigma"), scans),
+            **self.fitted.tables(),
             "zero_offsets": (
                 ("offset", *tells.Line._fields),
                 [(name, *line) for name, line in self.offsets.lines.items()],
@@ -143,18 +191,24 @@ class Commissioned(NamedTuple):
                 [(str(one.place), one.text) for one in self.findings],
             ),
             "not_judged": (Question._fields, [*self.questions]),
-            "next": (
-                ("scan", "settles", "command"),
-                [
-                    (
-                        NEXT_SCANS[kind][0],
-                        n,
-                        make + NEXT_SCANS[kind][1].format(sod=NEARER_SOD_RATIO * sod),
-                    )
-                    for kind, n in votes.most_common(MAX_NEXT_SCANS)
-                ],
-            ),
+            "next": (("scan", "settles", "command"), self._next_scans(out)),
         }
+
+    def _next_scans(self, out: Path) -> list[Sequence[Any]]:
+        """List the at most `MAX_NEXT_SCANS` scans that settle most questions: their
+        description, how many each settles, and its command with the files in `out`.
+        """
+        votes = Counter(q.settled_by for q in self.questions if q.settled_by)
+        stated = [s.settings.sod_mm for s in self.scans if s.settings]
+        sod = (stated[-1] if stated else None) or 1000.0
+        files = f"--machine {out / MACHINE_FILE} --profile {out / PROFILE_FILE}"
+        make = f"flexdt script new {files} --out next.txt --kind "
+        rows: list[Sequence[Any]] = []
+        for kind, settled in votes.most_common(MAX_NEXT_SCANS):
+            description, options = NEXT_SCANS[kind]
+            words = make + options.format(sod=NEARER_SOD_RATIO * sod)
+            rows.append((description, settled, words))
+        return rows
 
     def document(self, out: Path) -> dict[str, object]:
         """Make `commission.json`: the tables, each row an object, and the fit.
@@ -178,97 +232,158 @@ class Commissioned(NamedTuple):
 
 
 def commission(
-    folders: Sequence[Path], traffic: Path | None, read_log: ReadLog
+    sources: Sequence[Path], read_log: ReadLog, base: str | None = None
 ) -> Commissioned:
     """Estimate a machine and its profile from past scans: rates and signs from their
     texts, times from executed scripts, zero offsets from alignments.
 
-    The machine to begin with is the shipped one that most texts name; else the one whose
-    motors have the limits of an executed script; else the FleX-ray. Where no text names
-    one, that is a question; so are limits and times that no executed script has (fewer
-    than `MIN_DURATIONS` commands of a kind). Scans are sorted by date, those without one
-    last; a folder given twice counts once.
+    Scans are sorted by date, those without one last; one given twice counts once, as does an
+    executed script that a folder has, too. Limits and times that no executed script has
+    (fewer than `MIN_DURATIONS` commands of a kind) are questions.
 
     Args:
-        folders: of scans, as the scanner or a twin writes them.
-        traffic: a recording of `flexdt follow`, or a log; lines that a folder has too
-            count once.
+        sources: folders of scans, as the scanner or a twin writes them, executed scripts,
+            and recordings of `flexdt follow`.
         read_log: reads an executed script or a recording.
+        base: name or file of the machine to begin with; None: the one that the scans show.
 
     Returns:
         Machine, profile, findings, and questions that a person has to answer.
 
     Raises:
-        CommandError: no folder holds anything of a scan, or they are of several scanners.
+        CommandError: nothing holds anything of a scan, they are of several scanners, or a
+            file is no executed script.
         TwinError: there is no such folder.
+        MachineFileError: `base` is invalid, or lacks a motor of an executed script.
     """
-    open_questions = list[Question]()
-    ask = open_questions.append
-    read = [_texts(folder, ask) for folder in dict.fromkeys(folders)]
+    read, unread = _each(dict.fromkeys(sources), _with_texts)
     known = [d.builtin_machine(name) for name in d.builtin_machines()]
-    named = [
-        m.name
-        for s in read
-        if s.settings and (m := rebuild.named_machine(s.settings, known))
-    ]
-    shipped = machines.machine(Counter(named).most_common(1)[0][0] if named else None)
-    if not named:
-        by_limits = [
-            one
-            for s in read
-            if (
-                one := tells.scanner_of(_script(s, shipped, read_log, _nothing), known)
-            ).machine
-        ]
-        if by_limits:
-            taken = f"{by_limits[0].machine} is taken by {by_limits[0].by}"
-        else:
-            taken = "the FleX-ray is taken"
-        ask(Question("which scanner it is", f"no text names one that ships; {taken}"))
-        shipped = machines.machine(by_limits[0].machine if by_limits else None)
-    scans = sorted(
-        (_script(s, shipped, read_log, ask) for s in read),
-        key=lambda s: s.date or datetime.max,
-    )
-    if traffic is not None:
-        log = read_log(traffic, shipped)
-        commands = [x.command for x in log]
-        if all([x.command for x in s.log] != commands for s in scans):
-            scans.append(PastScan(str(traffic), log=log))
-    if words := tells.other_scanners(scans, known):
-        raise CommandError(
-            f"the folders are of several scanners; allowed: those of one. {words}"
-        )
+    start, doubts = _base(base, read, known, read_log)
+    scans, unclear = _each(read, lambda s: _with_script(s, start.machine, read_log))
+    scans = sorted(_without_copies(scans), key=lambda s: s.date or datetime.max)
+    _require_one_scanner(scans, known)
     if not any(s.settings or s.log or s.images for s in scans):
-        where = ", ".join(map(str, folders))
+        where = ", ".join(map(str, sources))
         raise CommandError(
             f"{where}: no settings text, executed script or radiograph of a scan"
         )
-    machine, text, fit = _fit_machine(scans, shipped)
-    scans = [_with_alignment(s, machine, ask) for s in scans]
-    offsets = tells.zero_offsets(scans, machine, d.profile_of(shipped))
-    unseen = [f"limits of {n}" for n in machine.axes if fit is None or n not in fit.axes]
-    if fit:
-        times = {k: x.n for k, x in machine.timing.spread.items()}
-    else:
-        times = {}
-    unseen += [
-        f"time of {k}" for k in machine.timing.kinds if times.get(k, 0) < MIN_DURATIONS
-    ]
-    why = f"no executed script tells it, or fewer than {MIN_DURATIONS} commands of one"
-    rest = [
-        *offsets.questions,
-        *(Question(subject, why, "recorded") for subject in unseen),
-    ]
+    fitted = fit_scans(scans, start, start.file)
+    scans, unaligned = _each(scans, lambda s: _with_alignment(s, fitted.machine))
+    offsets = tells.zero_offsets(scans, fitted.machine, d.profile_of(start.machine))
     findings = Findings(
         (
-            *_machine_errors(machine, offsets.profile),
-            *tells.contradictions(scans, shipped, machine),
+            *_machine_errors(fitted.machine, offsets.profile),
+            *tells.contradictions(scans, start.machine, fitted.machine),
             *offsets.findings,
         )
     )
-    questions = [*open_questions, *rest]
-    return Commissioned(machine, text, fit, scans, offsets, findings, questions)
+    questions = [
+        *unread,
+        *doubts,
+        *unclear,
+        *unaligned,
+        *offsets.questions,
+        *_unrecorded(fitted),
+    ]
+    return Commissioned(fitted, scans, offsets, findings, questions)
+
+
+def _each(
+    things: Iterable[T], read: Callable[[T], tuple[PastScan, list[Question]]]
+) -> tuple[list[PastScan], list[Question]]:
+    """Take a step for each scan; returns the scans, and all questions in their order."""
+    done = [read(thing) for thing in things]
+    return [scan for scan, _ in done], [question for _, own in done for question in own]
+
+
+def _base(
+    word: str | None,
+    scans: Sequence[PastScan],
+    known: Sequence[d.Machine],
+    read_log: ReadLog,
+) -> tuple[Base, list[Question]]:
+    """Choose the machine to begin with: the one that was named, or the shipped one that most
+    texts name, or whose motors have the limits of an executed script; else the FleX-ray.
+
+    Args:
+        word: that was named; None for none.
+        scans: with their texts.
+        known: machines that ship.
+        read_log: reads an executed script.
+
+    Returns:
+        The machine, and a question where neither a person nor a text names it.
+    """
+    if word is not None:
+        return Base.of(word), []
+    named = [
+        machine.name
+        for s in scans
+        if s.settings and (machine := rebuild.named_machine(s.settings, known))
+    ]
+    if named:
+        return Base.of(Counter(named).most_common(1)[0][0], named=False), []
+    default = machines.machine()
+    found = [
+        tells.scanner_of(_with_script(s, default, read_log)[0], known) for s in scans
+    ]
+    by_limits = next((one for one in found if one.machine), None)
+    taken = "the FleX-ray is taken"
+    if by_limits is not None:
+        taken = f"{by_limits.machine} is taken by {by_limits.by}"
+    why = f"no text names one that ships; {taken}"
+    taken_name = None if by_limits is None else by_limits.machine
+    return Base.of(taken_name, named=False), [Question("which scanner it is", why)]
+
+
+def _without_copies(scans: Sequence[PastScan]) -> list[PastScan]:
+    """Leave out executed scripts and recordings whose commands a folder has, too, or an
+    earlier one of them.
+    """
+    kept: list[PastScan] = []
+    files = {scan.name for scan in scans if Path(scan.name).is_file()}
+    seen = [_commands(scan) for scan in scans if scan.name not in files]
+    for scan in scans:
+        if scan.name in files:
+            if _commands(scan) in seen:
+                continue
+            seen.append(_commands(scan))
+        kept.append(scan)
+    return kept
+
+
+def _commands(scan: PastScan) -> list[Command]:
+    """List the commands that a scan has executed."""
+    return [x.command for x in scan.log]
+
+
+def _require_one_scanner(scans: Sequence[PastScan], known: Sequence[d.Machine]) -> None:
+    """Refuse scans of several scanners.
+
+    Raises:
+        CommandError: names those of each.
+    """
+    words = tells.other_scanners(scans, known)
+    if words:
+        raise CommandError(
+            f"the folders are of several scanners; allowed: those of one. {words}"
+        )
+
+
+def _unrecorded(fitted: Fitted) -> Iterator[Question]:
+    """Yield a question for the limits of each axis, and the time of each kind of command,
+    that executed scripts do not tell.
+    """
+    fit = fitted.fit
+    why = f"no executed script tells it, or fewer than {MIN_DURATIONS} commands of one"
+    for name in fitted.machine.axes:
+        if fit is None or name not in fit.axes:
+            yield Question(f"limits of {name}", why, "recorded")
+    timing = fitted.machine.timing
+    times = {} if fit is None else {kind: x.n for kind, x in timing.spread.items()}
+    for kind in timing.kinds:
+        if times.get(kind, 0) < MIN_DURATIONS:
+            yield Question(f"time of {kind}", why, "recorded")
 
 
 def _machine_errors(machine: d.Machine, profile: d.Profile) -> Iterator[Finding]:
@@ -286,127 +401,137 @@ def _machine_errors(machine: d.Machine, profile: d.Profile) -> Iterator[Finding]
         )
 
 
-def _nothing(question: Question) -> None:
-    """Ignore questions: scripts are read a second time, with the machine to which they
-    belong.
-    """
-
-
-def _texts(folder: Path, ask: Callable[[Question], None]) -> PastScan:
+def _with_texts(path: Path) -> tuple[PastScan, list[Question]]:
     """Read a scan's settings texts, the names of its images, and the shape of the first
     one.
 
     In the order: second text, first text, first image; at the first of them that cannot
-    be read the rest is left out.
+    be read the rest is left out. A file, which is an executed script, has none.
 
     Args:
-        folder: of the scan.
-        ask: takes each warning, and a text that cannot be read, as a question.
+        path: folder of the scan, or file.
 
     Returns:
-        The scan with the readable parts.
+        The scan with the readable parts; and each warning, and a text that cannot be read,
+        as a question.
     """
-    content = list_folder(folder)
+    if path.is_file():
+        return PastScan(str(path)), []
+    content = list_folder(path)
     warnings = list[str]()
-    scan = PastScan(str(folder), images=len(content.projections))
+    scan = PastScan(str(path), images=len(content.projections))
     try:
         if content.xre_settings is not None:
-            xre = parse_xre(read_text(folder / content.xre_settings))
+            xre = parse_xre(read_text(path / content.xre_settings))
             start = xre.text("Scan info", "Start") or ""
-            if start:
-                date = datetime.fromisoformat(start[:19])
-            else:
-                date = None
+            date = datetime.fromisoformat(start[:19]) if start else None
             scan = replace(scan, second=xre.settings, date=date)
         settings = read_settings(content, warnings)
         if settings is not None:
             scan = replace(scan, settings=settings, date=settings.started or scan.date)
         if content.projections:
-            first = read_image(folder / next(iter(content.projections.values())))
+            first = read_image(path / next(iter(content.projections.values())))
             scan = replace(scan, shape=first.shape)
     except ValueError as error:  # of ours, or a date's
         warnings.append(str(error))
-    for text in warnings:
-        ask(Question(scan.name, text))
-    return scan
+    return scan, [Question(scan.name, text) for text in warnings]
 
 
-def _script(
-    scan: PastScan, machine: d.Machine, read_log: ReadLog, ask: Callable[[Question], None]
-) -> PastScan:
+def _with_script(
+    scan: PastScan, machine: d.Machine, read_log: ReadLog
+) -> tuple[PastScan, list[Question]]:
     """Add the executed script to a scan, or else the script that was submitted.
 
     The folder's .txt, .tsv and .log files but the settings texts are tried in the order
     of their names; the first executed script ends the search.
 
     Args:
-        scan: whose folder is searched.
+        scan: whose folder is searched, or which is an executed script itself.
         machine: for the names of motors.
         read_log: reads an executed script.
-        ask: takes the errors of files that are neither, as questions.
 
     Returns:
-        The scan, with log and commands, commands alone, or unchanged.
+        The scan, with log and commands, commands alone, or unchanged; and the errors of
+        files that are neither, as questions.
+
+    Raises:
+        CommandError: the scan is a file, and no executed script.
     """
-    content = list_folder(Path(scan.name))
+    path = Path(scan.name)
+    if path.is_file():
+        return replace(scan, log=read_log(path, machine)), []
+    content = list_folder(path)
+    questions: list[Question] = []
     for name in sorted(content.names - {content.scan_settings, content.xre_settings}):
-        path = content.path / name
-        if path.suffix.lower() in (".txt", ".tsv", ".log"):
-            try:
-                log = read_log(path, machine)
-                return replace(scan, log=log, commands=tuple(x.command for x in log))
-            except CommandError as error:
-                script, problems = read_script(path.read_bytes())
-                if not script.commands or problems.errors:
-                    ask(Question(scan.name, "; ".join(error.lines)))
-                else:
-                    scan = replace(scan, commands=script.commands)
-    return scan
+        file = content.path / name
+        if file.suffix.lower() not in (".txt", ".tsv", ".log"):
+            continue
+        try:
+            log = read_log(file, machine)
+        except CommandError as error:
+            script, problems = read_script(file.read_bytes())
+            if not script.commands or problems.errors:
+                questions.append(Question(scan.name, "; ".join(error.lines)))
+            else:
+                scan = replace(scan, commands=script.commands)
+            continue
+        commands = tuple(x.command for x in log)
+        return replace(scan, log=log, commands=commands), questions
+    return scan, questions
 
 
-def _fit_machine(
-    scans: Sequence[PastScan], shipped: d.Machine
-) -> tuple[d.Machine, str, Fit | None]:
+def fit_scans(scans: Sequence[PastScan], base: Base, file: str) -> Fitted:
     """Fit a machine to the texts' signs and rates and to the executed scripts.
 
-    The file's text is the shipped one with the changed axes. Rotations keep their rates;
-    executed lines of other components count without a motor.
+    The file's text is that of the base with the changed axes and times. Rotations keep their
+    rates. Executed lines of components that a base lacks which nobody named count without a
+    motor.
 
     Args:
-        scans: past scans.
-        shipped: the machine to begin with.
+        scans: past scans, the oldest first.
+        base: the machine to begin with.
+        file: path of a machine file next to which meshes are.
 
     Returns:
         The machine, the text of its file, and the fit; None without executed scripts.
+
+    Raises:
+        MachineFileError: the base was named and lacks a motor, or its file cannot be edited.
     """
-    turning = shipped.geometry.get("angle", {})
+    turning = base.machine.geometry.get("angle", {})
     axes = {
-        n: a if n in turning else _with_rates(a, n, scans, shipped)
-        for n, a in shipped.axes.items()
+        n: a if n in turning else _with_rates(a, n, scans, base.machine)
+        for n, a in base.machine.axes.items()
     }
-    machine = shipped.model_copy(update={"axes": axes})
+    machine = base.machine.model_copy(update={"axes": axes})
+    executed = [s for s in scans if s.log]
     fit = None
-    logs = [
-        [
-            x
-            if own_name(getattr(x.command, "component", ""), axes) in axes
-            else replace(x, motor=None)
-            for x in s.log
-        ]
-        for s in scans
-        if s.log
-    ]
-    if logs:
-        names = ", ".join(Path(s.name).name for s in scans if s.log)
-        fit = fit_machine(
-            logs, machine, f"measured: {names} ({sum(map(len, logs))} lines)"
-        )
+    if executed:
+        names = ", ".join(Path(s.name).name for s in executed)
+        count = sum(len(s.log) for s in executed)
+        source = f"measured: {names.encode('utf-8', 'replace').decode()} ({count} lines)"
+        logs = [s.log if base.named else _of_axes(s.log, axes) for s in executed]
+        fit = fit_machine(logs, machine, source)
         machine = fit.machine
-    changed = [n for n, axis in machine.axes.items() if axis != shipped.axes[n]]
+    changed = [
+        n
+        for n, axis in machine.axes.items()
+        if axis != base.machine.axes[n] or (fit is not None and n in fit.axes)
+    ]
     text = fitted_text(
-        d.builtin_machine_text(shipped.name), machine, changed, machines.parsed
+        base.text, machine, changed, lambda text, _: machines.parsed(text, file)
     )
-    return machine, text, fit
+    return Fitted(machine, text, fit)
+
+
+def _of_axes(log: Sequence[Executed], axes: Mapping[str, d.Axis]) -> tuple[Executed, ...]:
+    """Return the lines of a log, those of other components than `axes` without a motor."""
+    return tuple(
+        x
+        if own_name(getattr(x.command, "component", ""), axes) in axes
+        else replace(x, motor=None)
+        for x in log
+    )
 
 
 def _with_rates(
@@ -451,21 +576,24 @@ def _with_rates(
 
 
 def _with_alignment(
-    scan: PastScan, machine: d.Machine, ask: Callable[[Question], None]
-) -> PastScan:
+    scan: PastScan, machine: d.Machine
+) -> tuple[PastScan, list[Question]]:
     """Add the poses of a past scan, and its alignment without a phantom.
 
     A scan without radiographs, or whose alignment determines no axis, counts as failed.
-    The zero offsets are the scan's own profile.
+    The zero offsets are the scan's own profile. An executed script alone is not expected to
+    have either.
 
     Args:
         scan: its texts and profile.
         machine: that made it.
-        ask: called with the failure as a question.
 
     Returns:
-        The scan with poses and alignment, as far as both succeeded.
+        The scan with poses and alignment, as far as both succeeded; and the failure as a
+        question.
     """
+    if Path(scan.name).is_file():
+        return scan, []
     try:
         scan = tells.standing(scan, machine)
         if not scan.images:
@@ -476,10 +604,10 @@ def _with_alignment(
         alignment = align_dataset(data).alignment
         if alignment.offsets is None:
             raise TwinError(f"align: {alignment.refused['axis_column_px']}")
-        return replace(scan, aligned=alignment)
     except TwinError as error:
-        ask(Question(scan.name, error.message, "ordinary" if scan.profile else ""))
-        return scan
+        kind = "ordinary" if scan.profile else ""
+        return scan, [Question(scan.name, error.message, kind)]
+    return replace(scan, aligned=alignment), []
 
 
 def write_commission(found: Commissioned, out: Path) -> None:
@@ -507,7 +635,7 @@ def write_commission(found: Commissioned, out: Path) -> None:
     try:
         part.mkdir(parents=True)
         for name, text in (
-            (MACHINE_FILE, found.text),
+            (MACHINE_FILE, found.fitted.text),
             (PROFILE_FILE, "\n".join(lines) + "\n"),
             ("commission.json", json.dumps(found.document(out), indent=1) + "\n"),
             ("report.html", page("Commissioning", body)),

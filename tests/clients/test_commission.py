@@ -46,7 +46,7 @@ def test_a_laboratory_is_found_and_every_planted_contradiction_named(
     seed: int, tmp_path: Path
 ) -> None:
     lab = Laboratory(seed)
-    found = commission(lab.write(tmp_path), None, read_log_file)
+    found = commission(lab.write(tmp_path), read_log_file)
     assert len(lab.planted) >= 3
     require_right(laboratories.judged(lab, found))
 
@@ -151,7 +151,7 @@ def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(
     tmp_path: Path,
 ) -> None:
     folder = bead_scan(tmp_path, {"dO_x": 0.31}, 31)
-    found = commission([folder], None, read_log_file)
+    found = commission([folder], read_log_file)
     assert list(found.findings) == []
     usual = builtin_profile("cwi-2023-08-21")
     line = found.offsets.lines["axs_tan"]
@@ -165,12 +165,12 @@ def test_scans_of_the_twin_agree_with_themselves_and_tell_its_hidden_axis(
     assert found.machine == builtin_machine()
 
 
-def test_the_public_log_alone_and_the_same_as_traffic(tmp_path: Path) -> None:
+def test_the_public_log_alone_and_the_same_once_more(tmp_path: Path) -> None:
     folder = tmp_path / "unitom"
     folder.mkdir()
     shutil.copy(LOG, folder)
-    alone = commission([folder], None, read_log_file)
-    twice = commission([folder], LOG, read_log_file)
+    alone = commission([folder], read_log_file)
+    twice = commission([LOG, folder, LOG], read_log_file)
     assert alone.fit is not None
     assert twice.fit is not None
     assert len(alone.fit.lines.rows) == len(twice.fit.lines.rows) == 57
@@ -180,6 +180,52 @@ def test_the_public_log_alone_and_the_same_as_traffic(tmp_path: Path) -> None:
         "unitom_xl is taken by the motors' limits" in q.why for q in alone.questions
     )
     assert alone.machine.name == "unitom_xl"
+
+
+def test_executed_scripts_are_scans_and_the_former_command_makes_the_same_machine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a base that was named, and with the one that the motors' limits show."""
+    made = tmp_path / "made"
+    words = [str(LOG), "--base", "unitom_xl", "--out"]
+    assert run(["commission", *words, str(made), "--json"]) == 0
+    said = capsys.readouterr()
+    document = json.loads(said.out)
+    assert said.err == ""
+    assert run(["machine", "fit", *words, str(tmp_path / "fit.toml"), "--json"]) == 0
+    fitted = capsys.readouterr()
+    assert fitted.err == (
+        "warning: `flexdt machine fit` is deprecated: `flexdt commission LOG... "
+        "--base unitom_xl --out DIR` writes DIR/machine.toml\n"
+    )
+    assert document["fit"] == json.loads(fitted.out)
+    assert (made / "machine.toml").read_text() == (tmp_path / "fit.toml").read_text()
+    assert [(s["scan"], s["executed_lines"]) for s in document["scans"]] == [
+        (str(LOG), 57)
+    ]
+    measured = {t["command"]: t["n"] for t in document["times"] if t["n"]}
+    assert measured == {k: t["n"] for k, t in document["fit"]["timing"].items()}
+    assert not any(q["what"] == str(LOG) for q in document["not_judged"])
+    named, found = (
+        commission([LOG], read_log_file, base) for base in ("unitom_xl", None)
+    )
+    assert found.machine == named.machine
+    assert found.questions[0].what == "which scanner it is"
+    assert named.questions == found.questions[1:]
+
+
+def test_files_that_are_no_scans_and_bases_that_lack_a_motor_are_errors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    script = tmp_path / "script.txt"
+    script.write_text("rot_obj\tmove absolute\t90\t\tACK\n")
+    assert run(["commission", str(script), *out]) == 1
+    assert f"{script}: no line of an executed script" in capsys.readouterr().err
+    mini = Path(__file__).parents[1] / "data" / "machines" / "mini.toml"
+    assert run(["commission", str(LOG), "--base", str(mini), *out]) == 1
+    assert "(another machine is named with --base)" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_folders_of_two_scanners_are_refused_with_the_folders_of_each(
@@ -201,8 +247,11 @@ def test_folders_of_two_scanners_are_refused_with_the_folders_of_each(
     assert (
         f"flexray (by its settings text), serial number 042_0001: {folders[0]}, " in said
     )
-    assert run(["commission", *words, "--traffic", str(LOG)]) == 1
-    assert str(LOG) in capsys.readouterr().err
+    for scan in ([str(LOG)], ["--traffic", str(LOG)]):
+        assert run(["commission", *words, *scan]) == 1
+        said = capsys.readouterr().err
+        assert f"no serial number: {LOG}" in said
+        assert ("--traffic is deprecated" in said) == (len(scan) == 2)
     text = (folders[1] / "scan settings.txt").read_text()
     (folders[1] / "scan settings.txt").write_text(text.replace("042_0001", "042_0002"))
     assert run(["commission", *words]) == 1
@@ -252,7 +301,7 @@ def test_limits_from_a_recording_of_raw_messages(
     folder = tmp_path / "past"
     shutil.copytree(folders[1], folder)
     (folder / "script_executed.txt").unlink()
-    found = commission([folder], traffic, read_log_file)
+    found = commission([folder, traffic], read_log_file)
     for name, limits in made.rig.limits.items():
         axis = found.machine.axes[name]
         assert (axis.lower, axis.upper, axis.max_speed, axis.max_acceleration) == limits
@@ -293,7 +342,7 @@ def test_a_scan_that_cannot_be_read_is_named_and_the_others_count(
     shutil.copytree(lab[1][0], bad)
     (bad / "scan settings.txt").write_text("SOD : far\n")
     (bad / "script_executed.txt").write_text("tube\tnothing\n")
-    found = commission([bad, *lab[1]], None, read_log_file)
+    found = commission([bad, *lab[1]], read_log_file)
     whys = [q.why for q in found.questions if q.what == str(bad)]
     assert any("cannot read 'SOD : far'" in why for why in whys)
     assert any("no line of an executed script" in why for why in whys)

@@ -105,7 +105,7 @@ def laboratories(count: int, seed: int) -> Iterator[Outcome]:
             lab = Laboratory(1000 * seed + k)
             folders = lab.write(Path(root))
             begun = time.perf_counter()
-            out = judged(lab, commission(folders, None, read_log_file))
+            out = judged(lab, commission(folders, read_log_file))
             out.seconds = time.perf_counter() - begun
             yield out
 

@@ -3,7 +3,7 @@
 A line has ten TAB separated columns: the seven of the script, then the command's own time
 [ms], its reply, which may be binary and hold TABs and line ends, and the moment it was
 sent (hh:mm:ss.mmm). So a line ends at its stamp. The form is known from one published log
-(`docs/machine-fit.md`).
+(`docs/commission.md`).
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class Fit:
         return total
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON document of `flexdt machine fit`.
+        """Return the part `fit` of the JSON document of `flexdt commission`.
 
         Axes have limits, maxima, source, last position and number of replies; `single`
         lists kinds with one sample.

@@ -356,7 +356,7 @@ def read_script(text: Source) -> tuple[c.Script, Findings]:
     problems: list[Finding] = []
     if is_log(text):
         message = (
-            "this is an executed script, a log: `flexdt machine fit` learns the machine "
+            "this is an executed script, a log: `flexdt commission` learns the machine "
             "from it, and `flexdt check SCRIPT --against` it compares; to run, "
             "a script has seven columns"
         )

@@ -1,16 +1,14 @@
-"""`flexdt machine`: machines as data, shown, checked, and fitted to logs of scripts."""
+"""`flexdt machine`: machines as data, shown and checked."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from flexdt.clients.cli import value_completion
-from flexdt.clients.cli.commands.script_files import read_log_file, tell
 from flexdt.clients.cli.console import table
-from flexdt.clients.cli.options import Answer, argument, option
+from flexdt.clients.cli.options import Answer
 from flexdt.library import machines
 
 if TYPE_CHECKING:
@@ -83,59 +81,6 @@ def check(name: NameOrFile) -> Answer:
     yield _places(found)
     if not found.components:
         yield "\nno components: nothing is checked for collisions"
-
-
-def fit(
-    logs: list[Path] = argument(..., "LOG..."),
-    out: Path = option(..., metavar="FILE", written=True),
-    base: str = option(machines.DEFAULT_MACHINE, metavar="FILE or NAME"),
-) -> Answer:
-    """Fit a machine to executed scripts: limits, rates and the times of its commands.
-
-    Args:
-        logs: Logs, or recordings of follow; oldest first.
-        out: Write the machine to this file.
-        base: Take values that are not in the logs from this machine.
-
-    Yields:
-        The fit as document of --json, then tables of axes and times, and lines. Commands
-        unlike the base machine are noted on standard error.
-    """
-    from flexdt.twin.machine.description import builtin_machine_text
-    from flexdt.twin.machine.fitted_machine import fitted_text
-    from flexdt.twin.script.log_fit import fit_machine, unlike
-
-    machine = machines.machine(base)
-    if machines.is_file(base):
-        text = Path(base).read_text("utf-8")
-    else:
-        text = builtin_machine_text(base)
-    commands = [read_log_file(log, machine) for log in logs]
-    names = ", ".join(log.name for log in logs).encode("utf-8", "replace").decode()
-    source = f"measured: {names} ({sum(map(len, commands))} lines)"
-    found = fit_machine(commands, machine, source)
-    for log, told in zip(logs, commands, strict=True):
-        tell(unlike(told, machine), str(log))
-    made = fitted_text(
-        text, found.machine, found.axes, lambda text, _: machines.parsed(text, str(out))
-    )
-    out.write_text(made, encoding="utf-8")
-    yield found.to_dict()
-    yield _axes(
-        {n: (found.machine.axes[n], found.machine.axes[n].source) for n in found.axes}
-    )
-    yield "\n" + _times(found.machine)
-    lines = found.lines
-    yield (
-        f"\n{len(lines.rows)} lines, {lines.total_real_s:.2f} s; "
-        f"absolute errors sum to {lines.sum_abs_error_s:.2f} s, "
-        f"{found.cross_validated_s:.2f} s with each time predicted from the others of its kind"
-    )
-    if len(logs) == 1:
-        yield (
-            "one log does not show how a scan differs from the next: ranges may be too narrow"
-        )
-    yield (f"{out}: written, everything else as in {base}")
 
 
 def _axes(axes: dict[str, tuple[Axis, str]]) -> str:

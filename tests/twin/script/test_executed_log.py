@@ -169,7 +169,7 @@ def test_ranges_of_steps_and_of_the_total(fitted: Fit) -> None:
 def test_a_log_is_no_script_and_the_message_says_what_it_is_good_for() -> None:
     (problem,) = check_script(LOG.read_bytes()).problems
     assert (problem.severity, problem.code) == ("error", "executed_log")
-    assert "flexdt machine fit" in problem.message
+    assert "flexdt commission" in problem.message
 
 
 def line(own: str = "5", reply: bytes = b"", moment: str = "09:00:00.000") -> bytes:
