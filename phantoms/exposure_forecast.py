@@ -18,6 +18,7 @@ from flexdt.phantoms.channels import Channel, chain_through, channels
 from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.samples import as_phantom
+from flexdt.phantoms.scan_limits import check_tube
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
 from flexdt.twin.findings import Findings
@@ -200,7 +201,7 @@ def expose(
     Transmission and the shares of saturated and starved pixels are of `SIMULATED_VIEWS`
     views over a circle, without noise. For `best`, each of `FILTERS` is tried with each
     voltage, and its exposure is divided into read-outs that the open beam does not
-    saturate; those outside the panel's exposure times are left out. They are sorted by
+    saturate; those that the machine may not have are left out. They are sorted by
     falling contrast to noise.
 
     Args:
@@ -266,6 +267,8 @@ def expose(
     }
     camera = changed_camera(spec, spec.camera, change)
     lit = ExposureSettings(tried[0], power, camera.exposure_ms, averages)
+    for one in tried:
+        check_tube(scanner, replace(lit, kV=one))
     request = ScanRequest(
         kind or "step",
         sod,
@@ -315,15 +318,13 @@ def expose(
         kVs = tried
     else:
         kVs = np.arange(10.0 * math.ceil(low / 10), high + 1, 10.0)
-    settings = [
-        seen.setting(layer, seen.unsaturated(layer, replace(lit, kV=float(one))))
+    exposures = [
+        (layer, seen.unsaturated(layer, replace(lit, kV=float(one))))
         for layer in FILTERS
         for one in kVs
     ]
     best = [
-        s
-        for s in settings
-        if spec.min_exposure_ms <= s.exposure_ms <= spec.max_exposure_ms
+        seen.setting(layer, one) for layer, one in exposures if _is_allowed(scanner, one)
     ]
     return Forecast(
         Transmission.of(through),
@@ -394,6 +395,17 @@ def _check_settings(
                     f"{integers}{low_end:g} to {high_end:g}",
                     {"asked": value, "allowed": [low_end, high_end]},
                 )
+
+
+def _is_allowed(machine: Machine, exposure: ExposureSettings) -> bool:
+    """Return whether a machine may have a voltage, power and exposure time."""
+    panel = machine.detector
+    try:
+        check_tube(machine, exposure)
+        changed_camera(panel, panel.camera, {"exposure_ms": exposure.exposure_ms})
+    except LimitError:
+        return False
+    return True
 
 
 def _plan_of(

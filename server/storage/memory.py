@@ -40,10 +40,10 @@ from flexdt.server.storage.scene_document import (
     save_scene,
 )
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.scanner import ScannerTwin
-from flexdt.twin.scanner.state import Sample
+from flexdt.twin.scanner.state import Sample, changed_tube
 
 FILE = "state.json"
 MIN_INTERVAL_S = 0.25
@@ -161,7 +161,7 @@ def read_memory(root: Directory) -> Memory | None:
 def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     """Set the scanner to the state in `memory`, X-rays off; an E-stop stays in force.
 
-    A voltage outside the tube's range is replaced by the present one, with a warning in
+    A voltage that the tube may not have is replaced by the present one, with a warning in
     the log. Positions are limited to the travel. The correction is not restored here.
 
     Args:
@@ -175,18 +175,9 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     """
     known: p.Scene | None
     known = memory.scene
-    spec = scanner.machine.tube
     # The correction in force comes from the history.
     known = known.model_copy(update={"correction": None})
-    if not spec.min_kV <= known.tube.kV <= spec.max_kV:  # the physics may be another one
-        log(
-            "the tube starts anew: its last voltage is outside what it has now",
-            logging.WARNING,
-            kV=known.tube.kV,
-            allowed=[spec.min_kV, spec.max_kV],
-        )
-        tube = known.tube.model_copy(update={"kV": scanner.tube.kV})
-        known = known.model_copy(update={"tube": tube})
+    known = known.model_copy(update={"tube": _allowed_tube(known.tube, scanner)})
     try:
         require_fit(known, scanner)
         scanner.place(_within(scanner.machine, known.positions), now)
@@ -203,6 +194,22 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
     if known is None:
         return None
     return sample_of(known)
+
+
+def _allowed_tube(known: p.TubePart, scanner: ScannerTwin) -> p.TubePart:
+    """Return tube settings as remembered, or with the scanner's present voltage if its tube
+    may not have them, as with another physics; this is logged.
+    """
+    try:
+        changed_tube(scanner.machine.tube, scanner.tube, known.kV, known.power_W)
+    except LimitError as error:
+        log(
+            "the tube starts anew: it may not have its last settings",
+            logging.WARNING,
+            reason=error.message,
+        )
+        return known.model_copy(update={"kV": scanner.tube.kV})
+    return known
 
 
 class JobsNotWrittenError(DatasetWriteError):

@@ -1,0 +1,174 @@
+"""A rule about settings of tube or camera that is added to `changed_tube` or `changed_camera` holds
+at every door: requests, scenes, restarts, scripts, followed machines, forecasts, batches.
+
+Motors have their own test (`tests/twin/test_limit_doors.py`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from in_process import Lab, M, P, run
+from scanner_traffic import event
+
+import flexdt as fx
+from flexdt.clients.following.hearing import heard
+from flexdt.phantoms.scan_limits import check_distances, check_tube
+from flexdt.protocol import RpcError
+from flexdt.server.storage import memory, scene_document
+from flexdt.twin.errors import LimitError
+from flexdt.twin.following.follower import Follower
+from flexdt.twin.following.mirror import Mirror
+from flexdt.twin.physics.exposure import ExposureSettings
+from flexdt.twin.scanner import state
+from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.script.compose import compose_script
+from flexdt.twin.script.planning.planner import plan_script
+from flexdt.twin.script.scan_request import ScanRequest
+
+BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 8, "material": "aluminium"}
+WORDS = "a rule that was added"
+Asked = dict[str, float]
+LINES = {"kV": ("tube", "set kV"), "power_W": ("tube", "set power"),
+         "exposure_ms": ("camera", "set exposure")}  # fmt: skip
+DEFAULTS = {
+    "kV": M.tube.kV,
+    "power_W": M.tube.power_W,
+    "exposure_ms": M.detector.exposure_ms,
+}
+
+
+def refused(call: Callable[[], object]) -> str:
+    """The message of a LimitError; "" where it was done."""
+    try:
+        call()
+    except LimitError as error:
+        return error.message
+    return ""
+
+
+def problems(found: Any) -> str:
+    return " ".join(p.message for p in found if p.severity == "error")
+
+
+def by_request(asked: Asked, _: Path) -> str:
+    scanner = ScannerTwin(M, P)
+    done = scanner.set_camera if "exposure_ms" in asked else scanner.set_tube
+    return refused(lambda: done(**asked))  # type: ignore[arg-type]
+
+
+def scene(asked: Asked) -> Any:
+    """What a scanner was before the rule was there."""
+    saved = memory.remember(ScannerTwin(M, P), 0.0, 0, [])
+    kept: Any = saved.scene
+    part = "camera" if "exposure_ms" in asked else "tube"
+    new = getattr(kept, part).model_copy(update=asked)
+    return saved.model_copy(update={"scene": kept.model_copy(update={part: new})})
+
+
+def by_scene(asked: Asked, _: Path) -> str:
+    scanner = ScannerTwin(M, P)
+    return refused(lambda: scene_document.require_fit(scene(asked).scene, scanner))
+
+
+def by_restart(asked: Asked, _: Path) -> str:
+    """What is remembered is not set; the reason is in the log."""
+    scanner, logged = ScannerTwin(M, P), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(memory, "log", lambda *_, **facts: logged.append(facts["reason"]))
+        memory.restore(scene(asked), scanner, 0.0)
+    [(name, value)] = asked.items()
+    part = scanner.camera if name == "exposure_ms" else scanner.tube
+    assert getattr(part, name) == (DEFAULTS[name] if logged else value)
+    return " ".join(logged)
+
+
+def by_script(asked: Asked, _: Path) -> str:
+    [(name, value)] = asked.items()
+    line = "\t".join((*LINES[name], repr(value), "", "ACK", "", ""))
+    return problems(plan_script(line, M, P).problems)
+
+
+def by_following(asked: Asked, _: Path) -> str:
+    [(name, value)] = asked.items()
+    said = heard(event(1, (*LINES[name], repr(value))), M.axes, "00:00:03.000")
+    mirror = Follower(M, P).hear(Mirror.of(M), said, 3.0)
+    return " ".join(alarm.message for alarm in mirror.alarms)
+
+
+def by_composing(asked: Asked, _: Path) -> str:
+    return refused(lambda: compose_script(ScanRequest("step", **asked), M, P))  # type: ignore[arg-type]
+
+
+def by_forecast(asked: Asked, _: Path) -> str:
+    return refused(lambda: fx.expose(BALL, machine=M, **asked))  # type: ignore[arg-type]
+
+
+def by_batch(asked: Asked, _: Path) -> str:
+    exposure = ExposureSettings(**(DEFAULTS | asked))
+    if "exposure_ms" in asked:
+        return refused(lambda: check_distances(M, M.detector.camera, exposure, 600, 1059))
+    return refused(lambda: check_tube(M, exposure))
+
+
+def by_image(asked: Asked, root: Path) -> str:
+    """The error of a request for an image with these settings, without setting them."""
+    told: list[str] = []
+    part = "camera" if "exposure_ms" in asked else "tube"
+
+    async def body(lab: Lab) -> None:
+        try:
+            await lab.client().call("projection.get", **{part: asked})
+        except (LimitError, RpcError) as error:
+            told.append(error.message)
+
+    run(root, body)
+    return " ".join(told)
+
+
+DOORS = (by_request, by_scene, by_restart, by_script, by_following, by_composing,
+         by_forecast, by_batch, by_image)  # fmt: skip
+
+
+@pytest.fixture
+def rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tube may not have 70 kV or 33 W, the camera not 222 ms; in all modules of flexdt."""
+
+    def no_tube(*args: Any, **named: Any) -> Any:
+        new = tube(*args, **named)
+        if new.kV == 70.0 or new.power_W == 33.0:
+            raise LimitError(WORDS, {"setting": "kV"})
+        return new
+
+    def no_camera(*args: Any, **named: Any) -> Any:
+        new = camera(*args, **named)
+        if new.exposure_ms == 222.0:
+            raise LimitError(WORDS, {"setting": "exposure_ms"})
+        return new
+
+    tube, camera = state.changed_tube, state.changed_camera
+    for old, new in ((tube, no_tube), (camera, no_camera)):
+        for title, module in [*sys.modules.items()]:
+            if title.startswith("flexdt") and getattr(module, old.__name__, None) is old:
+                monkeypatch.setattr(module, old.__name__, new)
+
+
+@pytest.mark.parametrize("name", LINES)
+@pytest.mark.parametrize("door", DOORS)
+def test_a_rule_that_is_added_holds_at_every_door(
+    door: Callable[[Asked, Path], str], name: str, rule: None, tmp_path: Path
+) -> None:
+    value = {"kV": 70.0, "power_W": 33.0, "exposure_ms": 222.0}[name]
+    assert WORDS in door({name: value}, tmp_path)
+    (tmp_path / "other").mkdir()
+    assert not door({name: value + 1.0}, tmp_path / "other")
+
+
+def test_what_may_not_be_is_not_proposed(rule: None) -> None:
+    proposed = {setting.kV for setting in fx.expose(BALL, machine=M, images=10).best}
+    assert {60.0, 80.0} <= proposed
+    assert 70.0 not in proposed
