@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
-from flexdt.phantoms import material, materials
+from flexdt.phantoms import Material, material, materials
+from flexdt.twin.attenuation.substances import tables
 from flexdt.twin.errors import LimitError, UnknownNameError
 
 # NIST X-Ray Mass Attenuation Coefficients, mu/rho [cm2/g] at (40, 50, 60) keV.
@@ -38,11 +41,38 @@ def test_all_materials_of_the_contract_are_there_and_labelled() -> None:
         assert energies == sorted(set(energies))
 
 
-def test_attenuation_falls_with_energy_but_for_the_edge_of_tungsten() -> None:
-    for m in materials().values():
-        values = [m.mu_at(e) for e in range(20, 69)]
-        assert values == sorted(values, reverse=True)
+def edges_keV(m: Material) -> list[float]:
+    """The absorption edges of its elements within its table [keV]."""
+    every = [tables().edges_keV[tables().elements[symbol]] for symbol, _ in m.fractions]
+    return [e for row in every for e in row.tolist() if 20.0 < e < 100.0]
+
+
+@pytest.mark.parametrize("name", materials())
+def test_the_points_are_those_of_the_composition(name: str) -> None:
+    m = material(name)
+    assert [m.points[0][0], m.points[-1][0]] == [20.0, 100.0]
+    made_of = m.substance
+    for energy, mass in m.points:
+        expected = made_of.attenuation_at(energy) * 10.0 / m.density_g_cm3
+        assert mass == pytest.approx(expected, rel=1e-3), energy
+
+
+@pytest.mark.parametrize("name", materials())
+def test_attenuation_falls_with_energy_but_for_the_edges_of_elements(name: str) -> None:
+    m = material(name)
+    for low, high in pairwise(range(20, 101)):
+        if not any(low <= edge <= high for edge in edges_keV(m)):
+            assert m.mu_at(low) > m.mu_at(high), low
+    for edge in edges_keV(m):
+        below = max(e for e, _ in m.points if e <= edge)
+        above = min(e for e, _ in m.points if e > edge)
+        assert above - below <= 1.0, f"two close points about {edge:g} keV"
+        assert m.mu_at(above) > m.mu_at(below)
+
+
+def test_tungsten_has_its_edge() -> None:
     wc = material("tungsten-carbide")
+    assert len(edges_keV(wc)) == 1
     assert wc.mu_at(70.0) > 4 * wc.mu_at(69.0)
 
 

@@ -29,7 +29,13 @@ from flexdt.clients.viewer.scenes.meshes.collision_bodies import bare, grown
 from flexdt.clients.viewer.scenes.meshes.painted_meshes import glb
 from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
 from flexdt.clients.viewer.scenes.name_tags import names_of_image
-from flexdt.clients.viewer.scenes.sample_looks import MeshCache, SampleLook, Skin, fetch
+from flexdt.clients.viewer.scenes.sample_looks import (
+    COLORS,
+    MeshCache,
+    SampleLook,
+    Skin,
+    fetch,
+)
 from flexdt.clients.viewer.scenes.views import Standpoint, beam_view, presets, rim
 from flexdt.clients.viewer.scenes.world import World, beads_on, placed, quaternion
 from flexdt.clients.viewer.scrubbed_plan import (
@@ -39,7 +45,7 @@ from flexdt.clients.viewer.scrubbed_plan import (
     source_path,
 )
 from flexdt.clients.viewer.shown_images import ShownImage, grey, packed, window_of
-from flexdt.phantoms import load_phantom, phantom_names
+from flexdt.phantoms import load_phantom, materials, phantom_names
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState, State
 from flexdt.twin.collision.convex_solids import UprightCylinder, hull
@@ -233,6 +239,10 @@ def test_only_the_close_up_shows_the_gear_a_fifth_of_a_panes_height(
         shares.append(share_of_height(whole.at(rng.uniform(0.7, 1.8)), gear_m))
     assert max(shares) < 0.2
     assert share_of_height(views["iso"].at(0.73), gear_m) < 0.05
+
+
+def test_every_material_has_a_colour() -> None:
+    assert [*COLORS] == [*materials()]
 
 
 def test_the_name_of_the_sample_stands_above_it() -> None:

@@ -27,16 +27,23 @@ from flexdt.protocol.state_model import SampleState
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
-COLORS: Mapping[str, tuple[int, int, int]] = {
-    "steel": (206, 212, 220),
-    "abs": (222, 66, 48),
-    "aluminium": (188, 198, 210),
-    "pmma": (150, 205, 230),
-    "water": (110, 170, 235),
-    "bone": (240, 226, 196),
-}
-"""Material -> colour; others get the last one's."""
 OTHER_COLOR: Final = (214, 170, 90)
+"""Of materials by formula, and of those without a colour of their own."""
+COLORS: Final[Mapping[str, tuple[int, int, int]]] = {
+    "abs": (222, 66, 48),
+    "pmma": (150, 205, 230),
+    "steel": (206, 212, 220),
+    "aluminium": (188, 198, 210),
+    "water": (110, 170, 235),
+    "air": OTHER_COLOR,
+    "tungsten-carbide": OTHER_COLOR,
+    "bone": (240, 226, 196),
+    "copper": OTHER_COLOR,
+    "titanium": OTHER_COLOR,
+    "glass": OTHER_COLOR,
+    "wood": OTHER_COLOR,
+}
+"""Material -> colour (r, g, b)."""
 MAX_LOOKS: Final = 8
 MAX_FACES: Final = 200_000
 DEFAULT_MATERIAL: Final = "abs"
