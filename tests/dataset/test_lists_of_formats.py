@@ -148,6 +148,15 @@ def scan_docstring() -> object:
     return [form.name for form in foreign_files.SCAN_FORMATS if form.name not in said]
 
 
+def scan_mentions() -> object:
+    texts = (
+        page("data-sets.md", "## Scans of other scanners\n\n", " in, and"),
+        page("coming-from/cil.md", "| readers (", ")").replace("NeXus", "NXtomo"),
+    )
+    return [(form.name, text) for form in foreign_files.SCAN_FORMATS for text in texts
+            if form.name not in text]  # fmt: skip
+
+
 def mesh_wire() -> object:
     return difference(get_args(scanner_messages.MeshFormat), mesh_files.FORMATS)
 
@@ -181,7 +190,7 @@ def unit_docstring() -> object:
 GEOMETRY = (geometry_page, geometry_usage, geometry_command_page, geometry_docstring,
             geometry_docstring_endings)  # fmt: skip
 VOLUMES = (volume_page, volume_docstring, reconstruction_docstring)
-SCANS = (scan_page, scan_docstring)
+SCANS = (scan_page, scan_docstring, scan_mentions)
 MESHES = (mesh_wire, mesh_pages, mesh_docstring)
 UNITS = (unit_wire, unit_docstring)
 

@@ -20,6 +20,8 @@ from four_balls import BALLS, COLS, MU, PIXEL, ROWS, SDD, SOD, VIEWS, found, ima
 from loaded_script import load
 
 import flexdt as fx
+from flexdt.library.reading.foreign_files import SCAN_FORMATS, ScanFormat
+from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.geometry.conventions import FloatArray
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -79,6 +81,36 @@ def ran(block: str, names: dict[str, Any] | None = None) -> dict[str, Any]:
     space = {} if names is None else names
     exec(compile(block, "<page>", "exec"), space)
     return space
+
+
+def test_every_format_of_scans_has_a_block_and_a_scan_of_the_balls() -> None:
+    assert [form.name for form in SCAN_FORMATS] == [*MAKERS][: len(SCAN_FORMATS)]
+
+
+@pytest.mark.parametrize("form", SCAN_FORMATS, ids=lambda form: form.name)
+def test_another_geometry_takes_the_place_of_the_files(
+    form: ScanFormat, tmp_path: Path
+) -> None:
+    MAKERS[form.name](tmp_path)
+    [path] = [p for p in tmp_path.rglob("*") if p.suffix in form.endings]
+    other = fx.ConeVec.circular(
+        sod=SOD + 1.0, sdd=SDD, angles=VIEWS, shape=(ROWS, COLS), pixel=PIXEL
+    )
+    data = fx.open(path, geometry=other)
+    np.testing.assert_array_equal(data.geometry.rows, other.rows)
+    assert data.complete
+
+
+@pytest.mark.parametrize("form", SCAN_FORMATS, ids=lambda form: form.name)
+@pytest.mark.parametrize("content", [b"", b"no scan\n", bytes(range(256)) * 64])
+def test_a_damaged_file_is_an_error_that_names_it(
+    content: bytes, form: ScanFormat, tmp_path: Path
+) -> None:
+    for ending in form.endings:
+        path = tmp_path / f"scan{ending}"
+        path.write_bytes(content)
+        with pytest.raises(DatasetError, match=re.escape(path.name)):
+            fx.open(path)
 
 
 def test_every_block_has_ten_lines_and_two_imports() -> None:
