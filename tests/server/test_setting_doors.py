@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from in_process import Lab, M, P, run
+from pydantic import ValidationError
 from scanner_traffic import event
 
 import flexdt as fx
@@ -23,9 +24,11 @@ from flexdt.server.storage import memory, scene_document
 from flexdt.twin.errors import LimitError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror
+from flexdt.twin.machine.description import DetectorSpec, TubeSpec
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.scanner import state
 from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import TubeSettings
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.planning.planner import plan_script
 from flexdt.twin.script.scan_request import ScanRequest
@@ -166,6 +169,33 @@ def test_a_rule_that_is_added_holds_at_every_door(
     assert WORDS in door({name: value}, tmp_path)
     (tmp_path / "other").mkdir()
     assert not door({name: value + 1.0}, tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("spec", "start"),
+    [
+        (
+            M.tube,
+            lambda s: state.changed_tube(s, TubeSettings(s.kV, s.power_W), None, None),
+        ),
+        (M.detector, lambda s: state.changed_camera(s, s.camera, {})),
+    ],
+    ids=["tube", "detector"],
+)
+def test_a_machine_starts_with_settings_that_it_allows(
+    spec: TubeSpec | DetectorSpec, start: Callable[[Any], object]
+) -> None:
+    """Each number of the machine file in turn has another value, or is refused there."""
+    tried = 0
+    for name in type(spec).model_fields:
+        for value in (0.0, 1e-3, 0.1, 1, 2, 50.0, 200.0, 1e3, 1e5, 1e7):
+            try:
+                other = type(spec).model_validate(spec.model_dump() | {name: value})
+            except ValidationError:
+                continue
+            tried += 1
+            assert not refused(lambda other=other: start(other)), (name, value)  # type: ignore[misc]
+    assert tried > 30
 
 
 def test_what_may_not_be_is_not_proposed(rule: None) -> None:

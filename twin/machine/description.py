@@ -311,8 +311,8 @@ class DetectorSpec(_Frozen):
 
     @model_validator(mode="after")
     def _fits(self) -> DetectorSpec:
-        """Check that the mode has a binning, that the ROI is on the panel, and that the
-        response is physical.
+        """Check that the mode has a binning, that the ROI is on the panel, that the
+        exposure is within its range, and that the response is physical.
 
         The energy that a photon leaves is at most its own; photon energies rise from
         above 0. The mode at start always counts as one of `mode_names`. Returns the
@@ -332,6 +332,13 @@ class DetectorSpec(_Frozen):
             check_roi(Roi(*self.roi), self.pixels, binning)
         except LimitError as error:
             raise _refused("roi", self.roi, error.message) from None
+        least, longest = self.min_exposure_ms, self.max_exposure_ms
+        _refuse_if(
+            not least <= self.exposure_ms <= longest,
+            "exposure_ms",
+            self.exposure_ms,
+            f"from min_exposure_ms to max_exposure_ms, [{least:g}, {longest:g}]",
+        )
         for i, (energy, left) in enumerate(self.response):
             allowed = f"at most the photon's energy, {energy:g} keV"
             _refuse_if(left > energy, f"response.{i}", [energy, left], allowed)
