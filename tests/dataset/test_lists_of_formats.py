@@ -10,6 +10,7 @@ import inspect
 import json
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -218,6 +219,18 @@ def test_lists_that_may_not_import_each_other_are_the_same(
 ) -> None:
     assert [*one] == [*other]
     assert len([*one]) > 2
+
+
+def test_packages_that_files_need_are_those_of_the_extra() -> None:
+    sources = (DOCS.parent / "flexdt").rglob("*.py")
+    called = re.compile(r"""\bpackage\(\s*"(\w+)"(?:,\s*"[^"]*")?\)""")
+    needed = {
+        name for path in sources for name in called.findall(path.read_text("utf-8"))
+    }
+    project = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))
+    brought = project["project"]["optional-dependencies"]["io"]
+    assert needed == {re.split(r"\W", one)[0] for one in brought}
+    assert needed == set(page("install.md", "| `io` | ", " |").split(", "))
 
 
 # Members that are added.
