@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import in_process
 import pytest
 from in_process import Lab, M, P, run
 from pydantic import ValidationError
@@ -24,7 +25,7 @@ from flexdt.server.storage import memory, scene_document
 from flexdt.twin.errors import LimitError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror
-from flexdt.twin.machine.description import DetectorSpec, TubeSpec
+from flexdt.twin.machine.description import DetectorSpec, Machine, TubeSpec
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.scanner import state
 from flexdt.twin.scanner.scanner import ScannerTwin
@@ -36,13 +37,25 @@ from flexdt.twin.script.scan_request import ScanRequest
 BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 8, "material": "aluminium"}
 WORDS = "a rule that was added"
 Asked = dict[str, float]
+RULES: dict[str, tuple[Machine, Asked]] = {
+    "max_kV": (M, {"kV": M.tube.max_kV + 1.0}),
+    "max_W": (M, {"power_W": M.tube.max_W + 1.0}),
+    "max_exposure_ms": (M, {"exposure_ms": M.detector.max_exposure_ms + 1.0}),
+}
+"""Figure of a machine -> a machine with it, and a setting beyond it."""
 LINES = {"kV": ("tube", "set kV"), "power_W": ("tube", "set power"),
          "exposure_ms": ("camera", "set exposure")}  # fmt: skip
-DEFAULTS = {
-    "kV": M.tube.kV,
-    "power_W": M.tube.power_W,
-    "exposure_ms": M.detector.exposure_ms,
-}
+
+
+def part_of(asked: Asked) -> str:
+    """Whose setting it is."""
+    return "camera" if "exposure_ms" in asked else "tube"
+
+
+def at_start(machine: Machine) -> Asked:
+    tube = machine.tube
+    return {"kV": tube.kV, "power_W": tube.power_W,
+            "exposure_ms": machine.detector.exposure_ms}  # fmt: skip
 
 
 def refused(call: Callable[[], object]) -> str:
@@ -54,87 +67,92 @@ def refused(call: Callable[[], object]) -> str:
     return ""
 
 
-def problems(found: Any) -> str:
-    return " ".join(p.message for p in found if p.severity == "error")
+# Each door returns how a setting is refused; "" where it is not.
 
 
-def by_request(asked: Asked, _: Path) -> str:
-    scanner = ScannerTwin(M, P)
-    done = scanner.set_camera if "exposure_ms" in asked else scanner.set_tube
-    return refused(lambda: done(**asked))  # type: ignore[arg-type]
+def by_request(machine: Machine, asked: Asked, _: Path) -> str:
+    scanner = ScannerTwin(machine, P)
+    done = {"camera": scanner.set_camera, "tube": scanner.set_tube}[part_of(asked)]
+    return refused(lambda: done(**asked))  # type: ignore[operator]
 
 
-def scene(asked: Asked) -> Any:
-    """What a scanner was before the rule was there."""
-    saved = memory.remember(ScannerTwin(M, P), 0.0, 0, [])
+def remembered(machine: Machine, asked: Asked) -> Any:
+    """What a server has kept of a scanner that once had this setting."""
+    saved = memory.remember(ScannerTwin(machine, P), 0.0, 0, [])
     kept: Any = saved.scene
-    part = "camera" if "exposure_ms" in asked else "tube"
-    new = getattr(kept, part).model_copy(update=asked)
-    return saved.model_copy(update={"scene": kept.model_copy(update={part: new})})
+    new = getattr(kept, part_of(asked)).model_copy(update=asked)
+    return saved.model_copy(
+        update={"scene": kept.model_copy(update={part_of(asked): new})}
+    )
 
 
-def by_scene(asked: Asked, _: Path) -> str:
-    scanner = ScannerTwin(M, P)
-    return refused(lambda: scene_document.require_fit(scene(asked).scene, scanner))
+def by_scene(machine: Machine, asked: Asked, _: Path) -> str:
+    scene = remembered(machine, asked).scene
+    return refused(lambda: scene_document.require_fit(scene, ScannerTwin(machine, P)))
 
 
-def by_restart(asked: Asked, _: Path) -> str:
+def by_restart(machine: Machine, asked: Asked, _: Path) -> str:
     """What is remembered is not set; the reason is in the log."""
-    scanner, logged = ScannerTwin(M, P), []
+    scanner, logged = ScannerTwin(machine, P), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(memory, "log", lambda *_, **facts: logged.append(facts["reason"]))
-        memory.restore(scene(asked), scanner, 0.0)
+        memory.restore(remembered(machine, asked), scanner, 0.0)
     [(name, value)] = asked.items()
-    part = scanner.camera if name == "exposure_ms" else scanner.tube
-    assert getattr(part, name) == (DEFAULTS[name] if logged else value)
+    at = getattr(getattr(scanner, part_of(asked)), name)
+    assert at == (at_start(machine)[name] if logged else value)
     return " ".join(logged)
 
 
-def by_script(asked: Asked, _: Path) -> str:
+def by_script(machine: Machine, asked: Asked, _: Path) -> str:
     [(name, value)] = asked.items()
     line = "\t".join((*LINES[name], repr(value), "", "ACK", "", ""))
-    return problems(plan_script(line, M, P).problems)
+    found = plan_script(line, machine, P).problems
+    return " ".join(p.message for p in found if p.severity == "error")
 
 
-def by_following(asked: Asked, _: Path) -> str:
+def by_following(machine: Machine, asked: Asked, _: Path) -> str:
     [(name, value)] = asked.items()
-    said = heard(event(1, (*LINES[name], repr(value))), M.axes, "00:00:03.000")
-    mirror = Follower(M, P).hear(Mirror.of(M), said, 3.0)
+    said = heard(event(1, (*LINES[name], repr(value))), machine.axes, "00:00:03.000")
+    mirror = Follower(machine, P).hear(Mirror.of(machine), said, 3.0)
     return " ".join(alarm.message for alarm in mirror.alarms)
 
 
-def by_composing(asked: Asked, _: Path) -> str:
-    return refused(lambda: compose_script(ScanRequest("step", **asked), M, P))  # type: ignore[arg-type]
+def by_composing(machine: Machine, asked: Asked, _: Path) -> str:
+    request = ScanRequest("step", **asked)  # type: ignore[arg-type]
+    return refused(lambda: compose_script(request, machine, P))
 
 
-def by_forecast(asked: Asked, _: Path) -> str:
-    return refused(lambda: fx.expose(BALL, machine=M, **asked))  # type: ignore[arg-type]
+def by_forecast(machine: Machine, asked: Asked, _: Path) -> str:
+    return refused(lambda: fx.expose(BALL, machine=machine, **asked))  # type: ignore[arg-type]
 
 
-def by_batch(asked: Asked, _: Path) -> str:
-    exposure = ExposureSettings(**(DEFAULTS | asked))
-    if "exposure_ms" in asked:
-        return refused(lambda: check_distances(M, M.detector.camera, exposure, 600, 1059))
-    return refused(lambda: check_tube(M, exposure))
+def by_batch(machine: Machine, asked: Asked, _: Path) -> str:
+    exposure = ExposureSettings(**(at_start(machine) | asked))
+    if part_of(asked) == "tube":
+        return refused(lambda: check_tube(machine, exposure))
+    camera = machine.detector.camera
+    return refused(lambda: check_distances(machine, camera, exposure, 600, 1059))
 
 
-def by_image(asked: Asked, root: Path) -> str:
-    """The error of a request for an image with these settings, without setting them."""
+def by_image(machine: Machine, asked: Asked, root: Path) -> str:
+    """A request for an image with this setting, without setting it."""
     told: list[str] = []
-    part = "camera" if "exposure_ms" in asked else "tube"
 
     async def body(lab: Lab) -> None:
         try:
-            await lab.client().call("projection.get", **{part: asked})
+            await lab.client().call("projection.get", **{part_of(asked): asked})
         except (LimitError, RpcError) as error:
             told.append(error.message)
 
-    run(root, body)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(in_process, "M", machine)
+        run(root, body)
     return " ".join(told)
 
 
-DOORS = (by_request, by_scene, by_restart, by_script, by_following, by_composing,
-         by_forecast, by_batch, by_image)  # fmt: skip
+Door = Callable[[Machine, Asked, Path], str]
+DOORS: tuple[Door, ...] = (by_request, by_scene, by_restart, by_script, by_following,
+                           by_composing, by_forecast, by_batch, by_image)  # fmt: skip
 
 
 @pytest.fixture
@@ -163,12 +181,21 @@ def rule(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", LINES)
 @pytest.mark.parametrize("door", DOORS)
 def test_a_rule_that_is_added_holds_at_every_door(
-    door: Callable[[Asked, Path], str], name: str, rule: None, tmp_path: Path
+    door: Door, name: str, rule: None, tmp_path: Path
 ) -> None:
     value = {"kV": 70.0, "power_W": 33.0, "exposure_ms": 222.0}[name]
-    assert WORDS in door({name: value}, tmp_path)
+    assert WORDS in door(M, {name: value}, tmp_path)
     (tmp_path / "other").mkdir()
-    assert not door({name: value + 1.0}, tmp_path / "other")
+    assert not door(M, {name: value + 1.0}, tmp_path / "other")
+
+
+@pytest.mark.parametrize("figure", RULES)
+@pytest.mark.parametrize("door", DOORS)
+def test_the_rule_of_a_figure_holds_at_every_door(
+    door: Door, figure: str, tmp_path: Path
+) -> None:
+    machine, asked = RULES[figure]
+    assert door(machine, asked, tmp_path)
 
 
 @pytest.mark.parametrize(
