@@ -157,8 +157,9 @@ web: install $(WEB_STAMP)
 	$(BIN)/python tests/viewer/test_page_source.py
 
 # The site, notebooks executed; warnings are errors. Result: docs/_build/html/index.html
-docs: $(DOCS_STAMP)
-	$(BIN)/python -m sphinx -b html -n -W --keep-going -q docs docs/_build/html
+docs: $(DOCS_STAMP) $(COMPILED)
+	$(BIN)/python -m sphinx -b html -n -W --keep-going -q --jobs 2 docs docs/_build/html
+	$(BIN)/python docs/tools/site_checks.py docs/_build/html
 
 # The oldest and the newest dependencies that pyproject.toml allows, in an environment of their own.
 lowest newest:

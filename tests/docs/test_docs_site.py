@@ -1,15 +1,14 @@
-"""The whole site is built once, as `make docs` does: warnings are errors, notebooks
-executed."""
+"""Pages of questions, and the checks of the site that `make docs` builds."""
 
 from __future__ import annotations
 
 import json
-import re
-import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+from loaded_script import load
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -29,57 +28,73 @@ def test_a_question_has_a_short_answer_with_code_and_a_picture(page: Path) -> No
     assert f"({page.name})" in (page.parent / "index.md").read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_site_builds_without_a_warning(tmp_path: Path) -> None:
-    words = [
-        "-b",
-        "html",
-        "-n",
-        "-W",
-        "--keep-going",
-        "-q",
-        "-d",
-        str(tmp_path / "doctrees"),
-    ]
-    done = subprocess.run(
-        [sys.executable, "-m", "sphinx", *words, str(DOCS), str(tmp_path / "html")],
-        capture_output=True, text=True, timeout=880, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-6000:]
-    html = tmp_path / "html"
-    for notebook in (*(DOCS / "tutorials").glob("*.md"), *QUESTIONS):
-        page = (html / notebook.relative_to(DOCS).with_suffix(".html")).read_text()
-        text = notebook.read_text()
-        cells = text.count("{code-cell}") - text.count("[remove-cell]")
-        assert page.count('class="cell_input docutils container"') == cells
-        assert "Traceback" not in page
-        if cells:
-            assert "cell_output" in page
-    # What was computed is in the pages: figures, and the calibration's secret found again.
-    assert len(list((html / "_images").glob("*.png"))) > 8
-    calibrate = (html / "tutorials" / "calibrate.html").read_text()
-    found = re.search(r"dO_y\s+(-?\d\.\d+) \+- (\d\.\d+)", calibrate)
-    assert found is not None
-    assert abs(float(found[1]) + 1.1) < 5 * float(found[2])
-    assert "state.get" in (html / "_generated" / "wire.html").read_text()
-    assert (
-        'id="flexdt-phantom-design"'
-        in (html / "_generated" / "commands.html").read_text()
-    )
-    cone_vec = html / "_generated" / "python" / "flexdt.twin.geometry.cone_vec.html"
-    assert "project_points" in cone_vec.read_text()
-    assert (
-        "flexdt.twin.geometry.cone_vec.html"
-        in (html / "reference" / "python.html").read_text()
-    )
-    # Evidence is rendered, old addresses forward, and the figures are made anew.
-    coverage = (html / "_generated" / "evidence" / "calibration.html").read_text()
-    assert 'id="coverage-of-the-joint-95-region"' in coverage
-    assert "itk-rtk" in (html / "_generated" / "evidence" / "bench.html").read_text()
-    assert 'url=use.html"' in (html / "how-to.html").read_text()
-    made = json.loads((DOCS / "_generated" / "figures" / "figures.json").read_text())
-    kept = json.loads((DOCS / "images" / "made" / "figures.json").read_text())
-    assert [*made] == [*kept]
-    for name, numbers in kept.items():
-        assert made[name] == pytest.approx(numbers, rel=0.05, abs=1e-3), name
+@pytest.fixture
+def checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The checks, of a site of one notebook and one figure."""
+    module = load(DOCS / "tools" / "site_checks.py")
+    monkeypatch.setattr(module, "DOCS", tmp_path)
+    monkeypatch.setattr(module, "NOTEBOOKS", [tmp_path / "tutorials" / "calibrate.md"])
+    return module
+
+
+CELL = '<div class="cell_input docutils container">dO_y  -1.08 +- 0.01</div> cell_output'
+
+
+def site(folder: Path, checks: ModuleType) -> dict[str, str]:
+    """Files of a source and its site that have no fault."""
+    figures = json.dumps({"aligned": {"before": 0.5, "after": 2.0}})
+    return {
+        "tutorials/calibrate.md": "```{code-cell}\n",
+        "_generated/figures/figures.json": figures,
+        "images/made/figures.json": figures,
+        "html/tutorials/calibrate.html": CELL,
+        **{f"html/_images/{number}.png": "" for number in range(checks.FIGURES + 1)},
+        **{f"html/{page}": text for page, text in checks.SHOWN.items()},
+    }
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "fault"),
+    [
+        ("html/tutorials/calibrate.html", CELL * 2, "2 of 1 cells are on its page"),
+        ("html/tutorials/calibrate.html", f"{CELL} Traceback", "an error is on its page"),
+        ("html/tutorials/calibrate.html", CELL[:-11], "no output is on its page"),
+        ("html/tutorials/calibrate.html", CELL.replace("-1.08", "-1.04"), "it is -1.1"),
+        ("html/tutorials/calibrate.html", CELL.replace("dO_y", "dO_z"), "no dO_y"),
+        ("html/_images/0.png", None, "8 pictures on the site"),
+        ("html/_generated/wire.html", "", "'state.get' is not on it"),
+        ("_generated/figures/figures.json", "{}", "aligned are kept"),
+        (
+            "_generated/figures/figures.json",
+            '{"aligned": {"before": 0.53, "after": 2.0}}',
+            "figure aligned: made",
+        ),
+    ],
+)
+def test_each_fault_of_a_site_is_found_and_nothing_else(
+    file: str,
+    content: str | None,
+    fault: str,
+    checks: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["site_checks.py", str(tmp_path / "html")])
+    for name, text in site(tmp_path, checks).items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert checks.main() == 0
+    assert capsys.readouterr().out == ""
+    if content is None:
+        (tmp_path / file).unlink()
+    else:
+        (tmp_path / file).write_text(content)
+    assert checks.main() == 1
+    assert fault in capsys.readouterr().out
+
+
+def test_the_notebooks_of_the_site_are_found() -> None:
+    notebooks = load(DOCS / "tools" / "site_checks.py").NOTEBOOKS
+    assert {path.parent.name for path in notebooks} == {"tutorials", "questions"}
+    assert len(notebooks) > len(QUESTIONS)
