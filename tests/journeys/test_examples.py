@@ -56,16 +56,10 @@ def test_submit_a_script_then_read_the_data_set(
     assert "13 projections of 200 x 160, complete: True" in out
 
 
-PROGRAMS = [
-    path
-    for folder in (EXAMPLES, EXAMPLES.parent / "tests" / "studies")
-    for path in sorted(folder.glob("*.py"))
-    if "ArgumentParser" in path.read_text()
-]
+PROGRAMS = [p for p in sorted(EXAMPLES.glob("*.py")) if "argparse" in p.read_text()]
 
 
 @pytest.mark.daily(3)
-@pytest.mark.campaign(6)
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda p: p.name)
 def test_every_program_explains_itself(path: Path) -> None:
     assert "usage:" in run(path.name, "--help")
@@ -92,9 +86,12 @@ def named(file: Path) -> set[str]:
 
 def test_every_example_is_run_by_a_test() -> None:
     """Named by a test's code as a whole, not mentioned in passing."""
-    tests = EXAMPLES.parent.joinpath("tests").rglob("test_*.py")
-    code = set().union(*(named(file) for file in tests))
-    assert [p.name for p in EXAMPLES.glob("*.py") if p.name not in code] == []
+    root = EXAMPLES.parent
+    for folder in (root, root / "extensions"):
+        tests = (folder / "tests").rglob("test_*.py")
+        code = set().union(*(named(file) for file in tests))
+        examples = (folder / "examples").glob("*.py")
+        assert [p.name for p in examples if p.name not in code] == []
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda p: p.name)
