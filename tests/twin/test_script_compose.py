@@ -624,7 +624,7 @@ def test_no_machine_is_proposed_what_its_own_check_refuses(block: int) -> None:
             made += 1
             sweep = collision_check() if machine.components else None
             report = check_script(text, machine, profile, collision=sweep)
-            assert report.ok, (seed, kind, [p.where_and_what for p in report.problems])
+            assert report.ok, (seed, kind, [p.placed_text for p in report.problems])
             codes = {p.code for p in report.problems}
             assert codes <= {"default_assumed", "sample_in_flat", *OPEN_BEAM_CODES}
     assert made > 5
