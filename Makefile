@@ -26,8 +26,7 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
   $(filter-out %_voxels.py %_lego.py,$(wildcard tests/phantoms/test_*.py)) \
   $(filter-out %_rtk.py %_astra.py,$(wildcard tests/twin/exchange/test_*.py))
 
-# The tests start some hundred processes. Where bytecode may not be kept, each compiles flexdt, and
-# each worker every test and its assertions, anew.
+# As tests/support/suite.py does for the tests: without kept bytecode each process compiles all it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo ready quick quick-tests test test-extensions slow studies page campaigns failed docs web lint typecheck lowest newest clean

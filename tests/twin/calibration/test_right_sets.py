@@ -12,7 +12,7 @@ from causes_named import calibrated, scored
 from faults_drawn import drawn
 from right_sets import FAR_SIGMAS, LEVELS, contains_what_is_asked, covered
 from right_sets import off as off_of
-from scipy.stats import f
+from scipy.special import fdtr
 
 from flexdt.twin.calibration.diagnose import fitted, tiles
 from flexdt.twin.calibration.diagnose.causes import cause, columns, every_cause
@@ -30,7 +30,7 @@ def levels(scale: float, scans: int = 400) -> list[float]:
     """Draw the levels of scans whose regions are `scale` times as long as they should be."""
     rng = np.random.default_rng(1)
     distance2 = rng.chisquare(14, scans) / scale**2
-    return f.cdf(distance2 / 14, 14, DEGREES).tolist()
+    return fdtr(14, DEGREES, distance2 / 14).tolist()
 
 
 def test_regions_of_another_size_are_told() -> None:

@@ -26,8 +26,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d, map_coordinates, spline_filter
-from scipy.special import ndtr
-from scipy.stats import t as student
+from scipy.special import ndtr, stdtrit
 
 from flexdt.twin.calibration.without_phantom.circular_scan import CircularScan
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import mirror_map
@@ -262,7 +261,7 @@ class Profile:
         count = len(sigma)
         dropped = int(np.isinf(sigma).sum())
         chances = 2.0 * count * math.comb(count, dropped)
-        times = float(student.isf(CHANCE / chances, max(count - dropped - 2, 1)))
+        times = -float(stdtrit(max(count - dropped - 2, 1), CHANCE / chances))
         own = np.sqrt(inverse[:, 2, 2])
         table = zip(self.radii.tolist(), values[:, 2].tolist(), own.tolist(), strict=True)
         return [
