@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,10 @@ FOLDERS = (
     "examples", "extensions",
 )  # fmt: skip
 PAGES = ("docs/phantoms.md", "docs/exchange.md", "docs/command-line.md", "docs/reconstruction.md",
-         "docs/other-scanners.md", "docs/tutorials/own-sample.md")  # fmt: skip
+         "docs/other-scanners.md", "docs/tutorials/own-sample.md", "docs/data-sets.md",
+         "docs/coming-from/cil.md", "docs/install.md")  # fmt: skip
+QUICK = "not slow and not browser"
+"""Marks of the tests that `make test` runs."""
 ROW = re.compile(
     r"^\| (?!file \|)(?P<file>[^|]*)\| (?P<change>[^|]*)\| (?P<test>[^|]*)\|$", re.M
 )
@@ -56,6 +60,11 @@ def test_recipes_are_tables_whose_rows_end_with_a_test() -> None:
         "A phantom",
         "A figure of the detector",
         "A format of geometry",
+        "A material",
+        "A limit rule",
+        "A field of the state",
+        "A reader of scan files",
+        "A cause of residuals",
     } <= set(tables)
     for name, rows in tables.items():
         assert len(rows) >= 3, name
@@ -93,8 +102,10 @@ def run(copy: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def passed(copy: Path, files: list[str], word: str) -> int:
-    """How many tests of `files` whose name has `word` passed in the copy; none may fail."""
+def tested(
+    copy: Path, files: Iterable[str], word: str, marks: str
+) -> subprocess.CompletedProcess[str]:
+    """Run those tests of `files` in the copy whose names have `word`, and whose marks are these."""
     words = [
         "-m",
         "pytest",
@@ -104,12 +115,36 @@ def passed(copy: Path, files: list[str], word: str) -> int:
         "-p",
         "no:xdist",
         "-m",
-        "not slow and not browser",
+        marks,
     ]
-    done = run(copy, *words, "-k", word, *files)
+    return run(copy, *words, "-k", word, *files)
+
+
+def passed(copy: Path, files: Iterable[str], word: str) -> int:
+    """How many tests of `files` whose name has `word` passed in the copy; none may fail."""
+    done = tested(copy, files, word, QUICK)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     count = re.search(r"(\d+) passed", done.stdout)
     return int(count[1]) if count else 0
+
+
+def failed(copy: Path, files: Iterable[str], word: str) -> set[str]:
+    """Functions of `files` whose name has `word` and that fail in the copy."""
+    done = tested(copy, files, word, QUICK)
+    return set(re.findall(r"^FAILED tests/\S*?\.py::(\w+)", done.stdout, re.MULTILINE))
+
+
+Changes = dict[str, tuple[tuple[str, str], ...]]
+"""File -> pairs: a text that is there once, and what is inserted before it."""
+
+
+def inserted(copy: Path, changes: Changes) -> None:
+    """Insert texts into files of the copy."""
+    for name, insertions in changes.items():
+        for place, text in insertions:
+            whole = (copy / name).read_text()
+            assert whole.count(place) == 1, (name, place)
+            (copy / name).write_text(whole.replace(place, text + place))
 
 
 def test_a_copy_is_imported_from_its_own_folders(copy: Path) -> None:
@@ -183,7 +218,7 @@ def test_a_format_of_geometry_is_added_by_its_recipe(copy: Path) -> None:
         "def read_added(text, shape):\n"
         "    return ScanGeometry(ConeVec(json.loads(text)), shape)\n"
     )
-    changes = {
+    changes: Changes = {
         "flexdt/library/datasets/exchange_formats.py": (
             ("FORMATS: Final[", "def _write_added(geometry, out):\n"
              "    from flexdt.twin.exchange.added import added_text\n\n"
@@ -203,11 +238,206 @@ def test_a_format_of_geometry_is_added_by_its_recipe(copy: Path) -> None:
         ),
         "docs/command-line.md": (("csv and back, images", "added, "),),
     }  # fmt: skip
-    for name, insertions in changes.items():
-        for place, text in insertions:
-            whole = (copy / name).read_text()
-            assert whole.count(place) == 1, (name, place)
-            (copy / name).write_text(whole.replace(place, text + place))
+    inserted(copy, changes)
     shown = run(copy, "-m", "flexdt.clients.cli", "export", "--help")
     assert "|added|" in shown.stdout, shown.stderr
     assert passed(copy, files_to_run(rows), "added or state") >= 20
+
+
+TIN = (
+    '[material.tin]\nlabel = "tin"\ndensity_g_cm3 = 7.29\nformula = "Sn"\n'
+    "points = [[20, 21.459], [29, 7.9028], [29.4, 42.9848], [30, 41.216], [40, 19.4274], "
+    "[50, 10.7011], [60, 6.5663], [80, 3.0294], [100, 1.6769]]\n\n"
+)
+
+
+@pytest.mark.slow
+def test_a_material_is_added_by_its_recipe(copy: Path) -> None:
+    files = files_to_run(recipes()["A material"])
+    word = "material or points or attenuation"
+    first: Changes = {"phantoms/data/materials.toml": (("[material.wood]", TIN),)}
+    inserted(copy, first)
+    table = copy / "phantoms" / "data" / "materials.toml"
+    right = table.read_text()
+    over_the_edge = right.replace("[29, 7.9028], [29.4, 42.9848]", "[28, 7.9028]")
+    table.write_text(over_the_edge)
+    assert failed(copy, files, word) == {
+        "test_the_points_are_those_of_the_composition",
+        "test_attenuation_falls_with_energy_but_for_the_edges_of_elements",
+        "test_the_materials_are_listed",
+        "test_every_material_has_a_colour",
+    }
+    table.write_text(right)
+    inserted(copy, {
+        "docs/phantoms.md": (("wood`, with tabulated", "tin "),),
+        "clients/viewer/scenes/sample_looks.py": (
+            ('    "wood": OTHER_COLOR', '    "tin": (200, 200, 190),\n'),
+        ),
+    })  # fmt: skip
+    assert passed(copy, files, word) >= 20
+    filtered = "import flexdt as fx; print(fx.Tube(filters=[('tin', 0.3)]).filters[-1])"
+    assert "tin" in run(copy, "-c", filtered).stdout
+
+
+@pytest.mark.slow
+def test_a_limit_rule_is_added_by_its_recipe(copy: Path) -> None:
+    files = ["tests/server/test_setting_doors.py"]
+    assert set(files) <= set(files_to_run(recipes()["A limit rule"]))
+    word = "figure or starts"
+    inserted(copy, {
+        "twin/machine/description.py": (
+            ("    kV: Positive\n    power_W: Positive\n",
+             '    max_mA: Positive | None = None\n    """Greatest current [mA]."""\n'),
+        ),
+        "tests/server/test_setting_doors.py": (
+            ('    "max_kV": (M,', '    "max_mA": (HELD, {"power_W": 60.0}),\n'
+             '    "max_mA by kV": (HELD, {"kV": 60.0}),\n'),
+            ("RULES: dict[",
+             'HELD = M.model_copy(update={"tube": M.tube.model_copy(update={"max_mA": 0.6})})\n'),
+        ),
+    })  # fmt: skip
+    # The figure alone does nothing, which every door says.
+    assert failed(copy, files, word) == {"test_the_rule_of_a_figure_holds_at_every_door"}
+    inserted(copy, {
+        "twin/scanner/state.py": (
+            ("    return new\n\n\ndef changed_camera(",
+             "    if spec.max_mA is not None and new.kV > 0.0:\n"
+             "        current = new.power_W / new.kV\n"
+             '        _require_within("tube", "mA", current, 0.0, spec.max_mA)\n'),
+        ),
+    })  # fmt: skip
+    # A machine may start with more than it allows.
+    assert failed(copy, files, word) == {
+        "test_a_machine_starts_with_settings_that_it_allows"
+    }
+    inserted(copy, {
+        "twin/machine/description.py": (
+            ('        _refuse_if(self.spot_points == 2',
+             "        most = math.inf if self.max_mA is None else self.max_mA * self.kV\n"
+             '        allowed = f"at most max_mA, {self.max_mA} mA, times kV"\n'
+             '        _refuse_if(self.power_W > most, "power_W", self.power_W, allowed)\n'),
+        ),
+    })  # fmt: skip
+    assert passed(copy, files, word) >= 40
+
+
+@pytest.mark.slow
+def test_a_field_of_the_state_is_added_by_its_recipe(copy: Path) -> None:
+    files = files_to_run(recipes()["A field of the state"])
+    inserted(copy, {
+        "protocol/state_model.py": (
+            ("    ready: bool = True\n", "    current_mA: float\n"
+             '    """tube current, from power and voltage"""\n'),
+        ),
+    })  # fmt: skip
+    assert failed(copy, files, "default") == {
+        "test_fields_that_were_added_have_a_default",
+    }
+    model = copy / "protocol" / "state_model.py"
+    model.write_text(
+        model.read_text().replace(
+            "current_mA: float\n", "current_mA: float | None = None\n"
+        )
+    )
+    word = "field or current"
+    assert failed(copy, files, word) == {
+        "test_the_twin_fills_every_field_of_the_state",
+        "test_the_page_shows_every_field_but_these",
+        "test_the_openrpc_file_is_current",
+    }
+    inserted(copy, {
+        "server/twin/state_views.py": (
+            ("        ready=tube.ready(now),\n",
+             "        current_mA=tube.power_W / tube.kV if tube.kV else None,\n"),
+        ),
+        "tests/server/test_state_fields.py": (
+            ("    JobStatus: {", '    TubeState: {"current_mA"},\n'),
+        ),
+    })  # fmt: skip
+    assert run(copy, "tests/protocol/test_openrpc_file.py").returncode == 0
+    assert passed(copy, files, word) >= 4
+
+
+PROBE = '''"""Read Probe's .probe: rows of the geometry and names of images, as JSON."""
+
+import json
+
+from flexdt.library.reading.foreign_parsing import head_text
+from flexdt.library.reading.listed_images import listed
+from flexdt.runtime.files.dataset_folder import list_folder
+from flexdt.twin.geometry.cone_vec import ConeVec
+
+
+def read_probe(path, geometry):
+    said = json.loads(head_text(path))
+    cone = ConeVec(said["rows"])
+    return listed(list_folder(path.parent), cone, said["images"], (), said["flats"])
+'''
+MAKER = """def probe(folder: Path) -> None:
+    import json
+
+    from PIL import Image
+
+    counts = 5e4 * np.concatenate([images(0.0, 0.0), np.ones((1, ROWS, COLS))])
+    names = [f"p{i:04d}.tif" for i in range(VIEWS + 1)]
+    for name, image in zip(names, counts, strict=True):
+        Image.fromarray(image.round().astype(np.uint16)).save(folder / name)
+    scan = fx.ConeVec.circular(
+        sod=SOD, sdd=SDD, angles=VIEWS, shape=(ROWS, COLS), pixel=PIXEL
+    )
+    said = {"rows": scan.rows.tolist(), "images": names[:-1], "flats": names[-1:]}
+    (folder / "scan.probe").write_text(json.dumps(said))
+
+
+"""
+BLOCK = """### Probe
+
+```python
+import flexdt as fx
+
+volume = fx.open("scan.probe").reconstruct("fdk")
+```
+
+"""
+
+
+@pytest.mark.slow
+def test_a_reader_of_scan_files_is_added_by_its_recipe(copy: Path) -> None:
+    files = files_to_run(recipes()["A reader of scan files"])
+    module = copy / "flexdt" / "library" / "reading" / "probe_reading.py"
+    module.write_text(PROBE)
+    inserted(copy, {
+        "flexdt/library/reading/foreign_files.py": (
+            ("from flexdt.library.reading.zeiss",
+             "from flexdt.library.reading.probe_reading import read_probe\n"),
+            ('    ScanFormat("NXtomo"', '    ScanFormat("Probe", (".probe",), read_probe),\n'),
+        ),
+    })  # fmt: skip
+    word = "state_the_lists or of_the_balls or Probe"
+    assert failed(copy, files, word) == {
+        "test_pages_docstrings_and_wire_state_the_lists",
+        "test_every_format_of_scans_has_a_block_and_a_scan_of_the_balls",
+        "test_another_geometry_takes_the_place_of_the_files",
+    }
+    inserted(copy, {
+        "flexdt/library/reading/folders.py": (("Zeiss's .txrm; an", "Probe's .probe; "),),
+        "docs/other-scanners.md": (
+            ("| NXtomo `.nxs`", "| Probe `.probe` | its TIFFs beside it |  |\n"),
+            ("### NXtomo\n", BLOCK),
+        ),
+        "docs/data-sets.md": (("NXtomo, RTK and CTSimU in", "Probe, "),),
+        "docs/coming-from/cil.md": (("TIFF, NeXus)", "Probe, "),),
+        "tests/docs/test_others_scans.py": (
+            ("MAKERS = {", MAKER),
+            ('"NXtomo": nxtomo, "RTK"', '"Probe": probe, '),
+        ),
+    })  # fmt: skip
+    # The file's geometry stays where another one is given.
+    assert failed(copy, files, word) == {
+        "test_another_geometry_takes_the_place_of_the_files"
+    }
+    module.write_text(PROBE.replace('ConeVec(said["rows"])',
+                                    'geometry or ConeVec(said["rows"])'))  # fmt: skip
+    assert passed(copy, files, word) >= 10
+    done = tested(copy, files, "volume and Probe", "slow")
+    assert "1 passed" in done.stdout, done.stdout[-3000:]
