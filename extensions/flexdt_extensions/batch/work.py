@@ -20,9 +20,8 @@ from typing import Any, Final, assert_never
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material
+from flexdt.phantoms import Phantom, bead_phantom, load_phantom, material, stated_keV
 from flexdt.phantoms.channels import chain_through, channels, line_integrals
-from flexdt.phantoms.materials import only_keV
 from flexdt.phantoms.scan_limits import (
     check_distances,
     check_placement,
@@ -571,7 +570,15 @@ def _physical(plan: Plan, item: Item, cone: ConeVec) -> Array:
     parts = channels(item.phantom)
     panel = detector_of(item.machine.detector)
     tube = tube_of(item.machine.tube)
-    chain = chain_through(parts, panel, tube, only_keV(plan.images.physics))
+    mono_keV: float | None
+    match plan.images.physics:
+        case "mono":
+            mono_keV = stated_keV()
+        case "ideal" | "poly":
+            mono_keV = None
+        case _:
+            assert_never(plan.images.physics)
+    chain = chain_through(parts, panel, tube, mono_keV)
     paths = np.stack([project_body(part.body, cone, item.shape) for part in parts])
     nothing = Chain(panel, tube, mono_keV=chain.mono_keV)
     empty = np.empty((0, *item.shape), dtype=np.float32)
