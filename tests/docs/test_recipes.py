@@ -102,7 +102,7 @@ def run(copy: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-def tested(
+def of_copy(
     copy: Path, files: Iterable[str], word: str, marks: str
 ) -> subprocess.CompletedProcess[str]:
     """Run those tests of `files` in the copy whose names have `word`, and whose marks are these."""
@@ -122,7 +122,7 @@ def tested(
 
 def passed(copy: Path, files: Iterable[str], word: str) -> int:
     """How many tests of `files` whose name has `word` passed in the copy; none may fail."""
-    done = tested(copy, files, word, QUICK)
+    done = of_copy(copy, files, word, QUICK)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     count = re.search(r"(\d+) passed", done.stdout)
     return int(count[1]) if count else 0
@@ -130,7 +130,7 @@ def passed(copy: Path, files: Iterable[str], word: str) -> int:
 
 def failed(copy: Path, files: Iterable[str], word: str) -> set[str]:
     """Functions of `files` whose name has `word` and that fail in the copy."""
-    done = tested(copy, files, word, QUICK)
+    done = of_copy(copy, files, word, QUICK)
     return set(re.findall(r"^FAILED tests/\S*?\.py::(\w+)", done.stdout, re.MULTILINE))
 
 
@@ -439,5 +439,5 @@ def test_a_reader_of_scan_files_is_added_by_its_recipe(copy: Path) -> None:
     module.write_text(PROBE.replace('ConeVec(said["rows"])',
                                     'geometry or ConeVec(said["rows"])'))  # fmt: skip
     assert passed(copy, files, word) >= 10
-    done = tested(copy, files, "volume and Probe", "slow")
+    done = of_copy(copy, files, "volume and Probe", "slow")
     assert "1 passed" in done.stdout, done.stdout[-3000:]
