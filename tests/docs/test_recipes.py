@@ -289,6 +289,12 @@ def test_a_limit_rule_is_added_by_its_recipe(copy: Path) -> None:
             ("    kV: Positive\n    power_W: Positive\n",
              '    max_mA: Positive | None = None\n    """Greatest current [mA]."""\n'),
         ),
+    })  # fmt: skip
+    figures = "every_figure_that_limits"
+    assert failed(copy, files, figures) == {
+        "test_every_figure_that_limits_settings_has_a_case"
+    }
+    inserted(copy, {
         "tests/server/test_setting_doors.py": (
             ('    "max_kV": (M,', '    "max_mA": (HELD, {"power_W": 60.0}),\n'
              '    "max_mA by kV": (HELD, {"kV": 60.0}),\n'),

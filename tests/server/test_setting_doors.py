@@ -37,9 +37,12 @@ from flexdt.twin.script.scan_request import ScanRequest
 BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 8, "material": "aluminium"}
 WORDS = "a rule that was added"
 Asked = dict[str, float]
+SOFTEST = M.model_copy(update={"tube": M.tube.model_copy(update={"min_kV": 40.0})})
 RULES: dict[str, tuple[Machine, Asked]] = {
+    "min_kV": (SOFTEST, {"kV": 39.0}),
     "max_kV": (M, {"kV": M.tube.max_kV + 1.0}),
     "max_W": (M, {"power_W": M.tube.max_W + 1.0}),
+    "min_exposure_ms": (M, {"exposure_ms": 0.5 * M.detector.min_exposure_ms}),
     "max_exposure_ms": (M, {"exposure_ms": M.detector.max_exposure_ms + 1.0}),
 }
 """Figure of a machine -> a machine with it, and a setting beyond it."""
@@ -196,6 +199,11 @@ def test_the_rule_of_a_figure_holds_at_every_door(
 ) -> None:
     machine, asked = RULES[figure]
     assert door(machine, asked, tmp_path)
+
+
+def test_every_figure_that_limits_settings_has_a_case() -> None:
+    figures = [*TubeSpec.model_fields, *DetectorSpec.model_fields]
+    assert {f for f in figures if f.startswith(("min_", "max_"))} <= set(RULES)
 
 
 @pytest.mark.parametrize(
