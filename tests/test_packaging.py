@@ -143,6 +143,7 @@ def environment_with(folder: Path, *more: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {
@@ -172,6 +173,7 @@ def test_the_wheel_of_the_extensions_holds_only_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_the_wheel_imports_as_flexdt_and_nothing_else(
     installed: Path, tmp_path: Path
 ) -> None:

@@ -541,6 +541,7 @@ def test_what_a_scan_cannot_tell_is_refused_with_the_reason() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_the_command_writes_a_correction_that_reconstruct_takes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

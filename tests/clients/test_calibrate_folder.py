@@ -58,6 +58,7 @@ def copy(folder: Path, tmp_path: Path) -> Path:
     return target
 
 
+@pytest.mark.campaign(1)
 def test_a_scanners_folder_is_calibrated_to_the_hidden_truth(
     copy: Path, tmp_path: Path
 ) -> None:

@@ -427,6 +427,7 @@ def restarting(folder: Path, first: Twin) -> tuple[threading.Thread, list[Twin]]
     return thread, made
 
 
+@pytest.mark.campaign(1)
 def test_both_clients_survive_a_killed_and_restarted_server(tmp_path: Path) -> None:
     first = Twin(tmp_path)
     made: list[Twin] = []

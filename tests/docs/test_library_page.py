@@ -89,6 +89,7 @@ def test_the_block_runs(name: str, there: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_the_readmes_lines_run(there: Path, capsys: pytest.CaptureFixture[str]) -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (block,) = [

@@ -17,15 +17,17 @@ import suite
 ROOT = Path(__file__).parents[2]
 
 
-def cases(count: int, *marks: pytest.MarkDecorator) -> list[Any]:
+def cases(
+    count: int, *marks: pytest.MarkDecorator, test: str = "test_drawn"
+) -> list[Any]:
     """Cases of one test of this file."""
 
     def case(number: int) -> Any:
         own = {one.name: one.mark for one in marks}
         return SimpleNamespace(
             path=Path(__file__),
-            originalname="test_drawn",
-            name=f"test_drawn[{number}]",
+            originalname=test,
+            name=f"{test}[{number}]",
             get_closest_marker=own.get,
             add_marker=lambda name: own.__setitem__(
                 name, getattr(pytest.mark, name).mark
@@ -49,13 +51,16 @@ def runs(every: list[Any]) -> str:
     ("mean_s", "marks", "wanted"),
     [
         (0.0, (), "tttttt"),
-        (0.2, (), "tttttt"),
-        (0.4, (), "tststs"),
-        (1.4, (), "tnnsnn"),
+        (0.08, (), "tttttt"),
+        (0.2, (), "tsstss"),
+        (0.4, (), "tnsnsn"),
+        (0.7, (), "snnsnn"),
+        (1.4, (), "snnnnn"),
         (1.6, (), "snnnnn"),
         (9.0, (), "snnnnn"),
         (0.0, (pytest.mark.daily(2),), "tsstss"),
-        (0.9, (pytest.mark.daily(2),), "tnsnsn"),
+        (0.2, (pytest.mark.daily(3),), "tstsss"),
+        (0.9, (pytest.mark.daily(2),), "snnnnn"),
         (0.0, (pytest.mark.daily(2), pytest.mark.campaign(3)), "tnstsn"),
         (9.0, (pytest.mark.campaign(2),), "snnnnn"),
         (0.0, (pytest.mark.slow, pytest.mark.campaign), "nnnnnn"),
@@ -74,6 +79,25 @@ def test_a_test_has_as_many_cases_as_its_budget_allows(
     known.write_text(json.dumps({f"{place}::test_drawn": mean_s}))
     monkeypatch.setattr(suite, "MEASURED", known)
     assert runs(cases(6, *marks)) == wanted
+
+
+def test_a_module_has_as_many_slow_tests_in_ci_as_its_budget_allows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The shortest first, and what is asked for by name."""
+    seconds = {"test_long": 6.0, "test_first": 1.4, "test_second": 3.0, "test_third": 3.1}
+    known = tmp_path / "means.json"
+    place = Path(__file__).relative_to(ROOT).as_posix()
+    known.write_text(json.dumps({f"{place}::{n}": s for n, s in seconds.items()}))
+    monkeypatch.setattr(suite, "MEASURED", known)
+    asked = [pytest.mark.campaign(1)]
+    every = [
+        case
+        for name in seconds
+        for case in cases(1, *(asked if name == "test_long" else ()), test=name)
+    ]
+    assert runs(every) == "sssn"
+    assert runs(cases(1, test="test_long")) == "s"
 
 
 def report(path: Path, **spent: list[float]) -> Path:
@@ -96,7 +120,7 @@ def test_what_no_report_has_is_kept_and_what_is_gone_is_not(tmp_path: Path) -> N
     first = report(tmp_path / "1.xml", **{slow: [2.0, 4.0], fast: [1.0, 1.0]})
     known = durations.merged({here + gone: 5.0}, durations.means([first]))
     assert known == {here + slow: 3.0, here + fast: 1.0}
-    second = report(tmp_path / "2.xml", **{fast: [0.2, 0.4], gone: [3.0]})
+    second = report(tmp_path / "2.xml", **{fast: [0.1, 0.1], gone: [3.0]})
     assert durations.merged(known, durations.means([second])) == {here + slow: 3.0}
 
 

@@ -98,6 +98,7 @@ def test_a_push_to_nobody_is_refused_before_the_work(
     assert not report.exists()
 
 
+@pytest.mark.campaign(1)
 def test_compare_is_within_after_and_not_before(
     flexdt: Run, dataset: Path, tmp_path: Path
 ) -> None:

@@ -46,6 +46,7 @@ def done(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_it_ends_well_and_says_what_it_did(
     done: tuple[subprocess.CompletedProcess[str], Path],
 ) -> None:
@@ -196,6 +197,7 @@ def test_a_truth_inside_the_data_directory_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_ctrl_c_ends_the_demo_and_its_servers(tmp_path: Path) -> None:
     words = ["demo", "--no-viewer", "--out", str(tmp_path)]
     with subprocess.Popen(

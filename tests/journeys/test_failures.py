@@ -162,6 +162,7 @@ def test_abort_marks_the_data_set_incomplete(
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
+@pytest.mark.campaign(1)
 def test_up_stops_cleanly(number: signal.Signals, tmp_path: Path) -> None:
     words = ["up", "--port", "0", "--projector-port", "0", "--viewer-port", "0",
              "--data", str(tmp_path)]  # fmt: skip

@@ -547,6 +547,7 @@ def test_without_pyzmq_it_says_what_to_install(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+@pytest.mark.campaign(1)
 def test_others_are_kept_out(host: str, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "flexdt.clients.gateway.main", "--bind", host, "--port", "0"],

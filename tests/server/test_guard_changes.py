@@ -288,6 +288,7 @@ def test_a_data_set_names_the_sample_that_stands_there_when_the_scan_begins(
     assert document["sample"]["name"] == "normal-3"
 
 
+@pytest.mark.campaign(1)
 def test_an_aborted_job_is_not_queued_again_into_another_sample(wire: Wire) -> None:
     job = running(wire, "again")
     wire.call("job.abort", job=job)

@@ -41,6 +41,7 @@ def correction_of(folder: Path) -> Any:
     return correction
 
 
+@pytest.mark.campaign(1)
 def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
     rays: Process, tmp_path: Path
 ) -> None:
@@ -110,6 +111,7 @@ def test_a_killed_twin_is_as_it_was_and_its_scan_goes_on_to_the_same_bytes(
     assert not process.logged("error", "critical", "unstructured")
 
 
+@pytest.mark.campaign(1)
 def test_an_estop_survives_a_kill_and_positions_in_flight_are_nearly_kept(
     rays: Process, tmp_path: Path
 ) -> None:

@@ -142,6 +142,7 @@ def test_move_projection_and_script_over_plain_lines(rays: Any, tmp_path: Path) 
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(
     tmp_path: Path,
 ) -> None:
@@ -190,6 +191,7 @@ def test_a_projector_killed_in_mid_scan_comes_back_and_nothing_is_lost(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_sigterm_in_mid_scan_ends_cleanly_and_the_data_set_says_incomplete(
     rays: Any, tmp_path: Path
 ) -> None:

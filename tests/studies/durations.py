@@ -5,7 +5,7 @@ build/durations/: processor time, which other work on the machine does not chang
 its fixtures and the processes that ended in it. The files that took more than `--over` seconds
 are listed, the longest first, with their longest test.
 
-`--write` keeps the means of tests whose cases take a second or more together, for
+`--write` keeps the means of tests whose cases take a third of a second or more together, for
 `tests/support/suite.py`, which leaves in `make test` what its budget allows. Tests that are in no
 report keep theirs, and those that are gone lose it.
 """
@@ -23,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "build" / "durations"
 MEASURED = ROOT / "tests" / "support" / "processor_s.json"
-LEAST_S = 1.0
+LEAST_S = 0.3
 """Processor time of all cases of a test from which their mean is kept."""
 
 

@@ -7,7 +7,7 @@ import os
 import shutil
 import signal
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,11 +48,19 @@ ROOT = Path(__file__).parents[2]
 MEASURED = Path(__file__).with_name("processor_s.json")
 """Test -> mean processor time of its cases [s], of those that take long together; written by
 `tests/studies/durations.py --write`."""
-BUDGET_S = 1.5
+BUDGET_S = 0.5
 """Processor time that the cases of one test may take together in `make test`; the others are
 slow."""
-CI_BUDGET_S = 3.0
+CI_BUDGET_S = 1.5
 """The same in CI, where one case is always run; the others are `night`."""
+MODULE_BUDGET_S = 5.0
+"""Processor time that the slow tests of one module may take together in CI, the shortest
+first. One is always run, and of one with `campaign(n)` as many cases as it says; the others
+are `night`."""
+
+
+PURE = [ROOT / "tests" / name for name in ("protocol", "twin", "phantoms")]
+"""Folders of tests that need no socket, process or file: they run first."""
 
 
 def spread_out(items: list[pytest.Item]) -> None:
@@ -60,14 +68,15 @@ def spread_out(items: list[pytest.Item]) -> None:
 
     `daily(n)` leaves n cases in `make test` and marks the others `slow`, and so does
     BUDGET_S. `campaign(n)` leaves n cases in CI and marks the other slow ones, and the
-    page's, `night`, and so does CI_BUDGET_S. The n cases are spread evenly over the table, so
-    that each kind of case is met.
+    page's, `night`, and so do CI_BUDGET_S and MODULE_BUDGET_S. The n cases are spread evenly
+    over the table, so that each kind of case is met.
     """
     mean_s = json.loads(MEASURED.read_text(encoding="utf-8"))
     cases: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
         name = getattr(item, "originalname", None) or item.name
         cases.setdefault((item.path, name), []).append(item)
+    longer: dict[Path, list[tuple[float, list[pytest.Item]]]] = defaultdict(list)
     for (path, name), every in cases.items():
         daily, campaign = (_kept(every, mark) for mark in ("daily", "campaign"))
         _leave(every, daily, "slow")
@@ -81,6 +90,20 @@ def spread_out(items: list[pytest.Item]) -> None:
         if spent * len(in_ci) > CI_BUDGET_S:
             count = max(1, int(CI_BUDGET_S // spent))
             _leave(in_ci, _spread(len(in_ci), count), "night", _is_slow)
+        slow = [i for i in in_ci if _is_slow(i) and not i.get_closest_marker("night")]
+        if slow and campaign is None:
+            longer[path].append((spent * len(slow), slow))
+    for tests in longer.values():
+        _leave_the_longest(tests)
+
+
+def _leave_the_longest(tests: list[tuple[float, list[pytest.Item]]]) -> None:
+    """Mark `night` the slow tests of a module that its budget does not allow in CI."""
+    left = MODULE_BUDGET_S
+    for number, (spent, every) in enumerate(sorted(tests, key=lambda test: test[0])):
+        left -= spent
+        if number and left < 0.0:
+            _leave(every, set(), "night")
 
 
 def _is_slow(item: pytest.Item) -> bool:
@@ -116,10 +139,11 @@ def _kept(every: list[pytest.Item], name: str) -> set[int] | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort modules: those that may take longest first, then those with slow tests, then
-    by their number.
+    """Sort modules: the pure core before what is built on it, so that a mistake shows early;
+    in each those that may take longest first, then those with slow tests, then by their
+    number, so that no worker is left with a long one at the end.
 
-    So no worker is left with a long one at the end. A browser test outside tests/viewer
+    A browser test outside tests/viewer
     raises UsageError, since `make page` looks there alone.
     """
     spread_out(items)
@@ -135,7 +159,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if (mark := item.get_closest_marker("timeout")) is not None:
             allowed_s[item.path] = max(mark.args[0], allowed_s.get(item.path, 0.0))
     items.sort(
-        key=lambda i: (-allowed_s.get(i.path, 0.0), i.path not in slow, -count[i.path])
+        key=lambda i: (
+            not any(i.path.is_relative_to(folder) for folder in PURE),
+            -allowed_s.get(i.path, 0.0),
+            i.path not in slow,
+            -count[i.path],
+        )
     )
 
 

@@ -113,6 +113,7 @@ def here(path: Path, out: Path) -> dict[str, Any]:
 # -- equal bytes ---------------------------------------------------------------------------------
 
 
+@pytest.mark.campaign(1)
 def test_two_numbers_of_processes_give_equal_manifests_and_chunks(
     plan_file: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -275,6 +275,7 @@ def test_what_workers_do_not_do(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_dask_workers_write_the_same_bytes_however_many(
     scan: Path,
     tmp_path: Path,
