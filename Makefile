@@ -1,5 +1,5 @@
-# make install | demo | quick | test | test-extensions | slow (studies, page, campaigns) | failed | docs |
-# web | lint | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
+# make install | demo | quick | test | lint | test-extensions | slow (studies, page, campaigns) | failed | docs |
+# web | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -91,7 +91,7 @@ $(PAGE_LINTED): $(wildcard clients/viewer/data/*.js $(WEB)/*.* clients/viewer/ts
 	@mkdir -p $(@D) && touch $@
 
 $(TYPED): $(SOURCES) | $(STAMP)
-	$(BIN)/mypy -p flexdt -p flexdt_extensions
+	$(BIN)/mypy --num-workers 2 -p flexdt -p flexdt_extensions
 	@mkdir -p $(@D) && touch $@
 
 # The kernels that most tests run: compiled once, not by all workers and by each server they start.
@@ -127,7 +127,7 @@ test-extensions: ready $(TEST_STAMP)
 
 slow: studies page campaigns
 
-# Tests that take more than a second or two: servers as processes, the demonstration, the site, studies
+# Tests that take more than a second or two: servers as processes, the demonstration, studies
 # in their short form. With three workers two cores had nothing to do for almost half of the time.
 studies: ready $(TEST_STAMP) $(WEB_STAMP)
 	$(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'slow and not browser and not night' \

@@ -1,4 +1,4 @@
-"""Run the kernels that many tests share, so that numba's disk cache holds them: `make kernels`.
+"""Run the kernels that many tests share, so that numba's disk cache holds them: `make ready`.
 
 Workers that start together, and every server that one of them starts, would each compile the
 same kernels: more than a minute of processor time each.
