@@ -38,17 +38,18 @@ from flexdt.protocol.rpc_errors import too_large
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.volume_store import memory_of
 from flexdt.server.storage.stored_samples import SampleStore
-from flexdt.twin.errors import MachineFileError, TwinError
+from flexdt.twin.errors import GeometryError, MachineFileError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid
+from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.sampled_views import spot_views
 from flexdt.twin.physics.scatter import Object
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
-from flexdt.twin.scanner.state import Sample, StagePlacement
+from flexdt.twin.scanner.state import Sample, StagePlacement, require_before_source
 
 MAX_TRUTH_VALUE = 1e6
 """Bound on the values of a truth file [mm, deg]; NaN and infinities are not below it."""
@@ -77,6 +78,36 @@ class TrueGeometry:
     def __repr__(self) -> str:
         """Format without the values, which must not be logged."""
         return "TrueGeometry(hidden)"
+
+    def require_applicable(self, machine: Machine, profile: Profile) -> None:
+        """Check it as corrections are checked; no value is repeated.
+
+        Args:
+            machine: whose travel it must suit.
+            profile: zero offsets.
+
+        Raises:
+            GeometryError: names a pose of the travel, if there is one, at which axis or
+                panel are behind the source.
+        """
+        what = "the truth"
+        camera = machine.detector.camera
+        try:
+            require_before_source(machine, profile, camera, self.__parameters, what)
+        except GeometryError as error:
+            pose = error.data.get("pose")
+            place = "it is implausible"
+            if isinstance(pose, dict):
+                motors = ", ".join(f"{name} {x:g}" for name, x in pose.items())
+                place = f"the rotation axis or the panel is behind the source at {motors}"
+            raise GeometryError(
+                f"the truth is no geometry of this machine: {place}",
+                {
+                    "check": "truth",
+                    "pose": pose,
+                    "allowed": "SOD and SDD > 0 at every pose",
+                },
+            ) from None
 
     def cone_vec(self, poses: Poses, placement: StagePlacement) -> ConeVec:
         """Compute the true geometry of each pose, in the frame of a sample at `placement`.

@@ -257,9 +257,11 @@ class TwinServer:
         """Held while the stage is changed, so that changes are made one by one."""
         self.stage = Stage(machine, profile, self.samples)
         self.detours = ObstacleMoves(self.scanner, self.clock, self.stage, self.changed)
+        true_geometry = truth or TrueGeometry()
+        true_geometry.require_applicable(machine, profile)
         self.imaging = Imaging(
             projector,
-            truth or TrueGeometry(),
+            true_geometry,
             self.samples,
             machine.detector.pixels,
             memory_limit,
@@ -441,7 +443,12 @@ class TwinServer:
         correction.
 
         One that is lost or does not fit leaves none in force, with a warning in the log.
+
+        Raises:
+            GeometryError: machine and profile themselves put axis or panel behind the
+                source.
         """
+        self.scanner.require_applicable(None)
         last = self.corrections.in_force
         lost = self.corrections.lost
         if lost is not None:

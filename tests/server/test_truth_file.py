@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.server.imaging.projections import load_truth
-from flexdt.twin.errors import MachineFileError
+from flexdt.server.imaging.projections import TrueGeometry, load_truth
+from flexdt.twin.errors import GeometryError, MachineFileError
+from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
 
 
 @pytest.mark.parametrize(
@@ -21,3 +23,18 @@ def test_a_value_that_no_geometry_can_have_is_refused_with_its_key(
     with pytest.raises(MachineFileError, match=r"truth\.toml: dO_x: ") as caught:
         load_truth(file, tmp_path / "data")
     assert value not in caught.value.message.partition("dO_x: ")[2]
+
+
+@pytest.mark.parametrize(
+    ("value", "where"),
+    [({"det_yaw": 8.125}, "tra_obj -234"), ({"dO_x": 81250.5}, "implausible")],
+)
+def test_a_truth_is_judged_as_a_correction_is_and_not_repeated(
+    value: dict[str, float], where: str
+) -> None:
+    machine = builtin_machine()
+    truth = TrueGeometry(Offsets.from_edge(value))
+    with pytest.raises(GeometryError, match=where) as caught:
+        truth.require_applicable(machine, builtin_profile(machine.default_profile))
+    assert "812" not in str(caught.value) + str(caught.value.data)
+    TrueGeometry().require_applicable(machine, builtin_profile(machine.default_profile))

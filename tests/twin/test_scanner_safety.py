@@ -221,6 +221,52 @@ def test_a_correction_replaces_the_last_and_shows_in_cone_vec_and_readout() -> N
     assert s.correction is None
 
 
+def test_a_correction_is_accepted_only_if_every_pose_has_a_geometry() -> None:
+    """With a yaw, lateral travel counts along the beam. What is accepted has a readout at
+    every corner of the travel, whatever the region of interest; what is refused names a
+    pose at which there is none, or the panel needs its region's centre."""
+    s, draw, accepted = scanner(), np.random.default_rng(11), 0
+    machine, camera = s.machine, s.camera
+    ends = {name: (a.lower, a.upper) for name, a in machine.axes.items()}
+    tilts = ["det_yaw", "det_pitch", "det_roll", "axis_tilt_x", "axis_tilt_z"]
+    for _ in range(60):
+        drawn = {name: float(draw.uniform(-8.0, 8.0)) for name in tilts}
+        drawn |= {
+            "dO_z": float(draw.uniform(-40.0, 40.0)),
+            "alpha": float(draw.uniform(-90.0, 90.0)),
+        }
+        correction = NamedCorrection.from_edge("drawn", "2026-01-01T00:00:00Z", drawn, "")
+        corners = {name: draw.choice(end, 100) for name, end in ends.items()}
+        refusal: GeometryError | None = None
+        try:
+            s.require_applicable(correction)
+        except GeometryError as error:
+            refusal = error
+        if refusal is not None:
+            pose = refusal.data["pose"]
+            assert isinstance(pose, dict)
+            assert all(pose[name] in ends[name] for name in pose)
+            assert all(f"{name} {x:g}" in refusal.message for name, x in pose.items())
+            continue
+        accepted += 1
+        roi = Roi(0, 0, 63, 63) if draw.random() < 0.5 else camera.roi
+        poses = s.poses_at(corners, replace(camera, roi=roi))
+        for i in range(len(poses)):
+            seen = readout(
+                poses[i : i + 1], camera, machine.detector.pixels, correction.parameters
+            )
+            assert seen is not None
+            assert all(np.isfinite(np.ravel(x)).all() for x in vars(seen).values())
+    assert 10 < accepted < 50
+
+
+def test_the_five_requests_that_silenced_a_twin_are_refused_at_the_first() -> None:
+    with pytest.raises(GeometryError, match="tra_tube 419, tra_obj -234, mag_obj 70"):
+        scanner().require_applicable(
+            NamedCorrection.from_edge("yaw", "2026-01-01T00:00:00Z", {"det_yaw": 8.0}, "")
+        )
+
+
 def test_a_readout_follows_whatever_it_is_made_of() -> None:
     """A scanner asked after every change says the same as one that is asked for the first
     time."""

@@ -14,7 +14,7 @@ Voxel size is pixel * SOD / SDD (the thesis's formula has the ratio upside down)
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal, TypedDict
 
@@ -24,9 +24,11 @@ from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import (
     FloatArray,
+    cross,
     rotation_x,
     rotation_y,
     rotation_z,
+    turn_detector,
 )
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets, require_plausible
 from flexdt.twin.geometry.panel import Panel
@@ -423,6 +425,10 @@ def _require_within(
         )
 
 
+BEFORE_SOURCE_MM: Final = 1e-6
+"""Least distance of axis and panel before the source [mm]: more than the rounding of one."""
+
+
 def require_applicable(
     machine: Machine,
     profile: Profile,
@@ -430,54 +436,144 @@ def require_applicable(
     correction: NamedCorrection | None,
 ) -> None:
     """Check that a correction leaves a geometry that a scanner can have, anywhere in the
+    travel; see `require_before_source`.
+
+    Args:
+        machine, profile, camera: as there.
+        correction: None checks the nominal geometry.
+
+    Raises:
+        GeometryError: as there.
+    """
+    if correction is None:
+        what = "the machine file's travel"
+        require_before_source(machine, profile, camera, NOMINAL, what)
+    else:
+        offsets = correction.parameters
+        require_before_source(machine, profile, camera, offsets, "the correction")
+
+
+def require_before_source(
+    machine: Machine,
+    profile: Profile,
+    camera: CameraSettings,
+    offsets: Offsets,
+    cause: str,
+) -> None:
+    """Check that offsets leave a geometry that a scanner can have, anywhere in the
     travel.
 
-    Three checks: each offset is plausible beside the machine's longest linear travel; the
-    geometry is one of a scanner, and the axis in front of the source, both at the motor
-    positions nearest to the source.
+    Each offset is plausible beside the machine's longest linear travel; rotation axis and
+    panel are before the source at every pose of the travel, whatever the region of
+    interest; and the rows are of the camera's pixels.
 
     Args:
         machine: with the travel of its motors.
         profile: zero offsets.
         camera: settings in force.
-        correction: None checks the nominal geometry.
+        offsets: correction, or true misalignment.
+        cause: of the geometry, for the message.
 
     Raises:
-        GeometryError: it does not; the message names the offset or the check.
+        GeometryError: it does not; the message names the offset, or the positions of the
+            motors at the worst pose.
     """
-    offsets = NOMINAL
-    if correction is not None:
-        offsets = correction.parameters
     travels = (a.upper - a.lower for a in machine.axes.values() if a.unit == "mm")
     require_plausible(offsets, max(travels, default=math.inf))
-    sensor = machine.detector.pixels
-    nearest = motor_poses(machine, profile, camera, _nearest(machine))
-    cone = check_cone_vec(nearest.cone_vec(offsets), camera.pixels_mm(sensor))
-    if readout(nearest, camera, sensor, offsets) is None:
-        what = "the correction"
-        if correction is None:
-            what = "the machine file's travel"
+    whole = Roi(
+        0, 0, machine.detector.pixels.columns - 1, machine.detector.pixels.rows - 1
+    )
+    everywhere = replace(camera, roi=whole)
+    for what, pose, mm in _least_before_source(machine, profile, everywhere, offsets):
+        if mm > BEFORE_SOURCE_MM:
+            continue
+        place = ", ".join(f"{name} {x:g}" for name, x in pose.items())
         raise GeometryError(
-            f"{what} puts the rotation axis behind the source somewhere",
-            {"check": "sod", "source": cone.source[0].tolist(), "allowed": "SOD > 0"},
+            f"{cause} puts the {what} behind the source ({mm:.4g} mm before it) at {place}",
+            {"check": "sod", "pose": pose, "asked": mm, "allowed": "> 0 at every pose"},
+        )
+    home = motor_poses(machine, profile, camera, {}).cone_vec(offsets)
+    check_cone_vec(home, camera.pixels_mm(machine.detector.pixels))
+
+
+def _least_before_source(
+    machine: Machine, profile: Profile, camera: CameraSettings, offsets: Offsets
+) -> Iterator[tuple[str, dict[str, float], float]]:
+    """Yield what must be before the source, the pose of the travel at which it is least
+    so, and how far there [mm].
+
+    The three distances are affine in the positions of the motors: no motor turns source
+    or panel, so that the panel's normal n and the tilted axis's direction t are the same
+    at every pose, and a turntable moves no point of its axis. Between the source and the
+    axis, the vector w is affine, and so are n . w (SOD), n . (w - (t . w) t) (the point
+    of the axis at the source's height) and the panel's n . d. An affine function has its
+    least value over a box in a corner, and which end of each travel that is does not
+    depend on the other motors: two poses of each motor tell it. A region of interest
+    shifts the panel's centre in its untilted plane, which with a yaw counts along the
+    beam: the farthest shift, half a panel, is taken away.
+
+    Yields:
+        Name; motor -> position [mm, deg], of those that matter; distance [mm].
+    """
+    names = list(machine.axes)
+    ends = [machine.axes[name] for name in names]
+    standing = np.array([a.home for a in ends])
+    lower = np.array([a.lower for a in ends])
+    upper = np.array([a.upper for a in ends])
+    tried = np.tile(standing, (2 * len(names), 1))
+    each = np.arange(len(names))
+    tried[each, each] = lower
+    tried[len(names) + each, each] = upper
+
+    def distances(positions: FloatArray) -> FloatArray:
+        """Compute the three distances of each pose (n, motors): (n, 3) [mm]."""
+        columns = dict(zip(names, positions.T, strict=True))
+        return _before_source(
+            machine, motor_poses(machine, profile, camera, columns), offsets
         )
 
+    at_lower, at_upper = np.split(distances(tried), 2)
+    for k, what in enumerate(
+        ("rotation axis", "rotation axis at the source's height", "panel")
+    ):
+        change = at_upper[:, k] - at_lower[:, k]
+        matters = np.abs(change) > BEFORE_SOURCE_MM
+        worst = np.where(change > 0.0, lower, upper)
+        worst = np.where(matters, worst, standing)
+        pose = {
+            name: float(x) for name, x, m in zip(names, worst, matters, strict=True) if m
+        }
+        yield what, pose, float(distances(worst[None])[0, k])
 
-def _nearest(machine: Machine) -> dict[str, float]:
-    """Compute the motor positions that bring sample and detector nearest to the source.
 
-    A motor goes to the end of its travel by the sign of its two factors along the beam,
-    added; where they add up to 0 it stays at home.
+def _before_source(machine: Machine, poses: Poses, offsets: Offsets) -> FloatArray:
+    """Compute how far axis, axis at the source's height, and the panel under its least
+    favourable region of interest are before the source, (n, 3) [mm].
 
-    Returns:
-        Motor -> position [mm, deg], of every motor.
+    Args:
+        machine: has the sensor's size.
+        poses: nominal, n, with the whole sensor read out.
+        offsets: to be added.
     """
-    along = {
-        name: machine.geometry.get("object_y", {}).get(name, 0.0)
-        + machine.geometry.get("detector_y", {}).get(name, 0.0)
-        for name in machine.axes
-    }
-    return {
-        name: a.lower if along[name] > 0 else a.upper if along[name] < 0 else a.home
-        for name, a in machine.axes.items()
-    }
+    cone = poses.cone_vec(offsets)
+    beam = np.array([offsets.tau_x, offsets.tau_z, 0.0]) - poses.mount - cone.source
+    level = beam * [1.0, 1.0, 0.0]
+    turned = cross(
+        *turn_detector(
+            poses.u, poses.v, offsets.det_yaw, offsets.det_pitch, offsets.det_roll
+        )
+    )
+    along = np.abs(np.einsum("nki,ni->nk", np.stack([poses.u, poses.v], axis=1), turned))
+    halves = 0.5 * np.array(machine.detector.pixels.size_mm)
+    pitches = np.linalg.norm(turned, axis=1, keepdims=True) * np.stack(
+        [np.linalg.norm(poses.u, axis=1), np.linalg.norm(poses.v, axis=1)], axis=1
+    )
+    shift = (along / pitches) @ halves
+    return np.stack(
+        [
+            np.einsum("ni,ni->n", beam, cone.normal),
+            np.einsum("ni,ni->n", level, cone.normal),
+            cone.source_detector_distance - shift,
+        ],
+        axis=1,
+    )
