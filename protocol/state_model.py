@@ -217,7 +217,8 @@ class State(Result):
     tube: TubeState
     camera: CameraState
     sample: SampleState
-    geometry: GeometryState
+    geometry: GeometryState | None
+    """null where there is none at this pose, or none could be computed; `missing` says why"""
     safety: SafetyState
     job: JobStatus | None = None
     correction: Correction | None = None
@@ -232,6 +233,10 @@ class State(Result):
     projector: str | None = None
     """why no image can be computed now, as where no projector answers; null where nothing is
     wrong, or without subscribers to the state"""
+    missing: dict[str, str] = Field(default_factory=dict)
+    """what is derived and could not be computed -> why, in words: `geometry`, `clearance`,
+    `sample` (its size, description and revision), `job`, `correction`, `image`. It is null in
+    this state; time, axes, tube, camera, safety, clock and controller are told all the same"""
 
 
 class Stopping(Result):

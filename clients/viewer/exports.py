@@ -180,11 +180,15 @@ def beside(state: State | None, image: ShownImage | None) -> str:
     if state is None:
         return ""
     at = state.geometry
-    rows = {
-        "source to sample": f"{at.SOD_mm:.2f} mm",
-        "source to detector": f"{at.SDD_mm:.2f} mm",
-        "magnification": f"{at.magnification:.4f}",
-        "voxel": f"{1000 * at.voxel_size_mm:.2f} µm",
+    rows = {}
+    if at is not None:
+        rows = {
+            "source to sample": f"{at.SOD_mm:.2f} mm",
+            "source to detector": f"{at.SDD_mm:.2f} mm",
+            "magnification": f"{at.magnification:.4f}",
+            "voxel": f"{1000 * at.voxel_size_mm:.2f} µm",
+        }
+    rows |= {
         "beam": f"{state.tube.kV:.0f} kV, {state.tube.power_W:.0f} W",
         "correction": "none" if state.correction is None else state.correction.name,
         "axes": "x right, y to the detector, z up",

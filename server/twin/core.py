@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Collection, Coroutine
 from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -512,16 +513,17 @@ class TwinServer:
     # Reading ------------------------------------------------------------------------------------
 
     def state(self) -> w.State:
-        """Compute the complete state for the wire.
+        """Compute the complete state for the wire; it raises nothing.
 
         Job, correction, controller, image, unsaved problem and projector problem are None
-        where there is none.
-
-        Raises:
-            GeometryError: the pose is impossible for a scanner.
+        where there is none. What is derived from the pose, the sample or files is None,
+        too, where it cannot be computed; `missing` then has the reason. So a stop, an
+        E-stop and a reset are always answered.
         """
         snapshot = self.scanner.state(self.clock.now())
         job = self.jobs.current
+        missing: dict[str, str] = {}
+        part = partial(state_views.derived, missing)
         problem = self.state_store.problem
         watch = self.projector_watch
         return w.State(
@@ -531,16 +533,23 @@ class TwinServer:
             },
             tube=state_views.tube_view(snapshot.tube, snapshot.time),
             camera=state_views.camera_view(snapshot.camera, self.machine),
-            sample=self.sample_state(),
-            geometry=state_views.geometry_view(snapshot.readout),
-            safety=state_views.safety_view(
-                snapshot.safety, self._clearance(snapshot), self.machine.safety_margin_mm
+            sample=part("sample", self.sample_state) or self._placed_sample(),
+            geometry=part(
+                "geometry", lambda: state_views.geometry_view(snapshot.readout)
             ),
-            job=None if job is None else self.jobs.status(job),
-            correction=self.correction_state(snapshot.correction),
+            safety=state_views.safety_view(
+                snapshot.safety,
+                part("clearance", lambda: self._clearance(snapshot)),
+                self.machine.safety_margin_mm,
+            ),
+            job=None if job is None else part("job", lambda: self.jobs.status(job)),
+            correction=part(
+                "correction", lambda: self.correction_state(snapshot.correction)
+            ),
             clock=state_views.clock_view(self.clock),
             controller=self.control.holder,
-            image=self.live.seen,
+            image=part("image", lambda: self.live.seen),
+            missing=missing,
             unsaved=None if problem is None else str(from_root(problem, self.root)),
             projector=None if watch is None else watch.problem,
         )
@@ -570,19 +579,27 @@ class TwinServer:
         force: voxels have none.
         """
         sample = self.scanner.sample
-        offset = w.SamplePlacement(**asdict(sample.offset))
+        placed = self._placed_sample()
         phantom = self.stage.phantom(sample)
         if phantom is None:
-            return w.SampleState(
-                name=sample.name or None, material=sample.material, offset=offset
-            )
+            return placed
         return w.SampleState(
             name=sample.name,
             material=sample_material(self.samples.head(sample.name), sample.material),
-            offset=offset,
+            offset=placed.offset,
             size_mm=phantom.size_mm,
             description=phantom.description,
             revision=self.samples.revision(sample.name),
+        )
+
+    def _placed_sample(self) -> w.SampleState:
+        """Describe the sample by its name, material and placement alone, which the
+        scanner itself knows.
+        """
+        sample = self.scanner.sample
+        offset = w.SamplePlacement(**asdict(sample.offset))
+        return w.SampleState(
+            name=sample.name or None, material=sample.material, offset=offset
         )
 
     def correction_state(self, correction: NamedCorrection | None) -> w.Correction | None:
@@ -728,9 +745,13 @@ class TwinServer:
         """Publish a job's status, log a new phase, and notify all watchers of the twin.
 
         The phases "running" and the one logged last are not logged. A job with an error
-        is logged as an error.
+        is logged as an error. A status that cannot be computed is left out: a stop that
+        pauses the job goes on.
         """
-        status = self.jobs.status(job)
+        status = state_views.derived({}, "job", lambda: self.jobs.status(job))
+        if status is None:
+            self.changed()
+            return
         self.hub.publish("job", status, slot=job.id)
         if status.state not in ("running", job.logged):
             data: dict[str, object] = {"job": job.id, "error": status.error}

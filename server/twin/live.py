@@ -413,11 +413,6 @@ class StateFeed:
                 settled()
 
     def _publish(self) -> None:
-        """Publish the state if anybody is subscribed to it; a TwinError is logged as a
-        warning, not raised.
-        """
-        try:
-            if self.hub.wanted("state"):
-                self.hub.publish("state", lambda _view: self.render())
-        except TwinError as error:
-            log("state not published", logging.WARNING, reason=str(error))
+        """Publish the state if anybody is subscribed to it."""
+        if self.hub.wanted("state"):
+            self.hub.publish("state", lambda _view: self.render())

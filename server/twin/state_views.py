@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Callable
+from typing import TypeVar
 
 from flexdt.protocol import state_model as w
+from flexdt.runtime.log import log
 from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.server.storage.scene_document import correction_fields
 from flexdt.twin.collision.first_contact import NearestPair
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.joining import StopMotion
@@ -34,6 +38,32 @@ def tube_view(tube: TubeSettings, now: float) -> w.TubeState:
 def camera_view(camera: CameraSettings, machine: Machine) -> w.CameraState:
     """Convert the camera's state to its wire form."""
     return w.CameraState(**camera.facts(machine.detector.pixels))
+
+
+Value = TypeVar("Value")
+
+
+def derived(
+    missing: dict[str, str], name: str, make: Callable[[], Value]
+) -> Value | None:
+    """Compute a derived part of the state, whatever it meets.
+
+    Args:
+        missing: gets the reason under `name` where it could not be computed.
+        name: of the part.
+        make: computes it.
+
+    Returns:
+        The part; None where it could not be computed.
+    """
+    try:
+        return make()
+    except TwinError as error:
+        missing[name] = error.message
+    except Exception as error:  # whatever it meets, where the motors are is told
+        log(f"the state's {name} cannot be computed", logging.ERROR, error=True)
+        missing[name] = f"it cannot be computed: {type(error).__name__}"
+    return None
 
 
 def geometry_view(readout: Readout | None) -> w.GeometryState:

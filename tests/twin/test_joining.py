@@ -278,6 +278,34 @@ def test_an_estop_of_category_0_coasts_says_what_it_hits_and_is_blocked_then() -
     assert s.safety.state == "ready"
 
 
+def test_an_estop_that_coasts_acts_whatever_its_sweep_meets(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What it would hit is said where it can be computed; the motors coast in any case, and
+    nothing moves off where contacts cannot be judged."""
+    estop = M.estop.model_copy(
+        update={"category": 0, "coasting": dict.fromkeys(M.axes, 20.0)}
+    )
+    guard = SceneGuard(build_scene(M, P, ()))
+    s = ScannerTwin(M.model_copy(update={"estop": estop}), P, guard=guard)
+    s.move({"mag_obj": 600.0}, 0.0)
+
+    def fail(*_: object, **__: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(SceneGuard, "__call__", fail)
+    monkeypatch.setattr(SceneGuard, "touching", fail)
+    stopping = s.estop(3.0)
+    assert (stopping.path, stopping.would_hit) == ("coasting", None)
+    end = s.rest_time(3.0)
+    assert s.state(end).safety.state == "estopped"
+    s.reset(end)
+    assert s.state(end).safety.state == "ready"
+    with pytest.raises(ZeroDivisionError):
+        s.move({"mag_obj": 500.0}, end)
+    assert s.rest_time(end) == end
+
+
 def test_coasting_ends_at_the_end_of_the_travel() -> None:
     coasting = dict.fromkeys(M.axes, 1.0)
     estop = M.estop.model_copy(update={"category": 0, "coasting": coasting})

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Unpack, assert_never
 
 import numpy.typing as npt
 
-from flexdt.twin.errors import CollisionError, SafetyError
+from flexdt.twin.errors import CollisionError, GeometryError, SafetyError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
@@ -242,17 +243,17 @@ class ScannerTwin:
 
         Returns:
             Distances, magnification, voxel and field; None where SOD or SDD is not
-            positive.
+            positive, or no geometry can be computed.
         """
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self.camera, self.parameters)
         if self._derived[0] != made_of:
             poses = self.poses_at(positions, self.camera)
             sensor = self.machine.detector.pixels
-            self._derived = (
-                made_of,
-                readout(poses, self.camera, sensor, self.parameters),
-            )
+            found = None
+            with suppress(GeometryError):
+                found = readout(poses, self.camera, sensor, self.parameters)
+            self._derived = (made_of, found)
         return self._derived[1]
 
     # Motion
@@ -431,7 +432,9 @@ class ScannerTwin:
                 trajectories = coasting(
                     self.machine, self._drives, now, self.machine.estop.coasting
                 )
-                hit = ahead.contact(trajectories) if trajectories else None
+                hit = None
+                with suppress(Exception):  # whatever a sweep meets, the motors coast
+                    hit = ahead.contact(trajectories) if trajectories else None
                 ends = (t.end for t in trajectories.values())
                 self._coasts_until = max(ends, default=now)
                 return self._stopped(StopMotion.of(trajectories, "coasting", now, hit))
@@ -705,7 +708,7 @@ class ScannerTwin:
         """
         self.require_applicable(correction)
         self._set_stage(sample, correction, guard)
-        self.safety = with_contact(self.safety, self._touching(now))
+        self.safety = self._safety_at(now)
         pair = self.safety.contact
         if pair is None:
             return []
@@ -854,12 +857,19 @@ class ScannerTwin:
         return self._judged[1]
 
     def _safety_at(self, now: float) -> Safety:
-        """Return the safety state, with contact judged by where the parts are."""
-        return with_contact(self.safety, self._touching(now))
+        """Return the safety state, with contact judged by where the parts are.
+
+        Where that cannot be judged it is the contact known before; no motion begins then
+        (`_require_ready`).
+        """
+        try:
+            return with_contact(self.safety, self._touching(now))
+        except Exception:  # whatever the guard meets, the safety state is told
+            return self.safety
 
     def _require_ready(self, what: str, now: float) -> None:
         """Update the safety state, and raise SafetyError unless motion is allowed."""
-        self.safety = self._safety_at(now)
+        self.safety = with_contact(self.safety, self._touching(now))
         rules.require_ready(self.safety, what)
 
     def _blocked(

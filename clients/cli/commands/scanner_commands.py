@@ -93,17 +93,21 @@ def _facts(state: State) -> list[tuple[str, str]]:
     t = state.tube
     s = state.sample
     rows, cols = c.shape
-    facts = [
-        (
-            "geometry",
-            f"SOD {g.SOD_mm:.4f} mm, SDD {g.SDD_mm:.4f} mm, magnification "
-            f"{g.magnification:.4f}, voxel {g.voxel_size_mm * 1000:.3f} um",
-        ),
-        (
-            "view",
-            f"{g.field_of_view_mm[0]:.2f} x {g.field_of_view_mm[1]:.2f} mm, piercing point "
-            f"column {g.piercing_point_px[0]:.2f}, row {g.piercing_point_px[1]:.2f}",
-        ),
+    facts = [("missing", f"{name}: {why}") for name, why in state.missing.items()]
+    if g is not None:
+        facts += [
+            (
+                "geometry",
+                f"SOD {g.SOD_mm:.4f} mm, SDD {g.SDD_mm:.4f} mm, magnification "
+                f"{g.magnification:.4f}, voxel {g.voxel_size_mm * 1000:.3f} um",
+            ),
+            (
+                "view",
+                f"{g.field_of_view_mm[0]:.2f} x {g.field_of_view_mm[1]:.2f} mm, piercing point "
+                f"column {g.piercing_point_px[0]:.2f}, row {g.piercing_point_px[1]:.2f}",
+            ),
+        ]
+    facts += [
         ("tube", f"{xrays(t)}, {t.kV:g} kV, {t.power_W:g} W"),
         (
             "camera",

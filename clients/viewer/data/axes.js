@@ -51,9 +51,11 @@ const JOG_FALLBACK = { mm: 50, deg: 45 };
  */
 
 /** @param {State} s */
-const sod = (s) => s.geometry.SOD_mm;
+const sod = (s) => s.geometry?.SOD_mm ?? NaN;
 /** @param {State} s */
-const sdd = (s) => s.geometry.SDD_mm;
+const sdd = (s) => s.geometry?.SDD_mm ?? NaN;
+/** @param {State} s */
+const voxel_um = (s) => 1000 * (s.geometry?.voxel_size_mm ?? NaN);
 const high = () => store.framing?.sample_height_mm ?? NaN;
 /** @type {Main[]} */
 const MAINS = [
@@ -82,7 +84,7 @@ const MAINS = [
     unit: "×",
     digits: 3,
     tip: "How much larger the sample is on the panel: SDD / SOD. Setting it moves the sample.",
-    now: (s) => s.geometry.magnification,
+    now: (s) => s.geometry?.magnification ?? NaN,
     axes: ["mag_obj"],
     shift: (s, v) => sdd(s) / v - sod(s),
   },
@@ -93,9 +95,9 @@ const MAINS = [
     tip:
       "A pixel of the image, as large as it is at the sample: pixel / magnification. " +
       "Setting it moves the sample.",
-    now: (s) => 1000 * s.geometry.voxel_size_mm,
+    now: voxel_um,
     axes: ["mag_obj"],
-    shift: (s, v) => sod(s) * (v / (1000 * s.geometry.voxel_size_mm) - 1),
+    shift: (s, v) => sod(s) * (v / voxel_um(s) - 1),
   },
   {
     words: "Sample above beam",

@@ -153,7 +153,7 @@ async function begin() {
 // Voxels are pixels of the mode that is set, at the distances that stand.
 let pixel_um = 0;
 function scaleVoxels() {
-  if (!store.state) return;
+  if (!store.state?.geometry) return;
   const { camera, geometry } = store.state;
   pixel_um = 1000 * camera.pixel_mm;
   scales.voxel_um = { low: pixel_um / VOXEL_RANGE, high: pixel_um, log: true };
@@ -200,6 +200,10 @@ async function predict() {
   }
   predicted = made();
   const { geometry: g, camera } = state;
+  if (!g) {
+    fail(state.missing["geometry"] ?? "no geometry here");
+    return;
+  }
   const bars = bySliders();
   setText(facts, `predicting a scan of ${sampleOf(predicted) || "nothing"} …`);
   const sod_mm = (bars.voxel_um / 1000 / camera.pixel_mm) * g.SDD_mm;
@@ -291,7 +295,7 @@ function draw(transmission) {
 }
 on("state", (s) => {
   if (!begun()) return;
-  const seen = JSON.stringify([s.camera.mode, s.camera.roi, s.geometry.SDD_mm.toFixed(1)]);
+  const seen = JSON.stringify([s.camera.mode, s.camera.roi, s.geometry?.SDD_mm.toFixed(1)]);
   if (pixel_um !== 1000 * s.camera.pixel_mm) scaleVoxels();
   const other = predicted ? differences(predicted, made()) : [];
   if (card.open && panel && seen !== panel) changed();

@@ -88,7 +88,7 @@ export function ofNow(state, coneVec, hello) {
     motors: Object.entries(state.axes)
       .filter(([, axis]) => !axis.virtual)
       .map(([name, axis]) => [name, axis.position]),
-    distances: [state.geometry.SOD_mm, state.geometry.SDD_mm],
+    distances: state.geometry && [state.geometry.SOD_mm, state.geometry.SDD_mm],
     camera: settings(camera),
     tube: [tube.kV, tube.power_W],
     lit: tube.on && tube.ready,

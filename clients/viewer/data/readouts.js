@@ -72,7 +72,9 @@ function readouts() {
   });
   setText(cells[ROWS.length], live ? beam(s.tube) : recordedBeam(recorded?.tube ?? null));
   setText($("#geometry-title"), heading("Geometry", subject()));
-  setText($("#geometry-of"), live ? "" : geometry ? "nominal, as scanned" : "not known");
+  const of = live ? "" : "nominal, as scanned";
+  const none = () => (live ? (s.missing["geometry"] ?? "") : "not known");
+  setText($("#geometry-of"), geometry ? of : none());
 }
 
 /** @param {{ kV: number | null; power_W: number | null; on: boolean } | null} tube */

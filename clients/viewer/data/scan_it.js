@@ -127,7 +127,7 @@ async function composed(frames, voxel_um) {
  * @returns {Promise<Answers["viewer.compose"] | null>}
  */
 async function script(state, views) {
-  const now_um = 1000 * (state.geometry.voxel_size_mm ?? 0.1);
+  const now_um = 1000 * (state.geometry?.voxel_size_mm ?? 0.1);
   const wanted_um = filling(state);
   const near = wanted_um !== null && Math.abs(wanted_um / now_um - 1) > SAME ? wanted_um : null;
   let refused = "";

@@ -108,7 +108,9 @@ let last = "";
 /** @param {State} s */
 function draw(s) {
   const height_mm = store.framing?.sample_height_mm ?? 0;
-  const outside = outline(s.sample, s.geometry, s.camera, height_mm, store.across_mm);
+  const outside = s.geometry
+    ? outline(s.sample, s.geometry, s.camera, height_mm, store.across_mm)
+    : [];
   const cut = outside.map((words) => /** @type {Warning} */ (["", words]));
   const list = [...ofMachine(s), ...cut, ...ofImage(s), ...ofScan(s)];
   const key = JSON.stringify(list);

@@ -235,15 +235,17 @@ export type Scrub = { time_s?: number | null };
 export type Spectrum = { kV: number };
 export type State = {
   time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState;
-  sample: SampleState; geometry: GeometryState; safety: SafetyState; job: JobStatus | null;
+  sample: SampleState; geometry: GeometryState | null; safety: SafetyState; job: JobStatus | null;
   correction: Correction | null; clock: ClockState; controller: string | null;
-  image: ImageFlags | null; unsaved: string | null; projector: string | null
+  image: ImageFlags | null; unsaved: string | null; projector: string | null;
+  missing: Record<string, string>
 };
 export type Stopped = {
   time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState;
-  sample: SampleState; geometry: GeometryState; safety: SafetyState; job: JobStatus | null;
+  sample: SampleState; geometry: GeometryState | null; safety: SafetyState; job: JobStatus | null;
   correction: Correction | null; clock: ClockState; controller: string | null;
-  image: ImageFlags | null; unsaved: string | null; projector: string | null
+  image: ImageFlags | null; unsaved: string | null; projector: string | null;
+  missing: Record<string, string>
 };
 export type SubmitResult = {
   job: string; dataset: string | null; warnings: Array<string>

@@ -18,6 +18,7 @@ from flexdt.protocol.methods.scanner_messages import CameraSet, TubeSet
 from flexdt.protocol.rpc_errors import invalid_params, problem, too_large
 from flexdt.server.imaging.radiography import marks_of
 from flexdt.server.imaging.radiography import predict as forecast
+from flexdt.server.twin import state_views
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.handler import Client, answers
 from flexdt.server.twin.handlers.motion_methods import camera_change
@@ -188,6 +189,7 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
 
     Raises:
         LimitError: the stage is empty, or a setting is beyond the machine's limits.
+        GeometryError: a distance is left out where the present pose has none.
     """
     sample = twin.scanner.sample
     scanner = twin.scanner
@@ -197,7 +199,10 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
     material = None
     if name == sample.name:
         material = sample.material
-    at = twin.state().geometry
+    sod, sdd = params.sod_mm, params.sdd_mm
+    if sod is None or sdd is None:
+        here = state_views.geometry_view(scanner.state(twin.clock.now()).readout)
+        sod, sdd = sod or here.SOD_mm, sdd or here.SDD_mm
     lit = scanner.tube
     camera = scanner.camera
     settings = {
@@ -213,8 +218,8 @@ async def predict(twin: TwinServer, client: Client, params: p.ExposurePredict) -
         "kind": params.kind,
         "profile": scanner.profile,
         "start": twin.submissions.start(),
-        "sod": params.sod_mm or at.SOD_mm,
-        "sdd": params.sdd_mm or at.SDD_mm,
+        "sod": sod,
+        "sdd": sdd,
     }
     async with twin.samples.turn:
         phantom = await asyncio.to_thread(twin.samples.load, name, material)
