@@ -21,7 +21,8 @@ from __future__ import annotations
 import re
 import struct
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
 from itertools import chain, islice
 from typing import Any, Final, TypeGuard, assert_never
 
@@ -51,6 +52,9 @@ MAX_ANSWER: Final[Mapping[Codec, int]] = {Codec.JSON: 64 << 20, Codec.MSGPACK: M
 
 MAX_OVERTAKING_BYTES: Final = 1 << 16
 """Larger messages are sent in pieces and do not overtake others [bytes]."""
+
+MAX_EXAMINED_BYTES: Final = 1 << 20
+"""Larger received messages are not examined before their turn [bytes]."""
 
 MAX_COPIED_BYTES: Final = 2**16 - 1
 """Payloads up to this size are copied into the head and have a shorter header [bytes]."""
@@ -130,7 +134,7 @@ class Connection:
         self._fed = 0
         """Number of messages in `_new` before the last `feed`."""
         self._suspect = False
-        """Whether `_new` contains an urgent name that `overtake` has still to reach."""
+        """Whether `_new` may contain an urgent name that `overtake` has still to reach."""
         self._held = 0
         """Bytes in `_ready` and `_new`."""
         self._begun = bytearray()
@@ -144,9 +148,14 @@ class Connection:
     @property
     def pending(self) -> int:
         """Bytes held of messages that have not been taken out, framing included."""
+        return self.pending_whole + len(self._begun)
+
+    @property
+    def pending_whole(self) -> int:
+        """Bytes of complete messages that wait to be taken out, framing included."""
         # Counted with the bodies, so that a flood of empty messages fills the allowance, too.
         framing = 1 if self.codec is Codec.JSON else 4
-        return self._held + framing * self.waiting + len(self._begun)
+        return self._held + framing * self.waiting
 
     @property
     def waiting(self) -> int:
@@ -367,14 +376,17 @@ class Connection:
         return bool(self._new)
 
     def overtake(
-        self, names: Collection[bytes], wanted: Callable[[bytes], bool], most: int = 32
+        self,
+        names: tuple[bytes, ...],
+        wanted: Callable[[bytes], bool],
+        most: int = 32,
     ) -> list[bytes]:
         """Take urgent messages out of the queue before their turn.
 
-        Every message up to `MAX_OVERTAKING_BYTES` is examined once: first its bytes are
-        searched for `names`, which is fast, and only a message with a match is passed to
-        `wanted`, which may decode it. Errors, larger messages and those that `wanted`
-        declines keep their place.
+        Every message up to `MAX_EXAMINED_BYTES` is examined once: first its bytes are
+        searched, which is fast, and only a message that `may_name` one of `names` is
+        passed to `wanted`, which may decode it. Errors, larger messages and those that
+        `wanted` declines keep their place.
 
         Args:
             names: names of urgent methods, as bytes.
@@ -389,14 +401,13 @@ class Connection:
         looked = 0
         if not self._suspect:
             # One search for all of them: usually there is no name, and none is looked at alone.
-            searched = _joined(self._new)
-            self._suspect = any(name in searched for name in names)
+            self._suspect = self._may_name(_joined(self._new), names)
         if not self._suspect:
             self._ready += self._new
             self._new.clear()
         while self._new and looked < most:
             message = self._new.popleft()
-            if _small(message) and any(name in message for name in names):
+            if _examined(message) and self._may_name(message, names):
                 looked += 1
                 if wanted(message):
                     out.append(message)
@@ -408,8 +419,25 @@ class Connection:
         return out
 
     def holds(self, name: bytes) -> bool:
-        """Return whether a message completed by the last `feed` contains the bytes `name`."""
-        return name in _joined(islice(self._new, self._fed, None))
+        """Return whether a message completed by the last `feed` may contain the text `name`."""
+        return self._may_name(_joined(islice(self._new, self._fed, None)), (name,))
+
+    def withdraw(self, message: bytes) -> bool:
+        """Take a message that `overtake` left in the queue out of it, by identity.
+
+        Returns:
+            Whether it was still there.
+        """
+        for at, ready in enumerate(self._ready):
+            if ready is message:
+                del self._ready[at]
+                self._held -= len(message)
+                return True
+        return False
+
+    def _may_name(self, raw: bytes, names: tuple[bytes, ...]) -> bool:
+        """Return whether received bytes may contain one of `names` as a text; see `may_name`."""
+        return may_name(self.codec or Codec.JSON, raw, names)
 
     def _end(self) -> None:
         """Mark the connection as closed and discard all bytes and messages not taken out yet."""
@@ -480,16 +508,40 @@ def _may_hold_http(data: bytes) -> bool:
     return any(mark in lower for mark in _HTTP_MARKS)
 
 
+def may_name(codec: Codec, raw: bytes, names: tuple[bytes, ...]) -> bool:
+    """Return whether an encoded document may contain one of `names` as a text.
+
+    False is certain, True is not: a valid document that contains the text never gives
+    False. MessagePack writes a text as its bytes. JSON writes each character of it as
+    itself or as an escape, and the only escape of a printable ASCII character other than
+    `"`, `/` and the backslash is `\\u00` and two hexadecimal digits.
+
+    Args:
+        codec: of the document.
+        raw: its bytes, or those of several.
+        names: of printable ASCII characters other than these three.
+    """
+    if any(name in raw for name in names):
+        return True
+    return codec is Codec.JSON and _escape_of(names).search(raw) is not None
+
+
+@cache
+def _escape_of(names: tuple[bytes, ...]) -> re.Pattern[bytes]:
+    """Make the expression of a JSON escape of any character of `names`."""
+    digits = "|".join(sorted({f"{character:02x}" for character in b"".join(names)}))
+    return re.compile(rf"\\u00(?:(?i:{digits}))".encode())
+
+
 def _joined(messages: Iterable[bytes | Malformed]) -> bytes:
-    """Join the small messages into one piece for a search (10^4 take a millisecond)."""
-    return b"\n".join(
-        [m for m in messages if isinstance(m, bytes) and len(m) <= MAX_OVERTAKING_BYTES]
-    )
+    """Join the messages to be examined into one piece for a search (10^4 take a
+    millisecond)."""
+    return b"\n".join(filter(_examined, messages))
 
 
-def _small(message: bytes | Malformed) -> TypeGuard[bytes]:
-    """Return whether this is a message short enough to be decoded while others wait."""
-    return isinstance(message, bytes) and len(message) <= MAX_OVERTAKING_BYTES
+def _examined(message: bytes | Malformed) -> TypeGuard[bytes]:
+    """Return whether this is a message short enough to be examined while others wait."""
+    return isinstance(message, bytes) and len(message) <= MAX_EXAMINED_BYTES
 
 
 def encoded(result: object, codec: Codec) -> Encoded:

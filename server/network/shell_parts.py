@@ -114,9 +114,10 @@ class Frozen:
         return message
 
 
-Read = Callable[[bytes, Connection], Awaitable[Frozen | tuple[Frozen, ...]]]
+Read = Callable[[bytes, Connection, bool], Awaitable[Frozen | tuple[Frozen, ...]]]
 """Reads a large message of a connection apart from the loop: one message, or those of a batch.
 
+The last argument says whether it may be urgent, and must not wait behind others that are not.
 Raises `RpcError` where that takes too much.
 """
 

@@ -3,12 +3,12 @@
 Requests of one connection are handled in order, one at a time, so that `axes.move` with
 wait and then `projection.get` show the end of the motion; urgent ones (stop, E-stop,
 abort, ping) overtake. Received messages wait as bytes and are decoded when their turn
-comes: one request of one connection in each turn of the loop (`turns`). Bytes that name
-an urgent method are looked at as they arrive. A client that does not read costs only its
-own connection: state events keep the newest value per slot, ordered events have a bounded
-queue, and a client that stays stuck is disconnected. This module does not know the
-meaning of methods, except that `session.hello` brings the token and that an E-stop comes
-first.
+comes: one request of one connection in each turn of the loop (`turns`). Messages that may
+name an urgent method, in whatever spelling, are decoded as they arrive. A client that does
+not read costs only its own connection: state events keep the newest value per slot, ordered
+events have a bounded queue, and a client that stays stuck is disconnected. This module does
+not know the meaning of methods, except that `session.hello` brings the token and that an
+E-stop comes first.
 
 A client takes one of `max_clients` places when it has shown the token, or with its first
 request where there is none. Until then, and while all places are taken, it is in a
@@ -24,7 +24,7 @@ import ssl as tls
 import time
 from collections.abc import Coroutine, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, cast
+from typing import Any, Final, TypeVar, cast
 
 from flexdt.protocol import (
     METHODS,
@@ -186,6 +186,27 @@ async def serve(
     return server
 
 
+_Result = TypeVar("_Result")
+_Read = m.Message | parts.Frozen | tuple[parts.Frozen, ...]
+"""A message as it is served: decoded, or read in another process (a tuple is a batch)."""
+_Left = _Read | batches.Split | None
+"""The part of a message that has been read early and waits for its turn."""
+
+
+@dataclass(frozen=True)
+class _Early:
+    """A large message that is read before its turn.
+
+    Attributes:
+        raw: its bytes in the queue, held here so that no other message has their
+            identity.
+        task: of reading it, and of serving what is urgent in it.
+    """
+
+    raw: bytes
+    task: asyncio.Task[_Left]
+
+
 class _Link(asyncio.BufferedProtocol):
     """One connection."""
 
@@ -222,8 +243,12 @@ class _Link(asyncio.BufferedProtocol):
         self.split: dict[int, batches.Split] = {}
         """Batches whose urgent items have been begun; the others wait in the
         queue, by identity."""
+        self.early: dict[int, _Early] = {}
+        """Large messages that are read before their turn while they wait in the queue, by
+        identity."""
+        self.reading_early = asyncio.Lock()
         self.worker: asyncio.Task[None] | None = None
-        self.tasks: set[asyncio.Task[None]] = set()
+        self.tasks: set[asyncio.Task[Any]] = set()
         self.deadlines = deadlines.Deadlines(
             lambda what, seconds: self.abort(f"no {what} within {seconds:g} s")
         )
@@ -347,19 +372,21 @@ class _Link(asyncio.BufferedProtocol):
             """Decode a message and start it if it is urgent; return whether to take it
             out of the queue.
 
-            Messages above `MAX_INLINE_BYTES`, ordinary ones, and those beyond
-            `MAX_URGENT_IN_SERVICE` in service (four times as many for E-stops) wait
-            for their turn. Of a batch with other items the urgent ones are started;
-            it stays in the queue, for the others.
+            Ordinary messages, and those beyond `MAX_URGENT_IN_SERVICE` in service (four
+            times as many for E-stops), wait for their turn. Of a batch with other items
+            the urgent ones are started; it stays in the queue, for the others. So does a
+            message above `MAX_INLINE_BYTES`, which `_read_early` reads.
 
             Args:
                 raw: the message as received.
             """
+            served = len(self.tasks) + len(found)
             if len(raw) > MAX_INLINE_BYTES:
-                return False  # it costs more than a look; it is urgent in its turn
+                if served < MAX_URGENT_IN_SERVICE * 4:
+                    self._start_early(raw)
+                return False
             message = self.wire.decode(raw)
             lane = self._lane(message)
-            served = len(self.tasks) + len(found)
             if lane == loop_turns.ORDINARY or served >= MAX_URGENT_IN_SERVICE * (
                 4 if lane == loop_turns.FIRST else 1
             ):
@@ -519,13 +546,14 @@ class _Link(asyncio.BufferedProtocol):
             self.log("open failed", logging.ERROR, error=True)
             self.abort("the application did not open a session")
 
-    def _lane(self, message: m.Message | parts.Frozen) -> int:
+    def _lane(self, message: _Read) -> int:
         """Determine the lane of a message: an E-stop's, an urgent one, the ordinary.
 
         Before admission, and for unknown methods and answers, the ordinary.
 
         Args:
-            message: a call or a batch, which has the lane of its most urgent item.
+            message: a call or a batch (a tuple where another process has read it), which
+                has the lane of its most urgent item.
 
         Returns:
             A lane of `loop_turns`.
@@ -534,6 +562,8 @@ class _Link(asyncio.BufferedProtocol):
         match message:
             case m.Batch(items):
                 return min(map(self._lane, items), default=loop_turns.ORDINARY)
+            case tuple():
+                return min(map(self._lane, message), default=loop_turns.ORDINARY)
             case parts.Frozen(method=method):
                 name = method
             case m.Request(method=method) | m.Notification(method=method):
@@ -545,7 +575,7 @@ class _Link(asyncio.BufferedProtocol):
             return loop_turns.FIRST
         return loop_turns.URGENT
 
-    def _urgent(self, message: m.Message | parts.Frozen) -> bool:
+    def _urgent(self, message: _Read) -> bool:
         """Return whether a message is not ordinary."""
         return self._lane(message) != loop_turns.ORDINARY
 
@@ -573,9 +603,9 @@ class _Link(asyncio.BufferedProtocol):
                 if isinstance(raw, m.Malformed):
                     await self._serve(raw)
                 elif (split := self.split.pop(id(raw), None)) is not None:
-                    # Its answers go out together, so that those begun earlier have to be there.
-                    await split.urgent_done.wait()
-                    await self._answer_batch(split.batch, waits=False)
+                    await self._finish(split)
+                elif (early := self.early.pop(id(raw), None)) is not None:
+                    await self._serve_left(await early.task)
                 elif raw is not None:
                     await self._serve(await self._decode(raw))
             if self.ended:
@@ -601,9 +631,58 @@ class _Link(asyncio.BufferedProtocol):
         except ProtocolError as error:
             self.out.reply(m.Failure(None, errors.parse_error(str(error))))
 
-    async def _decode(
-        self, raw: bytes
-    ) -> m.Message | parts.Frozen | tuple[parts.Frozen, ...]:
+    def _start_early(self, raw: bytes) -> None:
+        """Begin to read a large message before its turn, as it may be urgent."""
+        task = self._start(self._read_early(raw))
+        self.early[id(raw)] = _Early(raw, task)
+
+    async def _read_early(self, raw: bytes) -> _Left:
+        """Read a large message before its turn, and serve what is urgent in it.
+
+        A connection's messages are read one after the other, so that others have their
+        turn between them.
+
+        Args:
+            raw: the message, which waits in the queue.
+
+        Returns:
+            The part of it to be served in its turn: an ordinary message, a batch whose
+            urgent items have been served; None if it has been served, and has left the
+            queue.
+        """
+        async with self.reading_early:
+            message = await self._decode(raw, urgent=True)
+        if not self._urgent(message):
+            return message
+        if isinstance(message, m.Batch | tuple):
+            items = message if isinstance(message, tuple) else message.items
+            split = batches.Split(raw, self._batch(items))
+            await self._begin(split)
+            return split
+        if not self.wire.withdraw(raw):
+            return message  # its turn has come
+        del self.early[id(raw)]
+        self._relax()
+        await self._serve(message, urgent=True)
+        return None
+
+    async def _serve_left(self, left: _Left) -> None:
+        """Serve in its turn the part that `_read_early` has left of a message."""
+        match left:
+            case batches.Split():
+                await self._finish(left)
+            case None:
+                pass
+            case _:
+                await self._serve(left)
+
+    async def _finish(self, split: batches.Split) -> None:
+        """Serve the other items of a batch whose urgent ones have been begun, and answer it."""
+        # Its answers go out together, so that those begun earlier have to be there.
+        await split.urgent_done.wait()
+        await self._answer_batch(split.batch, waits=False)
+
+    async def _decode(self, raw: bytes, *, urgent: bool = False) -> _Read:
         """Decode a message, a large one in another process; errors become `Malformed`,
         nothing is raised.
 
@@ -612,6 +691,7 @@ class _Link(asyncio.BufferedProtocol):
 
         Args:
             raw: bytes of one message.
+            urgent: whether it may be urgent.
 
         Returns:
             The message; `Frozen` calls (a tuple for a batch) from the other process.
@@ -622,19 +702,14 @@ class _Link(asyncio.BufferedProtocol):
         if read is None or len(raw) <= MAX_INLINE_BYTES:
             return self.wire.decode(raw)
         try:
-            return await read(raw, self.wire)
+            return await read(raw, self.wire, urgent)
         except RpcError as error:
             return m.Malformed(error)
         except Exception:
             self.log("a message was not read", logging.ERROR, error=True)
             return m.Malformed(errors.internal())
 
-    async def _serve(
-        self,
-        message: m.Message | parts.Frozen | tuple[parts.Frozen, ...],
-        *,
-        urgent: bool = False,
-    ) -> None:
+    async def _serve(self, message: _Read, *, urgent: bool = False) -> None:
         """Answer one message or batch and send the answer; waits while the client reads
         too slowly.
 
@@ -888,32 +963,26 @@ class _Link(asyncio.BufferedProtocol):
         """Whether so much waits that reading pauses: messages, or bytes received ahead.
 
         `max_waiting` messages; more than `READ_AHEAD_BYTES` (`MAX_INLINE_BYTES` before
-        admission). Of an admitted client bytes count only beside a whole message, so
-        that an incomplete one may be completed.
+        admission). Of an admitted client only bytes of whole messages count, so that an
+        incomplete one, which may be urgent, is completed behind others.
         """
-        ahead = 0
-        if self.wire.whole or not self.let_in:
-            ahead = self.wire.pending
-        limit_bytes = MAX_INLINE_BYTES
         if self.let_in:
-            limit_bytes = READ_AHEAD_BYTES
+            ahead, limit_bytes = self.wire.pending_whole, READ_AHEAD_BYTES
+        else:
+            ahead, limit_bytes = self.wire.pending, MAX_INLINE_BYTES
         return self._load >= self.limits.max_waiting or ahead > limit_bytes
 
     def _relax(self) -> None:
         """Resume reading once messages that wait, urgent ones in service included, and
-        bytes are at most half of their limits: of bytes, `READ_AHEAD_BYTES`, before
-        admission too.
-
-        Bytes count only beside a whole message.
+        bytes of whole messages are at most half of their limits: of bytes,
+        `READ_AHEAD_BYTES`, before admission too.
         """
-        ahead = 0
-        if self.wire.whole:
-            ahead = self.wire.pending
+        ahead = self.wire.pending_whole
         # Half of what stops it, so that reading does not stop and go with each message.
         if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD_BYTES // 2:
             self.transport.resume_reading()
 
-    def _done(self, task: asyncio.Task[None]) -> None:
+    def _done(self, task: asyncio.Task[Any]) -> None:
         """Remove an ended task, report its error if it crashed, and resume reading if
         possible.
 
@@ -934,9 +1003,10 @@ class _Link(asyncio.BufferedProtocol):
             self.log("connection failed", logging.ERROR, error_type=repr(error))
             self.transport.abort()
 
-    def _start(self, work: Coroutine[object, object, None]) -> None:
-        """Run work as a task of the connection."""
+    def _start(self, work: Coroutine[object, object, _Result]) -> asyncio.Task[_Result]:
+        """Run work as a task of the connection, and return it."""
         task = self.loop.create_task(work)
         # asyncio itself refers to tasks weakly; this keeps it until it is done.
         self.tasks.add(task)
         task.add_done_callback(self._done)
+        return task

@@ -28,30 +28,41 @@ MAX_READ_S: Final = 60.0
 
 
 class Reader:
-    """Reads messages in a worker; `close` must be called at the end."""
+    """Reads messages in workers; `close` must be called at the end."""
 
     def __init__(self) -> None:
-        """Set up one worker process, which starts at the first large message."""
-        self._workers = Workers(1, MEMORY_BYTES, MAX_READ_S)
+        """Set up two worker processes, for what may be urgent and for the rest; each starts
+        at its first message."""
+        self._ordinary = Workers(1, MEMORY_BYTES, MAX_READ_S)
+        # Its messages are at most `MAX_EXAMINED_BYTES`, and none of them waits for minutes.
+        self._urgent = Workers(1, MEMORY_BYTES, MAX_READ_S)
 
-    async def __call__(self, raw: bytes, wire: Connection) -> Frozen | tuple[Frozen, ...]:
+    async def __call__(
+        self, raw: bytes, wire: Connection, urgent: bool = False
+    ) -> Frozen | tuple[Frozen, ...]:
         """Decode the message of `raw`, or those of a batch.
 
         An empty batch gives (). The parameters stay pickled.
 
+        Args:
+            raw: bytes of the message.
+            wire: its connection.
+            urgent: whether it may be urgent; then it has a worker that larger messages do
+                not keep.
+
         Raises:
             RpcError: -32008, it cannot be read within the limits.
         """
-        kind, *items = await self._workers.ask(
-            work, wire.codec, wire.max_batch, raw=(raw,)
-        )
+        workers = self._urgent if urgent else self._ordinary
+        kind, *items = await workers.ask(work, wire.codec, wire.max_batch, raw=(raw,))
         pairs = zip(items[::2], items[1::2], strict=True)
         frozen = tuple(Frozen(item, method.decode()) for method, item in pairs)
         return frozen if kind == b"batch" else frozen[0]
 
     def close(self) -> None:
-        """End the process."""
-        self._workers.close()
+        """End the processes."""
+        self._ordinary.close()
+        self._urgent.close()
 
 
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:

@@ -26,6 +26,7 @@ from flexdt.protocol import (
     Request,
     Response,
     RpcError,
+    connection,
 )
 
 PING = Request(1, "session.ping")
@@ -428,8 +429,9 @@ class Queue:
 @pytest.mark.parametrize("codec", Codec)
 @pytest.mark.parametrize("seed", range(40))
 def test_messages_come_out_whole_once_and_urgent_ones_first(
-    codec: Codec, seed: int
+    codec: Codec, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(connection, "MAX_EXAMINED_BYTES", PIECE)
     rng = random.Random(seed)
     wire, queue, stream = Connection(codec), Queue(codec), b""
     for _ in range(rng.randrange(2, 30)):
@@ -460,7 +462,7 @@ def test_messages_come_out_whole_once_and_urgent_ones_first(
                 return b"stop now" in body
 
             most = rng.choice([1, 2, 32])
-            got = wire.overtake([b"halt", b"stop"], wanted, most)
+            got = wire.overtake((b"halt", b"stop"), wanted, most)
             assert got == queue.overtake(most, shown[1])
             assert shown[0] == shown[1]
         assert wire.whole is (len(queue.whole) > 0)
