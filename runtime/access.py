@@ -71,6 +71,9 @@ class TwinLimits:
         ended_job_days: after which an ended job is forgotten [days].
         max_upload: size of an uploaded sample [bytes].
         max_samples: uploads there may be.
+        max_observer_samples: uploads there may be that came while another client had
+            control.
+        max_observer_bytes: size of these together [bytes].
         max_corrections: corrections there may be.
         disk_quota: of the data directory [bytes]; None: no limit but the disk's.
         max_subscriptions: topics that all connections together follow.
@@ -85,6 +88,8 @@ class TwinLimits:
     ended_job_days: float = 365.0
     max_upload: int = 512 << 20
     max_samples: int = 10_000
+    max_observer_samples: int = 100
+    max_observer_bytes: int = 1 << 30
     max_corrections: int = 10_000
     disk_quota: int | None = None
     max_subscriptions: int = 2048

@@ -36,12 +36,14 @@ class UploadHead(SampleUpload):
     Attributes:
         unit: of mesh coordinates.
         revision: names the content, in the document; those of older servers have none.
+        observer: whether it came while another client had control; in the document.
     """
 
     schema_version: Literal[1] = Field(default=1, alias="schema")
     data: Payload = b""
     unit: LengthUnit = "mm"
     revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
+    observer: bool = False
 
     @classmethod
     def of(cls, chunk: SampleUpload) -> UploadHead:

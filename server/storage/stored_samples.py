@@ -76,6 +76,7 @@ class SampleStore:
         most: uploads there may be.
         room: on the disk; None for any.
         memory_limit: of the parsed samples in memory [bytes]; None for any.
+        observers: number and bytes of the uploads that observers may have sent.
     """
 
     def __init__(
@@ -85,6 +86,7 @@ class SampleStore:
         most: int = 10_000,
         room: DiskRoom | None = None,
         memory_limit: int | None = None,
+        observers: tuple[int, int] = (100, 1 << 30),
     ) -> None:
         """List the uploads stored in a folder; delete temporary files, and bytes (.bin)
         of no known upload.
@@ -99,6 +101,8 @@ class SampleStore:
             most: number of uploads.
             room: on the disk; None for any.
             memory_limit: of loaded phantoms [bytes]; None for no limit.
+            observers: number and bytes of uploads that came while another client had
+                control.
         """
         if memory_limit is None:
             self._memory_limit = math.inf
@@ -107,6 +111,7 @@ class SampleStore:
         self._folder = folder
         self._limit = limit
         self._most = most
+        self._most_of_observers, self._bytes_of_observers = observers
         self._incoming: Incoming = Incoming(folder, 2 * limit, room)
         self._heads: dict[str, UploadHead] = {}
         """Their revisions are those of their files; those of older servers have none."""
@@ -210,7 +215,9 @@ class SampleStore:
                 break
             del self._loaded[old]
 
-    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
+    def receive(
+        self, head: UploadHead, start: int, data: bytes, *, observer: bool = False
+    ) -> int:
         """Check an upload's size and name, and write one chunk of it, see
         `Incoming.receive`.
 
@@ -220,14 +227,16 @@ class SampleStore:
             head: description of the upload.
             start: place of the chunk [bytes].
             data: the chunk.
+            observer: whether another client has control.
 
         Returns:
             Number of bytes received so far.
 
         Raises:
             RpcError: -32008, larger than allowed.
-            LimitError: a gap before this chunk, too many uploads, a name that is too
-                long, or that of a shipped phantom or the empty stage.
+            LimitError: a gap before this chunk, too many uploads (of observers, too
+                large ones together), a name that is too long, or that of a shipped
+                phantom or the empty stage.
             DatasetWriteError: the disk does not take it.
         """
         if head.total > self._limit:
@@ -247,9 +256,39 @@ class SampleStore:
                 f"{self._most} allowed; sample.delete makes room",
                 {"asked": len(self._heads) + 1, "allowed": self._most},
             )
+        if observer:
+            self.require_observers_room(head)
         return self._incoming.receive(head, start, data)
 
-    def parse(self, name: str, material: str | None = None) -> ReceivedSample:
+    def require_observers_room(self, head: UploadHead) -> None:
+        """Check that one more upload of an observer is within their number and their bytes.
+
+        Only complete ones count.
+
+        Raises:
+            LimitError: it is not; names what there is, and who can change that.
+        """
+        sent = [other.total for other in self._heads.values() if other.observer]
+        count, size = len(sent) + 1, sum(sent) + head.total
+        if count <= self._most_of_observers and size <= self._bytes_of_observers:
+            return
+        raise LimitError(
+            f"observers have sent {len(sent)} uploads of {sum(sent)} bytes, and with "
+            f"{head.name!r} it would be {count} of {size}; {self._most_of_observers} of "
+            f"{self._bytes_of_observers} bytes are allowed. The controller may send more, "
+            "and make room by sample.delete",
+            {
+                "asked": {"uploads": count, "bytes": size},
+                "allowed": {
+                    "uploads": self._most_of_observers,
+                    "bytes": self._bytes_of_observers,
+                },
+            },
+        )
+
+    def parse(
+        self, name: str, material: str | None = None, *, observer: bool = False
+    ) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
 
         It is removed from the uploads under way, so a second call fails.
@@ -258,11 +297,16 @@ class SampleStore:
             name: the upload's.
             material: also parse it of this material, in which it is on the stage; None:
                 not.
+            observer: whether another client has control.
 
         Raises:
             PhantomError, UnknownNameError: its content does not hold.
+            LimitError: observers have sent too much meanwhile.
         """
         head, raw = self._incoming.take(name)
+        head = head.model_copy(update={"observer": observer})
+        if observer:
+            self.require_observers_room(head)
         phantom = _parse(head, raw, head.material)
         worn = None
         if material is not None:
@@ -279,7 +323,8 @@ class SampleStore:
         head = upload.head
         stem = documents.file_stem(upload.head.name)
         changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
-        document = head.model_dump(by_alias=True, exclude={"start", "data"})
+        left_out = {"start", "data"} if head.observer else {"start", "data", "observer"}
+        document = head.model_dump(by_alias=True, exclude=left_out)
         document["revision"] = upload.revision
         changes.put_json(self._folder, f"{stem}.json", document)
 

@@ -123,6 +123,10 @@ class ControlLease:
         if self.holder != who:
             raise self._control_error(what)
 
+    def is_observer(self, who: str) -> bool:
+        """Return whether another client has control."""
+        return self.holder not in (None, who)
+
     def ensure_allowed(self, who: str, what: str) -> None:
         """Check after a wait that `who` may still move: no other client has taken
         control.
@@ -130,7 +134,7 @@ class ControlLease:
         Raises:
             RpcError: -32003, another client is the controller.
         """
-        if self.holder not in (None, who):
+        if self.is_observer(who):
             raise self._control_error(what)
 
     def release(self, who: str) -> None:
@@ -237,6 +241,10 @@ class TwinServer:
             self.limits.max_samples,
             room,
             memory_limit,
+            (
+                self.limits.max_observer_samples,
+                self.limits.max_observer_bytes,
+            ),
         )
         self.samples.standing = lambda: (
             self.scanner.sample.name,

@@ -136,40 +136,51 @@ async def upload(
     """Store one chunk of an upload; after the last one parse the sample, store it, and
     log it.
 
-    A complete upload under the name of the sample on the stage replaces that one there. A
-    sample on the stage needs control and an idle twin at each chunk.
+    A complete upload under the name of the sample on the stage replaces that one there.
+    An upload that replaces another needs control at each chunk, as `delete` does, and
+    for the sample on the stage an idle twin. One by an observer is within a quota.
 
     Returns:
         The bytes received and `complete`; for a complete upload also the sample, and
         warnings of assumed values and of motion that was halted.
     """
     head = UploadHead.of(params)
-    _ensure_idle_if_used(twin, client, head.name)
+    _ensure_replaceable(twin, client, head.name)
+    observer = twin.control.is_observer(client.name)
     received = await asyncio.to_thread(
-        twin.samples.receive, head, params.start, params.data
+        twin.samples.receive, head, params.start, params.data, observer=observer
     )
     if received < head.total:
         return p.UploadResult(name=head.name, received=received, complete=False)
     async with twin.samples.turn, twin.stage_turn:
-        _ensure_idle_if_used(twin, client, head.name)
+        _ensure_replaceable(twin, client, head.name)
         stands = twin.scanner.sample
         there = stands.name == head.name
         if head.kind != "mesh":
             stands = replace(stands, material=None)
         material = stands.material if there else None
-        upload = await asyncio.to_thread(twin.samples.parse, head.name, material)
+        observer = twin.control.is_observer(client.name)
+        upload = await asyncio.to_thread(
+            twin.samples.parse, head.name, material, observer=observer
+        )
         warnings = list(upload.phantom.assumed)
         if there:
             warnings += await h.change_stage(
                 twin,
                 stands,
                 twin.scanner.correction,
-                lambda: _ensure_idle_if_used(twin, client, head.name),
+                lambda: _ensure_replaceable(twin, client, head.name),
                 upload=upload,
             )
         else:
+
+            def take() -> None:
+                """Take the upload in; raise first if it would replace one of another's."""
+                _ensure_replaceable(twin, client, head.name)
+                twin.samples.know(upload)
+
             await twin.state_store.keep(
-                lambda: twin.samples.know(upload),
+                take,
                 files=lambda changes: twin.samples.store(changes, upload),
             )
         await asyncio.to_thread(twin.samples.tidy)
@@ -242,13 +253,21 @@ def _ensure_unused(twin: TwinServer, name: str) -> None:
         )
 
 
-def _ensure_idle_if_used(twin: TwinServer, client: h.Client, name: str) -> None:
-    """Check that a sample may change: if it is on the stage, under this connection's control
-    and in no scan.
+def _ensure_replaceable(twin: TwinServer, client: h.Client, name: str) -> None:
+    """Check that a file may come under a name: if there is one, under this connection's
+    control, which is taken where it is free; if it is on the stage, while nothing moves.
+
+    A scan that has begun with the file there, also one that a job could resume, would
+    be refused from then on.
 
     Raises:
         RpcError: -32003, names the controller or the job.
     """
+    if twin.samples.head(name) is not None:
+        before = twin.control.holder
+        twin.control.require(client.name, "sample.upload")
+        if before != twin.control.holder:
+            twin.feed.changed()
     if name == twin.scanner.sample.name:
         h.ensure_idle(twin, client, "sample.upload", "sample.upload")()
 
