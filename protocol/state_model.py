@@ -228,8 +228,9 @@ class State(Result):
     image: ImageFlags | None = None
     """the image made last, by anyone's request or by a scan"""
     unsaved: str | None = None
-    """why this state is not on the server's disk, as after an E-stop on a disk that fails: a
-    server that is killed now comes back without it; null where it is, or is being written"""
+    """what of this state is not on the server's disk, or why: an E-stop, a reset or positions at
+    rest that are still being written, or changes that a failing disk does not take. A server that
+    is killed now comes back without it; null where all of it is there"""
     projector: str | None = None
     """why no image can be computed now, as where no projector answers; null where nothing is
     wrong, or without subscribers to the state"""

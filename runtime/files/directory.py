@@ -13,6 +13,7 @@ threads. Systems that open no directories (Windows) get paths instead.
 from __future__ import annotations
 
 import errno
+import io
 import itertools
 import os
 import stat
@@ -219,19 +220,32 @@ class Directory:
         Raises:
             OSError: there is no such regular file, or the system refuses.
         """
-        with self._opened() as fd:
-            file = os.open(self._at(name), _WRITE, dir_fd=fd)
+        file = self._open_in_place(name)
         try:
-            if not stat.S_ISREG(os.fstat(file).st_mode):
-                raise OSError(
-                    errno.EINVAL, "it is no regular file", str(self.path / name)
-                )
             left = memoryview(data)
             while left.nbytes:
                 left = left[self._write(file, left) :]
             os.fsync(file)
         finally:
             os.close(file)
+
+    def open_in_place(self, name: str) -> io.FileIO:
+        """Open a regular file, unbuffered, to be overwritten in place; a link is not
+        followed.
+
+        Raises:
+            OSError: there is no such regular file, or the system refuses.
+        """
+        return io.FileIO(self._open_in_place(name), "r+")
+
+    def _open_in_place(self, name: str) -> int:
+        """Return the descriptor of `open_in_place`, which the caller closes."""
+        with self._opened() as fd:
+            file = os.open(self._at(name), _WRITE, dir_fd=fd)
+        if not stat.S_ISREG(os.fstat(file).st_mode):
+            os.close(file)
+            raise OSError(errno.EINVAL, "it is no regular file", str(self.path / name))
+        return file
 
     def allocate(self, name: str, size: int) -> None:
         """Make a file of `size` bytes whose blocks are reserved on the disk, in place of

@@ -1,15 +1,15 @@
 """The state that a twin server restores after it was killed: DATA/state.json.
 
-Positions, settings, tube, camera, sample, an E-stop in force and the corrections in force
-are one document, so that a change of several of them is atomic. Its size does not depend
-on the number of jobs: jobs have files of their own (`job_files`), of which those that
-have changed are written. A client's change that must survive is written first and takes
-effect afterwards (see `StateStore.keep`): if it cannot be written, nothing has changed.
-Positions and the progress of a scan are written as they change, at most a few times a
-second, and when the server stops. An E-stop waits for no disk, but it is written at once,
-whatever was written a moment ago or failed. After a restart X-rays are off, motors are
-where they were last recorded, and interrupted scans are marked so and can be resumed. A
-damaged document is set aside, and the server starts without it.
+Settings, tube, camera, sample and the corrections in force are one document, so that a
+change of several of them is atomic. E-stop, positions and X-rays have a file and a writer
+of their own (`journal`); the document has a copy with its version, of which the newer
+counts. Its size does not depend on the number of jobs: jobs have files of their own
+(`job_files`), of which those that have changed are written. A client's change that must
+survive is written first and takes effect afterwards (see `StateStore.keep`): if it cannot
+be written, nothing has changed. The progress of a scan is written as it changes, at most
+a few times a second, and when the server stops. After a restart X-rays are off, motors
+are where they were last recorded, and interrupted scans are marked so and can be resumed.
+A damaged document is set aside, and the server starts without it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ import asyncio
 import logging
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from itertools import islice
 from typing import Literal, TypeVar
@@ -33,6 +32,7 @@ from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.spare_files import SpareFiles
 from flexdt.runtime.log import log
 from flexdt.server.storage.job_files import Count, JobFiles, JobMemory
+from flexdt.server.storage.journal import Record
 from flexdt.server.storage.scene_document import (
     apply_settings,
     require_fit,
@@ -41,7 +41,6 @@ from flexdt.server.storage.scene_document import (
 )
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetWriteError
 from flexdt.twin.errors import LimitError, TwinError
-from flexdt.twin.machine.description import Machine
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample, changed_tube
 
@@ -67,6 +66,8 @@ class Memory(_Part):
     """The document.
 
     Attributes:
+        version: of the journal's record of which positions and E-stop are a copy; 0 of
+            servers without a journal.
         jobs: as earlier servers kept them; those that have no file yet.
         jobs_made: jobs there ever were.
         corrections: the name in force, None for nominal; several where their history has
@@ -78,6 +79,7 @@ class Memory(_Part):
     ended: bool = False
     scene: p.Scene
     estop: bool = False
+    version: Count = 0
     jobs: list[JobMemory] = Field(default_factory=list)
     jobs_made: Count = 0
     corrections: list[str | None] = Field(default_factory=list)
@@ -86,35 +88,35 @@ class Memory(_Part):
 def remember(
     scanner: ScannerTwin,
     now: float,
+    record: Record,
     made: int,
     corrections: list[str | None],
     *,
     unfiled: Sequence[JobMemory] = (),
     ended: bool = False,
 ) -> Memory:
-    """Make the document of the scanner at twin time `now`, with the motors' present
-    positions, not their targets.
+    """Make the document of the scanner at twin time `now`.
 
-    It has rates, tube, camera, sample and correction, whether an E-stop is in force, the
-    time of writing, and the arguments.
+    It has rates, tube, camera, sample and correction, the time of writing, and the
+    arguments.
 
     Args:
         scanner: as it is.
         now: twin time [s].
+        record: of the journal, now.
         made: jobs there ever were.
         corrections: as `Memory` has them.
         unfiled: jobs of an earlier server that could not be given files yet.
         ended: whether the server has ended.
     """
-    scene = save_scene(scanner, now).model_copy(
-        update={"positions": scanner.positions(now)}
-    )
+    scene = save_scene(scanner, now).model_copy(update={"positions": record.positions})
     return Memory(
         schema=1,
         saved=datetime.now(UTC).isoformat(timespec="milliseconds"),
         ended=ended,
         scene=scene,
-        estop=scanner.safety.state == "estopped",
+        estop=record.estop,
+        version=record.version,
         jobs=list(unfiled),
         jobs_made=made,
         corrections=corrections,
@@ -158,29 +160,42 @@ def read_memory(root: Directory) -> Memory | None:
     )
 
 
-def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
-    """Set the scanner to the state in `memory`, X-rays off; an E-stop stays in force.
+def copied_record(memory: Memory) -> Record:
+    """Return the record of which the document has a copy; of a server without a journal
+    it is the first one.
+    """
+    scene = memory.scene
+    return Record(
+        version=memory.version,
+        saved=memory.saved,
+        machine=scene.machine,
+        estop=memory.estop,
+        xrays=scene.tube.on,
+        positions=scene.positions,
+    )
+
+
+def restore(memory: Memory, scanner: ScannerTwin) -> Sample | None:
+    """Set the scanner to the settings in `memory`, X-rays off.
 
     A voltage that the tube may not have is replaced by the present one, with a warning in
-    the log. Positions are limited to the travel. The correction is not restored here.
+    the log. The correction is not restored here, nor are positions and E-stop (see
+    `journal.resume`).
 
     Args:
         memory: the state.
         scanner: to be set.
-        now: twin time [s].
 
     Returns:
         The sample to put on the stage; None if the state is of another machine or not
-        allowed any more, so that only the E-stop is restored.
+        allowed any more, so that nothing is restored.
     """
-    known: p.Scene | None
     known = memory.scene
     # The correction in force comes from the history.
     known = known.model_copy(update={"correction": None})
     known = known.model_copy(update={"tube": _allowed_tube(known.tube, scanner)})
     try:
         require_fit(known, scanner)
-        scanner.place(_within(scanner.machine, known.positions), now)
         apply_settings(known, scanner)
     except (TwinError, RpcError) as error:
         log(
@@ -188,10 +203,6 @@ def restore(memory: Memory, scanner: ScannerTwin, now: float) -> Sample | None:
             logging.WARNING,
             reason=str(error),
         )
-        known = None
-    if memory.estop:  # stays in force in any case
-        scanner.estop(now)
-    if known is None:
         return None
     return sample_of(known)
 
@@ -249,42 +260,34 @@ class StateStore:
         self._job_files = job_files
         self._changed_jobs = changed_jobs
         self._unwritten: ChangedJobs = {}
-        self._spares = SpareFiles(root)
+        self.spares = SpareFiles(root)
         self.problem: str | None = None
         """Why the last change that did not wait for the disk is not on it, or None."""
-        self.noticed: Callable[[str | None], None] = lambda problem: None
-        """Called when there is a problem, and with None when it is over."""
+        self.noticed: Callable[[], None] = lambda: None
+        """Called when a problem begins or ends."""
         self._changed = asyncio.Event()
-        self._at_once = asyncio.Event()
+        self._on_disk: Memory | None = None
+        """The document that was written last; None where that is not certain."""
         # Lock order: `_writing` is held by tasks over awaits, and within it `_file` by threads
         # over system calls. `_file` alone orders threads whose tasks have been cancelled.
         self._writing = asyncio.Lock()
         self._file = threading.Lock()
         self._ended = False
 
-    def changed(self, *, at_once: bool = False) -> None:
-        """Schedule a write after a change; `at_once` skips the pause."""
+    def changed(self) -> None:
+        """Schedule a write after a change."""
         self._changed.set()
-        if at_once:
-            self._at_once.set()
 
-    async def run(self, moving: Callable[[], bool]) -> None:
-        """Write the state after each change, and while motors move; end only by
-        cancellation.
+    async def run(self) -> None:
+        """Write the state after each change; end only by cancellation.
 
-        It is written at most once in `MIN_INTERVAL_S`, unless a write at once is
-        requested. A failure is logged and tried again after `FAR_S`; if only jobs failed,
-        further changes are written meanwhile.
-
-        Args:
-            moving: returns whether positions are changing.
+        It is written at most once in `MIN_INTERVAL_S`. A failure is logged and tried
+        again after `FAR_S`; if only jobs failed, further changes are written meanwhile.
         """
         while True:
-            if not moving():
-                await self._changed.wait()
+            await self._changed.wait()
             # Before the write: a change that comes meanwhile is for the next one.
             self._changed.clear()
-            self._at_once.clear()
             pause = MIN_INTERVAL_S
             try:
                 await self.flush()
@@ -297,10 +300,7 @@ class StateStore:
                 log("the state was not written", logging.ERROR, reason=str(error))
                 self._changed.set()  # the change is still pending
                 pause = FAR_S
-            # Not `wait_for`, which loses a cancellation that comes together with the event.
-            with suppress(TimeoutError):
-                async with asyncio.timeout(pause):
-                    await self._at_once.wait()
+            await asyncio.sleep(pause)
 
     async def flush(self) -> None:
         """Write the state and up to `MAX_JOBS_PER_TURN` changed jobs now, so that
@@ -313,11 +313,17 @@ class StateStore:
             DatasetWriteError, OSError: the system cannot write.
         """
         async with self._writing:
+            # The document is made here: only the loop's thread may look at the scanner.
+            document = self._make(False)
+            jobs = self._unwritten_jobs()
+            if (
+                not jobs
+                and self.problem is None
+                and _says_the_same(document, self._on_disk)
+            ):
+                return
             try:
-                # The document is made here: only the loop's thread may look at the scanner.
-                await asyncio.to_thread(
-                    self._put, self._make(False), self._unwritten_jobs()
-                )
+                await asyncio.to_thread(self._put, document, jobs)
             except (OSError, DatasetError) as error:
                 self._note(str(error))
                 raise
@@ -380,24 +386,25 @@ class StateStore:
                 # The disk comes first: a kill in between leaves a change that nobody was told
                 # of, never one that was answered and is lost.
                 taken = take()
+                if document is not None:
+                    self._on_disk = document
             # Of a cancellation too: `shield` in `keep` stops a requester's, not that of a
             # closing loop.
             except BaseException:
                 await asyncio.to_thread(self._undo, changes)
                 # The document of before is back, and owes what has changed since.
+                self._on_disk = None
                 self.changed()
                 raise
             await asyncio.to_thread(changes.done)
             return taken
 
     def _note(self, problem: str | None) -> None:
-        """Set `problem`; call `noticed` only when a problem begins (with it) or ends (with
-        None).
-        """
+        """Set `problem`; call `noticed` only when a problem begins or ends."""
         before = self.problem
         self.problem = problem
         if (before is None) != (problem is None):
-            self.noticed(problem)
+            self.noticed()
 
     def end(self) -> None:
         """Write the state as that of an ended server, and all changed jobs; an error is
@@ -447,7 +454,9 @@ class StateStore:
                 return
             # Before the write, which may fail: threads that come later must not write either.
             self._ended = memory.ended
-            self._spares.keep(FILE, _text(memory))
+            self._on_disk = None
+            self.spares.keep(FILE, _text(memory))
+            self._on_disk = memory
             for name, job in jobs.items():
                 self._put_job(name, job)
 
@@ -491,7 +500,7 @@ class StateStore:
             if files is not None:
                 files(changes)
             if document is not None:
-                changes.put(self._root, FILE, _text(document), self._spares.keep)
+                changes.put(self._root, FILE, _text(document), self.spares.keep)
 
     def _undo(self, changes: documents.Changes) -> None:
         """Undo changes on the disk, after a write that is under way; blocks."""
@@ -499,25 +508,20 @@ class StateStore:
             changes.undo()
 
 
+def _says_the_same(document: Memory, other: Memory | None) -> bool:
+    """Return whether two documents differ in nothing but their date and their copy of the
+    journal's record.
+    """
+    if other is None:
+        return False
+    scene = other.scene.model_copy(update={"positions": document.scene.positions})
+    copied = {"saved": document.saved, "version": document.version}
+    return document == other.model_copy(
+        update={"scene": scene, "estop": document.estop, **copied}
+    )
+
+
 def _text(memory: Memory) -> bytes:
     """Encode the state as JSON; an empty list of jobs is left out."""
     without = set() if memory.jobs else {"jobs"}
     return memory.model_dump_json(by_alias=True, exclude=without).encode("utf-8")
-
-
-def _within(machine: Machine, positions: Mapping[str, float]) -> dict[str, float]:
-    """Limit positions to the travel of their motors, as rounding may have brought them
-    out.
-
-    Args:
-        machine: must have all the axes.
-        positions: axis -> position [mm, deg].
-
-    Returns:
-        Axis -> position [mm, deg].
-    """
-    axes = machine.axes
-    return {
-        name: min(max(x, axes[name].lower), axes[name].upper)
-        for name, x in positions.items()
-    }

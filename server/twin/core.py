@@ -39,6 +39,7 @@ from flexdt.server.storage import corrections
 from flexdt.server.storage import memory as kept
 from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.job_files import JobFiles, JobMemory, number_of
+from flexdt.server.storage.journal import Content, Journal, Record, content_of, resume
 from flexdt.server.storage.past_scans import PastScans
 from flexdt.server.storage.stored_samples import (
     ReceivedSample,
@@ -64,6 +65,8 @@ from flexdt.twin.script import Exposure
 
 MAX_KEPT_LOG_ENTRIES = 50
 """Number of entries of the topic `log` that a late subscriber gets."""
+FEED_PATIENCE_S = 0.05
+"""Longest time for which subscribers do not get a state that is just being written [real s]."""
 MAX_FAILURES = 5
 """Number of failures within `FAILURE_WINDOW_S` after which a service is not restarted."""
 FAILURE_WINDOW_S = 60.0
@@ -296,8 +299,15 @@ class TwinServer:
             lambda: self.jobs.busy,
             self.stage.revision,
         )
+        self.journal = Journal(root, self._content, self._at_rest)
+        self.journal.noticed = self._noticed_disk
         self.feed = StateFeed(
-            self.scanner, self.clock, self.hub, self.state, lambda: self.jobs.running
+            self.scanner,
+            self.clock,
+            self.hub,
+            self.state,
+            lambda: self.jobs.running,
+            lambda: self.journal.durable(FEED_PATIENCE_S),
         )
         self.job_files = JobFiles(root)
         self.job_files.settle()
@@ -305,6 +315,7 @@ class TwinServer:
             root, self._memory, self.job_files, self.jobs.changed
         )
         self.state_store.noticed = self._noticed_disk
+        self._unsaved_was_told = False
         self._unfiled: list[JobMemory] = []
         """Jobs that an earlier server kept in its state and that have no files."""
         self._recalled = False
@@ -357,12 +368,15 @@ class TwinServer:
             )
         if not self._recalled:
             await asyncio.to_thread(self.job_files.clear)
+        # Before anybody is served: what an earlier server left is in the journal from now on.
+        self.journal.begin(self.state_store.spares.keep)
         self.changed()
         work: list[Callable[[], Coroutine[Any, Any, None]]] = [
             self.jobs.work,
             self.live.run,
             lambda: self.feed.run(self._settled),
-            lambda: self.state_store.run(self._moving),
+            self.journal.run,
+            self.state_store.run,
         ]
         if self.projector_watch is not None:
             work.append(self.projector_watch.run)
@@ -384,14 +398,16 @@ class TwinServer:
         self.past_scans.close()
         self.predictors.close()
         if self._tasks:
+            self.journal.end()
             self.state_store.end()
 
     def recall(self) -> Sample | None:
         """Restore scanner and jobs of the previous server, before `start`; log a warning
         if it was killed.
 
-        There is a warning, too, if jobs are to be resumed. Jobs are restored even where
-        no state is stored. A sample that cannot be read gives the empty stage.
+        There is a warning, too, if jobs are to be resumed. Jobs, positions and E-stop are
+        restored even where no state is stored; after a journal that cannot be read an
+        E-stop is in force. A sample that cannot be read gives the empty stage.
 
         Returns:
             The sample for the stage; None if nothing is stored, or nothing that fits this
@@ -399,22 +415,47 @@ class TwinServer:
         """
         memory = self.remembered
         left = self._recall_jobs(memory)
+        record = self._recall_motion(memory)
         if memory is None:
             return None
-        sample = kept.restore(memory, self.scanner, self.clock.now())
+        sample = kept.restore(memory, self.scanner)
         if not memory.ended or left:
             names = [job.id for job in left]
             self.tell(
                 "warning",
                 "restored what was known when the server ended"
                 + ("" if memory.ended else " without having been stopped"),
-                saved=memory.saved,
+                saved=memory.saved if record is None else max(memory.saved, record.saved),
                 jobs_to_resume=names,
-                estop=memory.estop,
+                estop=self.scanner.safety.state == "estopped",
             )
         if sample is None:
             return None
         return self._readable_sample(sample)
+
+    def _recall_motion(self, memory: kept.Memory | None) -> Record | None:
+        """Restore positions and E-stop from the newest record: the journal's, or its copy
+        in the state, as of a server without a journal.
+
+        Args:
+            memory: state of the previous server.
+
+        Returns:
+            The record; None without any.
+        """
+        record = self.journal.last
+        if memory is not None:
+            copied = kept.copied_record(memory)
+            self.journal.follow(copied.version)
+            if record is None or record.version < copied.version:
+                record = copied
+        now = self.clock.now()
+        if record is not None:
+            resume(record, self.scanner, now)
+        if self.journal.damaged:
+            self.tell("warning", "an E-stop is in force: a lost journal may have had one")
+            self.scanner.estop(now)
+        return record
 
     def _recall_jobs(self, memory: kept.Memory | None) -> list[Job]:
         """Restore the jobs of earlier servers, and write files for those that have none.
@@ -532,7 +573,7 @@ class TwinServer:
         job = self.jobs.current
         missing: dict[str, str] = {}
         part = partial(state_views.derived, missing)
-        problem = self.state_store.problem
+        unsaved = self.unsaved()
         watch = self.projector_watch
         return w.State(
             time=snapshot.time,
@@ -558,7 +599,7 @@ class TwinServer:
             controller=self.control.holder,
             image=part("image", lambda: self.live.seen),
             missing=missing,
-            unsaved=None if problem is None else str(from_root(problem, self.root)),
+            unsaved=unsaved,
             projector=None if watch is None else watch.problem,
         )
 
@@ -627,6 +668,7 @@ class TwinServer:
         """
         self.feed.changed()
         self.live.changed()
+        self.journal.changed(at_once=self._at_rest())
         self.state_store.changed()
         for end in self._awaited:  # a stop brings the end forward: look again
             if not end.done():
@@ -637,14 +679,31 @@ class TwinServer:
         return [self.scanner.sample, *self.jobs.samples()]
 
     def _settled(self) -> None:
-        """Request a live image and the saving of the state after motion has ended."""
+        """Request a live image and the saving of positions after motion has ended."""
         self.live.changed()
-        self.state_store.changed()
+        self.journal.changed(at_once=True)
 
     def _moving(self) -> bool:
         """Return whether any motor is under way now."""
         now = self.clock.now()
         return self.scanner.rest_time(now) > now
+
+    def _at_rest(self) -> bool:
+        """Return whether no motor is under way and no scan runs."""
+        return not self._moving() and not self.jobs.running
+
+    def _content(self) -> Content:
+        """Record what the journal has of the scanner now."""
+        return content_of(self.scanner, self.clock.now())
+
+    def unsaved(self) -> str | None:
+        """Say why the state is not on the disk, paths relative to the data directory; None
+        where it is.
+        """
+        problem = self.journal.problem or self.state_store.problem
+        if problem is None:
+            return self.journal.owed()
+        return str(from_root(problem, self.root))
 
     def _memory(self, ended: bool) -> kept.Memory:
         """Record the twin's state for the file that a restarted server reads.
@@ -662,6 +721,7 @@ class TwinServer:
         return kept.remember(
             self.scanner,
             self.clock.now(),
+            self.journal.take(),
             self.jobs.made,
             history,
             unfiled=self._unfiled,
@@ -723,23 +783,21 @@ class TwinServer:
         log(message, LEVELS[level], error=False, **data)
         self._publish_log(level, message, data)
 
-    def _noticed_disk(self, problem: str | None) -> None:
+    def _noticed_disk(self) -> None:
         """Log for all clients that changes cannot be saved (an error) or that they can be
-        saved again (info), and publish the state.
-
-        Args:
-            problem: reason of the failure; paths in it are shown relative to the data
-                directory. None when saving works again.
+        saved again (info), once for each, and publish the state.
         """
-        if problem is None:
-            self.tell("info", "the state is on the disk again")
-        else:
-            reason = str(from_root(problem, self.root))
+        problem = self.journal.problem or self.state_store.problem
+        told = self._unsaved_was_told
+        self._unsaved_was_told = problem is not None
+        if problem is not None and not told:
             self.tell(
                 "error",
                 "the state is not on the disk, and a kill would lose it",
-                reason=reason,
+                reason=str(from_root(problem, self.root)),
             )
+        if problem is None and told:
+            self.tell("info", "the state is on the disk again")
         self.feed.changed()
 
     def _publish_log(

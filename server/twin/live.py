@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, assert_never
 
@@ -349,6 +349,8 @@ class StateFeed:
         scanner, clock, hub: see their modules.
         render: makes the state.
         job_runs: whether a scan controls the time.
+        ready: waits a moment while the state is just being written, so that subscribers
+            are not told of every write.
     """
 
     scanner: ScannerTwin
@@ -356,6 +358,7 @@ class StateFeed:
     hub: Hub
     render: Callable[[], object]
     job_runs: Callable[[], bool]
+    ready: Callable[[], Awaitable[None]]
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
 
     def changed(self) -> None:
@@ -375,6 +378,7 @@ class StateFeed:
         while True:
             await self._changed.wait()
             self._changed.clear()
+            await self.ready()
             self._publish()
             moved = False
             while (rest := self.scanner.rest_time(self.clock.now())) > self.clock.now():
@@ -387,8 +391,9 @@ class StateFeed:
                     end.cancel()
                 self._publish()
             if moved:
-                self._publish()  # the end may have come between the last one and the check
                 settled()
+                await self.ready()
+                self._publish()  # the end may have come between the last one and the check
             await self._wait_until_warm(settled)
 
     async def _wait_until_warm(self, settled: Callable[[], None]) -> None:

@@ -111,8 +111,8 @@ def test_a_data_directory_that_was_removed_is_the_disk_s_fault(tmp_path: Path) -
             assert str(root) not in error.message
         assert settings(await c.call("state.get")) == before
         assert (await c.call("safety.estop"))["safety"]["estop"]
-        await lab.until(lambda: lab.twin.state_store.problem is not None, "it is noticed")
-        assert "state.json" in (await c.call("state.get"))["unsaved"]
+        await lab.until(lambda: lab.twin.journal.problem is not None, "it is noticed")
+        assert "journal" in (await c.call("state.get"))["unsaved"]
 
     root.mkdir()
     run(root, body)

@@ -16,6 +16,7 @@ from simulation import Simulation
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.storage.job_files import JobFiles
+from flexdt.server.storage.journal import content_of, record_of
 from flexdt.server.storage.memory import FILE, Memory, StateStore, remember
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -32,7 +33,8 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
     ended = threading.Event()
 
     def make(last: bool) -> Memory:
-        return remember(scanner, 0.0, 0, [], ended=last)
+        record = record_of(content_of(scanner, 0.0), 1)
+        return remember(scanner, 0.0, record, 0, [], ended=last)
 
     class Late(Memory):
         """Encoded by its thread only after the server has ended."""
@@ -57,7 +59,7 @@ def test_a_write_that_is_under_way_does_not_undo_the_last(
     monkeypatch.setattr(Directory, "keep", put)
 
     async def body() -> None:
-        work = asyncio.create_task(state_store.run(lambda: False))
+        work = asyncio.create_task(state_store.run())
         state_store.changed()
         await asyncio.to_thread(made.wait, 30.0)
         work.cancel()  # its thread goes on
@@ -97,9 +99,9 @@ def test_a_change_is_undone_on_a_disk_that_stays_full(tmp_path: Path, at: int) -
 
 
 @pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("failing", [False, True])
 def test_an_estop_survives_a_kill_a_moment_after_its_answer(
-    tmp_path: Path, seed: int, full: bool
+    tmp_path: Path, seed: int, failing: bool
 ) -> None:
     """Also right after another change, or after one that could not be written."""
     rng = random.Random(seed)
@@ -107,19 +109,23 @@ def test_an_estop_survives_a_kill_a_moment_after_its_answer(
         sim.start()
         client = sim.client()
         sim.advance(5.0)
-        if full:
-            sim.disk.set(Fault(0, errno.ENOSPC, lasting=True))
+        if failing:
+            sim.disk.set(Fault(0, errno.EIO, lasting=True))
         sim.call(client, "axes.move", targets={"rot_obj": 5.0})
         sim.advance(rng.uniform(0.01, 3.0))
-        if full:
+        if failing:
             assert sim.disk.failed
             sim.disk.set(None)
-        assert sim.call(client, "safety.estop")["safety"]["estop"]
-        sim.advance(0.07)  # a thread under way, and the next one: 0.03 s each at most
-        before = len(sim.disk.ops)
-        for _ in range(20):  # it is in force: no more news for the disk
-            sim.call(client, "safety.estop")
-        assert len(sim.disk.ops) == before
+        answer = sim.call(client, "safety.estop")
+        assert answer["safety"]["estop"]
+        if answer["unsaved"] is not None:
+            sim.advance(0.07)  # a thread under way, and the next one: 0.03 s each at most
+        if rng.random() < 0.5:
+            sim.advance(2.0)  # the motors have come to rest
+            before = len(sim.disk.ops)
+            for _ in range(20):  # it is in force: no more news for the disk
+                sim.call(client, "safety.estop")
+            assert len(sim.disk.ops) == before
         sim.kill()
         sim.start()
         assert sim.call(sim.client(), "state.get")["safety"]["state"] == "estop"

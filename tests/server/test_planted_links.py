@@ -304,8 +304,8 @@ def live(trace: Trace, root: Path, names: Sequence[str], kind: str, when: str) -
 def test_an_undisturbed_life_does_all_of_it(trace: Trace) -> None:
     """Otherwise the test below would plant too little."""
     said = " ".join(trace.files)
-    for wanted in ("state.json", "samples/cube.json", ".bin", "jobs/first.json", " one.json",
-                   "first/scan_000000.tif", "first/flexdt.json", "first/script.txt",
+    for wanted in ("journal", "state.json", "samples/cube.json", ".bin", "jobs/first.json",
+                   " one.json", "first/scan_000000.tif", "first/flexdt.json", "first/script.txt",
                    "second/flexdt.json", ".part-", ".before-"):  # fmt: skip
         assert wanted in said, wanted
     assert trace.folders == [

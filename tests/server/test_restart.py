@@ -14,6 +14,9 @@ from typing import Any
 import pytest
 from lab import Process, Refused, Wire, digests, fly_script, twin
 
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.two_slots import TwoSlots
+
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 
 
@@ -24,12 +27,12 @@ def restarted(process: Process, rays: Process, data: Path, *options: object) -> 
 
 
 def until_written(data: Path, holds: Callable[[Any], bool]) -> None:
-    """Wait until what would be known after a kill `holds`; it is written a moment later."""
+    """Wait until what the journal has `holds`; it is written a moment later."""
     until = time.monotonic() + 60.0
     while True:
-        with contextlib.suppress(FileNotFoundError):
-            memory = json.loads((data / "state.json").read_text())
-            if holds(memory):
+        with contextlib.suppress(ValueError), Directory(data) as folder:
+            found = TwoSlots(folder, "journal").read()
+            if found is not None and holds(json.loads(found[1])):
                 return
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -120,7 +123,7 @@ def test_an_estop_survives_a_kill_and_positions_in_flight_are_nearly_kept(
     try:
         wire = Wire(process.port)
         wire.call("axes.move", targets={"rot_obj": 720.0})
-        until_written(data, lambda memory: memory["scene"]["positions"]["rot_obj"] > 1.0)
+        until_written(data, lambda record: record["positions"]["rot_obj"] > 1.0)
         seen, begun = (
             wire.call("state.get")["axes"]["rot_obj"]["position"],
             time.monotonic(),
@@ -133,7 +136,7 @@ def test_an_estop_survives_a_kill_and_positions_in_flight_are_nearly_kept(
         assert not axis["moving"]
         assert 1.0 < axis["position"] <= seen + longest
         wire.call("safety.estop")
-        until_written(data, lambda memory: memory["estop"])
+        until_written(data, lambda record: record["estop"])
         process = restarted(process, rays, data)
         wire = Wire(process.port)
         assert wire.call("state.get")["safety"]["estop"] is True

@@ -22,6 +22,7 @@ from flexdt.clients.following.hearing import heard
 from flexdt.phantoms.scan_limits import check_distances, check_tube
 from flexdt.protocol import RpcError
 from flexdt.server.storage import memory, scene_document
+from flexdt.server.storage.journal import content_of, record_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.following.follower import Follower
 from flexdt.twin.following.mirror import Mirror
@@ -81,7 +82,9 @@ def by_request(machine: Machine, asked: Asked, _: Path) -> str:
 
 def remembered(machine: Machine, asked: Asked) -> Any:
     """What a server has kept of a scanner that once had this setting."""
-    saved = memory.remember(ScannerTwin(machine, P), 0.0, 0, [])
+    scanner = ScannerTwin(machine, P)
+    record = record_of(content_of(scanner, 0.0), 1)
+    saved = memory.remember(scanner, 0.0, record, 0, [])
     kept: Any = saved.scene
     new = getattr(kept, part_of(asked)).model_copy(update=asked)
     return saved.model_copy(
@@ -99,7 +102,7 @@ def by_restart(machine: Machine, asked: Asked, _: Path) -> str:
     scanner, logged = ScannerTwin(machine, P), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(memory, "log", lambda *_, **facts: logged.append(facts["reason"]))
-        memory.restore(remembered(machine, asked), scanner, 0.0)
+        memory.restore(remembered(machine, asked), scanner)
     [(name, value)] = asked.items()
     at = getattr(getattr(scanner, part_of(asked)), name)
     assert at == (at_start(machine)[name] if logged else value)

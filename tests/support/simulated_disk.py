@@ -30,8 +30,8 @@ TAKES_ROOM: tuple[Kind, ...] = ("open", "write", "link", "mkdir")
 has not had (a name that it had leaves its place there)."""
 REAL: dict[str, Callable[..., Any]] = {
     name: getattr(os, name)
-    for name in ("open", "close", "write", "pwrite", "ftruncate", "fsync", "replace", "rename",
-                 "link", "unlink", "remove", "mkdir", "posix_fallocate")
+    for name in ("open", "close", "write", "pwrite", "ftruncate", "fsync", "fdatasync", "replace",
+                 "rename", "link", "unlink", "remove", "mkdir", "posix_fallocate")
 }  # fmt: skip
 
 
@@ -78,6 +78,9 @@ class Disk:
         self._paths: dict[int, Path] = {}
         self._bytes: set[int] = set()
         """Inodes of files whose bytes are not safe."""
+        self._in_place: list[tuple[int, int, bytes]] = []
+        """Bytes that were overwritten in place and whose successors are not safe: inode,
+        place, and what was there; oldest first."""
         self._names: list[tuple[Path, Callable[[], None]]] = []
         """Changes of names that are not safe: directory, and how to take it back; oldest
         first."""
@@ -122,11 +125,25 @@ class Disk:
         for file in self.root.rglob("*"):
             if file.is_file() and file.stat().st_ino in self._bytes:
                 os.truncate(file, self._rng.randint(0, file.stat().st_size))
+            if file.is_file():
+                self._tear(file)
         self._safe()
+
+    def _tear(self, file: Path) -> None:
+        """Let what was overwritten in place come back in part: of each write a drawn
+        number of its first bytes stays.
+        """
+        inode = file.stat().st_ino
+        for _, at, old in [w for w in reversed(self._in_place) if w[0] == inode]:
+            kept = self._rng.randint(0, len(old))
+            with file.open("r+b") as out:
+                out.seek(at + kept)
+                out.write(old[kept:])
 
     def _safe(self) -> None:
         self._names.clear()
         self._bytes.clear()
+        self._in_place.clear()
         shutil.rmtree(self._kept, ignore_errors=True)
 
     # The system's calls -------------------------------------------------------------------------
@@ -168,9 +185,15 @@ class Disk:
         return written
 
     def _pwrite(self, fd: int, data: Any, offset: int) -> int:
-        """Write at a place. Its bytes are not counted as unsafe."""
+        """Write at a place, half of the data where the fault is a short write; what was
+        there may come back until it is safe.
+        """
         if fd in self._paths:
-            self._change("write", self._paths[fd])
+            about = os.fstat(fd)
+            if self._change("write", self._paths[fd], offset + len(data) > about.st_size):
+                data = memoryview(data)[: max(1, len(data) // 2)]
+            old = os.pread(fd, len(data), offset)
+            self._in_place.append((about.st_ino, offset, old))
         written: int = REAL["pwrite"](fd, data, offset)
         return written
 
@@ -194,11 +217,15 @@ class Disk:
         if path is None:
             return  # a disk in memory needs none
         self._change("fsync", path)
-        self._bytes.discard(os.fstat(fd).st_ino)
+        inode = os.fstat(fd).st_ino
+        self._bytes.discard(inode)
+        self._in_place = [write for write in self._in_place if write[0] != inode]
         if path.is_dir():
             self._names = [
                 (folder, back) for folder, back in self._names if folder != path
             ]
+
+    _fdatasync = _fsync
 
     def _replace(
         self,

@@ -24,6 +24,9 @@ from flexdt.twin.machine.camera import Roi
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import CameraChange
 
+DURABLE_S = 0.02
+"""Longest time for which the answer to an E-stop waits for the disk [real s]."""
+
 
 @answers(p.AXES_MOVE)
 async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult:
@@ -205,31 +208,37 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
 
 
 @answers(p.SAFETY_ESTOP)
-def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
+async def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
     """Stop as the machine's E-stop does with X-rays off, log it, and save that it is in
     force.
 
-    A running scan pauses, and a way around obstacles ends. While it is in force already
-    it stops again, but the state is not written at once.
+    It acts at once; the answer waits for the disk for at most `DURABLE_S`. A running scan
+    pauses, and a way around obstacles ends. While it is in force already it stops again,
+    but nothing is written.
 
     Returns:
-        The state with the stopping motion.
+        The state with the stopping motion, at its beginning; `unsaved` says so if the
+        disk does not have the E-stop yet.
     """
     twin.detours.cancel()
     twin.interrupt("E-stop")
-    in_force = twin.scanner.safety.state == "estopped"
     stopping = twin.scanner.estop(twin.clock.now(), client.name)
     twin.tell("warning", f"E-stop by {client.name}")
     twin.changed()
-    twin.state_store.changed(at_once=not in_force)  # a flood of them is one write
-    return state_views.stopped_view(twin.state(), stopping, twin.clock.now())
+    stopped = state_views.stopped_view(twin.state(), stopping, twin.clock.now())
+    await twin.journal.durable(DURABLE_S)
+    return stopped.model_copy(update={"unsaved": twin.unsaved()})
 
 
 @answers(p.SAFETY_RESET)
 def reset(twin: TwinServer, client: Client, params: p.Reset) -> w.State:
-    """Leave E-stop or blocked state, if `stop` (None: any) is the latest stop; return the state."""
+    """Leave E-stop or blocked state, if `stop` (None: any) is the latest stop; return the state.
+
+    It does not wait for the disk: a reset that a kill loses leaves the E-stop in force.
+    """
     twin.scanner.reset(twin.clock.now(), params.stop)
     twin.changed()
+    twin.journal.changed(at_once=True)
     return twin.state()
 
 
