@@ -313,16 +313,32 @@ class SampleStore:
             worn = (material, _parse(head, raw, material))
         return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
+    def prepare(self, upload: ReceivedSample) -> None:
+        """Write an upload's bytes, before any lock is taken; `store` makes them visible.
+
+        The file is named after its content, and nothing refers to it yet: unless `know`
+        is called, `tidy` deletes it.
+
+        Raises:
+            DatasetWriteError: the system cannot write.
+        """
+        name = upload.head.name
+        file = _bytes_file(name, upload.revision)
+        with self._lock:
+            head = self._heads.get(name)
+            if head is None or head.revision != upload.revision:
+                self._replaced.add(file)
+        self._folder.keep(file, upload.raw)
+
     def store(self, changes: documents.Changes, upload: ReceivedSample) -> None:
-        """Add an upload's bytes, then its description, to `changes`; the files of the
-        previous upload of that name stay until `tidy`.
+        """Add the description of a prepared upload to `changes`; the files of the previous
+        upload of that name stay until `tidy`.
 
         Raises:
             DatasetWriteError: the system cannot write.
         """
         head = upload.head
         stem = documents.file_stem(upload.head.name)
-        changes.put(self._folder, _bytes_file(head.name, upload.revision), upload.raw)
         left_out = {"start", "data"} if head.observer else {"start", "data", "observer"}
         document = head.model_dump(by_alias=True, exclude=left_out)
         document["revision"] = upload.revision
@@ -375,8 +391,8 @@ class SampleStore:
             del self._loaded[key]
 
     def tidy(self) -> None:
-        """Delete the files of uploads that were replaced or forgotten; a file that cannot
-        be deleted stays.
+        """Delete the files of uploads that were replaced, forgotten, or prepared in vain; a
+        file that cannot be deleted stays.
         """
         with self._lock:
             files = self._replaced
@@ -484,7 +500,9 @@ def _bytes_of(phantom: Phantom) -> int:
 def _revision(head: UploadHead, raw: bytes) -> str:
     """Hash a content, its bytes and how they are read, to 16 hexadecimal digits; not its name."""
     how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
-    return hashlib.sha256(how + b"\0" + raw).hexdigest()[:16]
+    content = hashlib.sha256(how + b"\0")
+    content.update(raw)
+    return content.hexdigest()[:16]
 
 
 def _shown(head: UploadHead, revision: str) -> str:

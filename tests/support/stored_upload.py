@@ -11,6 +11,7 @@ def completed(store: SampleStore, name: str) -> Phantom:
     """Read and keep an upload of which all bytes have come."""
     upload = store.parse(name)
     with Changes() as changes:
+        store.prepare(upload)
         store.store(changes, upload)
     store.know(upload)
     store.tidy()

@@ -164,25 +164,31 @@ async def upload(
             twin.samples.parse, head.name, material, observer=observer
         )
         warnings = list(upload.phantom.assumed)
-        if there:
-            warnings += await h.change_stage(
-                twin,
-                stands,
-                twin.scanner.correction,
-                lambda: _ensure_replaceable(twin, client, head.name),
-                upload=upload,
-            )
-        else:
 
-            def take() -> None:
-                """Take the upload in; raise first if it would replace one of another's."""
-                _ensure_replaceable(twin, client, head.name)
-                twin.samples.know(upload)
+        def take() -> None:
+            """Take the upload in; raise first if it would replace one of another's."""
+            _ensure_replaceable(twin, client, head.name)
+            twin.samples.know(upload)
 
-            await twin.state_store.keep(
-                take,
-                files=lambda changes: twin.samples.store(changes, upload),
-            )
+        try:
+            await asyncio.to_thread(twin.samples.prepare, upload)
+            if there:
+                warnings += await h.change_stage(
+                    twin,
+                    stands,
+                    twin.scanner.correction,
+                    lambda: _ensure_replaceable(twin, client, head.name),
+                    upload=upload,
+                )
+            else:
+                await twin.state_store.keep(
+                    take,
+                    files=lambda changes: twin.samples.store(changes, upload),
+                )
+        # Not of a cancellation: the change that was begun goes on, and needs the bytes.
+        except Exception:
+            await asyncio.to_thread(twin.samples.tidy)
+            raise
         await asyncio.to_thread(twin.samples.tidy)
     twin.tell("info", f"sample {head.name!r} was uploaded", bytes=received)
     return p.UploadResult(
