@@ -12,8 +12,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from sphinx.util import logging
-
 EVIDENCE = Path("evidence")
 """Folder of the evidence documents, below the folder of all pages."""
 RENDERED = Path("_generated", "evidence")
@@ -21,7 +19,6 @@ RENDERED = Path("_generated", "evidence")
 BENCHMARK = Path("images", "bench.json")
 """The kept benchmark, which is rendered beside them."""
 
-log = logging.getLogger(__name__)
 LINK = re.compile(r"(?<!!)\[([^\]\n]+)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
 
 
@@ -76,6 +73,9 @@ def read(app: Any, docname: str, content: list[str]) -> None:
     """Rewrite the links of a page in place, before it is parsed, and warn of those that
     lead nowhere (hook `source-read`); pages of `_generated` itself stay.
     """
+    from sphinx.util import logging  # tests use the rest, and need no Sphinx
+
+    log = logging.getLogger(__name__)
     page = Path(app.env.doc2path(docname)).resolve()
     if page.parent.name == "_generated":
         return
