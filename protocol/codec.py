@@ -47,9 +47,39 @@ def read_json(data: bytes | bytearray | memoryview) -> object:
             an object with one name twice; names the problem and, where known, its place.
     """
     raw = bytes(data).removeprefix(BYTE_ORDER_MARK)
-    document = from_json(raw, allow_inf_nan=False)
+    try:
+        document = from_json(raw, allow_inf_nan=False)
+    except ValueError:
+        _refuse_not_finite(raw)
+        raise
     _UNIQUE_NAME_DECODER.decode(raw.decode())
     return document
+
+
+def _refuse_not_finite(raw: bytes) -> None:
+    """Raise ValueError with a sentence if a text is no JSON because of a number that is not
+    finite, as Python and others write it; else do nothing.
+    """
+    if b"NaN" not in raw and b"Infinity" not in raw:
+        return
+
+    def refuse(name: str) -> None:
+        """Raise `_NotFiniteError` for the first such number."""
+        raise _NotFiniteError(
+            f"{name} was recognised, which is no JSON; expected: finite numbers, and a "
+            "member without a value left out"
+        )
+
+    try:
+        json.loads(raw, parse_constant=refuse)
+    except _NotFiniteError:
+        raise
+    except (ValueError, RecursionError):
+        pass  # the text is wrong before that
+
+
+class _NotFiniteError(ValueError):
+    """A number that JSON does not have."""
 
 
 def _unique(pairs: list[tuple[str, object]]) -> None:

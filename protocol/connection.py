@@ -5,7 +5,8 @@ below 16 MiB) means length-prefixed MessagePack, anything else JSON lines. A mes
 is too long or broken comes out as `Malformed`; a JSON connection recovers at the next
 newline, a MessagePack connection at the end of the frame. The caller owns the network. No
 received bytes make a method block or raise; only the end of the stream may be an error
-(`receive_end`).
+(`receive_end`). Other framings that are common (a length before JSON, UTF-16, NUL at a
+message's end, documents of many lines) are recognised, and refused by a sentence in JSON.
 
 Received bytes are divided into complete messages at once; these wait, still as bytes, in
 a queue.
@@ -78,6 +79,18 @@ _HTTP_MARKS: Final = b" http/", b"host"
 """Lower-case bytes of which received data holds one if a line may match `_HTTP`."""
 
 
+_EXPECTED: Final = (
+    "expected: each document on one line of UTF-8 JSON, ended by a line feed (\\n), or "
+    "MessagePack after a length of 4 bytes"
+)
+_LENGTH_BEFORE_JSON: Final = f"a length before JSON was recognised; {_EXPECTED}"
+_WIDE_TEXT: Final = f"UTF-16 or UTF-32 was recognised; {_EXPECTED}"
+_NUL: Final = f"a NUL byte was recognised, which no JSON text holds; {_EXPECTED}"
+_MANY_LINES: Final = f"JSON printed over several lines was recognised; {_EXPECTED}"
+_OPENED: Final = b"{", b"["
+"""Lines with which a document printed over several lines begins."""
+
+
 class Prepared:
     """A message that is encoded at most once per codec, for events to many connections."""
 
@@ -142,6 +155,12 @@ class Connection:
         self._skip = 0
         """Bytes of a rejected frame still to be skipped, or 1 for the rest of a rejected
         line."""
+        self._opening = codec is None
+        """Whether the codec was just derived, so that its first frame may be no frame."""
+        self._many_lines = False
+        """Whether the lines of a document that was refused at its first line go on."""
+        self._line_before = b""
+        """The last of them."""
         self._broken = False
         """Whether a fatal error waits in the queue, so that further bytes are ignored."""
 
@@ -234,20 +253,23 @@ class Connection:
         once.
 
         A chunk that is longer than `max_message`, has one line end or none, or may hold
-        HTTP is divided by `_feed_each_line`. Blank lines are dropped; the rest after the
-        last line end waits.
+        HTTP or a foreign framing is divided by `_feed_each_line`. Blank lines are
+        dropped; the rest after the last line end waits.
 
         Args:
             data: received bytes, any part of the stream.
         """
         first = data.find(b"\n") + 1
         last = data.rfind(b"\n") + 1
-        if first == last or len(data) > self.max_message or _may_hold_http(data):
+        plain = not (self._many_lines or _may_hold_http(data) or _may_be_foreign(data))
+        if first == last or len(data) > self.max_message or not plain:
             self._feed_each_line(data)
             return
         # Of many short lines only the first, which may have begun before, can be one to refuse.
         self._feed_each_line(data[:first])
-        if not self._broken:
+        if self._many_lines:
+            self._feed_each_line(data[first:])
+        elif not self._broken:
             # Split and filtered in C: a loop over ten thousand lines would hold up all
             # connections.
             lines = [*filter(bytes.strip, data[first : last - 1].split(b"\n"))]
@@ -256,12 +278,12 @@ class Connection:
             self._begun += data[last:]
 
     def _feed_each_line(self, data: bytes) -> None:
-        """Divide JSON lines one by one; queue an error for HTTP (fatal) and for lines
-        that are too long.
+        """Divide JSON lines one by one; queue an error for HTTP (fatal), for lines that
+        are too long, and for foreign framings (UTF-16: fatal).
 
         Blank lines are dropped; an incomplete line is kept. A line is refused as soon as
-        it is longer than `max_message`, and the rest of it is skipped up to its end.
-        After HTTP the rest of `data` is dropped.
+        it is longer than `max_message` or has a NUL, and the rest of it is skipped up to
+        its end. After a fatal error the rest of `data` is dropped.
 
         Args:
             data: received bytes, any part of the stream.
@@ -272,6 +294,9 @@ class Connection:
             self._begun.clear()
             if self._skip:  # the rest of a line that was refused
                 self._skip = 0
+            elif b"\0" in line[: self.max_message]:
+                if self._refuse_nul(line):
+                    return
             elif len(line) > self.max_message:
                 self._refuse(too_large("a line", len(line), self.max_message))
             elif _HTTP.match(line):
@@ -279,21 +304,73 @@ class Connection:
                 why = "this is a JSON-RPC server, not an HTTP one"
                 self._refuse(RpcError(Code.INVALID_REQUEST, why), fatal=True)
                 return
+            elif self._goes_on(line):
+                pass
             elif line.strip():
                 self._new.append(line)
                 self._held += len(line)
         if not self._skip:
             self._begun += rest
+        # Before its end has come: a sender of such texts never sends one.
+        if b"\0" in rest and not self._skip and b"\0" in self._begun[: self.max_message]:
+            self._skip = 1
+            if self._refuse_nul(bytes(self._begun)):
+                return
         # Before its end has come, or a line without one would fill the memory.
         if (came := len(self._begun)) > self.max_message:
             self._skip = 1
             self._refuse(too_large("a line", f"at least {came}", self.max_message))
 
+    def _refuse_nul(self, line: bytes) -> bool:
+        """Queue the error about a line, or its beginning, that has a NUL.
+
+        Only the bytes up to the NUL decide, however the line was cut.
+
+        Returns:
+            Whether it is fatal: in UTF-16 and UTF-32 every line has NULs.
+        """
+        before = line[: line.index(b"\0")]
+        wide = before in (b"\xff\xfe", b"\xfe\xff") or (
+            before.removeprefix(b"\xff\xfe") in _OPENED
+        )
+        # A length in little-endian order has high bytes of zero.
+        length = 1 <= len(before) <= 3 and not before.startswith(_OPENED)
+        why = _NUL
+        if wide:
+            why = _WIDE_TEXT
+        elif length:
+            why = _LENGTH_BEFORE_JSON
+        self._refuse(parse_error(why), fatal=wide)
+        return wide
+
+    def _goes_on(self, line: bytes) -> bool:
+        """Refuse a document over several lines at its first line, and return whether
+        `line` is part of such a document.
+
+        Of its other lines those are dropped that are indented, a member or brackets, and
+        cannot be a message; any other ends it, so that no request is lost.
+        """
+        opens = line.rstrip(b"\r").removeprefix(codecs.BYTE_ORDER_MARK) in _OPENED
+        # No object begins right behind an object's end or within one without a name.
+        begins = opens and self._line_before in (b"{", b"}", b"]")
+        self._line_before = line.rstrip()
+        if self._many_lines and not begins:
+            text = line.strip()
+            brackets = not text.strip(b"{}[],")
+            inner = line.startswith((b" ", b"\t", b'"')) and not text.startswith(_OPENED)
+            self._many_lines = brackets or inner
+            return self._many_lines
+        if opens:
+            self._new.append(Malformed(parse_error(_MANY_LINES)))
+            self._many_lines = True
+        return opens
+
     def _feed_frames(self, data: bytes | bytearray | memoryview) -> None:
         """Divide MessagePack frames; queue an error for one that is too long, and skip
         its rest.
 
-        An incomplete frame waits for more bytes. A frame above `max_message` is refused
+        An incomplete frame waits for more bytes. A first frame that begins as JSON does
+        is a fatal error, which is told in JSON. A frame above `max_message` is refused
         and skipped; a length above `MAX_FRAME` is a fatal error, as the stream has no
         known next frame then, and the rest of `data` is dropped.
 
@@ -306,6 +383,12 @@ class Connection:
         at = 0
         # A view, so that the chunk is copied once.
         begun += memoryview(data)[skipped:]
+        if self._opening and len(begun) >= 5:
+            self._opening = False
+            if (why := _foreign_opening(begun)) is not None:
+                self.codec = Codec.JSON
+                self._refuse(parse_error(why), fatal=True)
+                return
         held: bytes | bytearray = begun
         while (available := len(held)) - at >= 4:
             (size,) = _size(held, at)
@@ -506,6 +589,29 @@ def _may_hold_http(data: bytes) -> bool:
     # Two searches in C spare nearly all chunks the expression at each of their lines.
     lower = data.lower()
     return any(mark in lower for mark in _HTTP_MARKS)
+
+
+def _may_be_foreign(data: bytes) -> bool:
+    """Return whether each line must be checked for a framing that is not ours."""
+    return b"\0" in data or any(
+        opened + end in data for opened in _OPENED for end in (b"\n", b"\r\n")
+    )
+
+
+def _foreign_opening(begun: bytes | bytearray) -> str | None:
+    """Recognise a connection's first five bytes, which begin with 0, if they are no frame.
+
+    A frame holds a map or an array; none of their heads is 0 or the ASCII bracket of JSON.
+
+    Returns:
+        The sentence about it; None for a frame.
+    """
+    (size,) = _size(begun, 0)
+    if begun[4:5] in _OPENED and size >= 2:
+        return _LENGTH_BEFORE_JSON
+    utf_16 = begun[0] == begun[2] == begun[4] == 0 and begun[1:2] in _OPENED
+    utf_32 = not any(begun[:3]) and begun[3:4] in _OPENED and begun[4] == 0
+    return _WIDE_TEXT if utf_16 or utf_32 else None
 
 
 def may_name(codec: Codec, raw: bytes, names: tuple[bytes, ...]) -> bool:

@@ -62,6 +62,16 @@ def no_truth(value: object) -> object:
     return value
 
 
+def whole(value: object) -> object:
+    """Convert a number without a fraction to an int; return any other value unchanged.
+
+    JSON has one kind of number, and some languages write all of theirs as 8.0.
+    """
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
+
+
 def encoded(name: str) -> str:
     """Percent-encode `name` for use in a file's name; different names give different texts."""
     return quote(name, safe=" ", errors="surrogatepass").replace(".", "%2E")

@@ -31,6 +31,7 @@ from flexdt.protocol.field_checks import (
     no_truth,
     payload,
     plain_name,
+    whole,
 )
 from flexdt.protocol.image import Dtype
 
@@ -47,7 +48,9 @@ Payload = Annotated[
     WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
 ]
 """Binary data: base64 in JSON, raw bytes in MessagePack."""
-Version1 = Annotated[Literal[1], BeforeValidator(no_truth)]
+Integral = BeforeValidator(whole)
+"""Lets an integer be written with a fraction of zero: 8.0."""
+Version1 = Annotated[Literal[1], BeforeValidator(no_truth), Integral]
 """The version of a document; `true`, which Python holds for 1, is none."""
 _LINE_SCHEMA = {"pattern": r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*$"}
 Name = Annotated[
@@ -88,7 +91,7 @@ Distance = Annotated[float, Ge(1e-3), Le(1e5)]
 """Of source, object and detector [mm]."""
 Pitch = Annotated[float, Ge(1e-6), Le(1e3)]
 """Of voxels [mm]."""
-Side = Annotated[int, Ge(1), Le(32_768)]
+Side = Annotated[int, Ge(1), Le(32_768), Integral]
 """Voxels, or pixels, along a side."""
 Deviation = Annotated[float, Ge(-1e9), Le(1e9)]
 """True minus nominal, of a geometric parameter [mm or deg]."""
@@ -98,7 +101,7 @@ Shape2 = Annotated[tuple[int, int], Field(strict=False)]
 """(rows, columns)."""
 Roi = Annotated[tuple[int, int, int, int], Field(strict=False)]
 """(left, top, right, bottom), inclusive, unbinned pixels, origin top left."""
-Pixel = Annotated[int, Ge(0), Le(65_535)]
+Pixel = Annotated[int, Ge(0), Le(65_535), Integral]
 RoiAsked = Annotated[tuple[Pixel, Pixel, Pixel, Pixel], Field(strict=False)]
 """A `Roi` in a request."""
 Place = Annotated[float, Ge(-1), Le(65_535)]

@@ -158,8 +158,8 @@ class MeshSize(f.Params):
     counter-clockwise seen from outside.
     """
 
-    vertices: Annotated[int, Ge(4), Le(MAX_CORNERS)]
-    triangles: Annotated[int, Ge(4), Le(MAX_CORNERS)]
+    vertices: Annotated[int, Ge(4), Le(MAX_CORNERS), f.Integral]
+    triangles: Annotated[int, Ge(4), Le(MAX_CORNERS), f.Integral]
 
     @property
     def nbytes(self) -> int:
@@ -232,7 +232,9 @@ class Backproject(f.Params):
 class Cancel(f.Params):
     """A request of this connection that is no longer wanted."""
 
-    request: Annotated[int, Ge(0), Le(2**64 - 1)] | Annotated[str, Len(0, 1000)]
+    request: (
+        Annotated[int, Ge(0), Le(2**64 - 1), f.Integral] | Annotated[str, Len(0, 1000)]
+    )
 
 
 class VolumeInfo(f.Result):

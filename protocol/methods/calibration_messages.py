@@ -10,7 +10,7 @@ from pydantic import Field, JsonValue
 
 from flexdt.protocol import fields as f
 from flexdt.protocol.field_checks import few
-from flexdt.protocol.fields import ImageValue, Params, Result, Shape2, ShortText
+from flexdt.protocol.fields import ImageValue, Integral, Params, Result, Shape2, ShortText
 from flexdt.protocol.method import command, read
 from flexdt.protocol.state_model import Correction
 
@@ -26,11 +26,11 @@ class DatasetList(Params):
 
     search: Annotated[ShortText, MaxLen(200)] = ""
     """words; each occurs in name, sample, operator, date, state or a setting"""
-    start: Annotated[int, Ge(0), Le(1_000_000)] = 0
+    start: Annotated[int, Ge(0), Le(1_000_000), Integral] = 0
     """left out before"""
-    count: Annotated[int, Ge(1), Le(200)] = 50
+    count: Annotated[int, Ge(1), Le(200), Integral] = 50
     """listed at most"""
-    thumbnail: Annotated[int, Ge(0), Le(256)] = 0
+    thumbnail: Annotated[int, Ge(0), Le(256), Integral] = 0
     """longer side of a small image of each [pixels]; 0 for none"""
 
 
@@ -39,7 +39,7 @@ class DatasetGet(Params):
 
     name: DataSetName
     """of its folder"""
-    points: Annotated[int, Ge(2), Le(2000)] = 400
+    points: Annotated[int, Ge(2), Le(2000), Integral] = 400
     """largest number of images, evenly chosen, with their poses and times"""
     measure: bool = False
     """include their mean counts and clearances"""
@@ -52,10 +52,10 @@ class DatasetFrame(Params):
 
     name: DataSetName
     """of its folder"""
-    index: Annotated[int, Ge(0), Le(10_000_000)]
+    index: Annotated[int, Ge(0), Le(10_000_000), Integral]
     """of the image, in the order taken: dark and flat images count"""
     kind: Literal["line_integral", "counts"] = "counts"
-    binning: Annotated[int, Ge(1), Le(64)] = 1
+    binning: Annotated[int, Ge(1), Le(64), Integral] = 1
     """mean over so many pixels a side"""
 
 
@@ -197,7 +197,7 @@ class Mark(f.Params):
     """Where a bead was seen in a projection; pixel (0, 0) is the middle of the upper left
     one."""
 
-    frame: Annotated[int, Ge(0), Le(10_000_000)]
+    frame: Annotated[int, Ge(0), Le(10_000_000), Integral]
     """projection, counted from 0"""
     marker: f.AxisName
     """number of the bead in its phantom, counted from 0; any name of an unknown one"""
@@ -223,7 +223,7 @@ class CalibrationFit(f.Params):
     """name -> standard deviation [mm or deg]; 0: exactly known"""
     per_frame: Parameters = Field(default_factory=list)
     """parameters that may also move during the scan"""
-    steps: Annotated[int, Ge(0), Le(50)] = 0
+    steps: Annotated[int, Ge(0), Le(50), Integral] = 0
     """include covariances after so many parts of the frames"""
     residuals: bool = False
     """include those of every bead in every frame"""

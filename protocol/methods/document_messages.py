@@ -16,8 +16,8 @@ from flexdt.protocol.field_checks import few
 from flexdt.protocol.method import by_hand, read
 from flexdt.protocol.state_model import State
 
-Averages = Annotated[int, Ge(1), Le(100_000)]
-Frames = Annotated[int, Ge(1), Le(1_000_000)]
+Averages = Annotated[int, Ge(1), Le(100_000), f.Integral]
+Frames = Annotated[int, Ge(1), Le(1_000_000), f.Integral]
 Kept = Annotated[float, Ge(-2e9), Le(2e9)]
 """A `Deviation` that has been to radians and back."""
 Paces = Annotated[dict[f.AxisName, f.Pace], MaxLen(64), few(64)]

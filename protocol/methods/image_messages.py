@@ -27,7 +27,7 @@ class ProjectionGet(f.Params):
     """
 
     kind: Literal["line_integral", "counts"] = "line_integral"
-    binning: Annotated[int, Ge(1), Le(32)] = 1
+    binning: Annotated[int, Ge(1), Le(32), f.Integral] = 1
     """mean over so many pixels a side, beyond the camera's mode"""
     marks: bool = False
     """include which pixels are saturated, starved or cut off"""

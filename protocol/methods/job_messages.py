@@ -19,10 +19,13 @@ Moments = Annotated[
     Ge(1),
     Le(64),
     Field(description="moments averaged within the exposure of an image taken in motion"),
+    f.Integral,
 ]
 
 Seed = Annotated[
-    int | None, Field(ge=0, le=2**63 - 1, description="of the noise; made up if left out")
+    int | None,
+    Field(ge=0, le=2**63 - 1, description="of the noise; made up if left out"),
+    f.Integral,
 ]
 
 ScriptText = Annotated[str, MaxLen(8 * 2**20)]

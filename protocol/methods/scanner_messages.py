@@ -13,6 +13,7 @@ from flexdt.protocol import fields as f
 from flexdt.protocol.field_checks import require_extent
 from flexdt.protocol.fields import (
     Exposure,
+    Integral,
     Params,
     Power,
     RoiAsked,
@@ -31,7 +32,7 @@ from flexdt.protocol.state_model import (
     TubeState,
 )
 
-Bytes = Annotated[int, Ge(0), Le(2**53)]
+Bytes = Annotated[int, Ge(0), Le(2**53), Integral]
 """A place in, or a size of, something sent in parts [bytes]."""
 MESH_CHUNK = 4 << 20
 """Longest part of a mesh in one answer [bytes]; its base64 fits into a frame."""
@@ -85,7 +86,7 @@ class AxisSet(f.Params):
 class Reset(f.Params):
     """Leave the emergency stop, or blocked."""
 
-    stop: Annotated[int, Ge(0), Le(2**53)] | None = None
+    stop: Annotated[int, Ge(0), Le(2**53), Integral] | None = None
     """release this stop (safety.stop) alone; null: any"""
 
 
@@ -181,7 +182,7 @@ class SampleMesh(f.Params):
 
     start: Bytes = 0
     """first byte"""
-    count: Annotated[int, Ge(1), Le(MESH_CHUNK)] = 1 << 20
+    count: Annotated[int, Ge(1), Le(MESH_CHUNK), Integral] = 1 << 20
     """bytes at most"""
 
 
@@ -194,7 +195,7 @@ class SampleUpload(f.Params):
     format: Literal[MeshFormat, VoxelFormat, SceneFormat]
     """raw: float32 little-endian voxels [z, y, x] of attenuation [1/mm]; json, toml: the text
     of a phantom or scene file"""
-    total: Annotated[Bytes, Gt(0)]
+    total: Annotated[int, Ge(0), Le(2**53), Gt(0), Integral]
     """size of the whole [bytes]"""
     start: Bytes = 0
     """position of this chunk [bytes]"""

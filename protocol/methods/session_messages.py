@@ -9,7 +9,15 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.json_schema import WithJsonSchema
 
 from flexdt.protocol.field_checks import line
-from flexdt.protocol.fields import Empty, Nothing, Params, Result, ShortText, TopicName
+from flexdt.protocol.fields import (
+    Empty,
+    Integral,
+    Nothing,
+    Params,
+    Result,
+    ShortText,
+    TopicName,
+)
 from flexdt.protocol.method import Method, read
 from flexdt.protocol.state_model import State
 
@@ -63,7 +71,7 @@ class Subscribe(Params):
     max_rate_hz: Annotated[float, Ge(1e-3), Le(1000)] | None = None
     """at most so many events a second and topic; the newest value wins"""
     projection_kind: Literal["line_integral", "counts"] = "line_integral"
-    projection_binning: Annotated[int, Ge(1), Le(32)] = 1
+    projection_binning: Annotated[int, Ge(1), Le(32), Integral] = 1
     """mean over so many pixels a side, for the topic projection"""
 
 
