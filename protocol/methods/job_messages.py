@@ -105,6 +105,15 @@ class JobForget(f.Params):
         return self
 
 
+class JobList(f.Params):
+    """Which jobs to list; all without parameters."""
+
+    start: Annotated[int, Ge(0), Le(2**53)] = 0
+    """left out before"""
+    count: Annotated[int, Ge(1), Le(2**53)] | None = None
+    """listed at most; null: all others"""
+
+
 class JobForgetResult(f.Result):
     """The jobs that are not known any more; their data sets stay."""
 
@@ -164,9 +173,11 @@ class SubmitResult(f.Result):
 
 
 class JobListResult(f.Result):
-    """All jobs, oldest first."""
+    """Jobs, oldest first."""
 
     jobs: list[JobStatus]
+    total: int | None = None
+    """jobs that there are; null from an earlier server"""
 
 
 SCRIPT_CHECK = read(
@@ -212,7 +223,9 @@ JOB_STEP = command("job.step", JobRef, JobStatus, "run a paused job for one step
 JOB_ABORT = Method(
     "job.abort", JobAbort, JobStatus, "end a job, its data set incomplete", urgent=True
 )
-JOB_LIST = read("job.list", f.Empty, JobListResult, "all jobs, oldest first")
+JOB_LIST = read(
+    "job.list", JobList, JobListResult, "all jobs or a part of them, oldest first"
+)
 JOB_FORGET = command(
     "job.forget", JobForget, JobForgetResult, "forget ended jobs; data sets stay"
 )

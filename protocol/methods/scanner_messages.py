@@ -267,10 +267,22 @@ class SampleInfo(f.Result):
     uploaded: bool = False
 
 
+class SampleList(f.Params):
+    """Which samples to list; all without parameters."""
+
+    start: Annotated[int, Ge(0), Le(2**53)] = 0
+    """left out before"""
+    count: Annotated[int, Ge(1), Le(2**53)] | None = None
+    """listed at most; null: all others"""
+
+
 class SampleListResult(f.Result):
-    """All samples, and the materials a mesh may be made of."""
+    """Samples (the empty stage, shipped ones, uploads), and the materials a mesh may be
+    made of."""
 
     samples: list[SampleInfo]
+    total: int | None = None
+    """samples that there are; null from an earlier server"""
     materials: list[str] = Field(default_factory=list)
 
 
@@ -299,7 +311,12 @@ class SampleMeshResult(f.Result):
 
 
 SAMPLE_SET = by_hand("sample.set", SampleSet, SampleResult, "put a sample on the stage")
-SAMPLE_LIST = read("sample.list", f.Empty, SampleListResult, "the samples there are")
+SAMPLE_LIST = read(
+    "sample.list",
+    SampleList,
+    SampleListResult,
+    "the samples there are, or a part of them",
+)
 SAMPLE_MESH = read(
     "sample.mesh", SampleMesh, SampleMeshResult, "the shape of the sample on the stage"
 )

@@ -135,7 +135,8 @@ export type ImageValue = { shape: Array<number>; data: string };
 export type JobAbort = { job?: string | null; reason?: string | null };
 export type JobForget = { job?: string | null };
 export type JobForgetResult = { jobs: Array<string> };
-export type JobListResult = { jobs: Array<JobStatus> };
+export type JobList = { start?: number; count?: number | null };
+export type JobListResult = { jobs: Array<JobStatus>; total: number | null };
 export type JobRef = { job?: string | null };
 export type JobStatus = {
   job: string;
@@ -195,7 +196,10 @@ export type SampleInfo = {
   name: string; kind: "phantom" | "mesh" | "voxels" | "scene"; description: string;
   size_mm: [number, number, number] | null; uploaded: boolean
 };
-export type SampleListResult = { samples: Array<SampleInfo>; materials: Array<string> };
+export type SampleList = { start?: number; count?: number | null };
+export type SampleListResult = {
+  samples: Array<SampleInfo>; total: number | null; materials: Array<string>
+};
 export type SamplePart = {
   name: "" | string; material?: string | null; offset?: Placement
 };
@@ -282,7 +286,7 @@ export interface Methods {
   "tube.set": [TubeSet, TubeState];
   "camera.set": [CameraSet, CameraState];
   "sample.set": [SampleSet, SampleResult];
-  "sample.list": [Empty, SampleListResult];
+  "sample.list": [SampleList, SampleListResult];
   "sample.upload": [SampleUpload, UploadResult];
   "sample.delete": [SampleDelete, SampleDeleteResult];
   "exposure.predict": [ExposurePredict, ExposurePrediction];
@@ -293,7 +297,7 @@ export interface Methods {
   "job.resume": [JobRef, JobStatus];
   "job.step": [JobRef, JobStatus];
   "job.abort": [JobAbort, JobStatus];
-  "job.list": [Empty, JobListResult];
+  "job.list": [JobList, JobListResult];
   "job.forget": [JobForget, JobForgetResult];
   "dataset.get": [DatasetGet, DatasetResult];
   "calibration.apply": [Correct, CorrectionResult];

@@ -129,6 +129,11 @@ async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[
     return views
 
 
+def page(items: Sequence[Item], start: int, count: int | None) -> Sequence[Item]:
+    """Return the part of a list that a request wants; None: all from `start` on."""
+    return items[start:] if count is None else items[start : start + count]
+
+
 async def encoded_apart(client: Client, result: _R, count: int) -> _R | Encoded:
     """Return a result of `count` items; a long one is encoded in a thread."""
     if count <= ITEMS_A_TURN:

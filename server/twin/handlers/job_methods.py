@@ -11,7 +11,6 @@ from typing import TypeAlias
 
 from flexdt.protocol import Method
 from flexdt.protocol import state_model as w
-from flexdt.protocol.fields import Empty
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import job_messages as p
 from flexdt.protocol.rpc_errors import invalid_params, too_large
@@ -143,11 +142,15 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
 
 @h.answers(p.JOB_LIST)
 async def list_jobs(
-    twin: TwinServer, client: h.Client, params: Empty
+    twin: TwinServer, client: h.Client, params: p.JobList
 ) -> p.JobListResult | Encoded:
-    """List all jobs that are kept, oldest first, in several turns of the loop if there are many."""
-    jobs = await h.in_turns(twin.jobs.all(), twin.jobs.status)
-    return await h.encoded_apart(client, p.JobListResult(jobs=jobs), len(jobs))
+    """List the jobs that are kept, or a part of them, oldest first, in several turns of the
+    loop if there are many.
+    """
+    known = twin.jobs.all()
+    jobs = await h.in_turns(h.page(known, params.start, params.count), twin.jobs.status)
+    result = p.JobListResult(jobs=jobs, total=len(known))
+    return await h.encoded_apart(client, result, len(jobs))
 
 
 @h.answers(p.JOB_FORGET)

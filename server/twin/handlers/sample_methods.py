@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import replace
 
-from flexdt.phantoms import Phantom, load_phantom, materials, phantom_names
-from flexdt.protocol.fields import Empty
+from flexdt.phantoms import Phantom, is_shipped, load_phantom, materials
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import scanner_messages as p
 from flexdt.protocol.rpc_errors import busy
@@ -63,30 +62,35 @@ async def set_sample(
 
 @h.answers(p.SAMPLE_LIST)
 async def list_samples(
-    twin: TwinServer, client: h.Client, params: Empty
+    twin: TwinServer, client: h.Client, params: p.SampleList
 ) -> p.SampleListResult | Encoded:
-    """List the empty stage, shipped phantoms and uploads, in that order, and all
-    materials.
+    """List the empty stage, shipped phantoms and uploads, in that order, or a part of
+    them, and all materials.
 
     Phantoms have their size [mm], uploads a text with format and bytes. The list is made
     in several turns of the loop; more than `ITEMS_A_TURN` entries are encoded in a
     thread.
     """
-    empty = p.SampleInfo(
-        name=EMPTY_STAGE, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
+    names = [EMPTY_STAGE, *twin.samples.names]
+    part = h.page(names, params.start, params.count)
+    found = await h.in_turns(part, lambda name: _listed(twin, name))
+    samples = [info for info in found if info is not None]
+    result = p.SampleListResult(
+        samples=samples, total=len(names), materials=list(materials())
     )
-    shipped = await h.in_turns(
-        phantom_names(), lambda name: _sample_info(name, load_phantom(name))
-    )
-    heads = [
-        head
-        for name in twin.samples.uploads
-        if (head := twin.samples.head(name)) is not None
-    ]
-    uploads = await h.in_turns(heads, _upload_info)
-    samples = [empty, *shipped, *uploads]
-    result = p.SampleListResult(samples=samples, materials=list(materials()))
     return await h.encoded_apart(client, result, len(samples))
+
+
+def _listed(twin: TwinServer, name: str) -> p.SampleInfo | None:
+    """Describe a sample for the list; None for an upload that is gone meanwhile."""
+    if name == EMPTY_STAGE:
+        return p.SampleInfo(
+            name=name, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
+        )
+    if is_shipped(name):
+        return _sample_info(name, load_phantom(name))
+    head = twin.samples.head(name)
+    return None if head is None else _upload_info(head)
 
 
 @h.answers(p.SAMPLE_MESH)
