@@ -14,7 +14,7 @@ import ssl
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 
@@ -59,6 +59,12 @@ class ConnectionLimits:
     end_timeout_s: float = 30.0
     requests_per_s: float | None = None
     malformed: int = 100
+
+
+MAX_LIMIT: Final = 999_999_999
+"""Largest value of a limit in days or seconds: the most days that a duration can have."""
+MAX_WHOLE_LIMIT: Final = 2**53
+"""Largest value of a limit that counts or is in bytes."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +129,8 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
         others: names of other limits, which are skipped unchecked.
 
     Raises:
-        AccessError: no such limit (lists the limits), or not a finite number above 0.
+        AccessError: no such limit (lists the limits), or not a number above 0 that what
+            it limits can have.
     """
     names: tuple[str, ...] = limit_names(default)
     out: _L = default
@@ -141,6 +148,9 @@ def with_limits(words: Sequence[str], default: _L, others: Collection[str] = ())
         if not 0.0 < value < math.inf:
             raise AccessError(f"--limit {word!r}: {name} must be a number above 0")
         is_integer = isinstance(getattr(out, name), int) or name == "disk_quota"
+        most = MAX_WHOLE_LIMIT if is_integer else MAX_LIMIT
+        if value > most:
+            raise AccessError(f"--limit {word!r}: {name} must be at most {most:g}")
         changed: dict[str, Any] = {name: int(value) if is_integer else value}
         out = replace(out, **changed)
     return out
