@@ -366,16 +366,20 @@ class Directory:
         with self._opened() as fd:
             os.unlink(self._at(name), dir_fd=fd)
 
-    def discard(self, name: str) -> None:
-        """Delete an entry that is no directory, and wait for the disk; a missing one is
-        no error.
+    def discard(self, *names: str) -> None:
+        """Delete entries that are no directories, and wait for the disk once; a missing
+        one is no error.
 
         Raises:
-            DatasetWriteError: the system refuses.
+            DatasetWriteError: the system refuses one; later ones stay.
         """
-        refused = writing(self.path / name, f"cannot delete {self.path / name}")
-        with refused, suppress(FileNotFoundError, NotADirectoryError):
-            self.unlink(name)
+        gone = False
+        for name in names:
+            refused = writing(self.path / name, f"cannot delete {self.path / name}")
+            with refused, suppress(FileNotFoundError, NotADirectoryError):
+                self.unlink(name)
+                gone = True
+        if gone:
             self.sync()
 
     def stat(self, name: str) -> os.stat_result | None:

@@ -152,22 +152,26 @@ class Changes:
         data = json.dumps(document, indent=1, allow_nan=False).encode("utf-8")
         self.put(folder, name, data)
 
-    def remove(self, folder: Directory, name: str) -> None:
-        """Delete a file and wait for the disk; a missing one is no error.
+    def remove(self, folder: Directory, *names: str) -> None:
+        """Delete files of a folder and wait for the disk once; a missing one is no error.
 
-        It is only renamed, so that `undo` can restore it; `done` deletes it.
+        They are only renamed, so that `undo` can restore them; `done` deletes them.
 
         Raises:
             DatasetWriteError: the system refuses.
         """
-        before = self._before()
-        with writing(folder.path / name, f"cannot delete {folder.path / name}"):
-            try:
-                folder.rename(name, before)
-            except (FileNotFoundError, NotADirectoryError):
-                return
+        gone = False
+        for name in names:
+            before = self._before()
+            with writing(folder.path / name, f"cannot delete {folder.path / name}"):
+                try:
+                    folder.rename(name, before)
+                except (FileNotFoundError, NotADirectoryError):
+                    continue
             # Before the sync, which may fail: the file is away, and `undo` has to know.
             self._made.append(_Change(folder, name, None, before))
+            gone = True
+        if gone:
             folder.sync()
 
     def _before(self) -> str:

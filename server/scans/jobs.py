@@ -286,8 +286,11 @@ class Jobs:
             sample: sample of the scan.
 
         Raises:
+            UnknownNameError: the job has been forgotten.
             RpcError: -32003, `max_waiting` jobs wait, or the job has not ended.
         """
+        if job is not None:
+            job = self.get(job.id)
         waiting = sum(each.phase == "queued" for each in self._all.values())
         if waiting >= self.max_waiting:
             data = {"asked": waiting + 1, "allowed": self.max_waiting}
@@ -318,11 +321,11 @@ class Jobs:
             The job of the list: for a continued job the same object as before, with the
             draft's fields.
         """
+        self._forget_old(but=draft.id)
         self._count += draft.id not in self._all
         job = self._all.setdefault(draft.id, draft)
         # Into the same object: who holds the job, such as a wait for its end, follows it.
         vars(job).update(vars(draft))
-        self._forget_old()
         self._queue.put_nowait(job)
         self._tell(job)
         return job
@@ -482,7 +485,7 @@ class Jobs:
             RpcError: -32003, the named one has not ended.
         """
         if job is None:
-            return self._ended_before(self._today() - min_age)
+            return self._ended_for(min_age)
         found = self.get(job)
         if found.phase not in ENDED_PHASES or found is self.current:
             raise self._phase_error("forget", found, ENDED_PHASES)
@@ -498,31 +501,33 @@ class Jobs:
                 del self._all[job.id]
                 self._changed.add(job.id)
 
-    def _forget_old(self) -> None:
+    def _forget_old(self, but: str | None = None) -> None:
         """Forget the oldest ended jobs beyond `max_ended`, and those that ended over
         `max_age` ago.
 
-        The current job stays in the list.
+        The current job stays in the list, and the job `but`.
         """
         ended = [
             j
             for j in self._all.values()
-            if j.phase in ENDED_PHASES and j is not self.current
+            if j.phase in ENDED_PHASES and j is not self.current and j.id != but
         ]
         self.forget(ended[: max(0, len(ended) - self._max_ended)])
-        self.forget(self._ended_before(self._today() - self._max_age))
+        self.forget(j for j in self._ended_for(self._max_age) if j.id != but)
 
-    def _ended_before(self, than: datetime) -> list[Job]:
-        """List the ended jobs, except the current one, that ended at a moment or before.
+    def _ended_for(self, age: timedelta) -> list[Job]:
+        """List the ended jobs, except the current one, that ended at least so long ago.
 
         A job without an end time counts as old.
         """
+        # Ages are compared, not dates: no calendar has the date of a million days ago.
+        today = self._today()
         return [
             job
             for job in self._all.values()
             if job.phase in ENDED_PHASES
             and job is not self.current
-            and (job.ended or than) <= than
+            and (job.ended is None or today - job.ended >= age)
         ]
 
     def _tell(self, job: Job) -> None:

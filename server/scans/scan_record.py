@@ -12,7 +12,7 @@ from __future__ import annotations
 import base64
 import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, Final
 
@@ -205,13 +205,14 @@ class JobRecord:
             )
 
     @staticmethod
-    def forget(changes: Changes, root: Directory, name: str) -> None:
-        """Delete the one of a data set, among other changes.
+    def forget(changes: Changes, root: Directory, names: Sequence[str]) -> None:
+        """Delete those of data sets, among other changes.
 
         Raises:
             DatasetWriteError: the system refuses.
         """
-        changes.remove(root.folder(FOLDER), f"{file_stem(name)}.json")
+        files = [f"{file_stem(name)}.json" for name in names]
+        changes.remove(root.folder(FOLDER), *files)
 
     @classmethod
     def read(cls, root: Directory, name: str) -> JobRecord:

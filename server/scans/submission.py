@@ -272,8 +272,9 @@ class Submissions:
 
     async def again(
         self, job: Job, ensure_allowed: Callable[[], None] = lambda: None
-    ) -> None:
-        """Put a job that ended early into the queue again; only missing images are made.
+    ) -> Job:
+        """Put a job that ended early into the queue again, and return it; only missing
+        images are made.
 
         The scan is read from its record. Where its data set exists, it goes on under the
         conditions that it began with.
@@ -283,6 +284,7 @@ class Submissions:
             ensure_allowed: raises if the requester has lost control.
 
         Raises:
+            UnknownNameError: it has been forgotten meanwhile.
             RpcError: as `submit`; -32602, its record cannot be read or a job writes the
                 data set.
         """
@@ -302,7 +304,7 @@ class Submissions:
             assert begin is not None
             job_record = replace(job_record, begin=begin)
         scan = await self._checked(job_record, name, begun, ensure_allowed)
-        await self._enqueue(scan, ensure_allowed, job)
+        return await self._enqueue(scan, ensure_allowed, job)
 
     async def _enqueue(
         self,

@@ -8,7 +8,7 @@ there are. The start of a scan is in DATA/jobs, one file a data set
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import datetime
 from typing import Annotated, Literal
@@ -20,7 +20,6 @@ from flexdt.protocol.fields import SpeedUp
 from flexdt.protocol.state_model import JobPhase
 from flexdt.runtime.files import own_documents as documents
 from flexdt.runtime.files.directory import Directory
-from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.dataset.file_names import plain_name
 
 RECORDS = "jobs"
@@ -101,29 +100,33 @@ class JobFiles:
         self._records.make()
         changes.put(self._folder, _file(job.id), _text(job))
 
-    def remove(self, changes: documents.Changes, job: str) -> None:
-        """Delete a job's file, among other changes; none there is no error."""
-        changes.remove(self._folder, _file(job))
+    def remove(self, changes: documents.Changes, jobs: Sequence[str]) -> None:
+        """Delete the files of jobs, among other changes; none there is no error."""
+        changes.remove(self._folder, *map(_file, jobs))
 
-    def write(self, name: str, job: JobMemory | None) -> None:
-        """Write a job that has changed; None deletes its file.
-
-        The folder is made if it is missing; a missing file is no error.
+    def write(self, job: JobMemory) -> None:
+        """Write a job that has changed; the folder is made if it is missing.
 
         Raises:
             DatasetWriteError: the system refuses.
         """
-        if job is None:
-            self._folder.discard(_file(name))
-        else:
-            self._records.make()
-            self._folder.keep(_file(name), _text(job))
+        self._records.make()
+        self._folder.keep(_file(job.id), _text(job))
+
+    def delete(self, jobs: Sequence[str]) -> None:
+        """Delete the files of jobs, and wait for the disk once; a missing file is no
+        error.
+
+        Raises:
+            DatasetWriteError: the system refuses.
+        """
+        self._folder.discard(*map(_file, jobs))
 
     def clear(self) -> None:
         """Delete the file of every job; one that cannot be deleted stays."""
         for file in documents.ours(self._folder):
-            with suppress(DatasetWriteError):
-                self._folder.discard(file)
+            with suppress(OSError):
+                self._folder.unlink(file)
 
     def settle(self) -> None:
         """Clean the folders at the start: delete the rest of killed writers; set aside

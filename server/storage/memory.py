@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
@@ -48,8 +47,10 @@ FILE = "state.json"
 MIN_INTERVAL_S = 0.25
 """Shortest time between two writes [s of real time]."""
 ChangedJobs = dict[str, JobMemory | None]
-MAX_JOBS_PER_TURN = 200
+MAX_JOBS_PER_TURN = 20
 """Largest number of jobs that are written while other changes wait."""
+MAX_FORGOTTEN_PER_TURN = 200
+"""Largest number of jobs whose files are deleted while other changes wait."""
 FAR_S = 60.0
 """Pause after a failed write (a full disk) [s]."""
 
@@ -259,7 +260,9 @@ class StateStore:
         self._make = make
         self._job_files = job_files
         self._changed_jobs = changed_jobs
-        self._unwritten: ChangedJobs = {}
+        self._unwritten: dict[str, JobMemory] = {}
+        self._forgotten: dict[str, None] = {}
+        """Jobs whose files are to be deleted, oldest first."""
         self.spares = SpareFiles(root)
         self.problem: str | None = None
         """Why the last change that did not wait for the disk is not on it, or None."""
@@ -302,12 +305,16 @@ class StateStore:
                 pause = FAR_S
             await asyncio.sleep(pause)
 
-    async def flush(self) -> None:
-        """Write the state and up to `MAX_JOBS_PER_TURN` changed jobs now, so that
-        everything answered later survives a kill.
+    async def flush(self, job: str | None = None) -> None:
+        """Write the state and some changed jobs now, so that everything answered later
+        survives a kill.
 
-        If more jobs are left, another write is scheduled. The outcome is kept in
-        `problem`, and passed to `noticed` if it is new.
+        If more jobs are left, another write is scheduled: however many have changed, as
+        when thousands are forgotten at once, requests are served between turns. The
+        outcome is kept in `problem`, and `noticed` is called if it is new.
+
+        Args:
+            job: that is among the jobs written now, if it has changed.
 
         Raises:
             DatasetWriteError, OSError: the system cannot write.
@@ -315,7 +322,7 @@ class StateStore:
         async with self._writing:
             # The document is made here: only the loop's thread may look at the scanner.
             document = self._make(False)
-            jobs = self._unwritten_jobs()
+            jobs = self._jobs_of_a_turn(job)
             if (
                 not jobs
                 and self.problem is None
@@ -328,7 +335,7 @@ class StateStore:
                 self._note(str(error))
                 raise
             self._note(None)
-            if self._unwritten:
+            if self._unwritten or self._forgotten:
                 self._changed.set()
 
     async def keep(
@@ -336,10 +343,14 @@ class StateStore:
         take: Callable[[], T],
         after: Callable[[Memory], Memory] | None = None,
         files: Callable[[documents.Changes], None] | None = None,
+        choose: Callable[[], None] | None = None,
     ) -> T:
-        """Write a change that must survive, then apply it.
+        """Write a change that must survive, then apply it: the one place where jobs,
+        samples, corrections and settings change, one change at a time.
 
         Args:
+            choose: decides what is changed, when no other change is under way; an
+                exception leaves everything unchanged.
             take: makes the change, once it is on the disk; if it raises, the written
                 files are restored.
             after: the document with the change, from the one without; an exception leaves
@@ -351,13 +362,15 @@ class StateStore:
                 the disk.
         """
         # A requester that disconnects does not interrupt a write: it succeeds or is undone.
-        return await asyncio.shield(asyncio.ensure_future(self._keep(take, after, files)))
+        change = self._keep(take, after, files, choose)
+        return await asyncio.shield(asyncio.ensure_future(change))
 
     async def _keep(
         self,
         take: Callable[[], T],
         after: Callable[[Memory], Memory] | None,
         files: Callable[[documents.Changes], None] | None,
+        choose: Callable[[], None] | None,
     ) -> T:
         """Write a change to the disk, then apply it; restore the disk if either fails.
 
@@ -365,6 +378,7 @@ class StateStore:
 
         Args:
             take: applies the change in memory; may raise before it does.
+            choose: decides what is changed; called first.
             after: makes the state's document with the change from the present one; None
                 leaves the document.
             files: adds further files to the change.
@@ -376,6 +390,8 @@ class StateStore:
             Exception: of writing or of `take`; nothing has changed.
         """
         async with self._writing:
+            if choose is not None:
+                choose()
             document = None
             if after is not None:
                 # Within the lock: of two changes the second document contains the first change.
@@ -413,27 +429,38 @@ class StateStore:
         Later writes, as of threads still under way, are skipped.
         """
         try:
-            self._put(self._make(True), self._unwritten_jobs(most=sys.maxsize))
+            self.gather()
+            self._put(self._make(True), self._unwritten | self._forgotten)
         except (OSError, DatasetError) as error:
             log("the state was not written", logging.ERROR, reason=str(error))
 
     def owe(self, jobs: Sequence[JobMemory]) -> None:
-        """Add jobs to those that the next change writes."""
+        """Add jobs to those that are to be written."""
         self._unwritten |= {job.id: job for job in jobs}
 
     def is_unwritten(self, job: str) -> bool:
         """Return whether a change of a job is still to be written."""
         return job in self._unwritten
 
-    def _unwritten_jobs(self, most: int = MAX_JOBS_PER_TURN) -> ChangedJobs:
-        """List the jobs to write: those that have changed now, then earlier ones.
+    def gather(self) -> None:
+        """Take over the jobs that have changed, and those that are forgotten."""
+        for name, job in self._changed_jobs().items():
+            if job is None:
+                self._unwritten.pop(name, None)
+                self._forgotten[name] = None
+            else:
+                self._forgotten.pop(name, None)
+                self._unwritten[name] = job
 
-        Thousands may be forgotten at once; then requests are served between turns.
+    def _jobs_of_a_turn(self, first: str | None) -> ChangedJobs:
+        """List the jobs of one turn: `first` if it has changed, then others up to the
+        limits of a turn; None for those whose files are deleted.
         """
-        now = self._changed_jobs()
-        self._unwritten |= now
-        # All that changed now, whatever their number: `flush` promises that they survive a kill.
-        return now | dict(islice(self._unwritten.items(), max(0, most - len(now))))
+        self.gather()
+        jobs: ChangedJobs = dict(islice(self._unwritten.items(), MAX_JOBS_PER_TURN))
+        if first is not None and first in self._unwritten:
+            jobs[first] = self._unwritten[first]
+        return jobs | dict(islice(self._forgotten.items(), MAX_FORGOTTEN_PER_TURN))
 
     def _put(self, memory: Memory, jobs: ChangedJobs) -> None:
         """Write the document and then the jobs to the disk, one write at a time; blocks.
@@ -457,23 +484,28 @@ class StateStore:
             self._on_disk = None
             self.spares.keep(FILE, _text(memory))
             self._on_disk = memory
-            for name, job in jobs.items():
-                self._put_job(name, job)
+            try:
+                self._put_jobs(jobs)
+            except DatasetWriteError as error:
+                raise JobsNotWrittenError(error.message, error.data) from None
 
-    def _put_job(self, name: str, job: JobMemory | None) -> None:
-        """Write a job (None deletes its file), and remove it from the unwritten ones
+    def _put_jobs(self, jobs: ChangedJobs) -> None:
+        """Write jobs, then delete the files of forgotten ones, and note what is done
         unless it has changed again meanwhile.
 
         Raises:
-            JobsNotWrittenError: the disk does not take it.
+            DatasetWriteError: the disk does not take it.
         """
-        try:
-            self._job_files.write(name, job)
-        except DatasetWriteError as error:
-            raise JobsNotWrittenError(error.message, error.data) from None
-        # The loop may have noted a newer state of the job while this thread wrote.
-        if self._unwritten.get(name, ...) == job:
-            del self._unwritten[name]
+        forgotten = [name for name, job in jobs.items() if job is None]
+        for name, job in jobs.items():
+            if job is not None:
+                self._job_files.write(job)
+                # The loop may have noted a newer state of the job while this thread wrote.
+                if self._unwritten.get(name) == job:
+                    del self._unwritten[name]
+        self._job_files.delete(forgotten)
+        for name in forgotten:
+            self._forgotten.pop(name, None)
 
     def _put_all(
         self,

@@ -472,19 +472,23 @@ class TwinServer:
         self._recalled = True
         jobs = self.job_files.read()
         if memory is None:
-            return self.jobs.recall(jobs, 0, self.directory)
+            left = self.jobs.recall(jobs, 0, self.directory)
+            self.state_store.gather()
+            return left
         there = {job.id for job in jobs}
         unfiled = self.jobs.kept_of([job for job in memory.jobs if job.id not in there])
         try:
             for job in unfiled:
-                self.job_files.write(job.id, job)
+                self.job_files.write(job)
         except (
             DatasetWriteError
         ):  # tried again with each change; until then the state has them
             self._unfiled = unfiled
             self.state_store.owe(unfiled)
         known = sorted([*jobs, *unfiled], key=lambda job: number_of(job.id))
-        return self.jobs.recall(known, memory.jobs_made, self.directory)
+        left = self.jobs.recall(known, memory.jobs_made, self.directory)
+        self.state_store.gather()
+        return left
 
     def _apply_last(self) -> None:
         """Put the previous server's correction in force at the start.

@@ -240,7 +240,7 @@ def costs_of_changes(sim: Simulation, jobs: int, uploads: int) -> list[tuple[int
     sim.start()
     sim.stop()
     old_state(sim.data, jobs)
-    sim.start()
+    started(sim)  # until old jobs have been written, a few in each turn
     client = sim.client()
     sim.call(client, "script.submit", text=script(3))  # makes the folders
     for i in range(1 + uploads):
@@ -487,3 +487,35 @@ def test_scans_without_names_are_numbered_without_looking_at_all_of_the_day(
         assert len(found) < 10
 
     run(tmp_path, body)
+
+
+def test_a_setting_does_not_wait_for_thousands_of_old_jobs(tmp_path: Path) -> None:
+    """After a start that forgets nearly all of them: turns are short, and each is served
+    between two of them.
+    """
+    sim = Simulation(tmp_path, limits=TwinLimits(max_ended_jobs=10))
+    with sim:
+        sim.start()
+        sim.stop()
+        folder = sim.data / "jobs" / "status"
+        folder.mkdir(parents=True, exist_ok=True)
+        for n in range(1, 2001):
+            job = {"schema": 1, "id": f"job-{n}", "name": f"n{n}", "folder": f"n{n}",
+                   "phase": "done", "frames_total": 3, "frames_done": 3, "duration_s": 9.0,
+                   "ended": datetime.now(UTC).isoformat()}  # fmt: skip
+            (folder / f"job-{n}.json").write_text(json.dumps(job))
+        sim.start()
+        client = sim.client()
+        before = len(sim.disk.ops)
+        sim.call(client, "axes.set", axis="tra_obj", speed=3.0)
+        assert len(sim.disk.ops) - before < 300
+        assert len(list(folder.iterdir())) > 1500
+        sim.advance(30.0)
+        assert len(list(folder.iterdir())) == 10
+        sim.kill()
+        sim.start()
+        client = sim.client()
+        assert sim.call(client, "state.get")["axes"]["tra_obj"]["speed"] == 3.0
+        page = sim.call(client, "job.list", start=8, count=5)
+        assert [job["job"] for job in page["jobs"]] == ["job-1999", "job-2000"]
+        assert page["total"] == 10

@@ -89,8 +89,10 @@ async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobS
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED_PHASES and job.phase != "done":
-        await twin.submissions.again(job, h.ensure_allowed(twin, client, "a scan"))
-        return twin.jobs.status(job)
+        queued = await twin.submissions.again(
+            job, h.ensure_allowed(twin, client, "a scan")
+        )
+        return twin.jobs.status(queued)
     twin.jobs.resume(job)
     status = await _when(
         twin, job, lambda: job.phase != "paused" or job.error is not None
@@ -128,7 +130,7 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
     twin.jobs.abort(job, params.reason, client.name)
     unsaved = ""
     try:
-        await twin.state_store.flush()
+        await twin.state_store.flush(job.id)
     except (OSError, DatasetError) as error:  # an abort does not fail because of the disk
         reason = from_root(str(error), twin.root)
         unsaved = f"the abort is not on the disk, and a killed server would not know it: {reason}"
@@ -160,7 +162,7 @@ async def forget(
     """Remove ended jobs and their files from the list; data sets stay.
 
     They are the job named, whenever it ended, or else all that ended at least `days` ago;
-    without `days` all ended ones. One that was resumed meanwhile stays. A scan whose data
+    without `days` all ended ones. A scan whose data
     set exists keeps its record, so submitting it again resumes it.
 
     Returns:
@@ -171,32 +173,28 @@ async def forget(
         RpcError: -32003, the named one has not ended.
         DatasetWriteError: the system cannot write; nothing is removed.
     """
-    jobs = twin.jobs.ended(params.job, timedelta(days=params.days or 0.0))
+    jobs: list[Job] = []
+
+    def choose() -> None:
+        """Decide which jobs go: none of them is resumed before the change is made."""
+        jobs.extend(twin.jobs.ended(params.job, timedelta(days=params.days or 0.0)))
 
     def files(changes: Changes) -> None:
         """Add to the changes on the disk: the removal of the jobs' files, and of the scan
-        record where the data set's folder does not exist.
+        records where the data set's folder does not exist.
         """
-        for job in jobs:
-            twin.job_files.remove(changes, job.id)
-            if twin.directory.stat(job.name) is None:  # nothing is left to go on with
-                JobRecord.forget(changes, twin.directory, job.name)
+        twin.job_files.remove(changes, [job.id for job in jobs])
+        # Of these nothing is left to go on with.
+        lost = [job.name for job in jobs if twin.directory.stat(job.name) is None]
+        JobRecord.forget(changes, twin.directory, lost)
 
-    def take() -> list[Job]:
-        """Remove the jobs from the list and mark the state as changed; return the removed
-        ones.
-
-        Jobs that have been resumed meanwhile stay.
-        """
-        gone = [
-            job for job in jobs if job.phase in ENDED_PHASES
-        ]  # one may have been resumed meanwhile
-        twin.jobs.forget(gone)
+    def take() -> None:
+        """Remove the jobs from the list and mark the state as changed."""
+        twin.jobs.forget(jobs)
         twin.changed()
-        return gone
 
-    gone = await twin.state_store.keep(take, files=files)
-    return p.JobForgetResult(jobs=[job.id for job in gone])
+    await twin.state_store.keep(take, files=files, choose=choose)
+    return p.JobForgetResult(jobs=[job.id for job in jobs])
 
 
 async def _when(twin: TwinServer, job: Job, condition: Callable[[], bool]) -> w.JobStatus:
