@@ -2,7 +2,8 @@
 of prometheus_client's server.
 
 Beyond the loopback, pages other than `/healthz` need the server's token (`Authorization:
-Bearer ...`); on the loopback, requests of other sites' pages are refused by their Host.
+Bearer ...`), and a wrong one is answered late, as at the other ports; on the loopback,
+requests of other sites' pages are refused by their Host.
 Twin, projector and viewer supply the figures; this module puts them into the pages. A
 page is made in a turn of the event loop, to which the figures belong. Requests are
 counted as they are answered; gauges are read at the moment of the scrape.
@@ -19,6 +20,7 @@ import json
 import logging
 import socket
 import sys
+import time
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -38,6 +40,7 @@ from flexdt.runtime.access import (
     read_token,
     token_matches,
 )
+from flexdt.runtime.guesses import Guesses
 from flexdt.runtime.log import dropped, log
 from flexdt.runtime.process import BACKLOG, ServerLoop, durations
 from flexdt.runtime.process_settings import ServerSettings
@@ -238,13 +241,15 @@ def _application(
         405, or 503 if the loop is held.
     """
     loop = asyncio.get_running_loop()
+    guesses = Guesses()
 
     def response(asked: Mapping[str, Any]) -> HttpResponse:
         """Check a request, admit its connection, and have the loop make its page.
 
         The checks are, in order: 403 another site's Host (on loopback), 405 method, 404
         path, 401 token. No turn of the loop within `MAX_HELD_S`, or a closed loop, is
-        503. An exception of a page is raised.
+        503. An exception of a page is raised. A wrong token is logged, and answered
+        late by this thread, which is not admitted meanwhile.
 
         Args:
             asked: the request as WSGI has it.
@@ -266,6 +271,9 @@ def _application(
             and path not in OPEN_PAGES
             and not token_matches(bearer, token)
         ):
+            if given:  # without one nothing is guessed
+                host = str(asked["REMOTE_ADDR"])
+                time.sleep(guesses.wrong(host, host))
             return HttpResponse("{}", HTTPStatus.UNAUTHORIZED)
         asked[ADMIT]()
         page: Future[HttpResponse] = Future()

@@ -45,6 +45,7 @@ from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import ProtocolError, RpcError
 from flexdt.runtime import waiting_room
 from flexdt.runtime.access import ConnectionLimits, check_bind
+from flexdt.runtime.guesses import Guesses
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process import ListeningServer, tune
 from flexdt.runtime.waiting_room import WaitingList, neighbourhood
@@ -92,6 +93,7 @@ class TcpServer(ListeningServer):
         self.waiting = WaitingList[_Link](waiting_room.MAX_WAITING)
         self.reserved = WaitingList[_Link](RESERVED_PLACES)
         self.lines = Sparing()
+        self.guesses = Guesses(self.lines)
         self.turns = loop_turns.LoopTurns()
         self.urgent = tuple(x.name.encode() for x in self.methods.values() if x.urgent)
         self._unexamined: dict[_Link, None] = {}  # in the order in which they came
@@ -235,7 +237,7 @@ class _Link(asyncio.BufferedProtocol):
         self.token_check = admission.TokenCheck(
             server.token,
             lambda: self.loop.call_soon(self.close, "wrong tokens"),
-            server.lines,
+            server.guesses,
         )
         self.allowance = 0.0
         self.allowance_at = 0.0
@@ -925,7 +927,7 @@ class _Link(asyncio.BufferedProtocol):
         """
         if self.server.token is None:
             return
-        await self.token_check.check(hello.token, self.name)
+        await self.token_check.check(hello.token, self.name, self.address)
         require_compatible(hello.protocol)  # before the session opens
         if not self.let_in:
             self._admit()

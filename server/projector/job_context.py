@@ -18,6 +18,7 @@ import numpy.typing as npt
 from flexdt.protocol import MAX_FRAME, Correlation, Notification, Role, image
 from flexdt.protocol.messages import Id
 from flexdt.protocol.rpc_errors import superseded
+from flexdt.runtime.guesses import Guesses
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.waiting_room import neighbourhood
 from flexdt.server.network.admission import TokenCheck
@@ -39,13 +40,13 @@ SPARE_BYTES: Final = 4096
 class JobClient:
     """One connection, its jobs and its requests under way."""
 
-    def __init__(self, link: FrameLink, token: str | None, lines: Sparing) -> None:
+    def __init__(self, link: FrameLink, token: str | None, guesses: Guesses) -> None:
         """Make the state of a connected client, with two lanes and no jobs.
 
         Args:
             link: its connection.
             token: that it must show; None admits it at once.
-            lines: of the log about refused tokens.
+            guesses: at the port.
         """
         self.link = link
         self.let_in = token is None
@@ -57,7 +58,7 @@ class JobClient:
         """Number of messages so far."""
         self.pending_bytes = 0
         self.address = neighbourhood(link.peer.rpartition(":")[0])
-        self.token_check = TokenCheck(token, self.close_soon, lines)
+        self.token_check = TokenCheck(token, self.close_soon, guesses)
 
     def begin(self, id: Id, key: str | None = None) -> ComputeJob:
         """Make the job of a request, which is known by its id until that is answered."""
@@ -88,6 +89,7 @@ class Context:
         views: projected so far.
         superseded: requests that newer ones have replaced.
         lines: of the log about connections.
+        guesses: wrong tokens so far.
     """
 
     compute: ComputeThread
@@ -100,6 +102,7 @@ class Context:
     views: int = 0
     superseded: int = 0
     lines: Sparing = field(default_factory=Sparing)
+    guesses: Guesses = field(default_factory=Guesses)
 
     @property
     def waiting(self) -> int:

@@ -57,7 +57,7 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
     Raises:
         RpcError: not authorised: a wrong or missing token.
     """
-    await client.token_check.check(p.token, client.link.peer)
+    await client.token_check.check(p.token, client.link.peer, client.address)
     client.let_in = True
     client.link.deadlines.stop("hello")
     return {

@@ -89,7 +89,7 @@ class ProjectorServer(ListeningServer):
         If a token is needed, frames are limited to `MAX_STRANGER_FRAME_BYTES` until it is
         shown, and it must be shown within `hello_timeout_s`.
         """
-        client = JobClient(link, self.context.token, self.context.lines)
+        client = JobClient(link, self.context.token, self.context.guesses)
         self.context.clients[link] = client
         self.waiting.enter(client)
         if not client.let_in:
