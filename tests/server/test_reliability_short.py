@@ -86,6 +86,7 @@ def test_many_clients_keep_their_order() -> None:
     assert out.count("0 out of order, 0 cut off") == 2
 
 
+@pytest.mark.campaign(1)
 def test_an_estop_is_answered_beside_every_load() -> None:
     """Limits are a hundred times what they are on a machine that does nothing else."""
     out = run("latency.py", "--seconds", "0.2", "--scale", "0.05", "--slack", "100")
