@@ -126,6 +126,13 @@ class CollisionScene:
         return self.bodies[pair[0]].name, self.bodies[pair[1]].name
 
     @cached_property
+    def counts(self) -> FloatArray:
+        """Units of each motor that move a part by 1 mm or 1 deg, (axes,); 1 for other bodies."""
+        if self.parts is None:
+            return np.ones(len(self.axes))
+        return np.array([self.parts.machine.counts(name) for name in self.axes])
+
+    @cached_property
     def near(self) -> PairStack:
         """`pairs` as arrays."""
         return PairStack.of(len(self.axes), self.bodies, self.pairs)
@@ -159,7 +166,7 @@ class CollisionScene:
             else AxisPath.standing(home)
             for name, home in zip(self.axes, self.home.tolist(), strict=True)
         }
-        return path_of(self.axes, tables, start, end)
+        return path_of(self.axes, tables, start, end, self.counts)
 
     def vector(self, positions: Mapping[str, float]) -> FloatArray:
         """Convert positions to (axes,) [mm, deg]; motors left out are at home, other names

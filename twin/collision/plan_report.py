@@ -82,7 +82,7 @@ def collision_report(plan: ScanPlan, scene: CollisionScene) -> Clearance:
         positions; the least clearance [mm] with its pair; and a trace of (time [s],
         clearance [mm]) at about `TRACE_POINTS` moments.
     """
-    path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s)
+    path = path_of(scene.axes, plan.paths, 0.0, plan.duration_s, scene.counts)
     search = PathSearch(scene, path)
     contacts = _contacts(search)
     least, pair = _least(search, contacts)

@@ -36,7 +36,8 @@ from flexdt.twin.motion.profiles import AxisPath
 from flexdt.twin.scanner.safety import ROUNDING_MM, floor
 
 JUMP_TOLERANCE = 1e-6
-"""Largest jump of a motor between two pieces that counts as rounding [mm, deg]."""
+"""Largest jump of a motor between two pieces that counts as rounding [mm or deg that it moves
+a part]."""
 
 
 TIME_ROUNDING_SPACINGS = 8.0
@@ -109,7 +110,11 @@ class Path:
 
 
 def path_of(
-    axes: Sequence[str], tables: Mapping[str, AxisPath], start: float, end: float
+    axes: Sequence[str],
+    tables: Mapping[str, AxisPath],
+    start: float,
+    end: float,
+    counts: npt.ArrayLike = 1.0,
 ) -> Path:
     """Make the path of `axes` from `start` to `end`, cut wherever a motor changes its
     law.
@@ -122,6 +127,7 @@ def path_of(
         tables: motor -> its path; it rests before the beginning.
         start: of the path [s].
         end: of the path [s].
+        counts: units of each motor that move a part by 1 mm or 1 deg, (axes,).
 
     Raises:
         KeyError: a motor has no table.
@@ -142,6 +148,7 @@ def path_of(
         times = np.array([start, start])
     begin = times[:-1]
     length = np.diff(times)
+    jumpy = JUMP_TOLERANCE * np.broadcast_to(counts, len(axes))
     q = np.tile([float(tables[name].x[0]) for name in axes], (len(times), 1))
     v, a = np.zeros((2, len(begin), len(axes)))
     for column, name, table in moving:
@@ -151,7 +158,7 @@ def path_of(
         # places are off by the distance that the motor moves in that time. A clock that
         # is late has coarse ones.
         rounding = coarseness(begin[1:]) * float(np.abs(table.v).max())
-        jumps = np.abs(arrives[:-1] - x0[1:]) > JUMP_TOLERANCE + rounding
+        jumps = np.abs(arrives[:-1] - x0[1:]) > jumpy[column] + rounding
         if jumps.any():
             where = int(np.argmax(jumps))
             raise ValueError(

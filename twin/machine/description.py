@@ -920,6 +920,16 @@ class Machine(_Frozen):
             raise unknown_axis(axis, self)
         return self.virtual_axes[axis].moves
 
+    def counts(self, motor: str) -> float:
+        """Return how many units of a motor move some part by 1 mm, or turn it by 1 deg: 1
+        for motors in mm and deg, and for one that moves nothing.
+
+        What counts as rounding, in mm or deg, is so many times that of the motor. Of
+        several parts the one that it moves farthest counts.
+        """
+        shares = (abs(of.get(motor, 0.0)) for of in self.geometry.values())
+        return 1.0 / (max(shares, default=0.0) or 1.0)
+
     def axis(self, name: str) -> Axis:
         """Look up the motor called `name`.
 

@@ -21,7 +21,8 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import Machine
 
 POSITION_ROUNDING: Final = 1e-9
-"""Largest difference between two positions that counts as rounding [mm, deg]."""
+"""Largest difference between two positions that counts as rounding [mm or deg that the motor
+moves a part]."""
 Rate = Literal["speed", "acceleration"]
 
 
@@ -72,12 +73,13 @@ def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arriva
     messages = []
     beyond = None
     for motor, target in targets.items():
-        left = _distance_beyond(machine, motor, target)
+        left = distance_beyond(machine, motor, target)
         if left <= POSITION_ROUNDING:
             continue
         error = _outside(machine, motor, target)
         messages.append(error.message)
-        if not left <= machine.axes[motor].arrival_tolerance + POSITION_ROUNDING:
+        tolerated = machine.axes[motor].arrival_tolerance / machine.counts(motor)
+        if not left <= tolerated + POSITION_ROUNDING:
             beyond = beyond or error
     return Arrival(clamp(machine, targets, axis), tuple(messages), beyond)
 
@@ -143,7 +145,7 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
         UnknownNameError: no such motor.
     """
     a = machine.axis(axis)
-    if not _distance_beyond(machine, axis, value) <= POSITION_ROUNDING:
+    if not distance_beyond(machine, axis, value) <= POSITION_ROUNDING:
         raise _outside(machine, axis, value)
     return min(max(value, a.lower), a.upper)
 
@@ -174,10 +176,12 @@ def _bounded(machine: Machine, targets: Mapping[str, float]) -> dict[str, float]
     return {m: min(max(t, axes[m].lower), axes[m].upper) for m, t in targets.items()}
 
 
-def _distance_beyond(machine: Machine, motor: str, target: float) -> float:
-    """Compute how far a target is beyond the travel [mm, deg]; negative within it."""
+def distance_beyond(machine: Machine, motor: str, target: float) -> float:
+    """Compute how far beyond the travel a target brings the motor's part [mm, deg];
+    negative within it.
+    """
     a = machine.axes[motor]
-    return max(a.lower - target, target - a.upper)
+    return max(a.lower - target, target - a.upper) / machine.counts(motor)
 
 
 def _outside(machine: Machine, motor: str, target: float) -> LimitError:

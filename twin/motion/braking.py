@@ -20,18 +20,21 @@ from flexdt.twin.motion.drives import Drive, Drives
 from flexdt.twin.motion.profiles import TIME_ROUNDING_S, Piece, Trajectory
 
 PATH_TOLERANCE = 1e-5
-"""Largest distance of the pieces of constant acceleration from the slowed path [mm, deg].
+"""Largest distance of the pieces of constant acceleration from the slowed path [mm or deg
+that the motor moves a part].
 
 A thousandth of the tolerance of a sweep, so that a swept path stays certified.
 """
 MIN_TIME_RATE = 1e-9
 """Rate of programme time below which it counts as stopped."""
 VELOCITY_ROUNDING = 1e-6
-"""Velocity that counts as rounding [mm/s, deg/s]."""
+"""Velocity that counts as rounding [mm/s or deg/s of a part]."""
 MIN_CELL_S = 1e-7
 """Shortest piece of programme time [s]."""
 MAX_SINGLE_PIECE_S = 1e-4
-"""Duration over which one piece of constant acceleration strays by less than rounding [s]."""
+"""Longest duration of one piece of constant acceleration that stands for two [s]."""
+SINGLE_PIECE_STRAY = 1e-9
+"""How far it may end from where the path goes on [mm or deg of a part]."""
 STEP_TOLERANCE = 1e-9
 """Relative difference of two velocities below which the motors run in step."""
 
@@ -124,7 +127,7 @@ def braked_apart(
                 )
             # It was braking anyway: where it was bound is where it ends, exactly (and not a
             # rounding error beyond its limit).
-            near = abs(rest.target - current.target) < POSITION_ROUNDING
+            near = abs(rest.target - current.target) < POSITION_ROUNDING * drive.counts
             if near:
                 out[name] = replace(rest, target=current.target)
             else:
@@ -274,7 +277,7 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
     time = now
     while rate > 0.0 and drives:
         states = [_state(name, drive, s, most) for name, drive in drives.items()]
-        if max(abs(state.velocity) for state in states) < VELOCITY_ROUNDING:
+        if max(state.speed_of_part for state in states) < VELOCITY_ROUNDING:
             break
         until = min(state.until for state in states)
         ahead = until - s
@@ -286,7 +289,10 @@ def _cells(drives: Drives, now: float, most: Most) -> list[_Cell]:
         roughly = min(state.slowing(rate, 0.0) for state in states)
         # Where a motor accelerates, constant acceleration is an approximation over a
         # short time; it strays by 3 |a| rate slowing length^3 / 324.
-        jerk = max(3.0 * abs(state.acceleration) * rate * roughly for state in states)
+        jerk = max(
+            3.0 * abs(state.acceleration) / state.counts * rate * roughly
+            for state in states
+        )
         if jerk > 0.0:
             longest = min((324.0 * PATH_TOLERANCE / jerk) ** (1.0 / 3.0), rate / roughly)
             shorter = longest * (rate - 0.5 * roughly * longest)
@@ -320,6 +326,12 @@ class _State:
     acceleration: float
     most: float
     until: float
+    counts: float
+
+    @property
+    def speed_of_part(self) -> float:
+        """Speed at which the motor moves a part [mm/s, deg/s]."""
+        return abs(self.velocity) / self.counts
 
     def slowing(self, rate: float, ahead: float) -> float:
         """Compute by how much programme time may slow, at a constant rate, without
@@ -367,6 +379,7 @@ def _state(name: str, drive: Drive, s: float, most: Most) -> _State:
         acceleration,
         greatest(name, leg, s, most),
         min(until, drive.next_start(s)),
+        drive.counts,
     )
 
 
@@ -375,7 +388,8 @@ def _braked_trajectory(drive: Drive, cells: list[_Cell], now: float) -> Trajecto
 
     A motor that does not move in the cells rests at once where it is. Within a cell of
     constant slowing an accelerated motor has two pieces of constant acceleration, or one
-    if it is shorter than `MAX_SINGLE_PIECE_S`. An end within `POSITION_ROUNDING` of the
+    if that is shorter than `MAX_SINGLE_PIECE_S` and ends where the next begins, to
+    `SINGLE_PIECE_STRAY`. An end within `POSITION_ROUNDING` of the
     present trajectory's target is set to that.
 
     Args:
@@ -408,7 +422,11 @@ def _braked_trajectory(drive: Drive, cells: list[_Cell], now: float) -> Trajecto
         if cell.slowing == 0.0 or acceleration == 0.0:
             rate = acceleration * cell.rate**2 - velocity * cell.slowing
             pieces.append(Piece(cell.start, x, v, rate))
-        elif cell.length < MAX_SINGLE_PIECE_S:
+        elif (
+            cell.length < MAX_SINGLE_PIECE_S
+            and abs(distance - 0.5 * cell.length * (v + arrives))
+            < SINGLE_PIECE_STRAY * drive.counts
+        ):
             pieces.append(Piece(cell.start, x, v, (arrives - v) / cell.length))
         else:
             # Two halves of constant acceleration that meet position and velocity at both ends.
@@ -430,6 +448,6 @@ def _braked_trajectory(drive: Drive, cells: list[_Cell], now: float) -> Trajecto
     if not pieces or end == now:
         return motion.at_rest(target, now)
     final = drive.at(now).target
-    return Trajectory(
-        tuple(pieces), end, final if abs(target - final) < POSITION_ROUNDING else target
-    )
+    if abs(target - final) < POSITION_ROUNDING * drive.counts:
+        target = final
+    return Trajectory(tuple(pieces), end, target)

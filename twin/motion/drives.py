@@ -38,12 +38,15 @@ class Drive:
         trajectories: on the programme's own clock; a programme may have 100 000 of them,
             which take most of a second to shift.
         origin: the time at which that clock shows 0 [s].
+        counts: units of the motor that move a part by 1 mm, or turn it by 1 deg; what
+            counts as rounding is so many times that of a mm.
     """
 
     speed: float
     acceleration: float
     trajectories: tuple[Trajectory, ...]
     origin: float = 0.0
+    counts: float = 1.0
 
     @cached_property
     def _starts(self) -> tuple[float, ...]:
@@ -120,7 +123,12 @@ Drives = Mapping[str, Drive]
 def home(machine: Machine, now: float) -> dict[str, Drive]:
     """Make a drive for each axis, at rest at home since `now` [s], with the axis's rates."""
     return {
-        name: Drive(a.speed, a.acceleration, (motion.at_rest(a.home, now),))
+        name: Drive(
+            a.speed,
+            a.acceleration,
+            (motion.at_rest(a.home, now),),
+            counts=machine.counts(name),
+        )
         for name, a in machine.axes.items()
     }
 

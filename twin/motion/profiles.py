@@ -187,8 +187,8 @@ class Trajectory:
         """Find the first time at which the motor passes `position`, from the start of its
         motion on.
 
-        Rounding counts as passing: a position within 1e-9 of the target is passed at the
-        end at the latest.
+        Rounding counts as passing: a position within 1e-9 of the target, or eight times
+        the spacing of numbers there, is passed at the end at the latest.
 
         Args:
             position: of the motor [mm, deg].
@@ -208,7 +208,7 @@ class Trajectory:
             if dt is not None and piece.start + dt <= stop + 1e-9 + 4.0 * math.ulp(stop):
                 return min(piece.start + dt, stop)
         # A position that rounding puts a hair past the target is the target.
-        if abs(position - self.target) <= 1e-9:
+        if abs(position - self.target) <= max(1e-9, 8.0 * math.ulp(self.target)):
             return self.end
         return None
 

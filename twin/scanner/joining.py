@@ -20,7 +20,7 @@ from typing import Literal
 
 from flexdt.twin.errors import CollisionError, SafetyError
 from flexdt.twin.machine.description import Machine
-from flexdt.twin.machine.travel import POSITION_ROUNDING
+from flexdt.twin.machine.travel import POSITION_ROUNDING, distance_beyond
 from flexdt.twin.motion import profiles as motion
 from flexdt.twin.motion.braking import (
     Most,
@@ -36,7 +36,7 @@ from flexdt.twin.scanner.safety import Contact, Guard, floor, would_touch
 from flexdt.twin.scanner.state import NamedCorrection, Sample
 
 MIN_STEP = 0.05
-"""Shortest motion that begins before a contact [mm, deg]."""
+"""Shortest motion that begins before a contact [mm or deg that the motor moves a part]."""
 FIRST_LEAD_S = 0.5
 """Lead of the first attempt at braking before a contact [s]."""
 HALVINGS = 7
@@ -258,7 +258,8 @@ class Lookahead:
     def _advances(self, name: str, way: Trajectory) -> bool:
         """Return whether a motor is under way, or gets farther than `MIN_STEP`."""
         here = self.drives[name].at(self.now)
-        far = abs(way.target - here.position(self.now)) >= MIN_STEP
+        least = MIN_STEP * self.drives[name].counts
+        far = abs(way.target - here.position(self.now)) >= least
         return far or here.velocity(self.now) != 0.0
 
     def _halt_alone(
@@ -533,11 +534,8 @@ class Lookahead:
         Args:
             trajectories: motor -> trajectory; only its target is checked.
         """
-        axes = self.machine.axes
         return all(
-            axes[name].lower - POSITION_ROUNDING
-            <= t.target
-            <= axes[name].upper + POSITION_ROUNDING
+            distance_beyond(self.machine, name, t.target) <= POSITION_ROUNDING
             for name, t in trajectories.items()
         )
 

@@ -390,8 +390,8 @@ class ScannerTwin:
         if joined.contact is not None and not joined.trajectories:
             raise self._blocked(joined, now, f"jog {axis} at {velocity:g}")
         goes = any(
-            abs(t.target - t.position(now)) >= MIN_STEP
-            for t in joined.trajectories.values()
+            abs(t.target - t.position(now)) >= MIN_STEP * self._drives[name].counts
+            for name, t in joined.trajectories.items()
         )
         if joined.contact is None and goes:
             self.safety = rules.after_free_motion(self.safety)
