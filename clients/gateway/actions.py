@@ -7,7 +7,8 @@ A function returns the text of ACK or raises `Refusal`; while it runs, it keeps
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+import logging
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +30,7 @@ from flexdt.clients.gateway.vocabulary import (
     shown,
 )
 from flexdt.protocol.state_model import JobStatus, State
+from flexdt.runtime.log import log
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.machine.kinematics import motor_targets, virtual_reading
 from flexdt.twin.machine.travel import Rate, arrival, rate
@@ -285,11 +287,20 @@ async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> flo
     axes = (await twin.state()).axes
     bound = {motor: axes[motor].target for motor in machine.axes}
     found = arrival(machine, axis, motor_targets(machine, axis, target, bound))
+    if found.messages and found.is_clamped(machine):
+        _tell_clamped(found.messages)
     if found.beyond is None or not found.is_clamped(machine):
         return target  # the twin judges it by the same rule
     if axis in machine.axes:
         return found.motors[axis]
     return virtual_reading(machine, axis, {**bound, **found.motors})
+
+
+def _tell_clamped(messages: Sequence[str]) -> None:
+    """Log that values were set to the limit; ACK, whose columns Acquila has fixed, holds
+    the values in force."""
+    for message in messages:
+        log("limit_clamped", logging.WARNING, message=f"{message}; set to the limit")
 
 
 def rate_setting(what: Rate, digits: int) -> Action:
@@ -317,6 +328,7 @@ def rate_setting(what: Rate, digits: int) -> Action:
             found = rate(machine, axis, what, value)
             shares = machine.moves(axis)
             if found.messages and found.is_clamped(machine):
+                _tell_clamped(found.messages)
                 value = min(
                     found.motors[motor] / abs(share) for motor, share in shares.items()
                 )

@@ -101,6 +101,13 @@ class SceneLoad(f.Params):
     document: Scene
 
 
+class SceneLoaded(State):
+    """The state afterwards."""
+
+    warnings: list[str] = Field(default_factory=list)
+    """what was not done as the document says: positions set to a limit, motion halted"""
+
+
 class SceneResult(f.Result):
     """The whole state as one versioned document."""
 
@@ -118,7 +125,7 @@ class Discovery(f.Result):
 SCENE_SAVE = read(
     "scene.save", SceneSave, SceneResult, "whole state as one versioned document"
 )
-SCENE_LOAD = by_hand("scene.load", SceneLoad, State, "restore such a document")
+SCENE_LOAD = by_hand("scene.load", SceneLoad, SceneLoaded, "restore such a document")
 RPC_DISCOVER = read(
     "rpc.discover", f.Empty, Discovery, "this table as an OpenRPC document"
 )

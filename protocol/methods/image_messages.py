@@ -32,7 +32,7 @@ class ProjectionGet(f.Params):
     marks: bool = False
     """include which pixels are saturated, starved or cut off"""
     positions: f.Targets | None = None
-    """motor -> [mm, deg] there, beyond its travel too; others stay"""
+    """motor -> [mm, deg] there, within its travel; others stay"""
     tube: TubeSet | None = None
     """as though set so"""
     camera: CameraSet | None = None
@@ -105,6 +105,8 @@ class Projection(f.ImageValue):
     marks: f.ImageValue | None = None
     """uint8, as large as the image, on request: sum of 1 saturated, 2 starved, 4 sample
     cut off at this pixel of the edge; judged as though X-rays were on"""
+    warnings: list[str] | None = None
+    """of positions beyond the travel that were set to the limit"""
 
 
 class RayResult(f.Result):

@@ -27,6 +27,7 @@ from flexdt.server.twin.live import Shot, image_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
+from flexdt.twin.machine.travel import arrival
 from flexdt.twin.scanner.state import (
     EMPTY_STAGE,
     changed_camera,
@@ -56,9 +57,10 @@ async def get_projection(
         TwinError: the machine does not have a motor or a setting.
     """
     shot = twin.live.now()
+    warnings: list[str] | None = None
     elsewhere = any(x is not None for x in (params.positions, params.tube, params.camera))
     if elsewhere:
-        shot = _predicted_shot(twin, shot, params)
+        shot, warnings = _predicted_shot(twin, shot, params)
     if params.binning > min(shot.camera.shape):
         raise invalid_params(
             f"binning {params.binning} leaves nothing of {shot.camera.shape} pixels",
@@ -83,23 +85,39 @@ async def get_projection(
         if params.marks:
             marks = marks_of(way, radiograph, shot.camera, shot.exposure, params.binning)
             made = made.model_copy(update={"marks": ImageValue(**image.encode(marks))})  # type: ignore[arg-type]
+        if warnings:
+            made = made.model_copy(update={"warnings": warnings})
         return encoded(made, codec)
 
     async with twin.live.turn:
         return await asyncio.to_thread(work)
 
 
-def _predicted_shot(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Shot:
+def _predicted_shot(
+    twin: TwinServer, shot: Shot, params: p.ProjectionGet
+) -> tuple[Shot, list[str]]:
     """Return the shot with the requested positions, tube and camera in place of the
-    present ones.
+    present ones, and a message for each position that was set to a limit.
+
+    Positions have the rule of a request by itself (`twin/machine/travel.py`).
 
     X-rays that are switched on need no warm-up. Settings that are not requested stay as
     in `shot`.
 
     Raises:
-        LimitError, UnknownNameError: the machine does not have a motor or a setting.
+        LimitError: a position is beyond the travel; a setting that there is not.
+        UnknownNameError: the machine does not have a motor or a setting.
     """
     machine = twin.machine
+    there = dict(shot.positions)
+    messages = list[str]()
+    for motor, position in (params.positions or {}).items():
+        machine.axis(motor)
+        found = arrival(machine, motor, {motor: position})
+        if found.beyond is not None:
+            raise found.beyond
+        there |= found.motors
+        messages += [f"{message}; set to the limit" for message in found.messages]
     asked = params.tube or TubeSet()
     tube = changed_tube(machine.tube, shot.tube, asked.kV, asked.power_W)
     tube = switched(
@@ -107,8 +125,8 @@ def _predicted_shot(twin: TwinServer, shot: Shot, params: p.ProjectionGet) -> Sh
     )
     change = camera_change(params.camera or CameraSet())
     camera = changed_camera(machine.detector, shot.camera, change)
-    there = dict(shot.positions) | (params.positions or {})
-    return replace(shot, positions=tuple(sorted(there.items())), tube=tube, camera=camera)
+    positions = tuple(sorted(there.items()))
+    return replace(shot, positions=positions, tube=tube, camera=camera), messages
 
 
 def _require_room(shape: tuple[int, int], params: p.ProjectionGet, codec: Codec) -> None:

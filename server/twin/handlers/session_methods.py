@@ -142,15 +142,17 @@ def save(twin: TwinServer, client: Client, params: d.SceneSave) -> d.SceneResult
 
 
 @answers(d.SCENE_LOAD)
-async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State:
+async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> d.SceneLoaded:
     """Load a scene: check all of it, the motion included, then change stage, correction
     and settings and start the motors.
 
     A scene without a correction ends the one in force. It needs control and an idle twin,
-    after the sample is read and when it is done. Halted motion is a warning in the log.
+    after the sample is read and when it is done. Positions beyond the travel have the
+    rule of a request by itself (`limit_messages`). Its warnings are in the log, too.
 
     Returns:
-        The complete state afterwards.
+        The complete state afterwards, and the warnings: positions set to the limit, and
+        motion that was halted.
 
     Raises:
         RpcError: -32602, another machine's; -32003, a job runs or the client has no
@@ -188,12 +190,14 @@ async def load(twin: TwinServer, client: Client, params: d.SceneLoad) -> w.State
         history = None
         if correction != in_force:
             history = twin.corrections.after(correction)
-        warnings = await change_stage(
+        limits = twin.scanner.limit_messages(scene.positions, twin.clock.now())
+        halted = await change_stage(
             twin, sample, correction, ready, history=history, source="scene", scene=scene
         )
+    warnings = [*limits, *halted]
     for warning in warnings:
         twin.tell("warning", f"the scene was loaded: {warning}")
-    return twin.state()
+    return d.SceneLoaded(**dict(twin.state()), warnings=warnings)
 
 
 @answers(d.RPC_DISCOVER)
