@@ -108,9 +108,9 @@ class JobForget(f.Params):
 class JobList(f.Params):
     """Which jobs to list; all without parameters."""
 
-    start: Annotated[int, Ge(0), Le(2**53)] = 0
+    start: Annotated[int, Ge(0), Le(2**53), f.Integral] = 0
     """left out before"""
-    count: Annotated[int, Ge(1), Le(2**53)] | None = None
+    count: Annotated[int, Ge(1), Le(2**53), f.Integral] | None = None
     """listed at most; null: all others"""
 
 

@@ -270,9 +270,9 @@ class SampleInfo(f.Result):
 class SampleList(f.Params):
     """Which samples to list; all without parameters."""
 
-    start: Annotated[int, Ge(0), Le(2**53)] = 0
+    start: Annotated[int, Ge(0), Le(2**53), f.Integral] = 0
     """left out before"""
-    count: Annotated[int, Ge(1), Le(2**53)] | None = None
+    count: Annotated[int, Ge(1), Le(2**53), f.Integral] | None = None
     """listed at most; null: all others"""
 
 

@@ -227,6 +227,13 @@ export type Scene = {
   correction?: CorrectionPart | null
 };
 export type SceneLoad = { document: Scene };
+export type SceneLoaded = {
+  time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState;
+  sample: SampleState; geometry: GeometryState | null; safety: SafetyState; job: JobStatus | null;
+  correction: Correction | null; clock: ClockState; controller: string | null;
+  image: ImageFlags | null; unsaved: string | null; projector: string | null;
+  missing: Record<string, string>; warnings: Array<string>
+};
 export type SceneResult = { document: Record<string, JsonValue> };
 export type SceneSave = { name?: string | null };
 export type Screenshot = {
@@ -307,7 +314,7 @@ export interface Methods {
   "calibration.fit": [CalibrationFit, CalibrationFitResult];
   "calibration.align": [CalibrationAlign, CalibrationAlignResult];
   "scene.save": [SceneSave, SceneResult];
-  "scene.load": [SceneLoad, State];
+  "scene.load": [SceneLoad, SceneLoaded];
   "viewer.layers": [Layers, object];
   "viewer.theme": [Theme, object];
   "viewer.camera": [Camera, object];
