@@ -247,7 +247,7 @@ def test_a_format_of_geometry_is_added_by_its_recipe(copy: Path) -> None:
 
 
 TIN = (
-    '[material.tin]\nlabel = "tin"\ndensity_g_cm3 = 7.29\nformula = "Sn"\n'
+    '[material.planted]\nlabel = "tin"\ndensity_g_cm3 = 7.29\nformula = "Sn"\n'
     "points = [[20, 21.459], [29, 7.9028], [29.4, 42.9848], [30, 41.216], [40, 19.4274], "
     "[50, 10.7011], [60, 6.5663], [80, 3.0294], [100, 1.6769]]\n\n"
 )
@@ -257,7 +257,7 @@ TIN = (
 def test_a_material_is_added_by_its_recipe(copy: Path) -> None:
     files = files_to_run(recipes()["A material"])
     word = "material or points or attenuation"
-    first: Changes = {"phantoms/data/materials.toml": (("[material.wood]", TIN),)}
+    first: Changes = {"phantoms/data/materials.toml": (("[material.pmma]", TIN),)}
     inserted(copy, first)
     table = copy / "phantoms" / "data" / "materials.toml"
     right = table.read_text()
@@ -271,14 +271,14 @@ def test_a_material_is_added_by_its_recipe(copy: Path) -> None:
     }
     table.write_text(right)
     inserted(copy, {
-        "docs/phantoms.md": (("wood`, with tabulated", "tin "),),
+        "docs/phantoms.md": (("pmma steel ", "planted "),),
         "clients/viewer/scenes/sample_looks.py": (
-            ('    "wood": OTHER_COLOR', '    "tin": (200, 200, 190),\n'),
+            ('    "pmma": ', '    "planted": (200, 200, 190),\n'),
         ),
     })  # fmt: skip
     assert passed(copy, files, word) >= 20
-    filtered = "import flexdt as fx; print(fx.Tube(filters=[('tin', 0.3)]).filters[-1])"
-    assert "tin" in run(copy, "-c", filtered).stdout
+    filtered = "import flexdt as fx; print(fx.Tube(filters=[('planted', 0.3)]).filters[-1])"
+    assert "planted" in run(copy, "-c", filtered).stdout
 
 
 @pytest.mark.slow
