@@ -28,6 +28,7 @@ from flexdt.server.scans.scan_job import ENDED_PHASES, Job, JobInputs, Prepare, 
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.job_files import JobMemory, number_of
 from flexdt.twin.errors import TwinError, UnknownNameError
+from flexdt.twin.motion.drives import require_time
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import Exposure, ScanPlan
@@ -288,6 +289,7 @@ class Jobs:
         Raises:
             UnknownNameError: the job has been forgotten.
             RpcError: -32003, `max_waiting` jobs wait, or the job has not ended.
+            LimitError: the scan would end after the twin's clock.
         """
         if job is not None:
             job = self.get(job.id)
@@ -297,6 +299,7 @@ class Jobs:
             raise busy(f"{waiting} jobs wait already", data)
         if job is not None and job.phase not in ENDED_PHASES:
             raise self._phase_error("resume", job, ENDED_PHASES)
+        self._require_time(plan.duration_s)
         return replace(
             job or Job(f"job-{self._count + 1}", name, folder),
             prepare=prepare,
@@ -312,6 +315,11 @@ class Jobs:
             warnings=warnings or [],
             sample=sample,
         )
+
+    def _require_time(self, duration_s: float) -> None:
+        """Check that a scan that begins now ends before the clock does; raise LimitError."""
+        now = self._clock.now()
+        require_time("the scan", now + duration_s, now)
 
     def enqueue(self, draft: Job) -> Job:
         """Put a drafted job into the list and at the end of the queue, and publish it;
@@ -605,6 +613,7 @@ class Jobs:
             if job.start is None:
                 job.start = self._scanner.final_positions()
             scan = await job.prepare()
+            self._require_time(scan.plan.duration_s)
         except Exception as error:
             return self._store_failure(job, error)
         finally:

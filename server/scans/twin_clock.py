@@ -21,15 +21,13 @@ from typing import Literal
 
 from flexdt.protocol.fields import MAX_SPEED_UP
 from flexdt.twin.errors import LimitError
+from flexdt.twin.motion.profiles import LATE_S
 
 SpeedUp = float | Literal["max"]
 
 WINDOW_S = 5.0
 """Interval over which the real-time factor is measured [real s]."""
 SAMPLE_S = 0.25
-LATE_S = 1e9
-"""Time from which on (31 years) time runs no faster than real time [s]: its steps are
-0.1 us then, and motion is swept with an allowance for such steps."""
 WAKE_ROUNDS = 3
 """Rounds of the event loop for the tasks just woken, before time jumps again."""
 
@@ -172,17 +170,24 @@ class TwinClock:
         """Compute the twin's time now [s].
 
         It does not change while held, and at speed "max" only by jumps to awaited
-        moments. From twin time `LATE_S` on it runs at most at real time.
+        moments. From twin time `LATE_S` on it runs at most at real time, also at "max".
         """
-        if self._hold_count or self._speed_up == "max":
+        if self._hold_count or self._jumps:
             return self._base
         passed = self._wall() - self._base_wall
+        if self._speed_up == "max":
+            return self._base + passed
         quick = min(passed, max(0.0, LATE_S - self._base) / self._speed_up)
         return (
             self._base
             + quick * self._speed_up
             + (passed - quick) * min(1.0, self._speed_up)
         )
+
+    @property
+    def _jumps(self) -> bool:
+        """Whether time jumps to awaited moments: at speed "max", before `LATE_S`."""
+        return self._speed_up == "max" and self._base < LATE_S
 
     def _rebase(self) -> None:
         """Make the present twin time and real time the origin, before the rate changes."""
@@ -211,14 +216,13 @@ class TwinClock:
         if self._hold_count or not self._waiting:
             return
         loop = asyncio.get_running_loop()
-        if self._speed_up == "max":
+        if self._jumps:
             self._timer = loop.call_soon(self._jump_to_next, WAKE_ROUNDS)
         else:
             now = self._time()
-            if now < LATE_S:
-                pace = self._speed_up
-            else:
-                pace = min(1.0, self._speed_up)
+            pace = 1.0 if self._speed_up == "max" else self._speed_up
+            if now >= LATE_S:
+                pace = min(1.0, pace)
             wait = max(0.0, self._waiting[0][0] - now) / pace
             self._timer = loop.call_later(min(wait, 3600.0), self._wake_due)
 
@@ -226,8 +230,9 @@ class TwinClock:
         """Set the time to the first awaited moment and finish that one future; for speed
         "max".
 
-        Futures that are done are skipped; time never goes back. Then the next wake-up is
-        scheduled.
+        Futures that are done are skipped; time never goes back. It jumps no farther than
+        `LATE_S`; what waits for a later moment waits in real time from then on. Then the
+        next wake-up is scheduled.
 
         Args:
             patience: number of loop rounds to wait first, in which tasks that are ready
@@ -240,11 +245,16 @@ class TwinClock:
             return
         self._timer = None
         while self._waiting:
-            moment, _, future = heapq.heappop(self._waiting)
+            moment, _, future = self._waiting[0]
             if not future.done():
-                self._base = max(self._base, moment)
+                self._base = max(self._base, min(moment, LATE_S))
+                self._base_wall = self._wall()
+                if moment > LATE_S:
+                    break
                 future.set_result(None)
+                heapq.heappop(self._waiting)
                 break
+            heapq.heappop(self._waiting)
         self._set_timer()
 
     def _wake_due(self) -> None:

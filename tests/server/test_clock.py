@@ -7,12 +7,14 @@ import asyncio
 import numpy as np
 import pytest
 
-from flexdt.server.scans.twin_clock import LATE_S, TwinClock
+from flexdt.server.scans.twin_clock import TwinClock
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
+from flexdt.twin.motion.profiles import LATE_S, LATEST_MOTION_S, move
 from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.scanner.state import Sample
 
 
 class Wall:
@@ -148,3 +150,57 @@ def test_a_clock_that_is_late_runs_in_real_time_and_motion_on_it_is_swept() -> N
         now += rng.uniform(0.0, 9.0)
         scanner.stop(now)
     assert scanner.rest_time(now) >= now
+
+
+def test_a_clock_at_full_speed_jumps_no_farther_than_its_end() -> None:
+    """Issue 80: moves of 1e9 s each were accepted one after the other, to 4.2e11 s; from 1e14
+    s on positions jumped."""
+
+    async def main() -> None:
+        wall = [0.0]
+        clock = TwinClock("max", wall=lambda: wall[0])
+        await clock.sleep_until(LATE_S - 5.0)
+        assert clock.now() == LATE_S - 5.0
+        late = clock.at(LATE_S + 3.0)
+        for _ in range(20):
+            await asyncio.sleep(0.0)
+        assert (clock.now(), late.done()) == (LATE_S, False)
+        wall[0] = 2.0
+        assert clock.now() == LATE_S + 2.0
+        with clock.held():
+            wall[0] = 5.0
+            assert clock.now() == LATE_S + 2.0
+        wall[0] = 6.0
+        await asyncio.wait_for(clock.sleep_until(LATE_S + 3.0), 60.0)
+        assert clock.now() == LATE_S + 3.0
+        clock.set_speed_up(1e6)
+        wall[0] = 7.0
+        assert clock.now() == LATE_S + 4.0
+
+    asyncio.run(main())
+
+
+def test_motion_that_would_end_after_the_clock_is_refused_by_every_command() -> None:
+    machine = builtin_machine()
+    profile = builtin_profile(machine.default_profile)
+    for now in (0.9 * LATE_S, LATE_S, 3.0 * LATE_S):
+        s = ScannerTwin(machine, profile, now)
+        for setting in ("speed", "acceleration"):
+            s.set_axis("mag_obj", **{setting: 1e-6})
+        here = s.positions(now)
+        far = {"mag_obj": 900.0}
+        programme = {"mag_obj": [move(here["mag_obj"], 0.0, 5000.0, 1e-6, 1e-6, 0.0)]}
+        start = s.prepared(programme, now, here).certified()
+        for command in (
+            lambda s=s, now=now, far=far: s.move(far, now),
+            lambda s=s, now=now: s.jog("mag_obj", 1e-6, 1e12, now),
+            lambda s=s, now=now, far=far: s.stage_change(
+                Sample(), None, None, now, targets=far
+            ),
+            lambda s=s, now=now, start=start: s.follow(start, now),
+        ):
+            with pytest.raises(LimitError, match="of the twin's clock"):
+                command()
+        assert s.rest_time(now) == now
+        s.set_axis("mag_obj", speed=1.0, acceleration=1.0)
+        assert max(s.move(far, now).values()) < LATEST_MOTION_S

@@ -120,6 +120,28 @@ class Drive:
 Drives = Mapping[str, Drive]
 
 
+def require_time(what: str, end: float, now: float) -> None:
+    """Check that a motion ends before the clock does: its steps would be too coarse for
+    what was swept.
+
+    Args:
+        what: the command, for the message.
+        end: of the motion [s]; one without an end passes, as a jog that is renewed.
+        now: time of the command [s].
+
+    Raises:
+        LimitError: it ends more than `LATEST_MOTION_S` after `LATE_S` and now.
+    """
+    last = max(now, motion.LATE_S) + motion.LATEST_MOTION_S
+    if last < end < math.inf:
+        raise LimitError(
+            f"{what} would end at {end:.6g} s of the twin's clock, and motion ends by "
+            f"{last:.6g} s; a higher speed is quicker, and a twin that is started anew "
+            "begins at 0 s",
+            {"asked": end, "allowed": [now, last]},
+        )
+
+
 def home(machine: Machine, now: float) -> dict[str, Drive]:
     """Make a drive for each axis, at rest at home since `now` [s], with the axis's rates."""
     return {

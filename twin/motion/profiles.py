@@ -27,6 +27,11 @@ MIN_RATE = 1e-6
 """Least speed and acceleration that can be set: a move may be slow, but it ends."""
 
 
+LATE_S = 1e9
+"""Time from which on (31 years) a clock runs no faster than real time [s]: its steps are
+0.1 us then, and motion is swept with an allowance for such steps."""
+LATEST_MOTION_S = 1e6
+"""How long after `LATE_S`, or after a command that is given later, motion may end [s]."""
 TIME_ROUNDING_S = 1e-9
 """Largest difference between two times that counts as rounding [s]."""
 

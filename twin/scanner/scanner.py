@@ -283,7 +283,8 @@ class ScannerTwin:
             Motor -> seconds until it rests, of the motors that are sent.
 
         Raises:
-            UnknownNameError, LimitError: nothing moves.
+            UnknownNameError, LimitError: nothing moves; also for a motion that would end
+                after the twin's clock (`drives.require_time`).
             SafetyError: E-stopped or blocked; nothing moves.
             CollisionError: a contact is ahead. The motion halts before it where that is
                 free, and else nothing changes; the error's data has the outcome
@@ -292,6 +293,9 @@ class ScannerTwin:
         self._require_ready("motion", now)
         new = plan.plan_move(
             self.machine, self._drives, targets, now, relative=relative, shortest=shortest
+        )
+        plan.require_time(
+            "the move", max((t.end for t in new.values()), default=now), now
         )
         joined = self._lookahead(now).joined(new)
         if joined.contact is not None:
@@ -380,12 +384,13 @@ class ScannerTwin:
 
         Raises:
             UnknownNameError: no such axis.
-            LimitError: a velocity or lease out of range.
+            LimitError: a velocity or lease out of range, or an end after the twin's clock.
             SafetyError: E-stopped or blocked; nothing changes.
             CollisionError: a contact, and no free motion before it.
         """
         self._require_ready("motion", now)
         new = plan.plan_jog(self.machine, self._drives, axis, velocity, lease_s, now)
+        plan.require_time("the jog", max((t.end for t in new.values()), default=now), now)
         joined = self._lookahead(now).joined(new)
         if joined.contact is not None and not joined.trajectories:
             raise self._blocked(joined, now, f"jog {axis} at {velocity:g}")
@@ -530,6 +535,7 @@ class ScannerTwin:
             now: twin time [s], the zero of the programme's clock.
 
         Raises:
+            LimitError: it would end after the twin's clock; nothing moves.
             CollisionError: a contact anywhere along it, on the stage that it was prepared
                 for; the attempt counts, and nothing moves.
             SafetyError: E-stopped or blocked; the motors are not at rest exactly at its
@@ -547,6 +553,8 @@ class ScannerTwin:
             raise SafetyError(
                 what, {"asked": "a programme", "allowed": "checking it again"}
             )
+        ends = [legs[-1].end for legs in prepared.legs.values() if legs]
+        plan.require_time("the programme", now + max(ends, default=0.0), now)
         self._programmes += 1
         for name, legs in prepared.legs.items():
             self._drives[name] = self._drives[name].following(*legs, origin=now)
@@ -605,6 +613,7 @@ class ScannerTwin:
             drives = plan.with_settings(self.machine, drives, name, speed, acceleration)
         if targets:
             moves = plan.plan_move(self.machine, drives, targets, now)
+            plan.require_time("the move", max(t.end for t in moves.values()), now)
         else:
             moves = {}
         return StageChange(
