@@ -142,7 +142,10 @@ class Journal:
         been written."""
         self._taken: Record | None = self.last
         """Newest record made; its version has been given away."""
-        self._written: Content | None = None
+        self._on_disk: Content | None = None
+        """What the disk has; None where that is not known, as after a failure."""
+        self._under_way: Content | None = None
+        """What is being written: until its end the disk may have this or the other."""
         self._owed_was_told = False
         self._changed = asyncio.Event()
         self._at_once = asyncio.Event()
@@ -217,11 +220,12 @@ class Journal:
         Positions count while motors rest and no scan runs.
         """
         now = self._content()
-        written = self._written
+        disk = self._on_disk
+        either = [c for c in (disk, self._under_way) if c is not None]
         said = None
-        if written is None or written.estop != now.estop:
+        if disk is None or any(content.estop != now.estop for content in either):
             said = f"the {'E-stop' if now.estop else 'reset'} is being written"
-        elif written.positions != now.positions and self._at_rest():
+        elif self._at_rest() and any(c.positions != now.positions for c in either):
             said = "the motors' positions are being written"
         self._owed_was_told = self._owed_was_told or said is not None
         return said
@@ -265,11 +269,12 @@ class Journal:
             self._changed.clear()
             self._at_once.clear()
             record = self.take()
-            if self.problem is not None or not _is(self._written, record):
+            if not self._has(record):
+                self._under_way = record
                 try:
                     await loop.run_in_executor(self._thread, self._put, record)
                 except (OSError, ValueError, DatasetError) as error:
-                    self._note(str(error))
+                    self._failed(error)
                 else:
                     self._wrote(record)
             self._tell_waiting()
@@ -305,7 +310,7 @@ class Journal:
         try:
             self._put(record, make)
         except (OSError, ValueError, DatasetError) as error:
-            self._note(str(error))
+            self._failed(error)
         else:
             self._wrote(record)
 
@@ -322,12 +327,22 @@ class Journal:
 
     def _wrote(self, record: Record) -> None:
         """Note a record as written, and tell whoever was told that it was owed."""
-        self._written = record
+        self._on_disk = record
+        self._under_way = None
         told = self._owed_was_told
         self._owed_was_told = False
         if told and self.problem is None and self.owed() is None:
             self.noticed()
         self._note(None)
+
+    def _failed(self, error: Exception) -> None:
+        """Note that a write has failed, which may have left anything in its slot."""
+        self._on_disk = None
+        self._note(str(error))
+
+    def _has(self, record: Record) -> bool:
+        """Return whether the disk has what a record says, and nothing else."""
+        return self._on_disk is not None and _same(self._on_disk, record)
 
     def _note(self, problem: str | None) -> None:
         """Set `problem`, and tell when one begins or ends."""
@@ -351,11 +366,6 @@ def _same(a: Content, b: Content) -> bool:
         b.xrays,
         b.positions,
     )
-
-
-def _is(written: Content | None, record: Record) -> bool:
-    """Return whether the disk has what a record says."""
-    return written is not None and _same(written, record)
 
 
 def _within(machine: Machine, positions: dict[str, float]) -> dict[str, float]:

@@ -6,12 +6,17 @@ import errno
 import random
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
+from estop_histories import run_history
 from simulated_disk import Disk, Fault
 
 from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import Keep
 from flexdt.runtime.files.two_slots import SLOT_BYTES, TwoSlots
+from flexdt.server.storage.journal import Journal, Record
+from flexdt.server.storage.memory import StateStore
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 
@@ -87,3 +92,52 @@ def test_a_journal_that_was_removed_is_made_anew(tmp_path: Path) -> None:
         slots.write(3, b"three")
         assert TwoSlots(folder, "journal").read() == (3, b"three")
         slots.close()
+
+
+def run_histories(root: Path, count: int) -> None:
+    """Live the first `count` histories."""
+    for seed in range(count):
+        run_history(root / str(seed), seed)
+
+
+@pytest.mark.daily(12)
+@pytest.mark.campaign(60)
+@pytest.mark.parametrize("seed", range(500))
+def test_an_estop_inside_a_slow_write_survives_a_kill_at_any_moment(
+    seed: int, tmp_path: Path
+) -> None:
+    outcome = run_history(tmp_path, seed)
+    assert outcome.said_to_be_safe + outcome.unsaved > 0
+
+
+def test_a_lock_shared_with_other_writes_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The test's own test: the journal waits for the state's lock, as it was once."""
+    put, writing = Journal._put, []
+
+    class Shared(StateStore):
+        """Tells the journal whether another write is under way."""
+
+        def __init__(self, *args: Any) -> None:
+            super().__init__(*args)
+            writing.append(self)
+
+    def waits(journal: Journal, record: Record, make: Keep | None = None) -> None:
+        if writing and writing[-1]._writing.locked():
+            raise OSError(errno.EAGAIN, "it waits")
+        put(journal, record, make)
+
+    monkeypatch.setattr(Journal, "_put", waits)
+    monkeypatch.setattr("flexdt.server.storage.memory.StateStore", Shared)
+    with pytest.raises(AssertionError):
+        run_histories(tmp_path, 40)
+
+
+def test_an_owed_write_that_is_not_told_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The test's own test: `unsaved` is set by failures only, as it was once."""
+    monkeypatch.setattr(Journal, "owed", lambda journal: None)
+    with pytest.raises(AssertionError):
+        run_histories(tmp_path, 40)
