@@ -27,6 +27,8 @@ from flexdt.twin.errors import LimitError
 T = TypeVar("T")
 Keep = Callable[[str, bytes], None]
 """Writes a file of a folder, safe from a power cut."""
+RESERVE = 4
+"""Descriptors that are kept for taking changes back."""
 ASIDE = ".unreadable"
 """Inserted before the suffix of a file that is set aside; none of our names has two dots."""
 
@@ -105,13 +107,16 @@ class Changes:
     """Files written one after the other, which can all be restored.
 
     The replaced file is kept beside the new one under another name until `done` or
-    `undo`, so that undoing takes no room: a full disk is the usual reason for it. `with
-    Changes() as changes:` undoes them if the block raises.
+    `undo`, so that undoing takes no room: a full disk is the usual reason for it. Some
+    descriptors are reserved before the first change, so that undoing is possible where
+    the process has none left. `with Changes() as changes:` undoes them if the block
+    raises.
     """
 
     def __init__(self) -> None:
         """Begin without changes."""
         self._made: list[_Change] = []
+        self._reserve: list[int] = []
 
     def put(
         self, folder: Directory, name: str, data: bytes, keep: Keep | None = None
@@ -131,6 +136,7 @@ class Changes:
             DatasetWriteError: the system cannot write; `undo` restores the earlier
                 changes.
         """
+        self._reserved(folder, name)
         before = self._before()
         old = None
         try:
@@ -162,6 +168,7 @@ class Changes:
         """
         gone = False
         for name in names:
+            self._reserved(folder, name)
             before = self._before()
             with writing(folder.path / name, f"cannot delete {folder.path / name}"):
                 try:
@@ -173,6 +180,21 @@ class Changes:
             gone = True
         if gone:
             folder.sync()
+
+    def _reserved(self, folder: Directory, name: str) -> None:
+        """Reserve descriptors before the first change of a file.
+
+        Raises:
+            DatasetWriteError: there are none; nothing has been written.
+        """
+        with writing(folder.path / name, f"cannot write {folder.path / name}"):
+            while len(self._reserve) < RESERVE:
+                self._reserve.append(os.open(os.devnull, os.O_RDONLY))
+
+    def _release(self) -> None:
+        """Give the reserved descriptors back."""
+        while self._reserve:
+            os.close(self._reserve.pop())
 
     def _before(self) -> str:
         """Return an unused name for a replaced file."""
@@ -198,6 +220,7 @@ class Changes:
         """Confirm the changes: delete the replaced files, as far as the system allows,
         and forget the changes.
         """
+        self._release()
         for change in self._made:
             if change.before is not None:
                 # What stays is swept at the next start (`settle`), and takes only room.
@@ -211,6 +234,7 @@ class Changes:
         A file that somebody else has changed since, or deleted, is left alone. Failures
         are logged.
         """
+        self._release()
         # A file that was written twice goes back through its second version to the first.
         for change in reversed(self._made):
             try:

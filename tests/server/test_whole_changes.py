@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import random
+import resource
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,7 +14,10 @@ from simulation import Simulation
 
 from flexdt.protocol import RpcError
 from flexdt.runtime.access import AccessError, TwinLimits, limit_names, with_limits
+from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.own_documents import Changes
 from flexdt.server.storage.job_files import JobFiles
+from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 
 DAYS = limit_names(TwinLimits())
 
@@ -80,3 +86,50 @@ def test_ages_that_no_calendar_has(tmp_path: Path) -> None:
 def test_a_limit_that_its_use_cannot_have_is_refused_with_a_sentence(word: str) -> None:
     with pytest.raises(AccessError, match="must be at most"):
         with_limits([word], TwinLimits())
+
+
+@pytest.mark.parametrize("left", range(12))
+def test_a_change_for_which_descriptors_are_wanting_is_undone(
+    tmp_path: Path, left: int
+) -> None:
+    """However few there are: it is refused before its first write, or taken back."""
+    (tmp_path / "inner" / "deep").mkdir(parents=True)
+    with Directory(tmp_path) as root:
+        deep = root.folder("inner").folder("deep")
+        for folder in (root, deep):
+            folder.keep("a", b"old")
+            folder.keep("b", b"old")
+        taken = []
+        limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (256, limits[1]))
+        try:
+            with suppress(OSError):
+                while True:
+                    taken.append(os.open(os.devnull, os.O_RDONLY))
+            for _ in range(left):
+                os.close(taken.pop())
+            with (
+                pytest.raises((DatasetWriteError, ZeroDivisionError)),
+                Changes() as changes,
+            ):
+                _change_all(changes, root, deep, taken)
+        finally:
+            for fd in taken:
+                os.close(fd)
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        for folder in (root, deep):
+            assert [folder.read(name) for name in ("a", "b")] == [b"old", b"old"]
+            assert {f.name for f in folder.path.iterdir() if f.is_file()} == {"a", "b"}
+
+
+def _change_all(
+    changes: Changes, root: Directory, deep: Directory, taken: list[int]
+) -> None:
+    """Change files, take all descriptors that are left, and fail."""
+    for folder in (root, deep):
+        changes.put(folder, "a", b"new")
+        changes.remove(folder, "b")
+    with suppress(OSError):
+        while True:
+            taken.append(os.open(os.devnull, os.O_RDONLY))
+    raise ZeroDivisionError
