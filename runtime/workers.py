@@ -21,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
+from flexdt.runtime.fair_turns import FairTurns
 from flexdt.runtime.process import process_seconds
 from flexdt.runtime.worker import Parts, Work, receive_parts, send_parts
 
@@ -207,16 +208,24 @@ class Workers:
         count: at a time; further work waits its turn.
         memory_bytes: of each.
         seconds: of processor time that one piece of work may take.
+        most_waiting: requests that may wait for a place; None for any number.
     """
 
-    def __init__(self, count: int, memory_bytes: int, seconds: float) -> None:
+    def __init__(
+        self,
+        count: int,
+        memory_bytes: int,
+        seconds: float,
+        most_waiting: int | None = None,
+    ) -> None:
         """Set up `count` places for work at a time; no process starts before the first work.
 
-        A process has `memory_bytes`, a piece of work `seconds`.
+        A process has `memory_bytes`, a piece of work `seconds`. Places are given by
+        client in turn (`fair_turns`), to at most `most_waiting` who wait.
         """
         self.memory_bytes = memory_bytes
         self.seconds = seconds
-        self._turn = asyncio.Semaphore(count)
+        self._turns = FairTurns(count, most_waiting)
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
         self._idle: list[Worker] = []
         self._timer: asyncio.TimerHandle | None = None
@@ -242,11 +251,12 @@ class Workers:
             The parts that the function returns.
 
         Raises:
-            RpcError: as `Worker.ask`; -32003, no process could be started.
+            RpcError: as `Worker.ask`; -32003, no process could be started, or too many
+                requests wait.
             RuntimeError: as `Worker.ask`.
         """
         # First the place, then the process: requests that wait hold none.
-        async with self._turn:
+        async with self._turns:
             loop = asyncio.get_running_loop()
             worker = self._idle.pop() if self._idle else None
             if worker is None:

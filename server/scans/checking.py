@@ -22,6 +22,7 @@ from flexdt.protocol.codec import write_json, write_msgpack
 from flexdt.protocol.connection import MAX_ANSWER
 from flexdt.protocol.methods.job_messages import CHECK_LIMITS
 from flexdt.protocol.rpc_errors import Code, RpcError, too_large
+from flexdt.runtime.fair_turns import FairTurns
 from flexdt.runtime.process import ServerLoop
 from flexdt.runtime.workers import Workers
 from flexdt.server.scans.scan_record import PoseList, ScanSource
@@ -51,6 +52,8 @@ from flexdt.twin.script.planning.sample_findings import (
 )
 from flexdt.twin.script.problems import ScriptCode
 
+MAX_WAITING_CHECKS: Final = 64
+"""Largest number of checks that wait, but for the controller's."""
 MAX_PARALLEL_CHECKS: Final = 2
 """Largest number of checks in worker processes at a time; others wait."""
 MAX_CHECK_S: Final = float(CHECK_LIMITS["seconds"])
@@ -188,10 +191,12 @@ class Checks:
     def __init__(self, apart: bool = True) -> None:
         """Set up checks in worker processes, or (`apart` False) all in this process."""
         self._apart = apart
-        self._workers = Workers(MAX_PARALLEL_CHECKS, MEMORY_BYTES, MAX_CHECK_S)
+        self._workers = Workers(
+            MAX_PARALLEL_CHECKS, MEMORY_BYTES, MAX_CHECK_S, MAX_WAITING_CHECKS
+        )
         self._last: Checked | None = None
         # Light checks of many clients take turns, so that a scan always finds a worker thread.
-        self._turn = asyncio.Semaphore(MAX_PARALLEL_CHECKS)
+        self._turn = FairTurns(MAX_PARALLEL_CHECKS)
 
     async def report(
         self, check_input: CheckInput, codec: Codec, seen: SampleForecast | None = None

@@ -17,6 +17,7 @@ from prometheus_client import Metric
 from flexdt.protocol import AnyMethod
 from flexdt.protocol.fields import Params, TopicName
 from flexdt.protocol.state_model import JobPhase
+from flexdt.runtime.fair_turns import REQUESTER, Requester
 from flexdt.runtime.files.directory import free_bytes
 from flexdt.runtime.http_pages import Pages, Requests, counter, gauge, watching_pages
 from flexdt.runtime.wire_errors import explain, is_user_error
@@ -35,7 +36,8 @@ class TwinSession:
     def __init__(self, twin: TwinServer, peer: Peer) -> None:
         """Begin the session of a connection with the twin."""
         self._twin = twin
-        self._client = Client(peer)
+        self._client = client = Client(peer)
+        self._requester = Requester(peer, lambda: twin.control.holder == client.name)
 
     async def handle(self, method: AnyMethod, params: Params) -> object:
         """Answer one call: renew the client's lease, take control where the method needs
@@ -59,6 +61,7 @@ class TwinSession:
         twin = self._twin
         client = self._client
         twin.control.heard(client.name)
+        REQUESTER.set(self._requester)
         try:
             if method.control:
                 self._take_control(method.name)

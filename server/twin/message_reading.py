@@ -17,6 +17,7 @@ from flexdt.protocol.fields import Params
 from flexdt.protocol.method import parse_params
 from flexdt.protocol.methods.job_messages import TrajectoryInput
 from flexdt.protocol.rpc_errors import too_large
+from flexdt.runtime.fair_turns import REQUESTER, Requester
 from flexdt.runtime.workers import Workers
 from flexdt.server.network.shell_parts import Call, Frozen
 from flexdt.server.scans.scan_record import PoseList
@@ -53,6 +54,7 @@ class Reader:
         Raises:
             RpcError: -32008, it cannot be read within the limits.
         """
+        REQUESTER.set(Requester(wire, lambda: False))
         workers = self._urgent if urgent else self._ordinary
         kind, *items = await workers.ask(work, wire.codec, wire.max_batch, raw=(raw,))
         pairs = zip(items[::2], items[1::2], strict=True)
