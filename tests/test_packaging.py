@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
 from setuptools import find_packages
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -323,7 +324,12 @@ def test_one_version_everywhere() -> None:
     with (ROOT / "pyproject.toml").open("rb") as file:
         version = tomllib.load(file)["project"]["version"]
     with (ROOT / "extensions" / "pyproject.toml").open("rb") as file:
-        assert tomllib.load(file)["project"]["version"] == version
+        extensions = tomllib.load(file)["project"]
+    assert extensions["version"] == version
+    [flexdt] = [
+        r for r in map(Requirement, extensions["dependencies"]) if r.name == "flexdt"
+    ]
+    assert version in flexdt.specifier
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert str(citation["version"]) == version
     changelog = (ROOT / "CHANGELOG.md").read_text()
@@ -357,8 +363,6 @@ def test_the_conda_recipe_is_that_of_this_version() -> None:
 def test_bounds_are_no_tighter_than_those_of_our_dependencies() -> None:
     """rich and websockets are bounded for viser's sake: by its own bounds, and no others."""
     from importlib.metadata import requires
-
-    from packaging.requirements import Requirement
 
     with (ROOT / "pyproject.toml").open("rb") as file:
         ours = {

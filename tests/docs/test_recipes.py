@@ -433,11 +433,11 @@ def test_a_reader_of_scan_files_is_added_by_its_recipe(copy: Path) -> None:
             ("| NXtomo `.nxs`", "| Probe `.probe` | its TIFFs beside it |  |\n"),
             ("### NXtomo\n", BLOCK),
         ),
-        "docs/data-sets.md": (("NXtomo, RTK and CTSimU in", "Probe, "),),
+        "docs/data-sets.md": (("NXtomo, ", "Probe, "),),
         "docs/coming-from/cil.md": (("TIFF, NeXus)", "Probe, "),),
         "tests/docs/test_others_scans.py": (
             ("MAKERS = {", MAKER),
-            ('"NXtomo": nxtomo, "RTK"', '"Probe": probe, '),
+            ('"NXtomo": nxtomo', '"Probe": probe, '),
         ),
     })  # fmt: skip
     # The file's geometry stays where another one is given.
