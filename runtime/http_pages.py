@@ -40,11 +40,10 @@ from flexdt.runtime.access import (
     read_token,
     token_matches,
 )
-from flexdt.runtime.guesses import Guesses
 from flexdt.runtime.log import dropped, log
 from flexdt.runtime.process import BACKLOG, ServerLoop, durations
 from flexdt.runtime.process_settings import ServerSettings
-from flexdt.runtime.waiting_room import WaitingList, neighbourhood
+from flexdt.runtime.waiting_room import Guesses, WaitingList, neighbourhood
 
 MAX_SILENCE_S: Final = 5.0
 """Time after which a silent client is disconnected [s]."""

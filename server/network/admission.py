@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from flexdt.protocol.rpc_errors import not_authorised
 from flexdt.runtime.access import token_matches
-from flexdt.runtime.guesses import Guesses
+from flexdt.runtime.waiting_room import Guesses
 
 MAX_WRONG_TOKENS = 3
 """Number of wrong tokens after which a connection is closed."""

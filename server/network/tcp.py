@@ -45,10 +45,9 @@ from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import ProtocolError, RpcError
 from flexdt.runtime import waiting_room
 from flexdt.runtime.access import ConnectionLimits, check_bind
-from flexdt.runtime.guesses import Guesses
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process import ListeningServer, tune
-from flexdt.runtime.waiting_room import WaitingList, neighbourhood
+from flexdt.runtime.waiting_room import Guesses, WaitingList, neighbourhood
 from flexdt.server.network import admission, batches, deadlines, loop_turns, outbox
 from flexdt.server.network import shell_parts as parts
 

@@ -18,9 +18,8 @@ import numpy.typing as npt
 from flexdt.protocol import MAX_FRAME, Correlation, Notification, Role, image
 from flexdt.protocol.messages import Id
 from flexdt.protocol.rpc_errors import superseded
-from flexdt.runtime.guesses import Guesses
 from flexdt.runtime.log import Sparing
-from flexdt.runtime.waiting_room import neighbourhood
+from flexdt.runtime.waiting_room import Guesses, neighbourhood
 from flexdt.server.network.admission import TokenCheck
 from flexdt.server.projector.compute import (
     ComputeJob,

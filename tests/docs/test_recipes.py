@@ -277,7 +277,9 @@ def test_a_material_is_added_by_its_recipe(copy: Path) -> None:
         ),
     })  # fmt: skip
     assert passed(copy, files, word) >= 20
-    filtered = "import flexdt as fx; print(fx.Tube(filters=[('planted', 0.3)]).filters[-1])"
+    filtered = (
+        "import flexdt as fx; print(fx.Tube(filters=[('planted', 0.3)]).filters[-1])"
+    )
     assert "planted" in run(copy, "-c", filtered).stdout
 
 

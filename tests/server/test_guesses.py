@@ -10,7 +10,7 @@ import pytest
 from flexdt.protocol.rpc_errors import RpcError
 from flexdt.runtime import guesses as module
 from flexdt.runtime import http_pages
-from flexdt.runtime.guesses import MAX_ADDRESSES, MAX_DELAY_S, STEP_S, Guesses
+from flexdt.runtime.waiting_room import MAX_ADDRESSES, MAX_DELAY_S, STEP_S, Guesses
 from flexdt.server.network.admission import TokenCheck
 
 TOKEN = "a-token-of-some-length"
