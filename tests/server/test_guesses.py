@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from flexdt.protocol.rpc_errors import RpcError
-from flexdt.runtime import guesses as module
 from flexdt.runtime import http_pages
+from flexdt.runtime import waiting_room as module
 from flexdt.runtime.waiting_room import MAX_ADDRESSES, MAX_DELAY_S, STEP_S, Guesses
 from flexdt.server.network.admission import TokenCheck
 
