@@ -225,7 +225,7 @@ class Journal:
         said = None
         if disk is None or any(content.estop != now.estop for content in either):
             said = f"the {'E-stop' if now.estop else 'reset'} is being written"
-        elif self._at_rest() and any(c.positions != now.positions for c in either):
+        elif any(c.positions != now.positions for c in either) and self._at_rest():
             said = "the motors' positions are being written"
         self._owed_was_told = self._owed_was_told or said is not None
         return said

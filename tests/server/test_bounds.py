@@ -130,9 +130,13 @@ def test_a_service_goes_on_after_what_it_met_and_ends_the_process_if_it_cannot(
                 raise ZeroDivisionError("planted")
             return honest(now)
 
+        def met() -> bool:
+            """Whether it has been met twice by a feed that is woken again and again."""
+            lab.twin.feed.changed()
+            return left < 0
+
         monkeypatch.setattr(lab.twin.scanner, "rest_time", broken)
-        lab.twin.feed.changed()
-        await lab.until(lambda: left < 0, "it was met")
+        await lab.until(met, "it was met")
         await asyncio.sleep(0.3)
         before = len(c.of("state"))
         lab.twin.feed.changed()
