@@ -484,7 +484,7 @@ def require_before_source(
         0, 0, machine.detector.pixels.columns - 1, machine.detector.pixels.rows - 1
     )
     everywhere = replace(camera, roi=whole)
-    for what, pose, mm in _least_before_source(machine, profile, everywhere, offsets):
+    for what, pose, mm in least_before_source(machine, profile, everywhere, offsets):
         if mm > BEFORE_SOURCE_MM:
             continue
         place = ", ".join(f"{name} {x:g}" for name, x in pose.items())
@@ -496,7 +496,7 @@ def require_before_source(
     check_cone_vec(home, camera.pixels_mm(machine.detector.pixels))
 
 
-def _least_before_source(
+def least_before_source(
     machine: Machine, profile: Profile, camera: CameraSettings, offsets: Offsets
 ) -> Iterator[tuple[str, dict[str, float], float]]:
     """Yield what must be before the source, the pose of the travel at which it is least
