@@ -53,7 +53,7 @@ BUDGET_S = 0.5
 slow."""
 CI_BUDGET_S = 1.5
 """The same in CI, where one case is always run; the others are `night`."""
-MODULE_BUDGET_S = 5.0
+MODULE_BUDGET_S = 3.0
 """Processor time that the slow tests of one module may take together in CI, the shortest
 first. One is always run, and of one with `campaign(n)` as many cases as it says; the others
 are `night`."""
