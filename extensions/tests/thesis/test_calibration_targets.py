@@ -50,7 +50,7 @@ def test_every_target_is_met_missed_or_missing(
     )
     assert next(v for k, v in rows.items() if "camera demo" in k)[2] == "NO"
     missing = [v for v in rows.values() if v[2] == "missing"]
-    assert all(v[0].startswith(("flexdt study", "python examples")) for v in missing)
+    assert all(v[0].startswith(("flexdt study", "python tests/studies")) for v in missing)
     assert main([str(tmp_path)]) == 1
     assert "| NO |" in capsys.readouterr().out
     assert main([str(tmp_path / "nowhere")]) == 1
