@@ -161,6 +161,15 @@ class Empty(Params):
     """No parameters."""
 
 
+class Part(Params):
+    """Which part of a list to answer; all of it without parameters."""
+
+    start: Annotated[int, Ge(0), Le(2**53), Integral] = 0
+    """left out before"""
+    count: Annotated[int, Ge(1), Le(2**53), Integral] | None = None
+    """listed at most; null: all others"""
+
+
 class Nothing(Result):
     """An empty result."""
 

@@ -105,13 +105,8 @@ class JobForget(f.Params):
         return self
 
 
-class JobList(f.Params):
+class JobList(f.Part):
     """Which jobs to list; all without parameters."""
-
-    start: Annotated[int, Ge(0), Le(2**53), f.Integral] = 0
-    """left out before"""
-    count: Annotated[int, Ge(1), Le(2**53), f.Integral] | None = None
-    """listed at most; null: all others"""
 
 
 class JobForgetResult(f.Result):

@@ -267,13 +267,8 @@ class SampleInfo(f.Result):
     uploaded: bool = False
 
 
-class SampleList(f.Params):
+class SampleList(f.Part):
     """Which samples to list; all without parameters."""
-
-    start: Annotated[int, Ge(0), Le(2**53), f.Integral] = 0
-    """left out before"""
-    count: Annotated[int, Ge(1), Le(2**53), f.Integral] | None = None
-    """listed at most; null: all others"""
 
 
 class SampleListResult(f.Result):
