@@ -10,16 +10,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
-from flexdt.library.calibration.align_dataset import Aligned
-from flexdt.library.calibration.calibrate import Outcome, calibrate_with, typed_words
 from flexdt.library.calibration.calibration_options import CalibrationOptions
-from flexdt.library.calibration.proposed_commands import IN_MEMORY
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.reading.folders import load_dataset
-from flexdt.library.reading.listed_images import markers_alone
 from flexdt.phantoms import Phantom
 from flexdt.twin import long_work
 from flexdt.twin.algorithms import DEFAULT, PLAIN
@@ -30,6 +26,10 @@ from flexdt.twin.long_work import Progress
 from flexdt.twin.physics.tube import Tube
 from flexdt.twin.projection import Volume
 from flexdt.twin.signatures import public, with_options_of
+
+if TYPE_CHECKING:
+    from flexdt.library.calibration.align_dataset import Aligned
+    from flexdt.library.calibration.calibrate import Outcome
 
 Data = DataSet | str | PathLike[str]
 
@@ -93,6 +93,9 @@ def _calibrate(
     Raises:
         TwinError: neither data, nor geometry and markers.
     """
+    from flexdt.library.calibration.calibrate import calibrate_with, typed_words
+    from flexdt.library.reading.listed_images import markers_alone
+
     files: tuple[str, ...] = ()
     if geometry is not None:
         files = ("GEOMETRY",)
@@ -247,6 +250,8 @@ def _with_geometry(data: Data, geometry: ConeVec) -> DataSet:
 
 def _typed(data: Data) -> str:
     """Return the folder of a scan as it was given, or what stands for one in memory."""
+    from flexdt.library.calibration.proposed_commands import IN_MEMORY
+
     if not isinstance(data, DataSet):
         return str(data)
     if data.folder is None:

@@ -15,7 +15,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter, generic_filter
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
@@ -106,6 +105,8 @@ def measure_changes(views: Float32Array, gaps: FloatArray) -> Changes:
         Of each frame its part of that change with sigma and reliability, the smoothness of
         its change without shifts, and whether it equals the frame before.
     """
+    from scipy.ndimage import gaussian_filter
+
     n = len(views)
     soft = gaussian_filter(views, (0, SMOOTHING_PX, SMOOTHING_PX)).astype(np.float64)
     span = np.roll(gaps, 2) + np.roll(gaps, 1) + gaps
@@ -137,6 +138,8 @@ def _smoothness(image: FloatArray) -> float:
     """Compute the logarithm of the power of a smoothed image over that of white noise of
     the same power; 0 for an image of zeros.
     """
+    from scipy.ndimage import gaussian_filter
+
     power = float(np.square(image).mean())
     if power == 0.0:
         return 0.0
@@ -150,6 +153,8 @@ def _log_ratio(changes: Changes) -> FloatArray:
     MOST_LOG_RATIO; 0 where nothing changes about a frame, as where a round body turns
     back.
     """
+    from scipy.ndimage import generic_filter
+
     usual = _usual(changes)
     own = np.hypot(changes.sigma, LEAST_SCATTER * np.abs(usual))
     off = changes.turned - usual

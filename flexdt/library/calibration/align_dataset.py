@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from typing import Final, Generic
 
 import numpy as np
-from scipy.ndimage import shift
 
 from flexdt.library.datasets.image_doubts import image_doubts
 from flexdt.library.datasets.image_set import Images, Images_co, ImageSet
@@ -180,6 +179,8 @@ def _at_rest(data: ImageSet) -> tuple[Callable[[int], Float32Array], Poses]:
         panel steps by a few pixels, images are shifted and the panel of the poses is at
         rest.
     """
+    from scipy.ndimage import shift
+
     poses = data.poses
     aside = poses.detector - poses.detector.mean(axis=0)
     steps = np.stack(

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import fdtri
 
 from flexdt.library.calibration.calibrate import Outcome, digits
 from flexdt.library.datasets.image_set import ImageSet
@@ -166,6 +165,8 @@ def _ellipses(c: Certificate) -> list[str]:
     """Make HTML parts: a heading, and an SVG of the joint 95 % ellipse for each of the
     `MAX_ELLIPSES` most correlated pairs of parameters (fewer if there are no more).
     """
+    from scipy.special import fdtri
+
     names = list(c.estimates)
     pairs = [
         (abs(c.correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)

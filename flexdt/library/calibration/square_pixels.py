@@ -11,7 +11,6 @@ from typing import overload
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 
 from flexdt.library.datasets.image_set import Arrays, Counts, Images, ImageSet
 from flexdt.twin.dataset.dataset_errors import DatasetMissingError
@@ -104,6 +103,8 @@ class ResampledRows:
         Returns:
             (rows, cols): means of the spline that has the sums of the old rows.
         """
+        from scipy.interpolate import CubicSpline
+
         rows, cols = image.shape
         total = np.concatenate(
             [np.zeros((1, cols)), np.cumsum(image, axis=0, dtype=np.float64)]

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import shift
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect import spot_kernels as kernels
@@ -252,6 +251,8 @@ def _place(
         use: its usable pixels.
         out: written at `number`, unless the pixels do not determine the place.
     """
+    from scipy.ndimage import shift
+
     y, x = (a[use] for a in np.mgrid[part])
     x, y = (x - x.mean()) / light.shape[0], (y - y.mean()) / light.shape[0]
     target = seen[use].astype(np.float64)

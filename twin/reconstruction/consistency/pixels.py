@@ -536,11 +536,12 @@ class _Judged:
             paired: number of those with a counterpart, or more, in a part of the panel.
             share: of the panel's pixels in that part.
         """
-        from scipy.stats import poisson
+        from scipy.special import gammainc
 
         reached = 2 * AXIS_REACH_PX + 1
         expected = 0.5 * share * many * many * reached / self.suspects.size
-        return float(poisson.sf((paired + 1) // 2 - 1, expected))
+        least = (paired + 1) // 2
+        return float(gammainc(least, expected)) if least else 1.0
 
     def _flickering(self, bad: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
         """Find suspects that deviate and cease often, and more so than their neighbours,
@@ -553,16 +554,18 @@ class _Judged:
         Args:
             bad: pixels known to be bad, with which none is compared.
         """
-        from scipy.stats import binom, f
+        from scipy.special import betainc, fdtri
 
         changes = self.changes >= MIN_CHANGES_SHARE * (self.views - 1)
         row, col = np.nonzero(self.suspects & changes)
         own = self.often[row, col]
         others = COMPARED_COLUMNS * self._usual(self.often, bad, row, col)
-        chance = binom.sf(own - 1, own + others, 1.0 / (COMPARED_COLUMNS + 1))
+        rare = 1.0 / (COMPARED_COLUMNS + 1)
+        chance = np.where(own > 0, betainc(np.maximum(own, 1), others + 1.0, rare), 1.0)
         # A variance from n differences is as sure as one from 2 n / 3 values.
         freedom = max(2.0 * (self.views - 1) / 3.0, 1.0)
-        noise = f.isf(MAX_CHANCE, freedom, freedom)
+        # Both numbers of degrees are the same, so the upper quantile is one over the lower.
+        noise = 1.0 / fdtri(freedom, freedom, MAX_CHANCE)
         usual = self._usual(self.variance, bad, row, col)
         found = (chance < MAX_CHANCE) & (self.variance[row, col] > noise * usual)
         mask = np.zeros_like(self.suspects)
