@@ -52,6 +52,8 @@ class DataSet(ImageSet):
         complete: whether the scan reports its end and no file is missing.
         reason: why it is not complete.
         warnings: doubts about the data set.
+        provenance: every value of the scan's files, and whether it is used, contradicted or
+            ignored; a table.
         full_scale: largest count of the panel; None where it is not known.
         truth: of a simulated data set, its sample and settings.
 

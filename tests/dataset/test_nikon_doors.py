@@ -70,8 +70,11 @@ def test_a_key_with_two_values_is_refused(tmp_path, key, value):
     path.write_text(text + f"[Copy]\n{key}={value}\n")
     with pytest.raises(DatasetError, match=rf"{key} is \S+ and {value}; allowed"):
         fx.open(path)
-    path.write_text(text + "".join(text.splitlines(True)[1:]) + "Notes=1\nNotes=2\n")
-    assert fx.open(path).warnings == ()  # the same values twice, and unused ones
+    path.write_text(text + "".join(text.splitlines(True)[1:]))
+    assert fx.open(path).warnings == ()  # the same values twice
+    path.write_text(text + "Notes=1\nNotes=2\n")
+    [told] = fx.open(path).warnings
+    assert told.endswith("ignored: Notes = 1, Notes = 2")
 
 
 @pytest.mark.parametrize("lean", [0.0, 0.06, -0.06])
@@ -118,3 +121,100 @@ def test_a_text_of_any_length_is_refused(tmp_path, monkeypatch):
         file.truncate(17 << 20)
     with pytest.raises(DatasetError, match="bytes of text"):
         fx.open(path)
+
+
+def listed_angles(folder, ending, angles):
+    """A list of angles as Inspect-X leaves it: `_ctdata.txt` or `part.ang`."""
+    head = "Projs Frames Exposure(ms)\n{} 1 1000\nProjection\tAngle(deg)\tTime(s)\n"
+    rows = "".join(f"{i + 1}\t{angle}\t{2 * i}\n" for i, angle in enumerate(angles))
+    if ending == ".ang":
+        rows = "".join(f"{i + 1}:\t{angle}\n" for i, angle in enumerate(angles))
+        head = "Proj\tAngle(deg)\n"
+    (folder / f"part{ending}").write_text(head.format(len(angles)) + rows)
+
+
+def turned(data):
+    """Angles of the sources about the axis, from the first one [deg]."""
+    x, y = data.geometry.source[:, :2].T
+    return np.rad2deg(np.unwrap(np.arctan2(y, x) - np.arctan2(y[0], x[0])))
+
+
+@pytest.mark.parametrize("ending", ["_ctdata.txt", ".ang"])
+@pytest.mark.parametrize("way", [1, -1])
+def test_measured_angles_win_and_both_are_told(tmp_path, ending, way):
+    path = xtekct(tmp_path)
+    planned = turned(fx.open(path))
+    listed_angles(tmp_path, ending, way * 45.0 * np.arange(VIEWS))
+    data = fx.open(path)
+    assert data.warnings == ()
+    np.testing.assert_allclose(turned(data), planned, atol=1e-9)
+    listed_angles(tmp_path, ending, way * 22.5 * np.arange(VIEWS))
+    data = fx.open(path)
+    np.testing.assert_allclose(turned(data), planned / 2.0, atol=1e-9)
+    [told] = data.warnings
+    assert "157.5 deg by" in told
+    assert "315 deg by InitialAngle and AngularStep" in told
+    [step] = data.provenance.field("AngularStep")
+    assert step.use == "contradicted"
+
+
+def test_a_list_of_other_length_is_not_used_and_told(tmp_path):
+    path = xtekct(tmp_path)
+    listed_angles(tmp_path, ".ang", [0.0, 1.0])
+    data = fx.open(path)
+    np.testing.assert_allclose(np.abs(np.diff(turned(data))), 45.0, atol=1e-9)
+    [told] = data.warnings
+    assert "2 angles, 8 views: it is not used" in told
+
+
+def test_of_two_lists_the_measured_one_wins(tmp_path):
+    path = xtekct(tmp_path)
+    listed_angles(tmp_path, "_ctdata.txt", 44.0 * np.arange(VIEWS))
+    listed_angles(tmp_path, ".ang", -45.0 * np.arange(VIEWS))
+    data = fx.open(path)
+    np.testing.assert_allclose(np.abs(np.diff(turned(data))), 44.0, atol=1e-9)
+    assert len(data.warnings) == 0  # 7 deg in 315 are within .2 steps
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ({"NewCentreX": 3.2}, "1 field not known to flexdt, ignored: NewCentreX = 3.2"),
+        ({"CoefX2": 0.3}, "CoefX2 0.3, which is not applied: line integrals"),
+        ({"ObjectOffsetX": 0.4, "CentreOfRotationTop": 1, "CentreOfRotationBottom": 1},
+         "ObjectOffsetX 0.4 mm at the axis; ObjectOffsetX is taken"),
+        ({"Shuttling": "True"}, "Shuttling True, which is not applied"),
+    ],
+)  # fmt: skip
+def test_what_is_not_honoured_is_told(tmp_path, said, words):
+    told = fx.open(xtekct(tmp_path, said)).warnings
+    assert any(words in one for one in told), told
+
+
+def test_every_line_has_its_use_and_it_is_saved(tmp_path):
+    (tmp_path / "scan").mkdir()
+    path = xtekct(tmp_path / "scan", {"CoefX1": 1.0, "Scattering": 0, "XraykV": 90})
+    data = fx.open(path)
+    assert data.warnings == ()
+    lines = path.read_text().splitlines()[1:]
+    assert [f"{one.field}={one.value}" for one in data.provenance] == lines
+    assert {one.field for one in data.provenance.of("ignored")} == {
+        "InputFolderName", "CoefX1", "Scattering", "XraykV"
+    }  # fmt: skip
+    data.save(tmp_path / "saved")
+    assert fx.open(tmp_path / "saved").provenance == data.provenance
+    given = fx.open(path, geometry=data.geometry)
+    assert [one.field for one in given.provenance.of("contradicted")][:2] == [
+        "DetectorPixelSizeX",
+        "DetectorPixelSizeY",
+    ]
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("cm", 10.0), ("um", 1e-3)])
+def test_lengths_are_in_the_unit_of_the_file(tmp_path, unit, scale):
+    plain = fx.open(xtekct(tmp_path)).geometry.rows
+    said = {"Units": unit, "SrcToObject": 100.5 / scale, "SrcToDetector": 400.25 / scale,
+            "DetectorPixelSizeX": 0.2 / scale, "DetectorPixelSizeY": 0.2 / scale}  # fmt: skip
+    np.testing.assert_allclose(fx.open(xtekct(tmp_path, said)).geometry.rows, plain)
+    with pytest.raises(DatasetError, match="Units is ell; allowed: um, mm"):
+        fx.open(xtekct(tmp_path, {"Units": "ell"}))

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
@@ -42,6 +43,7 @@ class ScanGeometry:
         files: the images' names, () if unknown.
         notes: remarks for the reader.
         full_scale: largest count of the images; None if unknown.
+        provenance: values of the files that it came from, with their uses.
     """
 
     cone_vec: ConeVec
@@ -51,6 +53,7 @@ class ScanGeometry:
     files: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=(), compare=False)
     full_scale: int | None = field(default=None, compare=False)
+    provenance: Provenance = field(default=Provenance(), compare=False)
 
     def __post_init__(self) -> None:
         """Check the lengths of `real` and of `files`, where given, and the detector's

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
+from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
@@ -278,13 +279,14 @@ class _Document(BaseModel):
     files: Texts = ()
     notes: Texts = ()
     full_scale: int | None = None
+    provenance: list[dict[str, str | bool]] = []
 
 
 def geometry_text(geometry: ScanGeometry) -> str:
     """Format a geometry as this project's JSON file, one line a view, with a final newline.
 
     It has kind, schema, name, detector size (null if unknown), notes, files, `cone_vec`,
-    and `full_scale` and `real_cone_vec` where known.
+    and `full_scale`, `provenance` and `real_cone_vec` where known.
     """
     if geometry.shape is not None:
         rows, cols = geometry.shape
@@ -298,6 +300,7 @@ def geometry_text(geometry: ScanGeometry) -> str:
         "notes": list(geometry.notes),
         "files": list(geometry.files),
         **({} if geometry.full_scale is None else {"full_scale": geometry.full_scale}),
+        **({"provenance": geometry.provenance.to_list()} if geometry.provenance else {}),
     }
     parts = [
         f" {json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()
@@ -354,7 +357,21 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         content.files,
         content.notes,
         content.full_scale,
+        _provenance(content.provenance, file),
     )
+
+
+def _provenance(members: list[dict[str, str | bool]], file: str) -> Provenance:
+    """Make the provenance of its JSON form.
+
+    Raises:
+        ExchangeError: a member is missing, or a use has another name; names the file.
+    """
+    try:
+        return Provenance.from_list(members)
+    except (KeyError, ValueError) as error:
+        said = f"{file}: provenance: {error}"
+        raise ExchangeError(said, {"path": "provenance"}) from None
 
 
 def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.normalise import LineIntegrals, of_intensities
+from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -111,6 +112,8 @@ class ImageSet:
         complete: whether the scan reports its end and no file is missing.
         reason: why it is not complete.
         warnings: doubts about the data set.
+        provenance: every value of the scan's files, and whether it is used, contradicted or
+            ignored; a table.
         full_scale: largest count of the panel; None where it is not known.
         truth: of a simulated data set, its sample and settings.
         interpolated: pixels whose line integrals are interpolated, (rows, cols); None: dead
@@ -144,6 +147,7 @@ class ImageSet:
     complete: bool = True
     reason: str = ""
     warnings: tuple[str, ...] = ()
+    provenance: Provenance = field(default_factory=Provenance)
     full_scale: int | None = None
     truth: Any = None
     interpolated: npt.NDArray[np.bool_] | None = None
@@ -292,7 +296,8 @@ class ImageSet:
         if self.present:
             first = self.present[0]
             picture = thumbnail(self.counts(first), f"projection {first}")
-        return facts_table(f"DataSet {self.name}", facts) + picture
+        values = self.provenance._repr_html_() if self.provenance else ""
+        return facts_table(f"DataSet {self.name}", facts) + values + picture
 
     def _reference_counts(self) -> tuple[int, int]:
         """Return the numbers of dark and of flat images, of those in memory if there are,

@@ -219,6 +219,7 @@ def _geometry(data: ImageSet) -> tuple[str, bytes]:
             files=files,
             notes=data.warnings,
             full_scale=data.full_scale,
+            provenance=data.provenance,
         )
         return GEOMETRY, geometry_text(geometry).encode()
     entry = CorrectionEntry.of(data.correction)

@@ -444,6 +444,7 @@ def _from_geometry(content: Folder) -> DataSet:
         geometry.name,
         warnings=notes,
         full_scale=geometry.full_scale,
+        provenance=geometry.provenance,
     )
 
 

@@ -9,9 +9,7 @@ left of the line from the source to the panel's middle.
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -22,19 +20,36 @@ from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.image_set import Arrays
 from flexdt.library.reading.foreign_parsing import head_text
 from flexdt.library.reading.listed_images import NO_DARK, listed
+from flexdt.library.reading.nikon_angles import chosen_angles
+from flexdt.library.reading.nikon_table import NIKON
 from flexdt.runtime.files.dataset_folder import Folder, list_folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
+from flexdt.twin.length_units import MORE_UNITS_MM, UNITS_MM, length_mm
 from flexdt.twin.plausibility import PlausibilityCode, settled
 from flexdt.twin.plausibility.image_order import ordered
 from flexdt.twin.plausibility.scan_geometry import distance_findings
+from flexdt.twin.plausibility.stated_figures import (
+    angle_findings,
+    pixel_findings,
+)
 
-LINE: Final = re.compile(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*?)\s*$", re.MULTILINE)
+LINE: Final = re.compile(
+    r"^[ \t]*([^=\[;#\s][^=\n]*?)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE
+)
 PROJECTION: Final = re.compile(r"(.*?)(\d+)(\.tiff?)", re.IGNORECASE)
 MOST_VIEWS: Final = 1_000_000
-DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
-"""A number as programs of some countries write it."""
+SAME_AXIS_PX: Final = 0.01
+"""Difference of two places of the axis that no images tell [pixels]."""
+GEOMETRY_FIELDS: Final = (
+    "SrcToObject", "SrcToDetector", "DetectorPixelSizeX", "DetectorPixelSizeY",
+    "AngularStep", "InitialAngle", "ObjectOffsetX", "ObjectRoll", "ObjectTilt",
+    "CentreOfRotation", "CentreOfRotationTop", "CentreOfRotationBottom", "Units",
+)  # fmt: skip
+"""Fields whose place a given geometry takes."""
 
 
 def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -42,8 +57,8 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
 
     They are in `InputFolderName`, beside the file by default. The axis is placed and
     leant as the file's object offset, roll and tilt, or else CentreOfRotation, state. The
-    white level of the file serves as flat image, the dark one is zero; detector offsets
-    are not applied and become warnings.
+    white level of the file serves as flat image, the dark one is zero. Angles measured for
+    each view, in `_ctdata.txt` or the `.ang` file, come before `AngularStep`.
 
     Args:
         path: the .xtekct file.
@@ -55,64 +70,160 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
             open beam or not 1 to `MOST_VIEWS` projections; or images are missing or of
             another shape than it states.
     """
-    said = _stated(head_text(path))
-    views = _count(path, said, "Projections")
-    sod, sdd = (_number(path, said, key) for key in ("SrcToObject", "SrcToDetector"))
-    across, down = (_number(path, said, f"DetectorPixelSize{axis}") for axis in "XY")
-    impossible = distance_findings(
-        sod, sdd, (across, down), ("SrcToObject", "SrcToDetector")
-    )
-    if geometry is None:
-        settled(impossible, DatasetFormatError, str(path))
-    size = [_count(path, said, f"DetectorPixels{axis}") for axis in "YX"]
+    said = Ledger(NIKON, str(path))
+    said.state_all(LINE.findall(head_text(path)))
+    views = said.whole("Projections")
     if not 0 < views <= MOST_VIEWS:
         raise DatasetFormatError.instead(
             f"{path}: Projections is {views}", views, f"1 to {MOST_VIEWS}"
         )
-    top, bottom = (
-        _number(path, said, f"CentreOfRotation{end}", 0.0) for end in ("Top", "Bottom")
-    )
-    aside = _number(path, said, "ObjectOffsetX", 0.5 * (top + bottom) * sod / sdd)
-    lean = -np.rad2deg(np.arctan2(top - bottom, size[0] * down))
-    tilts = (
-        _number(path, said, "ObjectRoll", lean),
-        -_number(path, said, "ObjectTilt", 0.0),
-    )
-    turn = np.deg2rad(
-        _number(path, said, "InitialAngle", 0.0)
-        + _number(path, said, "AngularStep") * np.arange(views)
-    )
-    place = np.array(
-        [[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]]
-    )
-    rows = (place @ _axis(*np.deg2rad(tilts)))[None] @ rotation_z(-turn)
-    folder = list_folder(path.parent / said.get("InputFolderName", "").replace("\\", "/"))
-    if geometry is None:
-        cone = ConeVec(rows.reshape(views, 12))
-    else:
-        cone = geometry
+    size = [said.whole(f"DetectorPixels{axis}") for axis in "YX"]
+    pitch, cone, more = _geometry(said, path, views, size, geometry)
+    place = said.text("InputFolderName", ".").replace("\\", "/")
+    folder = list_folder(path.parent / place)
     names, told = _images(folder, len(cone))
-    data = listed(folder, cone, names, (), (), said.get("Name", ""))
+    data = listed(folder, cone, names, (), (), said.text("Name", path.parent.name))
     if list(data.shape) != size:
         raise DatasetFormatError(
             f"{path} says {size[1]} x {size[0]} pixels, {names[0]} has "
             f"{data.shape[1]} x {data.shape[0]}",
             {"asked": size, "allowed": list(data.shape)},
         )
-    level = _number(path, said, "WhiteLevel")
+    level = said.number("WhiteLevel")
     if level <= 0.0:
         raise DatasetFormatError.instead(
             f"{path}: WhiteLevel is {level:g}", level, "counts of the open beam, above 0"
         )
     white = np.full((1, *data.shape), level, np.float32)
-    doubts = told + [
-        f"{path.name} states {key} {said[key]}, which is not applied"
-        for key in ("DetectorOffsetX", "DetectorOffsetY")
-        if _number(path, said, key, 0.0)
-    ]
-    arrays = Arrays(None, np.zeros_like(white), white)
-    more = [doubt for doubt in data.warnings if not doubt.startswith(NO_DARK)]
-    return replace(data, arrays=arrays, warnings=(*more, *doubts))
+    if geometry is not None:
+        said.replaced(GEOMETRY_FIELDS, "geometry=")
+        found = pixel_findings(geometry, pitch[0])
+        told += settled(found, DatasetFormatError, path.name)
+    values = said.finish().and_also(more)
+    own = [doubt for doubt in data.warnings if not doubt.startswith(NO_DARK)]
+    return replace(
+        data,
+        arrays=Arrays(None, np.zeros_like(white), white),
+        warnings=(*own, *told, *said.warnings),
+        provenance=values,
+    )
+
+
+def _geometry(
+    said: Ledger, path: Path, views: int, size: list[int], given: ConeVec | None
+) -> tuple[tuple[float, float], ConeVec, Provenance]:
+    """Take the geometry of the file and the lists of angles beside it.
+
+    Args:
+        said: what the file states.
+        path: of the file.
+        views: that it states.
+        size: rows and columns that it states.
+        given: geometry in its place, or None.
+
+    Returns:
+        Pitch of columns and rows [mm], the geometry, and what became of the values of the
+        lists of angles.
+
+    Raises:
+        DatasetFormatError: a number is missing or distances are such as no scanner has.
+    """
+    unit = _unit(said, path)
+    sod, sdd = (unit * said.number(key) for key in ("SrcToObject", "SrcToDetector"))
+    across, down = (unit * said.number(f"DetectorPixelSize{axis}") for axis in "XY")
+    impossible = distance_findings(
+        sod, sdd, (across, down), ("SrcToObject", "SrcToDetector")
+    )
+    if given is None:
+        settled(impossible, DatasetFormatError, str(path))
+    aside, roll = _axis_place(said, unit, sod, sdd, across, size[0] * down)
+    tilts = np.deg2rad((roll, -said.number("ObjectTilt", 0.0)))
+    start = said.number("InitialAngle", 0.0)
+    planned = start + said.number("AngularStep") * np.arange(views, dtype=np.float64)
+    angles, values = chosen_angles(said, path, planned)
+    if given is not None:
+        doubts = angle_findings(given, np.deg2rad(angles))
+        said.warnings += settled(doubts, DatasetFormatError, path.name)
+        return (across, down), given, values
+    place = np.array(
+        [[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]]
+    )
+    rows = (place @ _axis(*tilts))[None] @ rotation_z(-np.deg2rad(angles))
+    return (across, down), ConeVec(rows.reshape(views, 12)), values
+
+
+def _unit(said: Ledger, path: Path) -> float:
+    """Return the length of the unit that the file states [mm]; 1 without one.
+
+    Raises:
+        DatasetFormatError: the unit is unknown.
+    """
+    name = said.text("Units", "mm")
+    size = length_mm(name)
+    if size is None:
+        known = ", ".join((*UNITS_MM, *MORE_UNITS_MM))
+        raise DatasetFormatError.instead(f"{path}: Units is {name[:40]}", name, known)
+    return size
+
+
+def _axis_place(
+    said: Ledger, unit: float, sod: float, sdd: float, pitch: float, height: float
+) -> tuple[float, float]:
+    """Choose between the places and leans of the axis that the file states.
+
+    Statements that differ by less than `SAME_AXIS_PX` pixels at the panel are the same.
+
+    Args:
+        said: what the file states.
+        unit: of its lengths [mm].
+        sod, sdd: source to axis and to panel [mm].
+        pitch: of columns [mm].
+        height: of the panel [mm].
+
+    Returns:
+        How far the axis stands to the left of the central ray [mm], and its lean [deg].
+    """
+    top, bottom, middle = (
+        _if_stated(said, f"CentreOfRotation{end}", unit * sod / max(sdd, 1e-9))
+        for end in ("Top", "Bottom", "")
+    )
+    same_mm = SAME_AXIS_PX * pitch * sod / max(sdd, 1e-9)
+    mean = None
+    lean = None
+    if top is not None or bottom is not None:
+        ends = (top or 0.0, bottom or 0.0)
+        mean = 0.5 * sum(ends)
+        at_panel = (ends[0] - ends[1]) * sdd / max(sod, 1e-9)
+        lean = -float(np.rad2deg(np.arctan2(at_panel, height)))
+    aside = said.agree(
+        "the axis",
+        [
+            ("ObjectOffsetX", _if_stated(said, "ObjectOffsetX", unit)),
+            ("CentreOfRotationTop", mean),
+            ("CentreOfRotation", middle),
+        ],
+        same_mm,
+        "mm at the axis",
+    )
+    if mean is not None and aside == mean:
+        said.use("CentreOfRotationBottom")
+    roll = said.agree(
+        "the axis's lean",
+        [
+            ("ObjectRoll", _if_stated(said, "ObjectRoll", 1.0)),
+            ("CentreOfRotationBottom", lean),
+        ],
+        float(np.rad2deg(2.0 * SAME_AXIS_PX * pitch / max(height, 1e-9))),
+        "deg",
+    )
+    return aside or 0.0, roll or 0.0
+
+
+def _if_stated(said: Ledger, key: str, scale: float) -> float | None:
+    """Take a number and scale it; None where it is missing or empty."""
+    if not (said.stated(key) or "").strip():
+        return None
+    return scale * said.number(key)
 
 
 def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
@@ -169,61 +280,6 @@ def _completed(names: list[str], views: int) -> list[str]:
     before, digits, after = numbers[first].groups()
     width = len(digits) if digits.startswith("0") else 1
     return [f"{before}{n:0{width}d}{after}" for n in range(start, start + views)]
-
-
-def _stated(text: str) -> dict[str, str]:
-    """Return keys and values of the file; a key with several values has all, separated by
-    "and", which is no number.
-    """
-    values: dict[str, dict[str, None]] = {}
-    for key, value in LINE.findall(text):
-        values.setdefault(key, {})[value] = None
-    return {key: " and ".join(several) for key, several in values.items()}
-
-
-def _count(path: Path, said: Mapping[str, str], key: str) -> int:
-    """Return a whole number of the file; arguments as for `_number`.
-
-    Raises:
-        DatasetFormatError: the value is no whole number.
-    """
-    value = _number(path, said, key)
-    if not value.is_integer():
-        raise DatasetFormatError.instead(
-            f"{path}: {key} is {value:g}", value, "a whole number"
-        )
-    return int(value)
-
-
-def _number(
-    path: Path, said: Mapping[str, str], key: str, default: float | None = None
-) -> float:
-    """Return a number of the file, with a decimal point or comma.
-
-    Args:
-        path: for the message.
-        said: keys and values of the file.
-        key: of the number.
-        default: where the key is missing or its value is empty; None makes that an error.
-
-    Raises:
-        DatasetFormatError: the value is no finite number.
-    """
-    text = said.get(key, "")
-    try:
-        if not text and default is not None:
-            return default
-        value = float(
-            text.replace(",", ".", 1) if DECIMAL_COMMA.fullmatch(text) else text
-        )
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise DatasetFormatError(
-            f"{path}: {key} is {text[:60] or 'missing'}; allowed: a number",
-            {"missing": key},
-        )
-    return value
 
 
 def _axis(roll: float, tilt: float) -> FloatArray:

@@ -1,0 +1,395 @@
+"""The table of a format: what each of its fields means, and what flexdt makes of it.
+
+A reader states every value of a file to a `Ledger` and takes from it what it needs. What it does
+not take, the table explains; what the table does not have, one warning names. So no value of a
+file is passed over in silence.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+from typing import Final, NoReturn
+
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.provenance import Provenance, Stated, Use, shortened
+
+DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+"""A number as programs of some countries write it."""
+SPACES: Final = re.compile(r"\s+")
+OFF: Final = ("", "0", "off", "no", "false", "none")
+"""Values of a switch that is off."""
+
+
+class Role(StrEnum):
+    """What flexdt makes of a field."""
+
+    USED = "used"
+    NOTED = "ignored"
+    """It bears on neither geometry nor images."""
+    DROPPED = "not applied"
+    """It bears on them and is not applied: a warning, unless its value has no effect."""
+    REFUSED = "refused"
+    """A scan with it is refused, unless its value has no effect."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a format.
+
+    Attributes:
+        name: as files have it, whatever its case and spaces; `*` stands for any text, `?` for
+            one character.
+        meaning: with the unit, as `flexdt describe` and the docs' page show it.
+        role: what flexdt makes of it.
+        why: what it is used for, why it is ignored, what follows from its not being applied,
+            or why it is refused.
+        unit: of a number; empty for none.
+        neutral: values without effect, for the last two roles.
+    """
+
+    name: str
+    meaning: str
+    role: Role
+    why: str
+    unit: str = ""
+    neutral: tuple[str, ...] = OFF
+
+    def without_effect(self, value: str) -> bool:
+        """Return whether a value is one of `neutral`; numbers count as numbers."""
+        plain = value.strip().strip("\"'").lower()
+        if plain in self.neutral:
+            return True
+        number = as_number(plain)
+        return any(as_number(one) == number for one in self.neutral) and not math.isnan(
+            number
+        )
+
+
+def used(name: str, meaning: str, by: str, unit: str = "") -> Field:
+    """Make a field that the reader takes; `by` says for what."""
+    return Field(name, meaning, Role.USED, by, unit)
+
+
+def noted(name: str, meaning: str, because: str = "no part of the geometry") -> Field:
+    """Make a field that bears on neither geometry nor images."""
+    return Field(name, meaning, Role.NOTED, because)
+
+
+def noted_all(
+    names: str, meaning: str, because: str = "no part of the geometry"
+) -> tuple[Field, ...]:
+    """Make fields of one meaning that bear on nothing; names are divided by blanks."""
+    return tuple(noted(name, meaning, because) for name in names.split())
+
+
+def dropped(
+    name: str,
+    meaning: str,
+    consequence: str,
+    unit: str = "",
+    neutral: tuple[str, ...] = OFF,
+) -> Field:
+    """Make a field that is not applied, with what follows from that."""
+    return Field(name, meaning, Role.DROPPED, consequence, unit, neutral)
+
+
+def refused(
+    name: str, meaning: str, because: str, neutral: tuple[str, ...] = OFF
+) -> Field:
+    """Make a field whose value makes a scan impossible to read."""
+    return Field(name, meaning, Role.REFUSED, because, neutral=neutral)
+
+
+@dataclass(frozen=True)
+class FormatTable:
+    """A format, as far as files of it were seen or described.
+
+    Attributes:
+        name: of the format or its maker.
+        source: where the facts come from.
+        fields: in the order of the docs' page; the first that fits a name counts.
+        rule: which of two statements of one thing wins, in a sentence.
+        seen: whether a file of the maker's own software was at hand.
+    """
+
+    name: str
+    source: str
+    fields: tuple[Field, ...]
+    rule: str
+    seen: bool = False
+
+    @cached_property
+    def _plain(self) -> Mapping[str, Field]:
+        """Fields by plain name, the first of each."""
+        plain: dict[str, Field] = {}
+        for one in self.fields:
+            plain.setdefault(plain_name(one.name), one)
+        return plain
+
+    @cached_property
+    def _patterns(self) -> Sequence[tuple[str, Field]]:
+        """Plain patterns and their fields."""
+        return [(plain_name(f.name), f) for f in self.fields if {*"*?"} & {*f.name}]
+
+    def field(self, name: str) -> Field | None:
+        """Find the field of a name, whatever its case and spaces; None for an unknown one."""
+        plain = plain_name(name)
+        found = self._plain.get(plain)
+        if found is not None:
+            return found
+        fits = (f for pattern, f in self._patterns if fnmatch.fnmatchcase(plain, pattern))
+        return next(fits, None)
+
+
+def plain_name(name: str) -> str:
+    """Return a field's name in lower case, with single spaces and none about a slash."""
+    text = SPACES.sub(" ", name.strip().lower())
+    text = text.replace("[", "(").replace("]", ")")  # brackets mean sets in patterns
+    return re.sub(r" ?/ ?", "/", text)
+
+
+def as_number(text: str) -> float:
+    """Return the number that a text is, with a decimal point or comma; NaN for no number."""
+    plain = text.strip()
+    if DECIMAL_COMMA.fullmatch(plain):
+        plain = plain.replace(",", ".", 1)
+    try:
+        return float(plain)
+    except ValueError:
+        return math.nan
+
+
+@dataclass
+class _Entry:
+    """A value while its file is read: `use` is None until something is made of it."""
+
+    name: str
+    value: str
+    use: Use | None = None
+    consequence: str = ""
+    known: bool = True
+
+
+@dataclass
+class Ledger:
+    """The values of one file while it is read.
+
+    Attributes:
+        table: of its format.
+        path: for messages.
+        warnings: what a user should know, in the order in which it was found.
+    """
+
+    table: FormatTable
+    path: str
+    warnings: list[str] = field(default_factory=list)
+    _entries: list[_Entry] = field(default_factory=list)
+    _by_name: dict[str, list[_Entry]] = field(default_factory=dict)
+
+    @property
+    def file(self) -> str:
+        """The file's name."""
+        return re.split(r"[/\\]", self.path)[-1]
+
+    def state(self, name: str, value: object) -> None:
+        """Enter a value of the file, in its order; every one is entered once."""
+        entry = _Entry(name, str(value))
+        self._entries.append(entry)
+        self._by_name.setdefault(plain_name(name), []).append(entry)
+
+    def state_all(self, values: Iterable[tuple[str, object]]) -> None:
+        """Enter values of the file, by name."""
+        for name, value in values:
+            self.state(name, value)
+
+    def stated(self, name: str) -> str | None:
+        """Return a value without taking it; the first of several, None without one."""
+        found = self._by_name.get(plain_name(name))
+        return found[0].value if found else None
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """Take a value as it stands.
+
+        Args:
+            name: of its field.
+            default: of a missing or empty value; None makes that an error.
+
+        Raises:
+            DatasetFormatError: it is missing without default, or stated twice differently.
+        """
+        found = self._by_name.get(plain_name(name), [])
+        values = list(dict.fromkeys(one.value.strip() for one in found))
+        if len(values) > 1:
+            self._refuse(name, " and ".join(values[:4]), "one value")
+        if not values or not values[0]:
+            if default is None:
+                self._refuse(name, "missing", "a value")
+            self._mark(name, Use.IGNORED, f"it is empty: {default or 'nothing'} is taken")
+            return default
+        self._mark(name, Use.USED, self._meaning(name))
+        return values[0]
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """Take a finite number, with a decimal point or comma; arguments as for `text`.
+
+        Raises:
+            DatasetFormatError: it is no such number, or as for `text`.
+        """
+        given = None if default is None else repr(default)
+        try:
+            text = self.text(name, given)
+        except DatasetFormatError as error:
+            said = str(error.data.get("asked", "missing"))
+            self._refuse(name, said, "a number")
+        value = as_number(text)
+        if not math.isfinite(value):
+            self._refuse(name, text[:60], "a number")
+        return value
+
+    def whole(self, name: str, default: int | None = None) -> int:
+        """Take a whole number; arguments as for `text`, errors as of `number`."""
+        value = self.number(name, default)
+        if not value.is_integer():
+            self._refuse(name, f"{value:g}", "a whole number")
+        return int(value)
+
+    def switch(self, name: str, default: bool = False) -> bool:
+        """Take a switch: ON, YES, TRUE and numbers but 0 are on, whatever follows them."""
+        text = self.text(name, "on" if default else "off").lower()
+        return re.split(r"[\s(]", text)[0] not in OFF
+
+    def set_aside(self, name: str, consequence: str) -> None:
+        """Say that a value is contradicted by one that was taken; one warning has both.
+
+        Args:
+            name: of its field.
+            consequence: both values, and which was taken.
+        """
+        self._mark(name, Use.CONTRADICTED, consequence)
+        self.warnings.append(f"{self.file}: {consequence}")
+
+    def ignore(self, name: str, because: str) -> None:
+        """Say that a value is ignored, without a warning."""
+        self._mark(name, Use.IGNORED, because)
+
+    def replaced(self, names: Iterable[str], by: str) -> None:
+        """Say that values are contradicted by what the caller gave, such as "geometry="."""
+        for name in names:
+            self._mark(name, Use.CONTRADICTED, f"{by} takes its place")
+
+    def use(self, name: str, by: str = "") -> None:
+        """Say that a value is used."""
+        self._mark(name, Use.USED, by or self._meaning(name))
+
+    def agree(
+        self,
+        what: str,
+        statements: Sequence[tuple[str, float | None]],
+        tolerance: float,
+        unit: str = "",
+    ) -> float | None:
+        """Choose between statements of one thing: the first that is there wins.
+
+        Others that differ by more than the tolerance are set aside, with both values.
+
+        Args:
+            what: the thing, for people.
+            statements: field and value of each, the winner first; None where it is missing.
+            tolerance: largest difference of equal values, in their unit.
+            unit: of the values.
+
+        Returns:
+            The value taken; None without any.
+        """
+        there = [(name, value) for name, value in statements if value is not None]
+        if not there:
+            return None
+        winner, taken = there[0]
+        self.use(winner)
+        mark = f" {unit}" if unit else ""
+        for name, value in there[1:]:
+            if abs(value - taken) <= tolerance:
+                self.use(name, f"{what}, as {winner} says")
+                continue
+            both = f"{name} says {value:.6g}{mark}, {winner} {taken:.6g}{mark}"
+            self.set_aside(name, f"{what}: {both}; {winner} is taken")
+        return taken
+
+    def finish(self) -> Provenance:
+        """Explain what was not taken, warn of it, and return the values with their uses.
+
+        Raises:
+            DatasetFormatError: a field that is refused has an effect.
+        """
+        for entry in self._entries:
+            if entry.use is None:
+                self._explain(entry)
+        self._repeated()
+        lost = [one for one in self._entries if not one.known]
+        if lost:
+            many = f"{len(lost)} field{'s' if len(lost) > 1 else ''} not known to flexdt"
+            named = ", ".join(f"{e.name} = {shortened(e.value, 30)}" for e in lost)
+            self.warnings.append(f"{self.file}: {many}, ignored: {named}")
+        return Provenance(
+            Stated(
+                e.name, e.value, e.use or Use.IGNORED, e.consequence, self.file, e.known
+            )
+            for e in self._entries
+        )
+
+    def _explain(self, entry: _Entry) -> None:
+        """Decide by the table what becomes of a value that the reader did not take."""
+        rule = self.table.field(entry.name)
+        entry.use = Use.IGNORED
+        if rule is None:
+            entry.known = False
+            entry.consequence = "not known to flexdt"
+        elif rule.role is Role.NOTED:
+            entry.consequence = f"{rule.meaning}: {rule.why}"
+        elif rule.role is Role.USED:
+            entry.consequence = "nothing needed it"
+        elif rule.without_effect(entry.value):
+            entry.consequence = f"{rule.meaning}: without effect at this value"
+        elif rule.role is Role.REFUSED:
+            allowed = " or ".join(one or "empty" for one in rule.neutral[:3])
+            self._refuse(entry.name, entry.value, f"{allowed}; {rule.why}")
+        else:
+            entry.consequence = f"not applied: {rule.why}"
+            said = f"{entry.name} {shortened(entry.value, 40)}"
+            self.warnings.append(
+                f"{self.file} states {said}, which is not applied: {rule.why}"
+            )
+
+    def _repeated(self) -> None:
+        """Warn of fields that are stated twice with different values and were not taken."""
+        for several in self._by_name.values():
+            values = list(dict.fromkeys(one.value.strip() for one in several))
+            if len(values) > 1 and several[0].known:
+                said = f"{several[0].name} is stated twice: {' and '.join(values[:4])}"
+                self.warnings.append(f"{self.file}: {said}; none is used")
+                for one in several:
+                    one.use = Use.CONTRADICTED
+                    one.consequence = said
+
+    def _meaning(self, name: str) -> str:
+        """Return what a field is used for, by the table."""
+        rule = self.table.field(name)
+        return "" if rule is None else rule.why or rule.meaning
+
+    def _mark(self, name: str, use: Use, consequence: str) -> None:
+        """Note the use of all statements of a field."""
+        for entry in self._by_name.get(plain_name(name), ()):
+            entry.use = use
+            entry.consequence = consequence
+
+    def _refuse(self, name: str, said: str, allowed: str) -> NoReturn:
+        """Raise the error of a field, with the file, what it says and what is allowed."""
+        message = f"{self.path}: {name} is {shortened(said)}; allowed: {allowed}"
+        facts = {"path": self.path, "missing": name, "asked": said}
+        raise DatasetFormatError(message, facts)
