@@ -26,6 +26,10 @@ OFF: Final = ("", "0", "off", "no", "false", "none")
 """Values of a switch that is off."""
 
 
+MOST_NAMED: Final = 60
+"""Unknown fields that one warning names."""
+
+
 class Role(StrEnum):
     """What flexdt makes of a field."""
 
@@ -170,6 +174,7 @@ class _Entry:
     """A value while its file is read: `use` is None until something is made of it."""
 
     name: str
+    rule: str
     value: str
     use: Use | None = None
     consequence: str = ""
@@ -197,9 +202,15 @@ class Ledger:
         """The file's name."""
         return re.split(r"[/\\]", self.path)[-1]
 
-    def state(self, name: str, value: object) -> None:
-        """Enter a value of the file, in its order; every one is entered once."""
-        entry = _Entry(name, str(value))
+    def state(self, name: str, value: object, place: str = "") -> None:
+        """Enter a value of the file, in its order; every one is entered once.
+
+        Args:
+            name: of its field, as the table has it.
+            value: as text.
+            place: where it stands in the file, if that is not the field's name.
+        """
+        entry = _Entry(place or name, name, str(value))
         self._entries.append(entry)
         self._by_name.setdefault(plain_name(name), []).append(entry)
 
@@ -287,6 +298,21 @@ class Ledger:
         """Say that a value is used."""
         self._mark(name, Use.USED, by or self._meaning(name))
 
+    def use_place(self, place: str, by: str) -> None:
+        """Say that the value at a place of the file is used, whatever its field."""
+        for entry in self._entries:
+            if entry.name == place.strip("/"):
+                entry.use = Use.USED
+                entry.consequence = by
+
+    def set_place_aside(self, place: str, consequence: str) -> None:
+        """Say that the value at a place is contradicted; one warning has both."""
+        for entry in self._entries:
+            if entry.name == place.strip("/"):
+                entry.use = Use.CONTRADICTED
+                entry.consequence = consequence
+        self.warnings.append(f"{self.file}: {consequence}")
+
     def agree(
         self,
         what: str,
@@ -334,8 +360,11 @@ class Ledger:
         lost = [one for one in self._entries if not one.known]
         if lost:
             many = f"{len(lost)} field{'s' if len(lost) > 1 else ''} not known to flexdt"
-            named = ", ".join(f"{e.name} = {shortened(e.value, 30)}" for e in lost)
-            self.warnings.append(f"{self.file}: {many}, ignored: {named}")
+            named = [f"{e.name} = {shortened(e.value, 30)}" for e in lost[:MOST_NAMED]]
+            if len(lost) > MOST_NAMED:
+                more = f"{len(lost) - MOST_NAMED} more, which data.provenance.unknown has"
+                named.append(more)
+            self.warnings.append(f"{self.file}: {many}, ignored: {', '.join(named)}")
         return Provenance(
             Stated(
                 e.name, e.value, e.use or Use.IGNORED, e.consequence, self.file, e.known
@@ -345,7 +374,7 @@ class Ledger:
 
     def _explain(self, entry: _Entry) -> None:
         """Decide by the table what becomes of a value that the reader did not take."""
-        rule = self.table.field(entry.name)
+        rule = self.table.field(entry.rule)
         entry.use = Use.IGNORED
         if rule is None:
             entry.known = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -14,20 +14,21 @@ from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, INVALID, PROJECTION
 from flexdt.library.extras import package
 from flexdt.library.reading.foreign_parsing import require_memory
+from flexdt.library.reading.nxtomo_geometry import (
+    file_geometry,
+    replaced_by,
+    stated_figures,
+)
+from flexdt.library.reading.nxtomo_scan import NxScan, scan_of
+from flexdt.library.reading.nxtomo_table import DETECTOR
+from flexdt.library.reading.one_exposure import on_one_exposure
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.length_units import UNITS_RAD, angle_rad, length_mm
-from flexdt.twin.plausibility import PlausibilityCode, settled
-from flexdt.twin.plausibility.scan_geometry import distance_findings
-from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
+from flexdt.twin.plausibility import settled
 
 KNOWN_KEYS: Final = (PROJECTION, FLAT, DARK, INVALID)
 MOST_DEFLATED: Final = 2000
 """Bytes of images for each byte of the file; of zeros alone there are more."""
-KNOWN_LENGTHS: Final = "m, cm, mm, um, nm, inch"
-"""Units of length that the message of an unknown one lists."""
-KNOWN_ANGLES: Final = ", ".join(UNITS_RAD)
 SMALL_BYTES: Final = 1 << 30
 """Images of which it does not matter how far they were deflated."""
 
@@ -64,7 +65,8 @@ def _read(
 ) -> DataSet:
     """Read the images of an open file, and their geometry.
 
-    Invalid images and those with unknown keys are left out, with a doubt.
+    Invalid images and those with unknown keys are left out, with a doubt. Counts are put
+    on one exposure and one current of the source.
 
     Args:
         file: open.
@@ -90,32 +92,81 @@ def _read(
         doubts.append(
             f"{many} images of the keys {', '.join(map(str, others))} are left out"
         )
+    scan = scan_of(file, name, path, keys)
     images = data[:]
-    several = [
-        images[keys == key] if (keys == key).any() else None for key in (DARK, FLAT)
-    ]
-    if several[1] is None and images.dtype.kind in "ui":
+    kinds = {key: images[keys == key] for key in (PROJECTION, DARK, FLAT)}
+    if not len(kinds[FLAT]) and images.dtype.kind in "ui":
         doubts.append(
             f"{path.name}: no image has the key of a flat image, {FLAT}; counts have no line "
             "integrals without one"
         )
-    projections = keys == PROJECTION
-    if not projections.any():
+    if not len(kinds[PROJECTION]):
         raise DatasetFormatError(
             f"{path}: no image has the key of a projection, {PROJECTION}",
             {"path": str(path)},
         )
     given = geometry
     if given is None:
-        given, told = _geometry(file, name, path, projections, data.shape[1:], distances)
+        given, told = file_geometry(scan, data.shape[1:], distances)
         doubts += told
+    else:
+        replaced_by(scan, "geometry=")
+    views, flats, told = _one_exposure(scan, kinds)
+    doubts += told
+    darks = kinds[DARK]
     made = DataSet.from_arrays(
-        images[projections], given, dark=several[0], flat=several[1], name=path.stem
+        views,
+        given,
+        dark=darks if len(darks) else None,
+        flat=flats if len(flats) else None,
+        name=path.stem,
     )
     doubts += settled(
-        _stated_figures(file, name, given, projections), DatasetFormatError, path.name
+        stated_figures(file, name, given, scan.projections),
+        DatasetFormatError,
+        path.name,
     )
-    return replace(made, warnings=(*made.warnings, *doubts))
+    values = scan.ledger.finish()
+    all_told = (*made.warnings, *doubts, *scan.ledger.warnings)
+    return replace(made, warnings=all_told, provenance=values)
+
+
+def _one_exposure(
+    scan: NxScan, kinds: dict[int, npt.NDArray[Any]]
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any], list[str]]:
+    """Put projections and flat images on one exposure and one current of the source.
+
+    Args:
+        scan: whose count_time and control state them.
+        kinds: image key -> images.
+
+    Returns:
+        Projections, flat images, and doubts.
+    """
+    factors = {}
+    told = []
+    for place in (f"{DETECTOR}/count_time", "control/data"):
+        values = scan.of_images(place)
+        if values is None:
+            continue
+        lit = values[np.isin(scan.keys, (PROJECTION, FLAT))]
+        if not (np.isfinite(lit).all() and (lit > 0.0).all()):
+            said = f"{place} has values that are not above 0: it is not used"
+            scan.ledger.set_aside(place, said)
+            continue
+        factors["control" if place.startswith("control") else "count_time"] = values
+        dark = values[scan.keys == DARK]
+        if (
+            place.endswith("count_time")
+            and len(dark)
+            and not np.allclose(dark, np.median(lit[: len(lit)]))
+        ):
+            told.append(
+                f"{scan.path.name}: count_time of the dark images is {dark[0]:g} s, of the "
+                f"others {np.median(lit):g} s; they are subtracted as they are"
+            )
+    made = on_one_exposure(kinds, scan.keys, factors, scan.path.name)
+    return made.views, made.flats, [*told, *made.told]
 
 
 def _entry(file: Any, path: Path) -> tuple[str, list[str]]:
@@ -221,256 +272,3 @@ def _sources(data: Any) -> Iterator[str]:
         )
     if data.external:
         yield from dict.fromkeys(str(name) for name, *_ in data.external)
-
-
-def _geometry(
-    file: Any,
-    name: str,
-    path: Path,
-    projections: npt.NDArray[np.bool_],
-    shape: tuple[int, int],
-    distances: tuple[float, float] | None,
-) -> tuple[ConeVec, list[str]]:
-    """Take the geometry from the file's cone_vec, or from its angles, pixel and
-    distances.
-
-    A cone_vec, at the file's root or in the entry's `flexdt`, is taken without
-    assumptions or checks. The other way assumes an upright panel with the axis in its
-    middle column, and square pixels without `y_pixel_size`; signs of the distances do not
-    matter.
-
-    Args:
-        file: with the entry.
-        name: of the group that holds the images.
-        path: for messages.
-        projections: which images are projections.
-        shape: of an image (rows, cols).
-        distances: source to axis and to panel [mm], in place of the file's.
-
-    Returns:
-        The geometry, and a sentence on the assumptions made; none with cone_vec.
-
-    Raises:
-        DatasetFormatError: the file states too little (lists the missing quantities), in
-            an unknown unit, or distances are such as no scanner has.
-    """
-    rows = _cone_rows(file, file[name.split("/")[0]])
-    if rows is not None:
-        return ConeVec(rows), []
-    angles = _angles(file, name, projections)
-    lengths = {
-        what: _length(file, name, *places)
-        for what, places in LENGTHS.items()
-        if distances is None or "size" in what
-    }
-    missing = [w for w, length in lengths.items() if w in NEEDED_LENGTHS and not length]
-    if distances is not None:
-        sod, sdd = distances
-        impossible = distance_findings(sod, sdd, lengths["x_pixel_size"] or 1e-9 * sdd)
-        settled(impossible, DatasetFormatError, f"{path}: distances={distances}")
-        lengths |= {"source distance": sod, "detector distance": sdd - sod}
-    if angles is None:
-        missing.insert(0, "rotation_angle")
-    pixel = lengths["x_pixel_size"]
-    if missing or angles is None or pixel is None:
-        raise _too_little(path, missing)
-    sod, beyond = (
-        abs(lengths[what] or 0.0) for what in ("source distance", "detector distance")
-    )
-    cone = ConeVec.circular(
-        sod=sod,
-        sdd=sod + beyond,
-        angles=np.degrees(angles),
-        shape=shape,
-        pixel=(pixel, lengths["y_pixel_size"] or pixel),
-    )
-    return cone, [
-        f"{path.name} says angles, pixels and distances (source to axis {sod:g} mm, "
-        f"axis to panel {beyond:g} mm): an upright panel is assumed, "
-        "and the axis in its middle column; `align` or `calibrate` finds them"
-    ]
-
-
-def _cone_rows(file: Any, entry: Any) -> npt.NDArray[Any] | None:
-    """Read the rows of the cone_vec (n, 12) at the file's root, or else in the entry's
-    `flexdt`; None without either.
-    """
-    for group, place in ((file, "cone_vec"), (entry, "flexdt/cone_vec")):
-        found = _member(group, place)
-        if found is not None:
-            return np.asarray(found[:])
-    return None
-
-
-def _too_little(path: Path, missing: Sequence[str]) -> DatasetFormatError:
-    """Make the error for quantities that a geometry needs and the file lacks; it names the
-    argument that gives them.
-    """
-    way = "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"
-    if {*missing} <= {"source distance", "detector distance"}:
-        way = "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
-    return DatasetFormatError(
-        f"{path}: the file has no cone_vec and no {', '.join(missing)}; give {way}",
-        {"missing": missing},
-    )
-
-
-LENGTHS: Final[Mapping[str, tuple[str, ...]]] = {
-    "x_pixel_size": ("instrument/detector/x_pixel_size", "x_pixel_size"),
-    "y_pixel_size": ("instrument/detector/y_pixel_size", "y_pixel_size"),
-    "source distance": ("instrument/source/distance", "source/distance"),
-    "detector distance": ("instrument/detector/distance", "distance"),
-}
-"""Length of NXtomo, distances from the sample -> its places in a file, from the entry or
-the group."""
-
-NEEDED_LENGTHS: Final = ("x_pixel_size", "source distance", "detector distance")
-"""Lengths without which a geometry is undetermined."""
-
-
-def _angles(
-    file: Any, name: str, projections: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.float64] | None:
-    """Read angles of the projections from the first place of the file that has one for
-    each image.
-
-    Places are the group with the images, the entry, and the entry's groups, in this
-    order. Angles without a unit are in degrees.
-
-    Args:
-        file: open HDF5.
-        name: of the group with the images.
-        projections: (n,) images that are projections.
-
-    Returns:
-        The projections' angles [rad]; None without such a place.
-
-    Raises:
-        DatasetFormatError: they are in an unknown unit.
-    """
-    entry = file[name.split("/")[0]]
-    near = file[name]
-    places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
-    for place in places:
-        for at in ("rotation_angle", "sample/rotation_angle"):
-            angles = _member(place, at)
-            if angles is not None and angles.shape == projections.shape:
-                values = np.asarray(angles, dtype=np.float64)[projections]
-                return values * _scale(angles, "deg", angle_rad, KNOWN_ANGLES)
-    return None
-
-
-def _length(file: Any, name: str, *members: str) -> float | None:
-    """Read a length from the first of some places that has one number.
-
-    All names are looked up in the entry, then in the group. A length without unit is in
-    metres; its sign is kept.
-
-    Args:
-        file: open HDF5.
-        name: of the group with the images.
-        members: names in the entry, or in the group.
-
-    Returns:
-        Length [mm]; None without such a place.
-
-    Raises:
-        DatasetFormatError: it is in an unknown unit.
-    """
-    entry = file[name.split("/")[0]]
-    near = file[name]
-    for place in (entry, near):
-        for member in members:
-            found = _member(place, member)
-            if getattr(found, "size", 0) == 1:
-                scale = _scale(found, "m", length_mm, KNOWN_LENGTHS)
-                return float(np.ravel(found)[0]) * scale
-    return None
-
-
-def _member(group: Any, name: str) -> Any:
-    """Return a member of a group; None if there is no such member or no group."""
-    if hasattr(group, "get"):
-        return group.get(name)
-    return None
-
-
-def _stated_figures(
-    file: Any, name: str, geometry: ConeVec, projections: npt.NDArray[np.bool_]
-) -> Iterator[Finding]:
-    """Compare the angles and the pixel that the file states with the geometry.
-
-    Only the first pixel size found counts (next to the images, then at the entry and its
-    groups). A value in an unknown unit is a finding, too.
-
-    Args:
-        file: open.
-        name: of the group that holds the images.
-        geometry: in use.
-        projections: (n,) which images are projections.
-
-    Returns:
-        Findings of differences.
-    """
-    try:
-        turn = _angles(file, name, projections)
-    except DatasetFormatError as error:
-        yield _not_compared(error)
-    else:
-        if turn is not None:
-            yield from angle_findings(geometry, turn)
-    entry = file[name.split("/")[0]]
-    near = file[name]
-    places = (near, entry, *(one for one in entry.values() if hasattr(one, "get")))
-    for place in (near, *(_member(p, "instrument/detector") for p in places)):
-        if place is None:
-            size = None
-        else:
-            size = _member(place, "x_pixel_size")
-        if size is not None and size.size == 1:
-            try:
-                scale = _scale(size, "m", length_mm, KNOWN_LENGTHS)
-            except DatasetFormatError as error:
-                yield _not_compared(error)
-                return
-            yield from pixel_findings(geometry, float(np.ravel(size)[0]) * scale)
-            return
-
-
-def _not_compared(error: DatasetFormatError) -> Finding:
-    """Make the warning of a figure in an unknown unit, of its error."""
-    remedy = "it is not compared with the geometry"
-    return warning(PlausibilityCode.UNKNOWN_UNIT, error.message, remedy)
-
-
-def _scale(
-    dataset: Any, usual: str, known: Callable[[str], float | None], names: str
-) -> float:
-    """Return the size of the unit that a dataset of HDF5 states.
-
-    Args:
-        dataset: with or without a unit.
-        usual: unit of one without.
-        known: gives the size of a unit, None of an unknown one.
-        names: of known units, for the message.
-
-    Raises:
-        DatasetFormatError: the unit is unknown.
-    """
-    unit = _unit(dataset, usual)
-    scale = known(unit)
-    if scale is None:
-        problem = f"{dataset.name} is in {unit[:40]!r}"
-        raise DatasetFormatError.instead(problem, unit[:40], names)
-    return scale
-
-
-def _unit(dataset: Any, usual: str) -> str:
-    """Return the unit that a dataset's attribute states, as a text or an array of one, or
-    the usual one without any.
-    """
-    said = np.ravel(dataset.attrs.get("units", usual))[:1].tolist()
-    first = said[0] if said else usual
-    if isinstance(first, bytes):
-        first = first.decode("utf-8", "replace")
-    return str(first).strip() or usual

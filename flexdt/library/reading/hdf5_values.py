@@ -1,0 +1,145 @@
+"""Values of HDF5 files: each with its path, as a text, and in a known unit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.length_units import UNITS_RAD, angle_rad, length_mm
+
+KNOWN_LENGTHS: Final = "m, cm, mm, um, nm, inch"
+"""Units of length that the message of an unknown one lists."""
+KNOWN_ANGLES: Final = ", ".join(UNITS_RAD)
+STRUCTURE: Final = (
+    "nx_class units signal default axes interpretation target definition version "
+    "nexus_version hdf5_version h5py_version file_name file_time file_update_time creator "
+    "axis primary long_name description empty iscalar class dimension_list "
+    "reference_list name "
+)
+"""Attributes, in lower case, that say how a file is built, or describe a value in words."""
+SHOWN_VALUES: Final = 100_000
+"""Members of an array of one dimension whose first and last are shown."""
+
+
+def members_of(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield path and dataset of everything below a group, and the attributes that say
+    more than how the file is built, as PATH@NAME with their value.
+
+    A dataset is yielded once, at its first path; of a link that leads nowhere the target,
+    as a text.
+
+    Args:
+        group: of an open file.
+        prefix: of the paths, ending with a slash if it is not empty.
+    """
+    yield from _members(group, prefix, set())
+
+
+def _members(group: Any, prefix: str, seen: set[Any]) -> Iterator[tuple[str, Any]]:
+    """Yield what `members_of` yields; `seen` are the objects that were yielded."""
+    yield from _attributes(group, prefix.rstrip("/"))
+    for name in group:
+        try:
+            item = group.get(name)
+        except (OSError, RuntimeError, KeyError):
+            item = None
+        path = f"{prefix}{name}"
+        if item is None:
+            link = group.get(name, getlink=True)
+            target = getattr(link, "filename", "") or getattr(link, "path", "")
+            yield path, f"a link to {target}, which is not there"
+            continue
+        if item.id in seen:
+            continue
+        seen.add(item.id)
+        if hasattr(item, "keys"):
+            yield from _members(item, f"{path}/", seen)
+        else:
+            yield path, item
+            yield from _attributes(item, path)
+
+
+def _attributes(item: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield the attributes of an object that are not of `STRUCTURE`."""
+    for name in item.attrs:
+        if name.lower() not in STRUCTURE.split():
+            yield f"{path}@{name}", item.attrs[name]
+
+
+def text_of(value: Any) -> str:
+    """Return a value as text, with its unit; of an array its shape, and its ends if it
+    has one dimension.
+    """
+    unit = unit_of(value, "") if hasattr(value, "attrs") else ""
+    mark = f" {unit}" if unit else ""
+    size = int(getattr(value, "size", 1) or 0)
+    shape = getattr(value, "shape", ())
+    if size != 1:
+        ends = ""
+        if len(shape) == 1 and 0 < size <= SHOWN_VALUES:
+            ends = f": {plain(value[0])} to {plain(value[size - 1])}"
+        words = " x ".join(map(str, shape))
+        return f"{words or 0} of {value.dtype}{ends}{mark}"
+    try:
+        member = np.ravel(value[()] if hasattr(value, "attrs") else value)[0]
+    except (TypeError, ValueError, OSError, IndexError):
+        return "?"
+    return f"{plain(member)}{mark}"
+
+
+def plain(member: Any) -> str:
+    """Return a member of an array as text; bytes are decoded."""
+    if isinstance(member, bytes):
+        return member.decode("utf-8", "replace")
+    if isinstance(member, np.generic):
+        member = member.item()
+    if isinstance(member, bytes):
+        return member.decode("utf-8", "replace")
+    return f"{member:.10g}" if isinstance(member, float) else str(member)
+
+
+def unit_of(dataset: Any, usual: str) -> str:
+    """Return the unit that a dataset's attribute states, as a text or an array of one, or
+    the usual one without any.
+    """
+    said = np.ravel(dataset.attrs.get("units", usual))[:1].tolist()
+    first = said[0] if said else usual
+    return plain(first).strip() or usual
+
+
+def _scale(
+    dataset: Any, usual: str, known: Callable[[str], float | None], names: str
+) -> float:
+    """Return the size of the unit that a dataset states.
+
+    Args:
+        dataset: with or without a unit.
+        usual: unit of one without.
+        known: gives the size of a unit, None of an unknown one.
+        names: of known units, for the message.
+
+    Raises:
+        DatasetFormatError: the unit is unknown.
+    """
+    unit = unit_of(dataset, usual)
+    scale = known(unit)
+    if scale is None:
+        problem = f"{dataset.name} is in {unit[:40]!r}"
+        raise DatasetFormatError.instead(problem, unit[:40], names)
+    return scale
+
+
+def lengths_mm(dataset: Any, usual: str = "m") -> npt.NDArray[np.float64]:
+    """Read lengths (n,) [mm] of a dataset; raises DatasetFormatError for an unknown unit."""
+    scale = _scale(dataset, usual, length_mm, KNOWN_LENGTHS)
+    return np.ravel(np.asarray(dataset[()], dtype=np.float64)) * scale
+
+
+def angles_rad(dataset: Any, usual: str = "deg") -> npt.NDArray[np.float64]:
+    """Read angles (n,) [rad] of a dataset; raises DatasetFormatError for an unknown unit."""
+    scale = _scale(dataset, usual, angle_rad, KNOWN_ANGLES)
+    return np.ravel(np.asarray(dataset[()], dtype=np.float64)) * scale
