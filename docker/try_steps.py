@@ -139,7 +139,7 @@ def start(name: str, stages: dict[str, list[tuple[str, str]]], place: Place, mor
     words = [w.replace(STATE, f"{inside}{home}") for w in entry]
     env = {
         "PATH": f"{inside}/opt/flexdt/bin:{os.environ['PATH']}", "HOME": f"{inside}{home}",
-        "NUMBA_CACHE_DIR": f"{inside}{home}/numba", "PYTHONDONTWRITEBYTECODE": "1",
+        "FLEXDT_CACHE": f"{inside}{home}/kernels", "PYTHONDONTWRITEBYTECODE": "1",
         "FLEXDT_HEALTH": health,
     }  # fmt: skip
     env |= dict(rest.split("=", 1) for word, rest in stages[name] if word == "ENV")

@@ -47,6 +47,7 @@ if _typing.TYPE_CHECKING:
     __version__: str
 
 from flexdt.runtime import process_threads as _process_threads
+from flexdt.twin import kernel_store as _kernel_store
 from flexdt.twin import long_work as _long_work
 
 
@@ -70,7 +71,15 @@ def _show_work(
     return shown_work(what, progress)
 
 
+def _open_kernel_store() -> _kernel_store.KernelStore:
+    """Open the folders in which compiled kernels are kept."""
+    from flexdt.runtime import kernel_files
+
+    return kernel_files.opened()
+
+
 _long_work.during = _show_work
+_kernel_store.opened_by = _open_kernel_store
 _process_threads.watch()
 
 _HOMES: _typing.Final = {

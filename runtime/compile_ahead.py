@@ -2,7 +2,7 @@
 `python -m flexdt.runtime.compile_ahead`.
 
 numba compiles under one lock, so each group of kernels has a process of its own, which
-runs it on a tiny problem and leaves it in numba's disk cache. Groups that are there
+runs it on a tiny problem and leaves it where kernels are kept. Groups that are there
 already cost nothing; other kernels compile at their first use. Names of groups may follow
 the command.
 """
@@ -119,15 +119,14 @@ ANALYSIS: Final = ("calibration", "bead detection", "FDK")
 
 
 def is_compiled(group: str) -> bool:
-    """Return whether numba's disk cache has the last kernel of a group, an entry of
-    `GROUPS`, for this processor; nothing is compiled.
+    """Return whether the last kernel of a group, an entry of `GROUPS`, is kept for this
+    processor; nothing is compiled.
     """
     from importlib import import_module
 
     module, _, name = GROUPS[group][1].partition(":")
     entry = getattr(import_module(f"flexdt.twin.{module}"), name)
-    processor = entry.targetctx.codegen().magic_tuple()
-    return any(key[1] == processor for key in entry._cache._cache_file._load_index())
+    return bool(entry._cache.is_kept())
 
 
 def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:

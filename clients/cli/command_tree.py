@@ -29,6 +29,7 @@ from flexdt.clients.cli.commands import doctor_command as installation
 from flexdt.clients.cli.commands import expose_command as exposure
 from flexdt.clients.cli.commands import follow_command as following
 from flexdt.clients.cli.commands import job_commands as jobs
+from flexdt.clients.cli.commands import kernels_command as compiled_kernels
 from flexdt.clients.cli.commands import machine_commands as machines
 from flexdt.clients.cli.commands import new_machine_command as new_machine
 from flexdt.clients.cli.commands import phantom_commands as phantoms
@@ -75,6 +76,14 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     "phantom": (
         "Phantoms: objects to scan.",
         {"list": phantoms.list_phantoms, "make": phantoms.make},
+    ),
+    "kernels": (
+        "Compiled kernels, and where they are kept.",
+        {
+            "compile": compiled_kernels.compile,
+            "share": compiled_kernels.share,
+            "delete": compiled_kernels.delete,
+        },
     ),
     "machine": (
         "Machines as data, and from their logs.",
@@ -137,7 +146,7 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
         "bench",
         "evidence",
     ),
-    "Processes": (*SERVERS, "demo", "doctor"),
+    "Processes": (*SERVERS, "demo", "doctor", "kernels"),
 }
 """Sections of the help page; commands in none of them are listed under Extensions."""
 

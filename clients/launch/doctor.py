@@ -29,6 +29,9 @@ WORST_ERROR: Final = 1e-5
 its maximum."""
 LITTLE_ROOM_BYTES: Final = 5 << 30
 SLOW_SYNC_S: Final = 0.05
+TOTAL_COMPILE_S: Final = 40
+"""Processor time for which the groups of `compile_ahead` compile, in all [s]; about, of one core
+of 2023."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,9 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
     """Run all checks, one after the other; a check that fails is an error among the
     results.
 
-    Order: python, packages, kernels, threads, memory, gpu, each port, disk. Each check
-    runs only when its result is requested. The error of a check that fails has its name,
-    and the exception's type and text.
+    Order: python, packages, kernels, kernel cache, threads, memory, gpu, each port, disk.
+    Each check runs only when its result is requested. The error of a check that fails has
+    its name, and the exception's type and text.
 
     Args:
         data: the data directory, which need not exist.
@@ -60,6 +63,7 @@ def examine(data: Path, ports: Sequence[tuple[str, int]]) -> Iterator[CheckOutco
         ("python", python),
         ("packages", packages),
         ("kernels", kernels),
+        ("kernel cache", kernel_cache),
         ("threads", threads),
         ("memory", memory),
         ("gpu", gpu),
@@ -152,6 +156,35 @@ def kernels() -> CheckOutcome:
             "kernels", "error", found, "reinstall numba; see docs/performance.md"
         )
     return CheckOutcome("kernels", "ok", found)
+
+
+def kernel_cache() -> CheckOutcome:
+    """Report where compiled kernels are kept and what first use will compile; a warning if
+    they cannot be kept."""
+    from flexdt.runtime import compile_ahead, kernel_files
+
+    files = kernel_files.opened()
+    place = files.writable()
+    missing = [
+        name for name in compile_ahead.GROUPS if not compile_ahead.is_compiled(name)
+    ]
+    if missing:
+        cost = (
+            f"first use compiles {', '.join(missing)} (some {TOTAL_COMPILE_S} s for all)"
+        )
+    else:
+        cost = "nothing is left to compile"
+    if place is None:
+        return CheckOutcome(
+            "kernel cache",
+            "warning",
+            f"no folder can be written ({files.told()}); each process: {cost}",
+            "set FLEXDT_CACHE to a folder of your own",
+        )
+    found = f"{place.folder} ({place.chosen_by}); {cost}"
+    return CheckOutcome(
+        "kernel cache", "ok", found, "flexdt kernels compile" if missing else ""
+    )
 
 
 def threads() -> CheckOutcome:

@@ -19,8 +19,6 @@ from typing import Any
 import pytest
 import yaml
 
-from flexdt.runtime import compile_ahead
-
 HOME = Path(__file__).resolve().parents[2] / "docker"
 UNITS = {
     "k": 1 << 10,
@@ -98,7 +96,7 @@ def written(service: dict[str, Any], image: list[tuple[str, str]]) -> set[str]:
         for word in words
         if word.startswith("/") and not word.startswith("/run/secrets/")
     }
-    return {*paths, environment(image)["NUMBA_CACHE_DIR"], "/tmp"}
+    return {*paths, environment(image)["FLEXDT_CACHE"], "/tmp"}
 
 
 def lying_in(path: str, found: dict[str, str]) -> str | None:
@@ -135,29 +133,16 @@ def test_folders_of_volumes_are_the_users() -> None:
         for word, rest in steps:
             user = rest if word == "USER" else user
             if word == "VOLUME":
-                made = [
-                    s
-                    for w, s in steps
-                    if w == "RUN" and (rest in s or "compile_ahead" in s)
-                ]
+                made = [s for w, s in steps if w == "RUN" and rest in s]
                 assert user == "flexdt", name
                 assert made, f"{name}: nothing makes {rest} before it is a volume"
 
 
 def test_images_hold_their_kernels_and_the_extras_of_their_options() -> None:
     images = stages()
+    assert images["build"][-1] == ("RUN", "/opt/flexdt/bin/flexdt kernels share")
     for name in ("projector", "twin", "viewer"):
-        steps = images[name]
-        compiles = next(
-            i for i, (w, s) in enumerate(steps) if w == "RUN" and "compile_ahead" in s
-        )
-        assert steps[compiles][1] == f"python -P -m {compile_ahead.MODULE}"
-        before = steps[:compiles]
-        assert ("USER", "flexdt") in before
-        assert (
-            environment(before)["NUMBA_CACHE_DIR"]
-            == environment(steps)["NUMBA_CACHE_DIR"]
-        )
+        assert ("VOLUME", environment(images[name])["FLEXDT_CACHE"]) in images[name]
     (install,) = [s for w, s in images["build"] if w == "RUN" and "pip install" in s]
     extras = set(re.findall(r"[a-z]+", install.rpartition("[")[2]))
     options = tomllib.loads((HOME.parent / "pyproject.toml").read_text())["project"]

@@ -44,7 +44,8 @@ assert not seen, seen
 @pytest.mark.slow  # half a minute of processor time: it begins with an empty cache
 @pytest.mark.campaign
 def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    homes = dict.fromkeys(("FLEXDT_CACHE", "XDG_CACHE_HOME", "TMPDIR"), str(tmp_path))
+    environment = os.environ | homes
     ahead = [sys.executable, "-P", "-m", "flexdt.runtime.compile_ahead"]
     groups = len(compile_ahead.GROUPS)
     for last in (f"flexdt: compiled {groups} of {groups} ", ""):
@@ -86,7 +87,7 @@ def test_who_waits_for_one_kernel_is_told_which(
         return sum([i * i for i in range(n)])
 
     monkeypatch.setattr(long_work, "LINE_INTERVALS_S", (0.01,))
-    assert compiling.serial(sum_of_squares, cache=False)(4) == 14
+    assert compiling.serial(sum_of_squares, keep=False)(4) == 14
     told = [record.getMessage() for record in caplog.records]
     assert any(
         line.startswith("flexdt: still compiling sum_of_squares (") for line in told

@@ -846,7 +846,8 @@ np.savez(sys.argv[1], forward=images, back=back(images, scan, like).data,
     found = {}
     for name, extra in lesser.items():
         # The usual one's kernels are compiled already.
-        own = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")} if extra else {}
+        folders = ("FLEXDT_CACHE", "XDG_CACHE_HOME", "TMPDIR")
+        own = dict.fromkeys(folders, str(tmp_path)) if extra else {}
         subprocess.run(
             [sys.executable, "-c", program, str(tmp_path / name)],
             env={**os.environ, **extra, **own},

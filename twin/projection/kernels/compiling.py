@@ -1,5 +1,4 @@
-"""How all kernels are compiled, two processor instructions that numba has no name for, and a
-key that keeps numba's disk cache honest.
+"""How all kernels are compiled and kept, and two processor instructions that numba has no name for.
 
 A voxel column starts on a new page as often as not, where the hardware's own prefetchers start
 from nothing: prefetching a few steps ahead doubled the projector's speed on one core. numba
@@ -19,25 +18,29 @@ has none of its parent's threads. The look is part of the compiled code: one ker
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import inspect
 import logging
+import pickle
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
-from types import ModuleType
+from functools import cache, cached_property, partial
+from types import FunctionType, ModuleType
 from typing import Any
 
+import numba
 from llvmlite import binding, ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
+from numba.core.compiler import Compiler, CompileResult
+from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-from flexdt.twin import kernel_threads, long_work
+from flexdt.twin import kernel_store, kernel_threads, long_work
 
 LOG = logging.getLogger("flexdt.kernels")
 """Logger of the kernels, to standard error unless the program has set up logging."""
@@ -171,31 +174,87 @@ class _EntryPoint(_Linked):
             return super()._compile_core()
 
 
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """numba's disk cache, whose code is loaded only if this module compiled it as it is now."""
-
-    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
-        return (*super()._index_key(signature, codegen), COMPILING)
+def _short_hash(*parts: object) -> str:
+    """Return 16 hexadecimal digits that change with any of the parts' texts."""
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
-ENTRY_POINT = {"cache": True, "nogil": True, "pipeline_class": _EntryPoint}
+class KeptCode(FunctionCache):  # type: ignore[misc]
+    """One entry point's machine code in the process's `kernel_store`, an item for each signature.
+
+    An item's name says all that the code depends on: source and free variables, this module,
+    numba, Python and the processor. Items of several versions, users and machines lie side by
+    side in one folder, and none is ever changed.
+    """
+
+    def __init__(self, function: FunctionType, options: Mapping[str, object]) -> None:
+        """Keep the code of a function that is compiled with these options; nothing is read
+        yet."""
+        self._py_func = function
+        self._options = sorted(
+            (name, sorted(value) if isinstance(value, set) else value)
+            for name, value in options.items()
+        )
+        self.enable()
+
+    @property
+    def cache_path(self) -> str:
+        """Name of the place, for numba's statistics."""
+        return repr(kernel_store.store())
+
+    @cached_property
+    def beginning(self) -> str:
+        """Beginning of the names of all this function's items that suit this process."""
+        function = self._py_func
+        source = _text(inspect.getfile(function))
+        codegen = numba.core.registry.cpu_target.target_context.codegen()
+        _, processor, code = self._index_key((), codegen)
+        version = (numba.__version__, sys.version_info[:2], sys.implementation.name)
+        known = _short_hash(source, code, self._options, processor, version, COMPILING)
+        return f"{function.__module__.rpartition('.')[2]}.{function.__name__}-{known}-"
+
+    def is_kept(self) -> bool:
+        """Return whether code that this process can use is kept, for any signature."""
+        return kernel_store.store().holds(self.beginning)
+
+    def _name(self, signature: Any) -> str:
+        return self.beginning + _short_hash(str(signature))
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        data = kernel_store.store().load(self._name(sig))
+        if data is None:
+            return None
+        return CompileResult._rebuild(target_context, *pickle.loads(data))
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        if not data.library.has_dynamic_globals:
+            kernel_store.store().save(self._name(sig), dumps(data._reduce()))
+
+    def flush(self) -> None:
+        """Do nothing: what is kept stays right."""
 
 
-def _entry_point(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a function that Python calls, and keep its code on disk; without a function
-    returns the decorator with these options.
+ENTRY_POINT = {"nogil": True, "pipeline_class": _EntryPoint}
+
+
+def _entry_point(
+    function: Callable[..., Any] | None = None, *, keep: bool = True, **options: Any
+) -> Any:
+    """Compile a function that Python calls, and keep its code between processes; without a
+    function returns the decorator with these options.
 
     The options are `ENTRY_POINT`'s, replaced by those given.
     """
     if function is None:
-        return partial(_entry_point, **options)
-    made = njit(function, **{**ENTRY_POINT, **options})
-    if isinstance(made._cache, FunctionCache):
-        made._cache.__class__ = _Cache
+        return partial(_entry_point, keep=keep, **options)
+    chosen = {**ENTRY_POINT, **options}
+    made = njit(function, **chosen)
+    if keep:
+        made._cache = KeptCode(function, chosen)
     return made
 
 
-# Only entry points go to the disk cache: a cached inner function would not notice that a
+# Only entry points are kept: a kept inner function would not notice that a
 # function it calls has changed. They call no other entry points.
 parallel = partial(_entry_point, error_model="numpy", parallel=True)
 serial = _entry_point
@@ -213,12 +272,18 @@ fused = partial(kernel, fastmath={"contract", "nsz"})
 def sources(*modules: ModuleType) -> int:
     """Compute a number that changes with the text of modules.
 
-    numba's disk cache of a function watches the function's own file only. An entry point
-    that calls kernels of other files refers to this number as a free variable, which is
-    part of the cache's key; otherwise the old form of an edited kernel would stay in use.
+    The name under which a function's code is kept follows from the function's own file. An
+    entry point that calls kernels of other files refers to this number as a free variable,
+    which is part of the name, too; otherwise the old form of an edited kernel would stay in use.
     """
     text = "".join(inspect.getsource(module) for module in modules)
     return zlib.crc32(text.encode())
+
+
+@cache
+def _text(file: str) -> str:
+    with open(file, encoding="utf-8") as opened:
+        return opened.read()
 
 
 COMPILING = sources(sys.modules[__name__])
