@@ -10,6 +10,7 @@ MOVED = {
     "how-to": "use",
     "explanation": "understand",
     "machine-fit": "commission",
+    "decisions/0024-kernels-shipped-once-more": "decisions/0020-kernels-compiled-at-installation",
 }
 """Old page -> page that has its subject now, without the ending."""
 
