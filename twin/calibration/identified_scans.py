@@ -29,6 +29,7 @@ from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, n
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
+from flexdt.twin.calibration.rivals import judge_rivals
 from flexdt.twin.calibration.second_measurement import seen_arc
 from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.offsets import Offsets
@@ -72,7 +73,8 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         if scan.index is not None:
             out.append(identified(scan.index, detections, request.start))
             continue
-        search = Search(turn=_stated_turn(scan, request))
+        first = out[0].parameters.alpha if out else None
+        search = Search(turn=_stated_turn(scan, request), near=first)
         seek = partial(attempt, model=state.model, poses=scan.poses, start=request.start)
         found = seek(detections, search=search)
         numbers = _numbers(found, detections, state.model, scan, request.start)
@@ -100,6 +102,8 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         findings += listed(finding)
         if found is None:
             break
+        if finding is None or not finding.forbids:
+            findings += listed(judge_rivals(found, scan.name, state.model.name))
         out.append(found)
     found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
     # In other scans of the same phantom the spots of a displaced bead are no others.
@@ -142,7 +146,7 @@ def _agreeing(found: Identification) -> bool:
     """Check whether the spots that there are fit the phantom in one way, however few beads
     have one.
     """
-    if found.ambiguous:
+    if not found.one_axis:
         return False
     return found.explained >= GOOD_SHARE and found.rms_px < GOOD_RMS_PX
 

@@ -3,8 +3,9 @@ geometry without a start angle.
 
 Many start angles are tried on some of the frames: predict, vote for the shift that brings
 predictions and spots together, assign within each frame (`linear_sum_assignment`), fit, and
-repeat with a narrower gate. The best hypothesis is finished on all frames. If others explain
-the spots equally well with another angle, the result is reported as ambiguous.
+repeat with a narrower gate. The best hypotheses are finished on all frames, and so are the turns
+of each after which the phantom looks the same. Places, missing spots, sizes and contrasts weigh
+them; those that are as likely as the best one, with another angle, are its rivals.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.calibration.fit.forecast import visible_beads
 from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX, FitProblem, as_poses, build_problem
+from flexdt.twin.calibration.symmetries import Symmetry, spacing, symmetry
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
-from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
@@ -49,9 +51,30 @@ SETTLED_PX = 1e-3
 spot. The fit of the geometry goes on from there."""
 MAX_FINALISTS = 4
 """Number of hypotheses finished on all frames."""
-MAX_RIVAL_EXCESS = 25.0
-"""Largest excess of a rival's squared residuals over the best hypothesis's, in units of
-its variance."""
+STARTS_BETWEEN = 4.0
+"""Start angles from a bead to its neighbour, where a turn brings one to the other."""
+MAX_RIVAL_LOG = 12.5
+"""Largest logarithm of the likelihood of the best hypothesis over a rival's."""
+AS_LIKELY_LOG = math.log(20.0)
+"""The same up to which the one nearest to the start is taken."""
+MISSING_LOG = math.log(20.0)
+"""Cost of a bead in view without a spot: one in twenty has none (assumed)."""
+SIZE_SPREAD = 0.05
+"""Relative error of a bead's stated radius beside the others', with what blur does to it;
+assumed."""
+CONTRAST_SPREAD = 0.25
+"""The same of a contrast: attenuations are of one energy, a beam has many; assumed."""
+MOST_FAR = 25.0
+"""Most that the size or contrast of one bead counts for, in squared standard deviations: a
+spot may be another's shadow."""
+WEIGHED_FRAMES = 60
+"""Frames in which spots are compared with beads in size and contrast."""
+ROBUST = 1.4826
+"""Standard deviation over the median of absolute deviations."""
+FREE_TURNS = (np.arange(1, 8) * 0.25 * math.pi).tolist()
+"""Turns that stand for all, where every one looks alike [rad]."""
+AXIS_PX = 0.1
+"""Distance of the axes of two hypotheses in the image up to which they share it [px]."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +82,20 @@ class Search:
     """How to search.
 
     Attributes:
-        starts: number of start angles round the circle.
+        starts: number of start angles round the circle, of a phantom whose beads are far apart.
         frames: at most so many frames take part in the search.
         gate_px: final gate; a spot further from its prediction is not that bead.
         turn: how far alpha may be from its start [rad]. Further ones count only if they
             explain the spots better; inf: alpha is not known before.
+        near: alpha to which the nearest of equally likely ones is taken [rad]; None: the
+            start's.
     """
 
     starts: int = 18
     frames: int = 20
     gate_px: float = 6.0
     turn: float = math.inf
+    near: float | None = None
 
     def allows(self, x: FloatArray, start: FloatArray) -> bool:
         """Check whether the six parameters `x` turn the phantom as far from `start`, (6,),
@@ -92,6 +118,10 @@ class Identification:
         explained: share of the complete spots that are some bead.
         found: share of the beads in view that have a spot, in frames that show any.
         rivals: other geometries that explain the spots as well, with other angles.
+        odds: of each rival, its probability over that of `parameters`.
+        free_turn: every angle explains the spots as well: the beads are on a line parallel to
+            the axis.
+        one_axis: all rivals have the same axis and magnification.
         typical_px: `rms_px` estimated from the median, which a few wrong spots do not
             change.
     """
@@ -106,11 +136,20 @@ class Identification:
     found: float
     rivals: tuple[Offsets, ...]
     typical_px: float = math.nan
+    odds: tuple[float, ...] = ()
+    free_turn: bool = False
+    one_axis: bool = True
 
     @property
     def ambiguous(self) -> bool:
         """More than one assignment explains the spots."""
         return bool(self.rivals)
+
+    @property
+    def start_angles(self) -> list[float]:
+        """Start angles that explain the spots, from 0 to 360, in order [deg]."""
+        found = (self.parameters, *self.rivals)
+        return sorted(p.to_edge()["alpha"] % 360.0 for p in found)
 
 
 def identify_beads(
@@ -150,7 +189,7 @@ def identify_beads(
     """
     found = identify(detections, phantom, geometry, start=start)
     if found.ambiguous:
-        angles = [p.to_edge()["alpha"] for p in (found.parameters, *found.rivals)]
+        angles = found.start_angles
         raise TwinError(
             "the beads cannot be told apart: start angles "
             + ", ".join(f"{a:.1f}" for a in angles)
@@ -215,11 +254,16 @@ def identify(
         start=start,
     )
     base = np.array([getattr(start, n) for n in SIX])
-    turn = np.eye(len(SIX))[SIX.index("alpha")] * 2.0 * math.pi / how.starts
-    hypotheses = [_Hypothesis(base + i * turn, math.inf, 0) for i in range(how.starts)]
+    pixels = float(np.median(poses.pixels_per_mm))
+    alike = symmetry(model.beads, how.gate_px / pixels)
+    # What looks alike is tried once; neighbours that look alike need starts between them.
+    closest = min(2.0 * math.pi / how.starts, spacing(model.beads) / STARTS_BETWEEN)
+    starts = min(math.ceil(alike.period / closest - 1e-9), 4 * how.starts)
+    turn = np.eye(len(SIX))[SIX.index("alpha")] * alike.period / starts
+    hypotheses = [_Hypothesis(base + i * turn, math.inf, 0) for i in range(starts)]
     # All start angles get the wide rounds; only the promising ones the narrow.
     hypotheses = _best_first(_rounds(problem, some, h, WIDE_PX) for h in hypotheses)
-    most = max(MAX_FINALISTS, how.starts // 2)
+    most = max(MAX_FINALISTS, starts // 2)
     stated = [h for h in hypotheses[most:] if how.allows(h.x, base)]
     hypotheses = hypotheses[:most] + stated
     hypotheses = _best_first(_rounds(problem, some, h, NARROW_PX) for h in hypotheses)
@@ -247,7 +291,8 @@ def identify(
             priors={n: LOOSE_FACTOR * w for n, w in ASSUMED.items()} | dict(loose or {}),
         )
         finals = _best_first(_finish(whole, scene, h, how, wide_px=60.0) for h in finals)
-    return _report(whole, scene, finals, shapes, start, how)
+    finals = _with_turned(whole, scene, finals, alike, how)
+    return _report(whole, scene, finals, shapes, start, how, alike)
 
 
 def attempt(
@@ -288,6 +333,7 @@ class _Shadows:
     covariances: FloatArray
     bias: FloatArray
     radii: FloatArray
+    contrast: FloatArray
     whole: npt.NDArray[np.bool_]
     counts: npt.NDArray[np.int64]
 
@@ -309,6 +355,7 @@ class _Shadows:
         covariances = np.full((n, m, 2, 2), np.nan)
         bias = np.zeros((n, m))
         radii = np.zeros((n, m))
+        contrast = np.zeros((n, m))
         whole = np.zeros((n, m), dtype=bool)
         for i, d in enumerate(detections):
             k = len(d)
@@ -316,8 +363,9 @@ class _Shadows:
             covariances[i, :k] = d.covariances
             bias[i, :k] = d.bias
             radii[i, :k] = d.radii_px
+            contrast[i, :k] = d.contrast
             whole[i, :k] = d.whole
-        return cls(points, covariances, bias, radii, whole, counts)
+        return cls(points, covariances, bias, radii, contrast, whole, counts)
 
     def picked(
         self, index: npt.NDArray[np.int64], origin: FloatArray
@@ -655,6 +703,102 @@ def _finish(
     return _followed(problem, shadows, x, gates, solver, how.gate_px, give_up=False)
 
 
+def _with_turned(
+    problem: FitProblem,
+    shadows: _Shadows,
+    finals: Sequence[_Hypothesis],
+    alike: Symmetry,
+    how: Search,
+) -> list[_Hypothesis]:
+    """Add to each hypothesis those that differ by a turn after which the beads look alike,
+    best first; those near another are left out.
+
+    Args:
+        problem: of the fit.
+        shadows: the spots of all frames.
+        finals: refined hypotheses, best first.
+        alike: the turns.
+        how: settings of the search.
+    """
+    out = _different(finals)
+    for h in tuple(out):
+        for turn in alike.turns.tolist():
+            turned = alike.turned(_at(problem, h.x, NOMINAL), turn)
+            x = h.x.copy()
+            for i, name in enumerate(_columns(problem)):
+                x[i] = getattr(turned, name)
+            if any(_turn_between(x, o.x) < math.radians(3.0) for o in out):
+                continue
+            loss, matches = _loss(_predicted(problem, x), shadows, how.gate_px)
+            other = _Hypothesis(x, loss, matches)
+            # Where the places are not exactly alike, the fit tells.
+            if loss > (1.0 + LEAST_GAIN) * h.loss:
+                other = _finish(problem, shadows, other, how)
+            out += _different([*out, other])[len(out) :]
+    return _best_first(out)
+
+
+def _misfit_of_kinds(
+    problem: FitProblem, shadows: _Shadows, h: _Hypothesis, how: Search
+) -> float:
+    """Compute minus the logarithm of the likelihood of what spots show besides their places:
+    sizes and contrasts of each bead's spots, up to a common factor, and beads in view that
+    have none. In `WEIGHED_FRAMES` frames at most.
+
+    Args:
+        problem: of all frames.
+        shadows: their spots.
+        h: the hypothesis.
+        how: settings of the search.
+    """
+    model = problem.model
+    frames = _spread(np.flatnonzero(shadows.counts > 0), WEIGHED_FRAMES)
+    geometry = _at(problem, h.x, NOMINAL)
+    radii = spot_radii(model, problem.poses[frames].cone_vec(geometry))
+    predicted = _predicted(problem, h.x)[frames]
+    some = shadows.take(frames)
+    index = assign(predicted, some.points, some.counts, how.gate_px)
+    clear = ~overlapping(predicted, radii)
+    half = problem.origin[frames][:, None] + 0.5
+    inside = (np.abs(predicted) + radii[..., None] <= half).all(axis=2)
+    missing = float(np.count_nonzero(inside & clear & (index < 0)))
+    rows = np.arange(len(frames))[:, None]
+    pick = np.maximum(index, 0)
+    told = (index >= 0) & clear & some.whole[rows, pick]
+    share = len(shadows.counts) / len(frames)
+    out = MISSING_LOG * missing * share
+    for seen, expected, spread in (
+        (some.radii, radii, SIZE_SPREAD),
+        (some.contrast, np.broadcast_to(model.contrasts, radii.shape), CONTRAST_SPREAD),
+    ):
+        good = told & (seen[rows, pick] > 0) & (expected > 0)
+        out += 0.5 * _unlike(seen[rows, pick], expected, good, spread)
+    return out
+
+
+def _unlike(
+    seen: FloatArray, expected: FloatArray, good: npt.NDArray[np.bool_], spread: float
+) -> float:
+    """Compute the squared distance of what beads show from what is expected, up to a common
+    factor, in standard deviations: of a bead its `spread`, and the error of its median.
+
+    Args:
+        seen, expected: (n, k), above 0 where `good`.
+        good: (n, k) values that count.
+        spread: relative.
+    """
+    use = good.sum(axis=0) >= 2
+    if np.count_nonzero(use) < 2:
+        return 0.0
+    ratio = np.full(seen.shape, np.nan)
+    ratio[good] = np.log(seen[good] / expected[good])
+    median = np.nanmedian(ratio[:, use], axis=0)
+    scatter = np.nanmedian(np.abs(ratio[:, use] - median), axis=0)
+    variance = spread**2 + (scatter * ROBUST) ** 2 / good.sum(axis=0)[use]
+    off = median - np.median(median)
+    return float(np.minimum(off**2 / variance, MOST_FAR).sum())
+
+
 def _report(
     problem: FitProblem,
     shadows: _Shadows,
@@ -662,15 +806,16 @@ def _report(
     shapes: FloatArray,
     start: Offsets,
     how: Search,
+    alike: Symmetry,
 ) -> Identification:
     """Make the identification of the best hypothesis: tracks, quality and rivals.
 
-    Rivals are hypotheses over 3 deg away whose excess of squared residuals is below
-    `MAX_RIVAL_EXCESS` variances of the best. Where the turn is stated, the best is the best
-    of those so near the start, unless another is better by as much; those near it are no
-    rivals if they see the same beads in all spots. Spots that overlap their neighbours in the
-    prediction get no track. The start angle is reduced to half a turn about that of
-    `start`.
+    Rivals are hypotheses over 3 deg away that are less likely by `MAX_RIVAL_LOG` at most.
+    Of those as likely as the best the one that turns the phantom least is the best. Where
+    the turn is stated, the best is the best of those so near the start, unless another is
+    beyond a rival; those near it are no rivals if they see the same beads in all spots. Spots
+    that overlap their neighbours in the prediction get no track. The start angle is reduced
+    to half a turn about that of `start`.
 
     Args:
         problem: of the fit.
@@ -679,6 +824,7 @@ def _report(
         shapes: (n, 2) rows and columns of the frames.
         start: offsets that the search began with.
         how: settings of the search.
+        alike: turns after which the phantom looks as before.
 
     Raises:
         TwinError: there is no hypothesis, or the best one has no finite loss.
@@ -692,17 +838,32 @@ def _report(
         )
     count = max(int(np.minimum(shadows.counts, len(model)).sum()), 1)
     base = np.array([getattr(start, n) for n in SIX])
+    goal = (
+        base if how.near is None else np.where(np.arange(len(SIX)) == 3, how.near, base)
+    )
+    least = max(_typical(problem, shadows, finals[0], how), 0.02) ** 2
+    behind = {id(h): 0.5 * (h.loss - finals[0].loss) * count / least for h in finals}
+    close = [h for h in finals if behind[id(h)] < 2.0 * MAX_RIVAL_LOG]
+    if len(close) > 1:
+        for h in close:
+            behind[id(h)] += _misfit_of_kinds(problem, shadows, h, how)
+        finals = sorted(close, key=lambda h: behind[id(h)])
+    top = behind[id(finals[0])]
+    finals = [h for h in finals if behind[id(h)] - top < MAX_RIVAL_LOG]
     stated = [h for h in finals if how.allows(h.x, base)]
     if stated:
-        least = max(finals[0].loss, 0.02**2)
-        if (stated[0].loss - finals[0].loss) * count < MAX_RIVAL_EXCESS * least:
-            finals = stated
-    best = finals[0]
+        finals = stated
+    best = min(
+        (h for h in finals if behind[id(h)] - behind[id(finals[0])] < AS_LIKELY_LOG),
+        key=lambda h: _turn_between(h.x, goal),
+    )
     predicted = _predicted(problem, best.x)
     index = assign(predicted, shadows.points, shadows.counts, how.gate_px)
     geometry = _at(problem, best.x, start)
     turns = round((geometry.alpha - start.alpha) / (2.0 * math.pi))
     geometry = replace(geometry, alpha=geometry.alpha - 2.0 * math.pi * turns)
+    if alike.free:
+        geometry = alike.turned(geometry, float(goal[3]) - geometry.alpha)
     touching = overlapping(predicted, spot_radii(model, poses.cone_vec(geometry)))
     index[touching] = -1
     seen = index >= 0
@@ -715,13 +876,13 @@ def _report(
     else:
         spread = math.inf
     total = max(int(shadows.counts.sum()), 1)
-    rivals = []
-    for h in finals[1:]:
-        if _turn_between(h.x, best.x) < math.radians(3.0):
-            continue
-        # Difference of squared residuals in units of the best one's variance.
-        excess = (h.loss - best.loss) * count
-        if excess >= MAX_RIVAL_EXCESS * max(spread, 0.02) ** 2:
+    rivals: list[Offsets] = []
+    odds: list[float] = []
+    if alike.free:
+        rivals = [alike.turned(geometry, turn) for turn in FREE_TURNS]
+        odds = [1.0] * len(rivals)
+    for h in finals:
+        if alike.free or _turn_between(h.x, best.x) < math.radians(3.0):
             continue
         if how.allows(best.x, base):
             other = assign(
@@ -730,6 +891,7 @@ def _report(
             if (other[seen] == index[seen]).all():
                 continue
         rivals.append(_at(problem, h.x, start))
+        odds.append(math.exp(behind[id(best)] - behind[id(h)]))
     view = visible_beads(model, poses, shapes, geometry) & ~touching
     return Identification(
         tracks=tracks,
@@ -742,12 +904,48 @@ def _report(
         found=float((seen & view).sum()) / max(int(view[shadows.counts > 0].sum()), 1),
         rivals=tuple(rivals),
         typical_px=spread,
+        odds=tuple(odds),
+        free_turn=alike.free,
+        one_axis=all(_one_axis(poses, geometry, rival) for rival in rivals),
     )
 
 
+def _typical(
+    problem: FitProblem, shadows: _Shadows, h: _Hypothesis, how: Search
+) -> float:
+    """Compute the typical distance of spots from their beads, a coordinate, by the median
+    [px]; infinite if no bead has a spot.
+    """
+    predicted = _predicted(problem, h.x)
+    index = assign(predicted, shadows.points, shadows.counts, how.gate_px)
+    frames, beads = np.nonzero(index >= 0)
+    if not len(frames):
+        return math.inf
+    off = predicted[frames, beads] - shadows.points[frames, index[frames, beads]]
+    return float(np.median(np.linalg.norm(off, axis=1))) / RAYLEIGH_MEDIAN
+
+
+def _one_axis(poses: Poses, one: Offsets, other: Offsets) -> bool:
+    """Check whether two geometries have the axis, and a length on it, within `AXIS_PX` of
+    each other in the first image.
+    """
+    reach = 20.0 * np.array([[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0]])
+    seen = []
+    for p in (one, other):
+        turned = stage_rotation(-(p.alpha + p.angle_scale * float(poses.angle[0])))
+        on_axis = np.array([p.tau_x, p.tau_z, 0.0]) - poses.mount[0] + reach @ turned.T
+        seen.append(poses[:1].cone_vec(p).project_points(on_axis, (1, 1))[0])
+    along = seen[0] - seen[1] - np.mean(seen[0] - seen[1], axis=0) * [0.0, 1.0]
+    return bool(np.abs(along).max() < AXIS_PX)
+
+
+def _columns(problem: FitProblem) -> list[str]:
+    """List the offsets among the problem's columns."""
+    return [n for n in problem.layout.names if n in NAMES]
+
+
 def _at(problem: FitProblem, x: FloatArray, start: Offsets) -> Offsets:
-    names = [n for n in problem.layout.names if n in NAMES]
-    return replace(start, **dict(zip(names, x.tolist(), strict=True)))
+    return replace(start, **dict(zip(_columns(problem), x.tolist(), strict=True)))
 
 
 def overlapping(predicted: FloatArray, radii: FloatArray) -> npt.NDArray[np.bool_]:

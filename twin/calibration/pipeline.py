@@ -43,6 +43,7 @@ from flexdt.twin.calibration.motion_of_scans import (
 )
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.request import CalibrationRequest, with_free
+from flexdt.twin.calibration.rivals import asked_of, with_rivals
 from flexdt.twin.calibration.scans_to_calibrate import require_different, require_scans
 from flexdt.twin.calibration.second_measurement import measure_again
 from flexdt.twin.findings import Finding, Findings
@@ -130,6 +131,7 @@ def calibrate(
     state = identify_scans(state, asked)
     if state.errors:
         return state
+    asked = asked_of(state, asked)
     fitted = _first_fit(state, asked)
     if fitted.state.errors or fitted.fit.certificate.spectrum.singular:
         return fitted.outcome  # Nothing that such a geometry predicts has a meaning.
@@ -268,7 +270,7 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
         ]
     if any(light.seen for light in state.missing_light):
         explained = [beside_missing_light(f) for f in explained]
-    fit = with_start(fit, asked.start, fitted.iterations)
+    fit = with_rivals(state, asked, with_start(fit, asked.start, fitted.iterations))
     return replace(state, fit=fit).with_findings(*explained)
 
 

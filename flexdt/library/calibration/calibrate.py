@@ -38,6 +38,7 @@ from flexdt.library.calibration.proposed_commands import (
     IN_MEMORY,
     VALUE,
     Typed,
+    angle_commands,
     option_words,
     settling_commands,
 )
@@ -396,6 +397,8 @@ def _outcome(
         typed: the words of the command.
     """
     document["next"] = next_commands(result, typed)
+    for finding in result.findings.warnings:
+        document["next"] += list(angle_commands(finding, typed))
     document["geometry"] = list(typed.geometry)
     if result.identifiable and result.motions:
         document["motion"] = [m.to_dict() for m in result.motions]
@@ -694,7 +697,7 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
     lengths = {
         n: e
         for n, e in result.fit.certificate.estimates.items()
-        if e.asked and e.unit == "mm"
+        if e.asked and e.unit == "mm" and math.isfinite(e.sigma)
     }
     if not lengths:
         return first

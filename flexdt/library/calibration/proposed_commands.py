@@ -121,6 +121,27 @@ def option_words(options: CalibrationOptions) -> dict[str, str]:
     return words
 
 
+def angle_commands(finding: Finding, typed: Typed) -> Iterator[str]:
+    """Yield the command that states how a phantom stands that looks alike in several ways,
+    with one of the start angles as an example; nothing where none tells it.
+
+    Args:
+        finding: that it does, with an angle as its figure [deg].
+        typed: the calibration that made it.
+    """
+    if finding.code is not CalibrationCode.AMBIGUOUS or not finding.remedy:
+        return
+    stated = {"start": f"alpha={finding.figure:.1f}", "prior": "alpha=5"}
+    for option, words in stated.items():
+        others = [
+            w
+            for w in (typed.options or {}).get(option, "").split(",")
+            if w not in ("", "none") and w.split("=")[0] != "alpha"
+        ]
+        stated[option] = ",".join([*others, words])
+    yield typed.command(**stated)
+
+
 def settling_commands(
     finding: Finding, typed: Typed, free: Sequence[str]
 ) -> Iterator[str]:
@@ -139,6 +160,7 @@ def settling_commands(
         return
     options = typed.options or {}
     if finding.code is CalibrationCode.AMBIGUOUS:
+        yield from angle_commands(finding, typed)
         frames = {name: options[name] for name in ("frames",) if name in options}
         yield replace(typed, options=frames).command(phantom=UNKNOWN)
         return

@@ -240,14 +240,15 @@ def explain_identification(
             f"{name}: no frame shows more than one bead: one bead alone fixes neither the "
             "scale nor the angle",
         )
-    if found is not None and found.ambiguous and convincing(found):
-        angles = [p.to_edge()["alpha"] % 360.0 for p in (found.parameters, *found.rivals)]
-        listed = ", ".join(f"{a:.1f}" for a in angles)
+    if found is not None and not found.one_axis and convincing(found):
+        listed = ", ".join(f"{a:.1f}" for a in found.start_angles)
         return error(
             CalibrationCode.AMBIGUOUS,
             f"{name}: the beads cannot be told apart: start angles {listed} deg explain the "
-            "shadows equally well: state how the phantom stands, --start alpha=DEG --prior "
-            "alpha=5, or take its beads for markers, --phantom unknown",
+            "shadows equally well",
+            "state how the phantom stands, as --start alpha=DEG --prior alpha=5, or take its "
+            "beads for markers, --phantom unknown",
+            figure=found.parameters.to_edge()["alpha"],
         )
     if found is not None:
         found = _without_bad_frames(found)
