@@ -16,6 +16,7 @@ from typing import Any, Final, Literal, get_args
 
 import typer
 
+from flexdt.runtime.public_address import PublicAddress, public_address
 from flexdt.runtime.settings import Settings, option
 
 LOOPBACK: Final = "127.0.0.1"
@@ -138,6 +139,11 @@ def scatter_method(text: str) -> str:
             f"{text!r} is not one of {', '.join(get_args(Scatter))}{removed}"
         )
     return text
+
+
+def public_url() -> Any:
+    """Declare the viewer's address behind a proxy; help pages leave it to the settings file."""
+    return option(None, public=False, hidden=True, metavar="URL", parser=public_address)
 
 
 def tcp_port(
@@ -310,6 +316,7 @@ class ViewerSettings(TwinClientSettings, ServerSettings):
         port: Listen on this port; 0: any free one.
         twin: Connect to the twin there.
         token_file: Show this file's token to the twin; browsers must show it here.
+        public_url: Admit browsers that find it at this URL, behind a proxy.
     """
 
     command = "viewer"
@@ -318,6 +325,7 @@ class ViewerSettings(TwinClientSettings, ServerSettings):
         Address(LOOPBACK, TWIN_PORT), metavar="HOST:PORT", parser=address
     )
     token_file: Path | None = option(None, metavar="FILE")
+    public_url: PublicAddress | None = public_url()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -356,6 +364,7 @@ class UpSettings(FarProjectorSettings, ScannerSettings):
         projector_port: Give the projector this port; 0 is any free one.
         projector_memory: Let the projector hold volumes of this size, e.g. 4GiB.
         viewer_port: Give the viewer this port; 0 is any free one.
+        public_url: Admit browsers that find the viewer at this URL, behind a proxy.
         no_viewer: Start no viewer.
         gateway_port: Serve Acquila's interface on this port and the next (see gateway).
     """
@@ -364,5 +373,6 @@ class UpSettings(FarProjectorSettings, ScannerSettings):
     projector_port: int = tcp_port(PROJECTOR_PORT)
     projector_memory: str | None = option(None, public=False, metavar="SIZE")
     viewer_port: int = tcp_port(VIEWER_PORT)
+    public_url: PublicAddress | None = public_url()
     no_viewer: bool = option(False)
     gateway_port: int | None = tcp_port(None, most=MAX_PORT - 1)

@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import html
 import json
+import os
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -34,6 +37,27 @@ from flexdt.twin.signatures import public
 STOP_TIMEOUT_S = 30.0
 UP = "flexdt.clients.launch.up"
 LOG = "servers.log"
+
+
+@dataclass(frozen=True)
+class ViewerCell:
+    """A notebook's cell that shows the viewer.
+
+    Args:
+        url: of its page.
+        height_px: of the frame; None: a link in place of a frame.
+    """
+
+    url: str
+    height_px: int | None = None
+
+    def _repr_html_(self) -> str:
+        """Make the frame, or the link."""
+        url = html.escape(self.url, quote=True)
+        if self.height_px is None:
+            return f'<a href="{url}" target="_blank">{url}</a>'
+        style = f"width:100%;height:{self.height_px:d}px;border:0"
+        return f'<iframe src="{url}" title="flexdt" style="{style}"></iframe>'
 
 
 class ServersError(CommandError):
@@ -82,6 +106,14 @@ class Servers:
         viewer = self.ready.get("viewer")
         if isinstance(viewer, dict):
             return str(viewer["url"])
+        return None
+
+    @property
+    def viewer_port(self) -> int | None:
+        """Where the viewer listens; None without one."""
+        viewer = self.ready.get("viewer")
+        if isinstance(viewer, dict):
+            return int(viewer["port"])
         return None
 
     @property
@@ -205,7 +237,9 @@ class LocalTwin:
         scatter: scattered radiation, with physics mono and poly: off or mc.
         speed_up: the twin's seconds for each of yours, or "max".
         truth: file with a hidden misalignment.
-        viewer: whether to start the viewer as well; see `viewer_url`.
+        viewer: whether to start the viewer as well; see `viewer_url` and `viewer`.
+        public_url: admit browsers that find the viewer at this URL, such as a hub's; None for
+            its own address only.
         progress: show that the servers start, after two seconds; False for silence.
 
     Raises:
@@ -229,6 +263,7 @@ class LocalTwin:
         speed_up: float | Literal["max"] = "max",
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,
+        public_url: str | None = None,
         progress: Progress = None,
     ) -> None:
         """Take the servers' options; they start on entering. Arguments: see the class.
@@ -245,6 +280,7 @@ class LocalTwin:
             "scatter": scatter,
             "speed-up": speed_up,
             "truth": truth,
+            "public-url": public_url,
         }
         self._options: dict[str, Any] = {
             name: value for name, value in options.items() if value is not None
@@ -339,6 +375,27 @@ class LocalTwin:
     def viewer_url(self) -> str | None:
         """Where a browser finds the viewer; None without one."""
         return self._now()[1].viewer_url
+
+    def viewer(self, height_px: int = 800) -> ViewerCell:
+        """Show the viewer in a notebook's cell: the page itself in a JupyterHub with
+        jupyter-server-proxy, elsewhere a link.
+
+        Raises:
+            RuntimeError: this LocalTwin was made without `viewer=True`, or is not running.
+
+        Example:
+            >>> lab = LocalTwin(viewer=True)  # doctest: +SKIP
+            >>> twin = lab.start()  # doctest: +SKIP
+            >>> lab.viewer()  # doctest: +SKIP
+        """
+        url = self._now()[1].viewer_url
+        port = self._now()[1].viewer_port
+        if url is None or port is None:
+            raise RuntimeError("this LocalTwin has no viewer; make it with viewer=True")
+        hub = os.environ.get("JUPYTERHUB_SERVICE_PREFIX")
+        if hub is not None:
+            return ViewerCell(f"{hub.rstrip('/')}/proxy/{port}/", height_px)
+        return ViewerCell(url, None)
 
     def _now(self) -> tuple[ExitStack, Servers, TwinClient, Path]:
         if self._running is None:

@@ -26,6 +26,7 @@ from flexdt.runtime.process_settings import (
     UpSettings,
     ViewerSettings,
 )
+from flexdt.runtime.public_address import PublicAddress
 from flexdt.runtime.settings import parse, shared, words
 from flexdt.runtime.supervisor import (
     Addresses,
@@ -166,7 +167,12 @@ def port_problem(option: str, host: str, port: int) -> str | None:
     return None
 
 
-def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
+def ready_line(
+    addresses: Addresses,
+    *,
+    secure: bool = False,
+    public: PublicAddress | None = None,
+) -> str:
     """Format the supervisor's `ready` line: the twin's address, and every process's by
     name (one JSON object, no line end).
 
@@ -175,6 +181,7 @@ def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
     Args:
         addresses: of the processes.
         secure: the viewer's URL is https.
+        public: the viewer's address behind a proxy, which its URL is then.
 
     Returns:
         JSON with ready, host, port, and an object for each process.
@@ -184,7 +191,8 @@ def ready_line(addresses: Addresses, *, secure: bool = False) -> str:
     for name, address in addresses.items():
         entry: dict[str, object] = {"host": address.host, "port": address.port}
         if name == "viewer":
-            entry["url"] = f"{'https' if secure else 'http'}://{address}/"
+            own = f"{'https' if secure else 'http'}://{address}/"
+            entry["url"] = str(public or own)
         if name == "gateway":
             entry["inbound"] = address.port + 1
         document[name] = entry
@@ -230,7 +238,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return REFUSED
     supervisor = Supervisor(
         services(options),
-        announce=lambda addresses: _say(ready_line(addresses, secure=secure), sys.stdout),
+        announce=lambda addresses: _say(
+            ready_line(addresses, secure=secure, public=options.public_url), sys.stdout
+        ),
         note=lambda line: _say(f"flexdt up: {line}", sys.stderr),
     )
     try:

@@ -38,6 +38,7 @@ from flexdt.clients.viewer.viser_gate import MARK, parted
 from flexdt.runtime.access import check_bind, is_loopback, is_rebound, token_matches
 from flexdt.runtime.log import log
 from flexdt.runtime.process import TLS_HANDSHAKE_S, one_at_a_time
+from flexdt.runtime.public_address import PublicAddress
 
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 16 << 20
@@ -93,6 +94,7 @@ class Front:
         scene_html: viser's page, as it serves it.
         downloads: key -> file; taken out when fetched.
         token: a browser must show it once (`/?token=...`); None for none.
+        public: where browsers find it behind a proxy; None: where it listens.
         max_scenes: views open at a time.
         max_pages: pages open at a time; `page` closes further ones, which have no place here.
         still: answers `/still.jpg`, the scene as a picture, from the query; None: not yet.
@@ -105,6 +107,7 @@ class Front:
         scene_html: bytes,
         downloads: dict[str, Download],
         token: str | None = None,
+        public: PublicAddress | None = None,
         max_scenes: int = 256,
         max_pages: int = 64,
         still: Still | None = None,
@@ -120,6 +123,7 @@ class Front:
             scene_html: viser's page.
             downloads: id -> file; each is fetched once.
             token: required of browsers; None for none.
+            public: where browsers find it behind a proxy; None: where it listens.
             max_scenes, max_pages: largest numbers of open views and pages.
             still: makes a picture of the scene; None for none.
         """
@@ -136,6 +140,7 @@ class Front:
         self.wrong_tokens = 0
         self._downloads = downloads
         self._token = token
+        self._public = public
         self._still = still
         more = b"<style>%s</style><script>%s</script><script>%s</script>" % (
             page_file("scene.css"),
@@ -145,7 +150,7 @@ class Front:
         bare, self._program = parted(scene_html)
         self._program_path = f"/viser-{hashlib.sha256(self._program).hexdigest()[:16]}.js"
         bare = bare.replace(
-            MARK, b'<script src="%b"></script>' % self._program_path.encode(), 1
+            MARK, b'<script src="../..%b"></script>' % self._program_path.encode(), 1
         )
         self._scene_html = bare.replace(b"<head>", b"<head>" + more, 1)
         self._loopback = True
@@ -209,6 +214,14 @@ class Front:
             self._server.close()
             await self._server.wait_closed()
 
+    def _asked(self, request: Request) -> SplitResult:
+        """Return the address of a request below this viewer, without a public path that a
+        proxy has left in it."""
+        url = urlsplit(request.path)
+        if self._public is None:
+            return url
+        return url._replace(path=self._public.below(url.path))
+
     # -- plain requests ----------------------------------------------------------------------
 
     async def _answer(
@@ -228,7 +241,7 @@ class Front:
             The response; None to go on with a WebSocket.
         """
         try:
-            url = urlsplit(request.path)
+            url = self._asked(request)
             denied = self._foreign(request) or await self._stranger(
                 connection, request, url
             )
@@ -301,17 +314,19 @@ class Front:
     def _foreign(self, request: Request) -> Response | None:
         """Check that a request is not from another site's page.
 
-        On the loopback address the Host must be a local one; elsewhere it is not checked.
-        An Origin must equal the Host; a request without Origin passes.
+        On the loopback address the Host must be a local one or the public one; elsewhere it
+        is not checked. An Origin must equal the Host, or the public one; a request without
+        Origin passes.
 
         Returns:
             The error (403); None admits.
         """
         host = request.headers.get("Host", "")
-        if self._loopback and is_rebound(host):
+        public = None if self._public is None else self._public.host
+        if self._loopback and host != public and is_rebound(host):
             return _plain(http.HTTPStatus.FORBIDDEN, f"this viewer is not {host}")
         origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and urlsplit(origin).netloc not in (host, public):
             return _plain(
                 http.HTTPStatus.FORBIDDEN, f"requests from {origin} are not served"
             )
@@ -322,9 +337,10 @@ class Front:
     ) -> Response | None:
         """Check the token in a request's URL, else its cookie.
 
-        A right token sets the cookie and is redirected (302) to the path without it. All
-        others but a right cookie get 401, at the path / with a form. A wrong token is
-        counted, logged and answered after `GUESS_S`, one after the other, at once only
+        A right token sets the cookie, for the path at which the browser finds this viewer,
+        and is redirected (302) to the page without it; only the page takes one. All others
+        but a right cookie get 401, at the path / with a form. A wrong token is counted,
+        logged and answered after `GUESS_S`, one after the other, at once only
         while the front closes.
 
         Args:
@@ -338,18 +354,19 @@ class Front:
         """
         if self._token is None:
             return None
-        given = parse_qs(url.query).get("token", [None])[0]
+        given = None
+        if url.path == "/":
+            given = parse_qs(url.query).get("token", [None])[0]
         if given is not None and token_matches(given, self._token):
-            if self._secure:
-                secure = "; Secure"
-            else:
-                secure = ""
-            cookie = f"{COOKIE}={_pass(self._token)}; HttpOnly; SameSite=Strict; Path=/{secure}"
+            # Without a path it is that of the page as the browser knows it, and not sent to others.
+            cookie = f"{cookie_name(self._token)}={_pass(self._token)}; HttpOnly; SameSite=Strict"
+            if self._secure or (self._public is not None and self._public.is_secure):
+                cookie += "; Secure"
             headers = Headers(
-                {"Location": url.path, "Set-Cookie": cookie, "Content-Length": "0"}
+                {"Location": "./", "Set-Cookie": cookie, "Content-Length": "0"}
             )
             return Response(http.HTTPStatus.FOUND.value, "Found", headers, b"")
-        if _same(_cookie(request), _pass(self._token)):
+        if _same(_cookie(request, cookie_name(self._token)), _pass(self._token)):
             return None
         if given is not None:
             self.wrong_tokens += 1
@@ -380,7 +397,7 @@ class Front:
         excess gets no place here, and is closed by the page handler.
         """
         assert connection.request is not None
-        path = urlsplit(connection.request.path).path
+        path = self._asked(connection.request).path
         if (match := PAGE_PATH.fullmatch(path)) is not None:
             if self._pages < self._max_pages:
                 cast(BrowserConnection, connection).seat()
@@ -468,15 +485,23 @@ def _same(given: str | None, wanted: str) -> bool:
     )
 
 
-def _cookie(request: Request) -> str | None:
-    """Return the value of our cookie in a request; None without it.
+def cookie_name(token: str) -> str:
+    """Return the name of the cookie for a token: that of another viewer at the same host has
+    another."""
+    return (
+        f"{COOKIE}_{hmac.new(token.encode(), b'cookie', hashlib.sha256).hexdigest()[:8]}"
+    )
+
+
+def _cookie(request: Request, wanted: str) -> str | None:
+    """Return the value of a cookie in a request; None without it.
 
     The first one counts.
     """
     for header in request.headers.get_all("Cookie"):
         for part in header.split(";"):
             name, _, value = part.strip().partition("=")
-            if name == COOKIE:
+            if name == wanted:
                 return value
     return None
 

@@ -72,14 +72,24 @@ async def run(options: ViewerSettings, out: TextIO) -> int:
     else:
         looks = None
     viewer = Viewer(
-        twin_address, ANSWERS, machine, profile, token, options.data, limits, looks
+        twin_address,
+        ANSWERS,
+        machine,
+        profile,
+        token,
+        options.data,
+        limits,
+        looks,
+        public=options.public_url,
     )
     context = server_tls(options.tls_cert, options.tls_key)
     try:
         await viewer.start(options.host, options.port, context)
         assert viewer.front is not None
         at = Address(options.host, viewer.front.port)
-        url = f"{'http' if context is None else 'https'}://{at}/"
+        url = str(
+            options.public_url or f"{'http' if context is None else 'https'}://{at}/"
+        )
         async with served_pages(viewer_pages(viewer), options) as pages:
             stop = stop_signal()
             announce(

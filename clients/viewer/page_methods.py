@@ -930,7 +930,7 @@ def _offer(viewer: Viewer, name: str, content: bytes) -> dict[str, object]:
     while len(viewer.downloads) >= 16:
         del viewer.downloads[next(iter(viewer.downloads))]
     viewer.downloads[key] = Download(name, content)
-    return {"url": f"/download/{key}", "name": name, "bytes": len(content)}
+    return {"url": f"download/{key}", "name": name, "bytes": len(content)}
 
 
 def _stamp() -> str:

@@ -46,6 +46,7 @@ from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
 from flexdt.runtime.access import ViewerLimits
 from flexdt.runtime.log import log
+from flexdt.runtime.public_address import PublicAddress
 from flexdt.runtime.workers import Workers
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
@@ -99,6 +100,7 @@ class Viewer:
         data: the twin's data directory where it can be read, for slices of running scans.
         limits: for all pages together.
         looks: part of `machine` -> its own mesh.
+        public: where browsers find it behind a proxy; None: where it listens.
 
     Attributes:
         near: components near a contact, which all scenes highlight.
@@ -115,6 +117,7 @@ class Viewer:
         data: Path | None = None,
         limits: ViewerLimits | None = None,
         looks: Mapping[str, bytes] | None = None,
+        public: PublicAddress | None = None,
     ) -> None:
         """Prepare link, feeds, viser's server and the pages' state; see the class.
 
@@ -123,6 +126,7 @@ class Viewer:
         """
         self.twin_address = address
         self._token = token
+        self._public = public
         self._machine = machine
         self._profile = profile
         self.looks = looks
@@ -195,6 +199,7 @@ class Viewer:
             self.scenes.html(),
             self.downloads,
             self._token,
+            self._public,
             max_scenes=SCENES_A_PAGE * self.limits.max_pages,
             max_pages=self.limits.max_pages,
             still=self.still,

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import random
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,19 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from browsers import CHROMIUM, FLAGS, kept_port, need_browser
 from looking import KNOWN_HERE, USUAL, seen, until
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol.state_model import State
 
-CHROMIUM = "/usr/bin/chromium"
-FLAGS = [
-    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update",
-    "--disable-sync", "--disable-gpu-compositing",
-]  # fmt: skip
-"""WebGL by SwiftShader; what lies around the scenes is put together without it, at an eighth of
-the processor time."""
 BUSY = ("running", "paused", "queued")
 SPEED_UP = 8
 """Of the twin's clock, unless a test sets another for itself."""
@@ -38,24 +28,6 @@ window.setTimeout = (f, ms, ...more) => later(f, ms > 5000 ? 2 ** 31 - 1 : ms, .
 """
 """Notes stay until the test ends: a slow machine may look for one later than people do."""
 HARMLESS = ("ERR_FILE_NOT_FOUND", "favicon")
-
-
-LEAST_PORT, MOST_PORT = 15_000, 30_000
-"""Ports that Linux gives nobody by itself (net.ipv4.ip_local_port_range)."""
-
-
-def kept_port() -> int:
-    """Find a free port on which a server that was ended can start again: while it is away no
-    other process gets that port as any free one.
-    """
-    while True:
-        port = random.SystemRandom().randint(LEAST_PORT, MOST_PORT)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return port
 
 
 class Process:
@@ -187,20 +159,6 @@ def twin(lab: Lab) -> Iterator[TwinClient]:
     """A bystander that looks at the twin's state."""
     with lab.client() as client:
         yield client
-
-
-def need_browser() -> Any:
-    """playwright's entry, or a skip with a reason."""
-    reason = None
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        reason = "playwright is not installed"
-    if not os.access(CHROMIUM, os.X_OK):
-        reason = f"{CHROMIUM} is missing (Debian's package chromium)"
-    if reason is not None:
-        pytest.skip(reason)
-    return sync_playwright
 
 
 # Of a module, not the session: playwright keeps an event loop running, which others must not

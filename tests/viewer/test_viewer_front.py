@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -24,6 +25,7 @@ from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.page import ON_THE_WAY
 from flexdt.runtime import waiting_room
 from flexdt.runtime.access import AccessError, client_tls, server_tls
+from flexdt.runtime.public_address import public_address
 
 TOKEN = "a-token-of-sixteen-or-more"
 TLS = Path(__file__).parents[1] / "data" / "tls"
@@ -176,7 +178,7 @@ def test_what_has_not_changed_is_not_sent_again() -> None:
         one = (await fetch(port, f"/scene/{'a' * 12}/iso"))[2].decode()
         other = (await fetch(port, f"/scene/{'b' * 12}/beam"))[2].decode()
         assert "run(" not in one
-        (path,) = set(re.findall(r'src="(/viser-[0-9a-f]+\.js)"', one + other))
+        (path,) = set(re.findall(r'src="../..(/viser-[0-9a-f]+\.js)"', one + other))
         for asked, patience in (
             (path, "immutable"),
             ("/main.js", "no-cache"),
@@ -259,7 +261,7 @@ def test_a_token_is_asked_for_once() -> None:
             async with connect(url, proxy=None):
                 pass
         status, headers, _ = await fetch(front.port, f"/?token={TOKEN}")
-        assert (status, headers["Location"]) == (302, "/")
+        assert (status, headers["Location"]) == (302, "./")
         assert TOKEN not in headers["Set-Cookie"]
         assert "HttpOnly" in headers["Set-Cookie"]
         assert "Secure" not in headers["Set-Cookie"], "a browser would not send it back"
@@ -312,7 +314,7 @@ def test_what_cannot_be_read_is_refused() -> None:
     async def work(front: Front) -> None:
         assert (await fetch(front.port, "/", Host="[::"))[0] == 400
         assert (await fetch(front.port, "/", Origin="http://[::"))[0] == 400
-        cookie = f"{module.COOKIE}=\u00e9\u00e9"
+        cookie = f"{module.cookie_name(TOKEN)}=\u00e9\u00e9"
         assert (await fetch(front.port, "/", Cookie=cookie))[0] in (400, 401)
         assert (await fetch(front.port, "/?token=\u00e9"))[0] in (400, 401)
 
@@ -579,3 +581,27 @@ def test_two_pages_at_the_socket(lab: Any) -> None:
                 assert answer["error"]["code"] == -32600
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ("text", "host", "path", "secure"),
+    [
+        ("https://hub.example/user/ann/proxy/8080/", "hub.example", "/user/ann/proxy/8080/", True),
+        ("http://Hub.example:8000", "hub.example:8000", "/", False),
+        ("https://hub.example/node/n1/8080", "hub.example", "/node/n1/8080/", True),
+    ],
+)  # fmt: skip
+def test_a_public_address_is_read(text: str, host: str, path: str, secure: bool) -> None:
+    found = public_address(text)
+    assert (found.host, found.path, found.is_secure) == (host, path, secure)
+    assert public_address(str(found)) == found
+    assert found.below(f"{path}ws/abc") == found.below("/ws/abc") == "/ws/abc"
+    assert found.below("/other/ws/abc") == "/other/ws/abc"
+
+
+@pytest.mark.parametrize(
+    "text", ["", "hub.example", "ftp://hub.example/", "https://", "https://a@b/", "http://[::", "https://h/?x=1"]
+)  # fmt: skip
+def test_what_is_no_address_of_a_page_is_refused(text: str) -> None:
+    with pytest.raises(typer.BadParameter, match=r"https://hub\.example/user"):
+        public_address(text)

@@ -33,7 +33,7 @@ from websockets.typing import Origin, Subprotocol
 
 from flexdt.clients.viewer import page_messages
 from flexdt.clients.viewer import viser_gate as gate
-from flexdt.clients.viewer.front import COOKIE, Front
+from flexdt.clients.viewer.front import Front, cookie_name
 from flexdt.clients.viewer.page_messages import ALLOWED, Unwanted, admitted
 from flexdt.clients.viewer.scenes.views import Standpoint
 from flexdt.clients.viewer.viser_gate import GateError, Scenes
@@ -272,10 +272,11 @@ def test_strangers_do_not_reach_viser() -> None:
 
     async def work(scenes: Scenes, front: Front) -> None:
         own, theirs = f"http://127.0.0.1:{front.port}", "http://evil.example"
-        right = f"{COOKIE}={gate_pass()}"
+        name = cookie_name(TOKEN)
+        right = f"{name}={gate_pass()}"
         for origin, cookie, code in (
             (theirs, "", 403), (theirs, right, 403), (own, "", 401),
-            (own, f"{COOKIE}=wrong", 401), (None, "", 401),
+            (own, f"{name}=wrong", 401), (None, "", 401),
         ):  # fmt: skip
             with pytest.raises(InvalidStatus) as refused:
                 async with frame(front, origin, cookie):

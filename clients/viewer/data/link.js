@@ -148,10 +148,11 @@ export function rename(name) {
   socket?.close();
 }
 export function connect() {
-  const scheme = location.protocol === "https:" ? "wss" : "ws";
-  socket = new WebSocket(
-    `${scheme}://${location.host}/ws/${pageId}?person=${encodeURIComponent(person())}`,
-  );
+  // Below the page's own address: a proxy may have put it anywhere.
+  const address = new URL(`ws/${pageId}`, document.baseURI);
+  address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  address.searchParams.set("person", person());
+  socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => {
     store.viewer = true;

@@ -116,7 +116,7 @@ export async function shared(three, solid, m) {
     camera,
   };
   const programs = await Promise.all(
-    ["/slices.js", "/raycast.js"].map((file) => fetch(file).then((r) => r.text())),
+    ["slices.js", "raycast.js"].map((file) => fetch(file).then((r) => r.text())),
   );
   const program = programs
     .join("\n")

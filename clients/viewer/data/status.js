@@ -164,6 +164,9 @@ const BACK = "the page comes back by itself";
 const LATE =
   "viewer or twin do not answer, or the network is slow; " +
   "what is done here may come late or not at all";
+const UNREACHED =
+  "no connection of this page has reached it: a proxy between them must pass WebSockets on, and " +
+  `the viewer must know this address (flexdt viewer --public-url ${location.origin}${location.pathname})`;
 /** @returns {Missing | null} */
 function missing() {
   if (store.refused) {
@@ -175,11 +178,8 @@ function missing() {
     };
   }
   if (!store.viewer) {
-    return {
-      word: "no viewer",
-      title: "The viewer is away",
-      why: `it does not answer; ${BACK}`,
-    };
+    const why = store.hello ? "it does not answer" : UNREACHED;
+    return { word: "no viewer", title: "The viewer is away", why: `${why}; ${BACK}` };
   }
   if (!store.twin) {
     const why = `${store.problem || "waiting for it"}; ${BACK}`;
@@ -211,6 +211,7 @@ function connection() {
   const unconfirmed = pressed !== null && performance.now() - pressed.at > 1000 * OLD_S;
   bar(told, connecting);
   document.body.dataset.old = String(told !== null);
+  $("#estop").toggleAttribute("data-dead", !store.viewer || !store.twin);
   $("#veil").hidden = told === null && !unconfirmed;
   const title = told?.title ?? "";
   setText($("#veil-title"), unconfirmed ? `${UNCONFIRMED}${title && `. ${title}`}` : title);

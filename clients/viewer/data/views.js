@@ -83,7 +83,7 @@ async function start({ box, iframe, src }, view) {
  * @returns {Frame}
  */
 function frame(view) {
-  const src = `/scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
+  const src = `scene/${pageId}/${view}?${DPR ? `fixedDpr=${DPR}&` : ""}gap=${GAP_MS}`;
   const iframe = el("iframe", { title: NAMES[view] });
   iframe.addEventListener("load", () => {
     if (iframe.contentWindow) emit("frame", iframe.contentWindow);
