@@ -1,4 +1,5 @@
-"""Write the pages that follow from code and data: wire, commands, Python modules, evidence.
+"""Write the pages that follow from code and data: wire, commands, Python modules, formats of
+scans, evidence.
 
 They are written to `_generated/` beside the pages, only when they change.
 """
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import evidence_pages
+import format_pages
 
 MODULE = re.compile(r"^### `(flexdt[\w.]*)`$", re.MULTILINE)
 """Heading of a public module on a page that lists them."""
@@ -302,6 +304,7 @@ def write(app: Any) -> None:
     texts |= module_pages(pages)
     for name, text in evidence_pages.pages(pages / "evidence").items():
         texts[f"evidence/{name}"] = evidence_pages.moved(text)
+    texts |= {f"formats/{name}": text for name, text in format_pages.pages().items()}
     for path in generated.rglob("*.md"):
         if path.relative_to(generated).as_posix() not in texts:
             path.unlink()

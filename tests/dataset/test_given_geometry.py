@@ -71,6 +71,6 @@ def test_another_number_of_views_is_refused(folder: Path) -> None:
 def test_distances_are_refused(folder: Path) -> None:
     with pytest.raises(
         DatasetError,
-        match=r"distances with a scan of flexdt or a scanner.*allowed: with NXtomo",
+        match=r"distances with a scan of flexdt or a scanner.*allowed: with .*NXtomo",
     ):
         fx.open(folder, distances=(100.0, 200.0))

@@ -16,19 +16,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from four_balls import BALLS, COLS, MU, PIXEL, ROWS, SDD, SOD, VIEWS, found, images
 from loaded_script import load
 
 import flexdt as fx
-from flexdt.library.reading.foreign_files import SCAN_FORMATS, ScanFormat
+from flexdt.library.reading.foreign_files import (
+    SCAN_FORMATS,
+    ScanFormat,
+    format_of,
+)
 from flexdt.twin.dataset.dataset_errors import DatasetError
 from flexdt.twin.geometry.conventions import FloatArray
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "other-scanners.md").read_text(encoding="utf-8")
-BLOCKS = dict(
+FORMATS = load(ROOT / "docs" / "_ext" / "format_pages.py")
+BLOCKS = {
+    form.name: FORMATS.block(FORMATS.page(form)) for form in SCAN_FORMATS if form.table
+} | dict(
     re.findall(r"^### ([^\n]+)\n(?:(?!^### ).)*?```python\n(.*?)```", PAGE, re.M | re.S)
 )
+"""Format -> the block of its page, from its file to a volume."""
 START = 0.4
 """Stage angle of the first view [rad]."""
 RTK = '<?xml version="1.0"?>\n<!DOCTYPE RTKGEOMETRY>\n<RTKThreeDCircularGeometry version="3">\n{}'
@@ -44,16 +53,83 @@ def nikon(folder: Path) -> None:
     made.xtekct(folder / "part", aside=0.7, start=START)
 
 
+def counts_of(
+    folder: Path, sense: float, white: float, names: str, start: float = START
+) -> None:
+    """The balls' images as 16 bit TIFFs, columns to the right as seen from the source."""
+    folder.mkdir(exist_ok=True)
+    for view, image in enumerate(images(0.0, start, sense)):
+        counts = np.rint(white * image).astype(np.uint16)
+        tifffile.imwrite(folder / names.format(view), counts)
+
+
+def skyscan(folder: Path) -> None:
+    counts_of(folder / "part", 1.0, 58_000.0, "part{:08d}.tif")
+    (folder / "part" / "part.log").write_text(
+        f"[System]\r\nScanner=SkyScan1275\r\n[Acquisition]\r\nFilename Prefix=part\r\n"
+        f"Number Of Files= {VIEWS}\r\nNumber Of Rows= {ROWS}\r\nNumber Of Columns= {COLS}\r\n"
+        f"Optical Axis (line)= {(ROWS - 1) / 2}\r\nObject to Source (mm)={SOD}\r\n"
+        f"Camera to Source (mm)={SDD}\r\nImage Pixel Size (um)={1000 * PIXEL * SOD / SDD}\r\n"
+        f"Depth (bits)=16\r\nReference Intensity=58000\r\nUse 360 Rotation=YES\r\n"
+        f"Rotation Step (deg)={360 / VIEWS}\r\nRotation Direction=CC\r\n"
+        f"Scanning Start Angle={np.rad2deg(START)}\r\n"
+    )
+
+
+def phoenix(folder: Path) -> None:
+    counts_of(folder / "part", 1.0, 30_000.0, "part_{:04d}.tif", 0.0)
+    voxel = PIXEL * SOD / SDD
+    (folder / "part" / "part.pca").write_text(
+        f"[Geometry]\nFDD={SDD}\nFOD={SOD}\nVoxelSizeX={voxel}\nVoxelSizeY={voxel}\n"
+        f"[CT]\nNumberImages={VIEWS}\nRotationSector=360\n"
+        f"[Image]\nDimX={COLS}\nDimY={ROWS}\nFreeRay=30000\n"
+    )
+
+
+def yxlon(folder: Path) -> None:
+    (folder / "part").mkdir()
+    counts_of(folder / "part" / "Projections", -1.0, 32_767.0, "p{:04d}.tif")
+    size = f"<Width>{PIXEL}</Width><Height>{PIXEL}</Height>"
+    (folder / "part" / "ScanParameter.xml").write_text(
+        '<S xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"><ConeBeamScanParameter>'
+        f"<PixelSize>{size}</PixelSize><ProjectionSize><Width>{COLS}</Width>"
+        f"<Height>{ROWS}</Height></ProjectionSize><ProjectionBitdepth>15</ProjectionBitdepth>"
+        '<ScanTrajectory xsi:type="CircleTrajectory"><PixelPitch>1</PixelPitch>'
+        f"<Fdd>{SDD}</Fdd><Fod>{SOD}</Fod><StartAngle>{-np.rad2deg(START)}</StartAngle>"
+        f"<NumberOfProjections>{VIEWS}</NumberOfProjections><Rotation>360</Rotation>"
+        "</ScanTrajectory></ConeBeamScanParameter></S>"
+    )
+
+
+def data_exchange(folder: Path) -> None:
+    with pytest.importorskip("h5py").File(folder / "scan.h5", "w") as file:
+        file["exchange/data"] = np.rint(5e4 * images(0.0, START)).astype(np.uint16)
+        file["exchange/data_white"] = np.full((2, ROWS, COLS), 50_000, np.uint16)
+        file["exchange/data_dark"] = np.zeros((2, ROWS, COLS), np.uint16)
+        file["exchange/theta"] = np.rad2deg(START) + 360.0 / VIEWS * np.arange(VIEWS)
+        file["measurement/instrument/detector/pixel_size_x"] = PIXEL / 1000.0
+
+
 def zeiss(folder: Path) -> None:
     pytest.importorskip("olefile")
     load(ROOT / "tests" / "dataset" / "test_zeiss.py").balls(folder / "tooth.txrm", 3)
 
 
 def nxtomo(folder: Path) -> None:
-    frames = np.r_[np.full((1, ROWS, COLS), 5e4), 5e4 * images(0.0, 0.0)]
+    frames = np.r_[np.full((1, ROWS, COLS), 5e4), 5e4 * images(0.0, START)]
+    angles = np.rad2deg(START) + 360.0 / VIEWS * np.arange(VIEWS)
     with pytest.importorskip("h5py").File(folder / "scan.nxs", "w") as file:
-        file["entry/detector/data"] = frames.round().astype(np.uint16)
-        file["entry/detector/image_key"] = [1] + [0] * VIEWS
+        entry = file.create_group("entry/instrument")
+        entry["detector/data"] = frames.round().astype(np.uint16)
+        entry["detector/image_key"] = [1] + [0] * VIEWS
+        for name, value in (
+            ("detector/x_pixel_size", PIXEL),
+            ("detector/distance", SDD - SOD),
+            ("source/distance", -SOD),
+        ):
+            entry[name] = value
+            entry[name].attrs["units"] = "mm"
+        file["entry/sample/rotation_angle"] = np.r_[0.0, angles]
 
 
 def rtk(folder: Path) -> None:
@@ -74,7 +150,16 @@ def rtk(folder: Path) -> None:
     (folder / "projections.mha").write_bytes(head.encode() + lines.tobytes())
 
 
-MAKERS = {"Nikon": nikon, "Zeiss": zeiss, "NXtomo": nxtomo, "RTK": rtk}
+MAKERS = {
+    "Nikon": nikon,
+    "SkyScan": skyscan,
+    "phoenix": phoenix,
+    "YXLON": yxlon,
+    "Zeiss": zeiss,
+    "Data Exchange": data_exchange,
+    "NXtomo": nxtomo,
+    "RTK": rtk,
+}
 
 
 def ran(block: str, names: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -92,7 +177,7 @@ def test_another_geometry_takes_the_place_of_the_files(
     form: ScanFormat, tmp_path: Path
 ) -> None:
     MAKERS[form.name](tmp_path)
-    [path] = [p for p in tmp_path.rglob("*") if p.suffix in form.endings]
+    [path] = [p for p in tmp_path.rglob("*") if format_of(p) is form]
     other = fx.ConeVec.circular(
         sod=SOD + 1.0, sdd=SDD, angles=VIEWS, shape=(ROWS, COLS), pixel=PIXEL
     )
@@ -111,6 +196,21 @@ def test_a_damaged_file_is_an_error_that_names_it(
         path.write_bytes(content)
         with pytest.raises(DatasetError, match=re.escape(path.name)):
             fx.open(path)
+
+
+@pytest.mark.parametrize("form", SCAN_FORMATS, ids=lambda form: form.name)
+def test_a_page_has_the_two_lines_and_every_field(form: ScanFormat) -> None:
+    assert form.table is not None
+    text = FORMATS.pages()[FORMATS.file_name(form.name)]
+    assert len(FORMATS.block(text).strip().splitlines()) == 4  # an import, a blank, two
+    rows = re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE)
+    assert rows == [field.name for field in form.table.fields]
+    for field in form.table.fields:
+        found = form.table.field(field.name)
+        assert found is not None
+        assert found.role is field.role, field.name  # no row is hidden by an earlier one
+        assert field.meaning
+        assert field.why
 
 
 def test_every_block_has_ten_lines_and_two_imports() -> None:

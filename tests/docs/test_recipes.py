@@ -21,8 +21,8 @@ FOLDERS = (
     "examples", "extensions",
 )  # fmt: skip
 PAGES = ("docs/phantoms.md", "docs/exchange.md", "docs/command-line.md", "docs/reconstruction.md",
-         "docs/other-scanners.md", "docs/tutorials/own-sample.md", "docs/data-sets.md",
-         "docs/coming-from/cil.md", "docs/install.md")  # fmt: skip
+         "docs/other-scanners.md", "docs/tutorials/own-sample.md", "docs/install.md",
+         "docs/_ext/format_pages.py")  # fmt: skip
 QUICK = "not slow and not browser"
 """Marks of the tests that `make test` runs."""
 ROW = re.compile(
@@ -368,20 +368,45 @@ def test_a_field_of_the_state_is_added_by_its_recipe(copy: Path) -> None:
     assert passed(copy, files, word) >= 4
 
 
+PROBE_TABLE = '''"""The fields of Probe's .probe."""
+
+from flexdt.twin.dataset.format_table import FormatTable, used
+
+PROBE = FormatTable(
+    "Probe",
+    "this test",
+    (
+        used("rows", "cone_vec of each view", "the geometry", "mm"),
+        used("images", "names of the projections", "the images"),
+        used("flats", "names of the flat images", "the flat image"),
+    ),
+    "There are no two statements of one thing.",
+    example='fx.open("scan.probe")',
+)
+'''
 PROBE = '''"""Read Probe's .probe: rows of the geometry and names of images, as JSON."""
 
 import json
+from dataclasses import replace
 
 from flexdt.library.reading.foreign_parsing import head_text
 from flexdt.library.reading.listed_images import listed
+from flexdt.library.reading.probe_table import PROBE
 from flexdt.runtime.files.dataset_folder import list_folder
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.geometry.cone_vec import ConeVec
 
 
 def read_probe(path, geometry):
-    said = json.loads(head_text(path))
-    cone = ConeVec(said["rows"])
-    return listed(list_folder(path.parent), cone, said["images"], (), said["flats"])
+    content = json.loads(head_text(path))
+    said = Ledger(PROBE, str(path))
+    said.state_all(content.items())
+    cone = ConeVec(content["rows"])
+    for name in content:
+        said.use(name)
+    folder = list_folder(path.parent)
+    data = listed(folder, cone, content["images"], (), content["flats"])
+    return replace(data, provenance=said.finish())
 '''
 MAKER = """def probe(folder: Path) -> None:
     import json
@@ -400,15 +425,6 @@ MAKER = """def probe(folder: Path) -> None:
 
 
 """
-BLOCK = """### Probe
-
-```python
-import flexdt as fx
-
-volume = fx.open("scan.probe").reconstruct("fdk")
-```
-
-"""
 
 
 @pytest.mark.slow
@@ -416,11 +432,14 @@ def test_a_reader_of_scan_files_is_added_by_its_recipe(copy: Path) -> None:
     files = files_to_run(recipes()["A reader of scan files"])
     module = copy / "flexdt" / "library" / "reading" / "probe_reading.py"
     module.write_text(PROBE)
+    module.with_name("probe_table.py").write_text(PROBE_TABLE)
     inserted(copy, {
         "flexdt/library/reading/foreign_files.py": (
-            ("from flexdt.library.reading.zeiss",
-             "from flexdt.library.reading.probe_reading import read_probe\n"),
-            ('    ScanFormat("NXtomo"', '    ScanFormat("Probe", (".probe",), read_probe),\n'),
+            ("from flexdt.library.reading.skyscan_reading",
+             "from flexdt.library.reading.probe_reading import read_probe\n"
+             "from flexdt.library.reading.probe_table import PROBE\n"),
+            ('    ScanFormat("YXLON"',
+             '    ScanFormat("Probe", (".probe",), read_probe, table=PROBE),\n'),
         ),
     })  # fmt: skip
     word = "state_the_lists or of_the_balls or Probe"
@@ -430,24 +449,21 @@ def test_a_reader_of_scan_files_is_added_by_its_recipe(copy: Path) -> None:
         "test_another_geometry_takes_the_place_of_the_files",
     }
     inserted(copy, {
-        "flexdt/library/reading/folders.py": (("Zeiss's .txrm; an", "Probe's .probe; "),),
+        "flexdt/library/reading/folders.py": (("Zeiss's .txrm; a", "Probe's .probe; "),),
         "docs/other-scanners.md": (
-            ("| NXtomo `.nxs`", "| Probe `.probe` | its TIFFs beside it |  |\n"),
-            ("### NXtomo\n", BLOCK),
+            ("| YXLON `.xml`", "| Probe `.probe` | its TIFFs beside it |  |\n"),
         ),
-        "docs/data-sets.md": (("NXtomo, ", "Probe, "),),
-        "docs/coming-from/cil.md": (("TIFF, NeXus)", "Probe, "),),
         "tests/docs/test_others_scans.py": (
             ("MAKERS = {", MAKER),
-            ('"NXtomo": nxtomo', '"Probe": probe, '),
+            ('"YXLON": yxlon', '"Probe": probe, '),
         ),
     })  # fmt: skip
     # The file's geometry stays where another one is given.
     assert failed(copy, files, word) == {
         "test_another_geometry_takes_the_place_of_the_files"
     }
-    module.write_text(PROBE.replace('ConeVec(said["rows"])',
-                                    'geometry or ConeVec(said["rows"])'))  # fmt: skip
+    module.write_text(PROBE.replace('ConeVec(content["rows"])',
+                                    'geometry or ConeVec(content["rows"])'))  # fmt: skip
     assert passed(copy, files, word) >= 10
     done = of_copy(copy, files, "volume and Probe", "slow")
     assert "1 passed" in done.stdout, done.stdout[-3000:]

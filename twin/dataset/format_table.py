@@ -54,7 +54,8 @@ class Field:
         why: what it is used for, why it is ignored, what follows from its not being applied,
             or why it is refused.
         unit: of a number; empty for none.
-        neutral: values without effect, for the last two roles.
+        neutral: values without effect, in lower case, for the last two roles; what follows
+            them in brackets does not count.
     """
 
     name: str
@@ -66,7 +67,7 @@ class Field:
 
     def without_effect(self, value: str) -> bool:
         """Return whether a value is one of `neutral`; numbers count as numbers."""
-        plain = value.strip().strip("\"'").lower()
+        plain = re.sub(r"\s*\(.*\)$", "", value.strip().strip("\"'").lower())
         if plain in self.neutral:
             return True
         number = as_number(plain)
@@ -86,10 +87,18 @@ def noted(name: str, meaning: str, because: str = "no part of the geometry") -> 
 
 
 def noted_all(
-    names: str, meaning: str, because: str = "no part of the geometry"
+    names: str,
+    meaning: str,
+    because: str = "no part of the geometry",
+    divider: str | None = None,
+    under: str = "",
 ) -> tuple[Field, ...]:
-    """Make fields of one meaning that bear on nothing; names are divided by blanks."""
-    return tuple(noted(name, meaning, because) for name in names.split())
+    """Make fields of one meaning that bear on nothing; names are divided by blanks, or by
+    a divider, and follow `under`.
+    """
+    return tuple(
+        noted(f"{under}{name}", meaning, because) for name in names.split(divider)
+    )
 
 
 def dropped(
@@ -119,14 +128,14 @@ class FormatTable:
         source: where the facts come from.
         fields: in the order of the docs' page; the first that fits a name counts.
         rule: which of two statements of one thing wins, in a sentence.
-        seen: whether a file of the maker's own software was at hand.
+        example: the call that opens a file, on the docs' page.
     """
 
     name: str
     source: str
     fields: tuple[Field, ...]
     rule: str
-    seen: bool = False
+    example: str = ""
 
     @cached_property
     def _plain(self) -> Mapping[str, Field]:
@@ -218,6 +227,11 @@ class Ledger:
         """Enter values of the file, by name."""
         for name, value in values:
             self.state(name, value)
+
+    def shown(self, name: str, value: str) -> None:
+        """Show a value that was entered before it could be read."""
+        for entry in self._by_name.get(plain_name(name), ()):
+            entry.value = value
 
     def stated(self, name: str) -> str | None:
         """Return a value without taking it; the first of several, None without one."""

@@ -24,6 +24,7 @@ from flexdt.library.datasets.image_doubts import SATURATED
 from flexdt.library.datasets.saving import unfinished
 from flexdt.library.reading.foreign_files import (
     SCAN_FORMATS,
+    format_of,
     open_file,
     refuse_distances,
 )
@@ -97,8 +98,9 @@ def load_dataset(
 
     Args:
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts;
-            Nikon's .xtekct file beside its TIFFs; Zeiss's .txrm; an NXtomo file; or a
-            folder with one of these.
+            Nikon's .xtekct, SkyScan's .log, phoenix's .pca or YXLON's
+            ScanParameter.xml with its TIFFs; Zeiss's .txrm; a Data Exchange or NXtomo
+            file; or a folder with one of these.
         machine: the scanner, for texts that do not name one that ships with the package.
             Ignored, like `profile`, unless flexdt.json or texts are read.
         profile: zero offsets to use; default: those of the file, or the profile that
@@ -383,9 +385,14 @@ def _foreign_file(content: Folder) -> Path | None:
     ):
         return None
     known = tuple(ending for form in SCAN_FORMATS for ending in form.endings)
-    named = [name for name in content.names if name.lower().endswith(known)]
-    if len(named) == 1:
-        return content.path / named[0]
+    named = [
+        content.path / name
+        for name in sorted(content.names)
+        if name.lower().endswith(known)
+    ]
+    found = [path for path in named if format_of(path) is not None]
+    if len(found) == 1:
+        return found[0]
     return None
 
 
@@ -394,7 +401,12 @@ def _other_scan(content: Folder) -> str:
     of an error's sentence; "" if it holds neither.
     """
     for form in SCAN_FORMATS:
-        named = sorted(n for n in content.names if n.lower().endswith(form.endings))
+        named = [
+            name
+            for name in sorted(content.names)
+            if name.lower().endswith(form.endings)
+            and format_of(content.path / name) is form
+        ]
         if named:
             return f"; it holds a scan of {form.name}: fx.open({str(content.path / named[0])!r})"
     images = sorted(n for n in content.names if n.lower().endswith((".tif", ".tiff")))

@@ -12,11 +12,26 @@ from typing import Final, NoReturn
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.exchange_formats import FORMATS
+from flexdt.library.reading.dxchange_reading import (
+    is_data_exchange,
+    read_data_exchange,
+)
+from flexdt.library.reading.dxchange_table import DATA_EXCHANGE
 from flexdt.library.reading.foreign_parsing import parsing
 from flexdt.library.reading.nikon_reading import read_nikon
+from flexdt.library.reading.nikon_table import NIKON
 from flexdt.library.reading.nxtomo_reading import read_nxtomo
+from flexdt.library.reading.nxtomo_table import NXTOMO
+from flexdt.library.reading.phoenix_reading import read_phoenix
+from flexdt.library.reading.phoenix_table import PHOENIX
+from flexdt.library.reading.skyscan_reading import is_skyscan, read_skyscan
+from flexdt.library.reading.skyscan_table import SKYSCAN
+from flexdt.library.reading.yxlon_reading import is_yxlon, read_yxlon
+from flexdt.library.reading.yxlon_table import YXLON
 from flexdt.library.reading.zeiss_reading import read_zeiss
+from flexdt.library.reading.zeiss_table import ZEISS
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.format_table import FormatTable
 from flexdt.twin.geometry.cone_vec import ConeVec
 
 
@@ -30,18 +45,35 @@ class ScanFormat:
         read: from a path and a geometry in place of the file's, or None, to the data set.
         distant: whether `read` takes distances too, where the file has only angles and
             pixels.
+        table: of its fields; None where it has none yet.
+        holds: whether a file with such an ending is of this format; None: every one is.
     """
 
     name: str
     endings: tuple[str, ...]
     read: Callable[..., DataSet]
     distant: bool = False
+    table: FormatTable | None = None
+    holds: Callable[[Path], bool] | None = None
 
 
 SCAN_FORMATS: Final = (
-    ScanFormat("Nikon", (".xtekct",), read_nikon),
-    ScanFormat("Zeiss", (".txrm",), read_zeiss),
-    ScanFormat("NXtomo", FORMATS["nxtomo"].endings, read_nxtomo, distant=True),
+    ScanFormat("Nikon", (".xtekct",), read_nikon, table=NIKON),
+    ScanFormat("SkyScan", (".log",), read_skyscan, table=SKYSCAN, holds=is_skyscan),
+    ScanFormat("phoenix", (".pca",), read_phoenix, table=PHOENIX),
+    ScanFormat("YXLON", (".xml",), read_yxlon, table=YXLON, holds=is_yxlon),
+    ScanFormat("Zeiss", (".txrm",), read_zeiss, table=ZEISS),
+    ScanFormat(
+        "Data Exchange",
+        (".h5", ".hdf5", ".hdf"),
+        read_data_exchange,
+        distant=True,
+        table=DATA_EXCHANGE,
+        holds=is_data_exchange,
+    ),
+    ScanFormat(
+        "NXtomo", FORMATS["nxtomo"].endings, read_nxtomo, distant=True, table=NXTOMO
+    ),
 )
 """In the order in which they are listed."""
 
@@ -61,14 +93,13 @@ def open_file(
         DatasetError: another kind of file, one that is damaged or lacks data, or
             distances with another format; names the formats that are allowed.
     """
-    ending = path.suffix.lower()
-    for form in SCAN_FORMATS:
-        if ending in form.endings:
-            if distances is not None and not form.distant:
-                refuse_distances(path, form.name, distances)
-            more = () if distances is None else (distances,)
-            with parsing(path, form.name):
-                return form.read(path, geometry, *more)
+    form = format_of(path)
+    if form is not None:
+        if distances is not None and not form.distant:
+            refuse_distances(path, form.name, distances)
+        more = () if distances is None else (distances,)
+        with parsing(path, form.name):
+            return form.read(path, geometry, *more)
     listed = ", ".join(
         f"{form.name} ({', '.join(form.endings)})" for form in SCAN_FORMATS
     )
@@ -80,6 +111,22 @@ def open_file(
             "allowed": [one for form in SCAN_FORMATS for one in form.endings],
         },
     )
+
+
+def format_of(path: Path) -> ScanFormat | None:
+    """Find the format of a file by its ending, whatever its case, and its content.
+
+    Of the formats with its ending the first whose content it has counts; a file with none
+    of them is that of the first without such a check.
+
+    Returns:
+        The format; None for an ending that no format has, or another content.
+    """
+    forms = [form for form in SCAN_FORMATS if path.suffix.lower() in form.endings]
+    for form in forms:
+        if form.holds is not None and path.is_file() and form.holds(path):
+            return form
+    return next((form for form in forms if form.holds is None), None)
 
 
 def refuse_distances(path: Path, name: str, distances: tuple[float, float]) -> NoReturn:

@@ -9,7 +9,6 @@ left of the line from the source to the panel's middle.
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -17,30 +16,26 @@ from typing import Final
 import numpy as np
 
 from flexdt.library.data_set import DataSet
-from flexdt.library.datasets.image_set import Arrays
 from flexdt.library.reading.foreign_parsing import head_text
-from flexdt.library.reading.listed_images import NO_DARK, listed
 from flexdt.library.reading.nikon_angles import chosen_angles
 from flexdt.library.reading.nikon_table import NIKON
-from flexdt.runtime.files.dataset_folder import Folder, list_folder
+from flexdt.library.reading.text_scans import (
+    compared,
+    folder_name,
+    ini_values,
+    projections_in,
+    under_a_level,
+)
+from flexdt.runtime.files.dataset_folder import list_folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 from flexdt.twin.length_units import MORE_UNITS_MM, UNITS_MM, length_mm
-from flexdt.twin.plausibility import PlausibilityCode, settled
-from flexdt.twin.plausibility.image_order import ordered
+from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
-from flexdt.twin.plausibility.stated_figures import (
-    angle_findings,
-    pixel_findings,
-)
 
-LINE: Final = re.compile(
-    r"^[ \t]*([^=\[;#\s][^=\n]*?)[ \t]*=[ \t]*(.*?)[ \t]*$", re.MULTILINE
-)
-PROJECTION: Final = re.compile(r"(.*?)(\d+)(\.tiff?)", re.IGNORECASE)
 MOST_VIEWS: Final = 1_000_000
 SAME_AXIS_PX: Final = 0.01
 """Difference of two places of the axis that no images tell [pixels]."""
@@ -71,47 +66,33 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
             another shape than it states.
     """
     said = Ledger(NIKON, str(path))
-    said.state_all(LINE.findall(head_text(path)))
+    values = ini_values(head_text(path))
+    said.state_all((key, value) for _, key, value in values)
     views = said.whole("Projections")
     if not 0 < views <= MOST_VIEWS:
         raise DatasetFormatError.instead(
             f"{path}: Projections is {views}", views, f"1 to {MOST_VIEWS}"
         )
-    size = [said.whole(f"DetectorPixels{axis}") for axis in "YX"]
-    pitch, cone, more = _geometry(said, path, views, size, geometry)
+    size = said.whole("DetectorPixelsY"), said.whole("DetectorPixelsX")
+    cone, more = _geometry(said, path, views, size, geometry)
     place = said.text("InputFolderName", ".").replace("\\", "/")
     folder = list_folder(path.parent / place)
-    names, told = _images(folder, len(cone))
-    data = listed(folder, cone, names, (), (), said.text("Name", path.parent.name))
-    if list(data.shape) != size:
-        raise DatasetFormatError(
-            f"{path} says {size[1]} x {size[0]} pixels, {names[0]} has "
-            f"{data.shape[1]} x {data.shape[0]}",
-            {"asked": size, "allowed": list(data.shape)},
-        )
+    names, told = projections_in(folder, len(cone))
     level = said.number("WhiteLevel")
     if level <= 0.0:
         raise DatasetFormatError.instead(
             f"{path}: WhiteLevel is {level:g}", level, "counts of the open beam, above 0"
         )
-    white = np.full((1, *data.shape), level, np.float32)
-    if geometry is not None:
-        said.replaced(GEOMETRY_FIELDS, "geometry=")
-        found = pixel_findings(geometry, pitch[0])
-        told += settled(found, DatasetFormatError, path.name)
-    values = said.finish().and_also(more)
-    own = [doubt for doubt in data.warnings if not doubt.startswith(NO_DARK)]
-    return replace(
-        data,
-        arrays=Arrays(None, np.zeros_like(white), white),
-        warnings=(*own, *told, *said.warnings),
-        provenance=values,
+    title = said.text("Name", folder_name(path))
+    data = under_a_level(
+        said, folder, cone, names, level, size=size, name=title, told=told
     )
+    return replace(data, provenance=data.provenance.and_also(more))
 
 
 def _geometry(
-    said: Ledger, path: Path, views: int, size: list[int], given: ConeVec | None
-) -> tuple[tuple[float, float], ConeVec, Provenance]:
+    said: Ledger, path: Path, views: int, size: tuple[int, int], given: ConeVec | None
+) -> tuple[ConeVec, Provenance]:
     """Take the geometry of the file and the lists of angles beside it.
 
     Args:
@@ -122,8 +103,7 @@ def _geometry(
         given: geometry in its place, or None.
 
     Returns:
-        Pitch of columns and rows [mm], the geometry, and what became of the values of the
-        lists of angles.
+        The geometry, and what became of the values of the lists of angles.
 
     Raises:
         DatasetFormatError: a number is missing or distances are such as no scanner has.
@@ -142,14 +122,13 @@ def _geometry(
     planned = start + said.number("AngularStep") * np.arange(views, dtype=np.float64)
     angles, values = chosen_angles(said, path, planned)
     if given is not None:
-        doubts = angle_findings(given, np.deg2rad(angles))
-        said.warnings += settled(doubts, DatasetFormatError, path.name)
-        return (across, down), given, values
+        compared(said, given, across, angles, GEOMETRY_FIELDS)
+        return given, values
     place = np.array(
         [[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]]
     )
     rows = (place @ _axis(*tilts))[None] @ rotation_z(-np.deg2rad(angles))
-    return (across, down), ConeVec(rows.reshape(views, 12)), values
+    return ConeVec(rows.reshape(views, 12)), values
 
 
 def _unit(said: Ledger, path: Path) -> float:
@@ -224,62 +203,6 @@ def _if_stated(said: Ledger, key: str, scale: float) -> float | None:
     if not (said.stated(key) or "").strip():
         return None
     return scale * said.number(key)
-
-
-def _images(folder: Folder, views: int) -> tuple[list[str], list[str]]:
-    """List the names of the projections by their numbers, missing ones included.
-
-    Names of another form are left out with a doubt.
-
-    Args:
-        folder: of the images.
-        views: that the file states.
-
-    Returns:
-        The names, and doubts about them.
-
-    Raises:
-        DatasetFormatError: two have one number.
-    """
-    images = [name for name in folder.names if name.lower().endswith((".tif", ".tiff"))]
-    found = ordered(images)
-    told = settled(
-        found.findings.without(PlausibilityCode.GAP),
-        DatasetFormatError,
-        str(folder.path),
-    )
-    if found.others:
-        told.append(
-            f"{', '.join(found.others)} are no projections by their names: left out"
-        )
-    names = [name for name in found.names if name not in found.others]
-    return _completed(names, views), told
-
-
-def _completed(names: list[str], views: int) -> list[str]:
-    """Complete fewer names than views by names like that of the lowest number, from 1, 0
-    or that number on: the first start from which the numbers that are there are in the
-    range.
-
-    Without such a start, or where a name does not end in a number of its own, the names
-    are returned as they are.
-
-    Args:
-        names: of the images that are there.
-        views: that the file states.
-    """
-    parts = [PROJECTION.fullmatch(name) for name in names]
-    numbers = {int(part[2]): part for part in parts if part is not None}
-    if len(numbers) < len(names) or len(names) >= views or not names:
-        return names
-    first = min(numbers)
-    last = max(numbers)
-    start = next((at for at in (1, 0, first) if at <= first and last < at + views), None)
-    if start is None:
-        return names
-    before, digits, after = numbers[first].groups()
-    width = len(digits) if digits.startswith("0") else 1
-    return [f"{before}{n:0{width}d}{after}" for n in range(start, start + views)]
 
 
 def _axis(roll: float, tilt: float) -> FloatArray:

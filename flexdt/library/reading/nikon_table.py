@@ -99,4 +99,5 @@ NIKON: Final = FormatTable(
     "The first of these that is there: the measured angles of _ctdata.txt, those of .ang, "
     "InitialAngle and AngularStep; ObjectOffsetX and ObjectRoll before CentreOfRotationTop "
     "and Bottom, these before CentreOfRotation.",
+    example='fx.open("part/part.xtekct")',
 )

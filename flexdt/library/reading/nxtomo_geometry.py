@@ -251,7 +251,7 @@ def _heights(scan: NxScan) -> npt.NDArray[np.float64]:
     Movements of the sample along and across the beam that stay are ignored.
     """
     for place in TRANSLATIONS:
-        for one in scan.members.get(place, ()):
+        for one in scan.members.get(place, []):
             values = np.ravel(one[()])
             if len(values) == len(scan.keys):
                 values = values[scan.projections]
@@ -293,7 +293,7 @@ def replaced_by(scan: NxScan, by: str) -> None:
     """
     scan.ledger.replaced(GEOMETRY_PLACES, by)
     for place in (*FLIPS, *TRANSLATIONS):
-        found = scan.members.get(place, ())
+        found = scan.members.get(place, [])
         values = [np.ravel(one[()]) for one in found if one.dtype.kind in "biuf"]
         if any(np.ptp(v) > 0.0 if len(v) > 1 else v.any() for v in values if len(v)):
             words = f"{place} {text_of(found[0])}: {by} is taken for the images as stored"

@@ -158,4 +158,5 @@ NXTOMO: Final = FormatTable(
     "flexdt's cone_vec before all other figures; x_flipped and y_flipped before "
     "transformations; x_rotation_axis_pixel_position before estimated_cor_from_motor; the "
     "figures beside the images before those of the entry.",
+    example='fx.open("scan.nxs")',
 )

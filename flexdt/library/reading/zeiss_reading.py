@@ -20,8 +20,10 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.extras import package
+from flexdt.library.reading.zeiss_table import ZEISS
 from flexdt.runtime.files.dataset_folder import opened
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
@@ -31,6 +33,14 @@ KINDS: Final = {3: "u1", 5: "<u2", 10: "<f4"}
 REFERENCES: Final = ("ReferenceData", "MultiReferenceData")
 """Storages with images of the open beam, `Image` or `Image1` and so on."""
 NOT_APPLIED: Final = ("ImageInfo/CameraOffset", "ImageInfo/CameraFineRotation")
+SHOWN: Final = ("ImageInfo/", "ReconSettings/", "Alignment/")
+"""Beginnings of the streams whose numbers the provenance shows."""
+GEOMETRY_STREAMS: Final = (
+    "ImageInfo/StoRADistance", "ImageInfo/DtoRADistance", "ImageInfo/PixelSize",
+    "ImageInfo/Angles", "ImageInfo/YPosition", "ReconSettings/CenterShift",
+    "Alignment/X-Shifts", "Alignment/Y-Shifts", *NOT_APPLIED,
+)  # fmt: skip
+"""Streams whose place a given geometry takes."""
 GEOMETRY_HINT: Final = ", or give it: geometry=ConeVec"
 
 
@@ -58,7 +68,8 @@ def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
             ):  # of these a list is made
                 raise OSError("its list of sectors is longer than itself")
             with olefile.OleFileIO(raw, raise_defects=olefile.DEFECT_INCORRECT) as ole:
-                return _read(_Streams(ole, size), geometry, path.stem)
+                streams = _Streams(ole, size, _stated(ole, path))
+                return _read(streams, geometry, path.stem)
     except TwinError as error:
         said = error.message
     except (
@@ -70,10 +81,12 @@ def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
 
 @dataclass(frozen=True)
 class _Streams:
-    """An open file and its size [bytes], which bounds whatever it claims of itself."""
+    """An open file, its size [bytes], which bounds whatever it claims of itself, and its
+    streams."""
 
     ole: Any
     size: int
+    said: Ledger
 
     def values(
         self,
@@ -109,7 +122,12 @@ class _Streams:
             raise DatasetFormatError(
                 f"{name} {said}; allowed: {wanted} to {self.size} bytes{hint}"
             )
-        return np.frombuffer(self.ole.openstream(name).read(wanted), kind)
+        found = np.frombuffer(self.ole.openstream(name).read(wanted), kind)
+        self.said.use(name)
+        if name.startswith(SHOWN):
+            ends = f"{found[0]:g}" if count == 1 else f"{found[0]:g} to {found[-1]:g}"
+            self.said.shown(name, ends)
+        return found
 
     def whole(self, name: str, default: float | None = None) -> int:
         return int(self.values(name, "<u4", default=default)[0])
@@ -180,7 +198,11 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
             f"{taken} images of {cols} x {rows} pixels are claimed in {file.size} bytes"
         )
         raise DatasetFormatError(said)
-    cone, doubts = _geometry(file, taken, rows) if geometry is None else (geometry, [])
+    if geometry is None:
+        cone, doubts = _geometry(file, taken, rows)
+    else:
+        cone, doubts = geometry, []
+        file.said.replaced(GEOMETRY_STREAMS, "geometry=")
     names = [f"ImageData{k // 100 + 1}/Image{k + 1}" for k in range(taken)]
     images = file.images(names, code, (rows, cols))
     flats = _reference(file, code, (rows, cols))
@@ -206,7 +228,34 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
         reason = f"{taken} of {planned} images were taken"
     else:
         reason = ""
-    return replace(data, complete=not reason, reason=reason)
+    values = file.said.finish()
+    return replace(
+        data,
+        complete=not reason,
+        reason=reason,
+        warnings=(*data.warnings, *file.said.warnings),
+        provenance=values,
+    )
+
+
+def _stated(ole: Any, path: Path) -> Ledger:
+    """Enter the streams of an open file, with their sizes; images as one.
+
+    Args:
+        ole: the file.
+        path: for messages.
+    """
+    said = Ledger(ZEISS, str(path))
+    images = 0
+    for parts in ole.listdir():
+        name = "/".join(parts)
+        if name.startswith("ImageData"):
+            images += 1
+        else:
+            said.state(name, f"{ole.get_size(name)} bytes")
+    said.state("ImageData*", f"{images} images")
+    said.use("ImageData*")
+    return said
 
 
 def _reference(
@@ -233,6 +282,8 @@ def _reference(
             n for k in range(1000) if file.ole.exists(n := f"{folder}/Image{k or ''}")
         ]
         if names:
+            for name in names:
+                file.said.use(name)
             images = file.images(names, file.whole(f"{folder}/DataType", code), shape)
             if not np.isfinite(images).all():
                 raise DatasetFormatError(f"{names[0]} has pixels that are no numbers")
@@ -287,6 +338,8 @@ def _geometry(file: _Streams, views: int, rows: int) -> tuple[ConeVec, list[str]
     doubts = [
         f"{name} of {value:g} is not applied" for name, value in stated.items() if value
     ]
+    for name in NOT_APPLIED:
+        file.said.ignore(name, "it is not applied" if stated[name] else "it is 0")
     if center[0]:
         doubts.append(f"CenterShift of {center[0]:g} pixels is applied")
     o = np.zeros(views)

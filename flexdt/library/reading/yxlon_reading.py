@@ -1,0 +1,123 @@
+"""Read YXLON's ScanParameter.xml and its TIFFs; from documentation, no file seen.
+
+As TIGRE's YXLONDataLoader has it: angles fall from StartAngle, in its sense, which is ours of a
+stage that turns anticlockwise; columns run to the right as seen from the source.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree
+
+import numpy as np
+
+from flexdt.library.data_set import DataSet
+from flexdt.library.reading.foreign_parsing import head_text
+from flexdt.library.reading.text_scans import compared, projections_in, under_a_level
+from flexdt.library.reading.yxlon_table import YXLON
+from flexdt.runtime.files.dataset_folder import list_folder
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility.scan_geometry import distance_findings
+
+PARAMETERS: Final = "ConeBeamScanParameter"
+FOLDERS: Final = ("Projections", "Projektionen")
+"""Names of the folder of the images, beside the file."""
+MOST_VIEWS: Final = 1_000_000
+GEOMETRY_FIELDS: Final = (
+    "PixelSize/Width", "PixelSize/Height", "ScanTrajectory/PixelPitch",
+    "ScanTrajectory/Fdd", "ScanTrajectory/Fod", "ScanTrajectory/StartAngle",
+    "ScanTrajectory/Rotation",
+)  # fmt: skip
+"""Fields whose place a given geometry takes."""
+
+
+def is_yxlon(path: Path) -> bool:
+    """Return whether a file has YXLON's element of a cone beam."""
+    with path.open("rb") as file:
+        return PARAMETERS.encode() in file.read(1 << 16)
+
+
+def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
+    """Read a scan of YXLON's; its TIFFs stay in their files.
+
+    Args:
+        path: ScanParameter.xml.
+        geometry: one view for each projection, in place of the file's.
+
+    Raises:
+        DatasetError: no such XML, a number is missing, impossible distances or another
+            trajectory, or images are missing or of another shape.
+    """
+    try:
+        root = ElementTree.fromstring(head_text(path))
+    except ElementTree.ParseError as error:
+        said_of = f"{path} is not valid XML: {error}"
+        raise DatasetFormatError(said_of, {"path": str(path)}) from None
+    said = Ledger(YXLON, str(path))
+    for element in root:
+        inside = element if _plain(element.tag) == PARAMETERS else [element]
+        for part in inside:
+            said.state_all(_values(part, ""))
+    views = said.whole("ScanTrajectory/NumberOfProjections")
+    if not 0 < views <= MOST_VIEWS:
+        problem = f"{path}: NumberOfProjections is {views}"
+        raise DatasetFormatError.instead(problem, views, f"1 to {MOST_VIEWS}")
+    size = said.whole("ProjectionSize/Height"), said.whole("ProjectionSize/Width")
+    cone = _geometry(said, path, views, geometry)
+    level = 2.0 ** said.whole("ProjectionBitdepth", 16) - 1.0
+    there = [path.parent / name for name in FOLDERS if (path.parent / name).is_dir()]
+    folder = list_folder(there[0] if there else path.parent)
+    names, told = projections_in(folder, len(cone))
+    return under_a_level(
+        said,
+        folder,
+        cone,
+        names,
+        level,
+        size=size,
+        name=path.parent.name,
+        told=told,
+        corrected=True,
+    )
+
+
+def _plain(tag: str) -> str:
+    """Return a name without its namespace."""
+    return tag.rpartition("}")[2]
+
+
+def _values(element: ElementTree.Element, above: str) -> Iterator[tuple[str, str]]:
+    """Yield path and text of every element without members, and attributes as PATH@NAME."""
+    path = f"{above}{_plain(element.tag)}"
+    for name, value in element.attrib.items():
+        yield f"{path}@{_plain(name)}", value
+    if not len(element):
+        yield path, (element.text or "").strip()
+    for inner in element:
+        yield from _values(inner, f"{path}/")
+
+
+def _geometry(said: Ledger, path: Path, views: int, given: ConeVec | None) -> ConeVec:
+    """Take the geometry of the file, or compare a given one with it.
+
+    Raises:
+        DatasetFormatError: a number is missing, or distances are such as no scanner has.
+    """
+    unit = said.number("ScanTrajectory/PixelPitch", 1.0)
+    sdd, sod = (unit * said.number(f"ScanTrajectory/{name}") for name in ("Fdd", "Fod"))
+    pixel = [said.number(f"PixelSize/{name}") for name in ("Width", "Height")]
+    impossible = distance_findings(sod, sdd, pixel, ("Fod", "Fdd"))
+    if given is None:
+        settled(impossible, DatasetFormatError, str(path))
+    start = said.number("ScanTrajectory/StartAngle", 0.0)
+    span = said.number("ScanTrajectory/Rotation", 360.0)
+    angles = start - span / views * np.arange(views, dtype=np.float64)
+    if given is not None:
+        compared(said, given, pixel[0], angles, GEOMETRY_FIELDS)
+        return given
+    return ConeVec.circular(sod=sod, sdd=sdd, angles=angles, pixel=pixel)

@@ -1,0 +1,76 @@
+"""The fields of YXLON's ScanParameter.xml; names are the elements below the cone beam's."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from flexdt.twin.dataset.format_table import (
+    FormatTable,
+    dropped,
+    noted_all,
+    refused,
+    used,
+)
+
+YXLON: Final = FormatTable(
+    "YXLON",
+    "TIGRE's YXLONDataLoader; from documentation, no file of YXLON's seen",
+    (
+        used("PixelSize/Width", "pitch of columns", "the geometry", "mm"),
+        used("PixelSize/Height", "pitch of rows", "the geometry", "mm"),
+        used("ProjectionSize/Width", "columns", "the images are compared with it"),
+        used("ProjectionSize/Height", "rows", "the images are compared with it"),
+        used("ProjectionBitdepth", "bits of the counts", "the open beam, 2^bits - 1"),
+        used("ScanTrajectory/PixelPitch", "unit of the trajectory", "the geometry", "mm"),
+        used("ScanTrajectory/Fdd", "source to panel", "the geometry", "PixelPitch"),
+        used("ScanTrajectory/Fod", "source to axis", "the geometry", "PixelPitch"),
+        used("ScanTrajectory/NumberOfProjections", "number of images", "the views"),
+        used("ScanTrajectory/StartAngle", "angle of the first view", "the views", "deg"),
+        used("ScanTrajectory/Rotation", "turn of all views", "the views", "deg"),
+        refused(
+            "ScanTrajectory@type",
+            "kind of trajectory",
+            "give geometry= for another than a circle",
+            neutral=("circletrajectory", ""),
+        ),
+        dropped(
+            "ScanTrajectory/YoCenter",
+            "shift of the axis [PixelPitch]",
+            "its sign is not documented: the axis is taken in the middle column; `align` or "
+            "`fx.find_convention` decides",
+        ),
+        *(
+            dropped(
+                f"DejustmentParameter/{name}",
+                what,
+                "it is taken as 0; `align` finds the axis and the panel's roll",
+            )
+            for name, what in (
+                ("HorizontalDetectorOffset", "shift of the panel [PixelPitch]"),
+                ("VerticalDetectorOffset", "the same upwards [PixelPitch]"),
+                ("DetectorTiltA", "turn of the panel [deg]"),
+                ("DetectorTiltB", "turn of the panel [deg]"),
+                ("DetectorTiltC", "turn of the panel [deg]"),
+            )
+        ),
+        dropped(
+            "DetectorOrientation",
+            "turn of the images",
+            "they are taken as they are stored",
+            neutral=("original", "", "0"),
+        ),
+        dropped(
+            "DetectorFlipDirections",
+            "mirrored images",
+            "they are taken as they are stored",
+        ),
+        *noted_all("Name Comment Date Version Manufacturer", "words"),
+        *noted_all(
+            "Voltage Current FilterMaterial FilterThickness IntegrationTime",
+            "of the exposure",
+            "`tube=` of reconstruct takes it",
+        ),
+    ),
+    "There are no two statements of one thing.",
+    example='fx.open("part/ScanParameter.xml")',
+)

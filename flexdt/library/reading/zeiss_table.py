@@ -1,0 +1,73 @@
+"""The streams of Zeiss's .txrm."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from flexdt.twin.dataset.format_table import FormatTable, noted, noted_all, used
+
+INFO: Final = "ImageInfo/"
+ZEISS: Final = FormatTable(
+    "Zeiss",
+    "the readers CIL, dxchange, xrmreader and mbirjax; the format is unpublished and no "
+    "scanner's file was at hand",
+    (
+        used(f"{INFO}ImageHeight", "rows", "the images"),
+        used(f"{INFO}ImageWidth", "columns", "the images"),
+        used(f"{INFO}NoOfImages", "planned images", "the views"),
+        used(f"{INFO}ImagesTaken", "images that were taken", "the views"),
+        used(f"{INFO}DataType", "type of the pixels", "the images"),
+        used(f"{INFO}XrayGeometry", "1: a cone beam", "a parallel beam is refused"),
+        used(f"{INFO}StoRADistance", "source to axis of each view", "the geometry", "mm"),
+        used(f"{INFO}DtoRADistance", "axis to panel of each view", "the geometry", "mm"),
+        used(f"{INFO}PixelSize", "pixel at the axis", "the geometry", "um"),
+        used(f"{INFO}YPosition", "height of the stage", "a helix is refused", "um"),
+        used(f"{INFO}Angles", "angle of each view", "the views", "deg"),
+        used(f"{INFO}CameraOffset", "shift of the camera", "it is not applied"),
+        used(f"{INFO}CameraFineRotation", "roll of the camera", "it is not applied"),
+        used("ReconSettings/CenterShift", "shift of the axis", "the panel", "pixels"),
+        used("Alignment/X-Shifts", "shift of each view", "the panel", "pixels"),
+        used("Alignment/Y-Shifts", "the same upwards", "the panel", "pixels"),
+        used("ImageData*", "images", "the images"),
+        used("ReferenceData/*", "open beam", "the flat image"),
+        used("MultiReferenceData/*", "open beams", "the flat image"),
+        *noted_all(
+            "Current Voltage XrayVoltage XrayCurrent ExpTimes ExpTime Date FocusTarget "
+            "MosiacMode MosiacRows MosiacColumns AbsorptionScaleFactor "
+            "AbsorptionScaleOffset Temperature Energy SourceFilterName ObjectiveName "
+            "OpticalMagnification CameraBinning CameraName CamPixelSize "
+            "CameraNumberOfFramesPerImage "
+            "HorizontalBin VerticalBin ReferenceFile DetectorBits SourceDriftInterval "
+            "XPosition ZPosition OriginalDataRefCorrected",
+            "how the scan was taken",
+            under=INFO,
+        ),
+        *(
+            noted(f"{group}/*", "the scanner's own", "other programs read none of it")
+            for group in (
+                "PositionInfo",
+                "AutoRecon",
+                "ReconSettings",
+                "AcquisitionSettings",
+                "GlobalMinMax",
+                "SourceDriftInfo",
+                "DetAssemblyInfo",
+                "SampleInfo",
+                "ThumbNail",
+                "ImageFilters",
+                "FilterInfo",
+                "ConfigureBackup",
+                "Angles",
+            )
+        ),
+        *noted_all(
+            "exeVersion Version fileVersion Alignment/MetrologyShiftsApplied "
+            "Alignment/ReferenceShiftsApplied Alignment/StageShiftsApplied "
+            "Alignment/EncoderSupport Alignment/X-Mean Alignment/Y-Mean",
+            "of the file",
+        ),
+    ),
+    "There are no two statements of one thing; of the references the first group that has "
+    "images counts.",
+    example='fx.open("tooth.txrm")',
+)
