@@ -25,7 +25,7 @@ from setuptools import find_packages
 ROOT = Path(__file__).resolve().parents[1]
 CODE = ("protocol", "twin", "phantoms", "runtime", "server", "clients")
 FOLDERS = ("flexdt", *CODE)
-TEXTS = ("pyproject.toml", "README.md", "LICENSE")
+TEXTS = ("pyproject.toml", "setup.py", "README.md", "LICENSE")
 
 
 def present() -> set[str]:
@@ -76,22 +76,32 @@ def test_all_folders_are_typed() -> None:
     assert all((ROOT / folder / "py.typed").is_file() for folder in FOLDERS)
 
 
-def built(out: Path, place: str) -> Path:
-    """The wheel of the project in the folder `place` of the repository, made from its sdist."""
-    # A copy, because setuptools writes build/ and egg-info beside the sources.
-    source = out / "source"
+def checkout(source: Path, *, links: bool = True) -> None:
+    """Copy what is tracked of the project; without links each is a text file with its target,
+    as Git on Windows makes them."""
     tracked = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT, capture_output=True, check=True,
     ).stdout.decode().split("\0")  # fmt: skip
     for name in filter(None, tracked):
-        if (
-            name.split("/")[0] in (*FOLDERS, "src", "extensions", *TEXTS)
-            and (ROOT / name).exists()
-        ):
-            target = source / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, target, follow_symlinks=False)
+        path = ROOT / name
+        if name.split("/")[0] not in (*FOLDERS, "src", "extensions", *TEXTS):
+            continue
+        if not (path.exists() or path.is_symlink()):
+            continue
+        target = source / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_symlink() and not links:
+            target.write_text(os.readlink(path))
+        else:
+            shutil.copy2(path, target, follow_symlinks=False)
+
+
+def built(out: Path, place: str) -> Path:
+    """The wheel of the project in the folder `place` of the repository, made from its sdist."""
+    # A copy, because setuptools writes build/ and egg-info beside the sources.
+    source = out / "source"
+    checkout(source)
     subprocess.run(
         [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), "."],
         cwd=source / place, check=True, capture_output=True,
@@ -155,6 +165,52 @@ def test_the_wheel_holds_only_flexdt(wheel: Path) -> None:
     assert not [
         n for n in names if "__pycache__" in n or n.endswith((".nbi", ".nbc", ".ts"))
     ]
+
+
+def building(source: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation",
+         "--disable-pip-version-check", "--wheel-dir", str(source / "out"), *words],
+        cwd=source, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+def test_a_checkout_without_links_gives_the_same_wheels(
+    wheel: Path, tmp_path: Path
+) -> None:
+    checkout(tmp_path, links=False)
+    assert (tmp_path / "src" / "flexdt").is_file()
+    done = building(tmp_path, ".", "./extensions")
+    assert done.returncode == 0, done.stderr
+    (own,) = (tmp_path / "out").glob("flexdt-*.whl")
+    linked, copied = (zipfile.ZipFile(each) for each in (wheel, own))
+    assert {n: linked.read(n) for n in linked.namelist() if n.endswith(".py")} == {
+        n: copied.read(n) for n in copied.namelist() if n.endswith(".py")
+    }
+    assert sorted(linked.namelist()) == sorted(copied.namelist())
+    (more,) = (tmp_path / "out").glob("flexdt_extensions-*.whl")
+    assert "flexdt_extensions/__init__.py" in zipfile.ZipFile(more).namelist()
+
+
+@pytest.mark.parametrize(
+    "missing", ["src/flexdt", "flexdt/twin", "src/flexdt_command.py"]
+)
+def test_a_checkout_that_lacks_a_link_is_refused_in_one_sentence(
+    tmp_path: Path, missing: str
+) -> None:
+    """What builds it, run as setuptools does; an archive may have dropped links altogether."""
+    checkout(tmp_path, links=False)
+    (tmp_path / missing).write_text("../nothing")
+    done = subprocess.run(
+        [sys.executable, "setup.py", "--version"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    (told,) = done.stderr.splitlines()
+    assert missing in told
+    assert "core.symlinks=true" in told
 
 
 @pytest.mark.slow
