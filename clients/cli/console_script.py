@@ -277,3 +277,7 @@ def _command() -> None:
     from flexdt.clients.cli import main as command
 
     command()
+
+
+if __name__ == "__main__":
+    main()

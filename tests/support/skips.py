@@ -31,6 +31,8 @@ CI_MAY_LACK = (
     r"there is a sbatch here",
     r"needs the whole history of a git clone",
     r"the travel is shorter than the walk",
+    r"needs root, to",
+    r"no other user can reach",
 )
 """Patterns of reasons: packages of hundreds of megabytes or of conda alone, devices, compilers,
 and cases in which there is nothing to test."""
