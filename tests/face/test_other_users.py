@@ -24,9 +24,7 @@ data = fx.simulate("lego", scan, tube=fx.Tube(kV=90), noise=1)
 data.save("lego-scan")
 print(fx.open("lego-scan").reconstruct("fdk", voxel=4.0).shape)
 """
-DEMO = (
-    "from flexdt.clients.cli import main\nmain(['demo', '--no-viewer'])"
-)
+DEMO = "from flexdt.clients.cli import main\nmain(['demo', '--no-viewer'])"
 
 
 def reached(path: Path) -> bool:

@@ -27,7 +27,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, cached_property, partial
-from types import FunctionType, ModuleType
+from types import ModuleType
 from typing import Any
 
 import numba
@@ -187,7 +187,9 @@ class KeptCode(FunctionCache):  # type: ignore[misc]
     side in one folder, and none is ever changed.
     """
 
-    def __init__(self, function: FunctionType, options: Mapping[str, object]) -> None:
+    def __init__(
+        self, function: Callable[..., Any], options: Mapping[str, object]
+    ) -> None:
         """Keep the code of a function that is compiled with these options; nothing is read
         yet."""
         self._py_func = function
