@@ -19,7 +19,6 @@ from flexdt.phantoms.checked_reading import PhantomError, scene_from_dict, scene
 from flexdt.phantoms.files.mesh_files import mesh_phantom, voxel_phantom
 from flexdt.phantoms.files.mesh_files import mesh_phantom as from_mesh
 from flexdt.phantoms.files.phantom_files import load_phantom_file
-from flexdt.phantoms.materials import Material, material, materials, stated_keV
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
 from flexdt.phantoms.samples import (
@@ -29,6 +28,7 @@ from flexdt.phantoms.samples import (
     phantom_names,
     shepp_logan,
 )
+from flexdt.twin.attenuation.materials import Material, material, materials, stated_keV
 
 __all__ = [
     "Material",

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.materials import material
 from flexdt.phantoms.phantom import Phantom
+from flexdt.twin.attenuation.materials import material
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere, Vector

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from flexdt.phantoms.materials import Material, material
 from flexdt.phantoms.phantom import Phantom
+from flexdt.twin.attenuation.materials import Material, material
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
 from flexdt.twin.projection import analytic_solids as analytic
 

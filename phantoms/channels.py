@@ -19,11 +19,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexdt.phantoms.materials import Material, material, materials
 from flexdt.phantoms.mesh_booleans import united
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface
 from flexdt.phantoms.voxelise import as_volume, voxelise
+from flexdt.twin.attenuation.materials import Material, material, materials
 from flexdt.twin.errors import GeometryError, UnknownNameError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray

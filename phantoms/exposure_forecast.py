@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms.channels import Channel, chain_through, channels
-from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.samples import as_phantom
 from flexdt.phantoms.scan_limits import check_tube
+from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError
 from flexdt.twin.findings import Findings

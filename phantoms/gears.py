@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.phantoms.materials import Material, material
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, size_about_origin
+from flexdt.twin.attenuation.materials import Material, material
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Cylinder, Ellipsoid, Scene, Solid
 

@@ -31,9 +31,10 @@ from flexdt.phantoms.files.mesh_files import (
     voxel_phantom,
 )
 from flexdt.phantoms.gears import gear_phantom
-from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
+from flexdt.phantoms.placement import Place, placed
+from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 from flexdt.twin.projection import Volume
@@ -171,6 +172,7 @@ def as_phantom(
     material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
     priority: Sequence[float] = (),
+    place: Place = "keep",
 ) -> Phantom:
     """Convert a sample to a phantom.
 
@@ -179,8 +181,7 @@ def as_phantom(
             file, or of a mesh; a Volume; an array [z, y, x]; a mesh with `vertices` (n,
             3) and `faces` (m, 3) [mm], such as trimesh's; a Scene or Solid; a dictionary
             as in a scene file; a pair (any of these, material); or a list of them, which
-            add up. One mesh has the middle of its box on the axis; those of a
-            list keep their places.
+            add up. All stay where they are.
         material: of a mesh (default: abs) or of an array. Without one an array holds
             attenuation [1/mm], with one the part of each voxel that the material fills (0
             to 1), and with several, {1: "pmma", 2: "steel"}, the label of what fills it
@@ -188,6 +189,8 @@ def as_phantom(
         voxel_mm: edge of an array's voxels, one or along x, y, z [mm].
         priority: of each of a list: where meshes overlap, the one of the highest is there
             alone.
+        place: "centred" puts the middle of the sample's box on the axis at the reference
+            height; the description says by how much it was moved.
 
     Raises:
         PhantomError, UnknownNameError: names the sample and the allowed kinds.
@@ -197,16 +200,15 @@ def as_phantom(
         ...            ).size_mm
         (10.0, 10.0, 10.0)
     """
-    phantom = _one(sample, material, voxel_mm, keep=False, priority=priority)
+    phantom = _one(sample, material, voxel_mm, priority)
     files.require_replaced(phantom, sample)
-    return phantom
+    return placed(phantom, place)
 
 
 def _one(
     sample: object,
     material: str | Mapping[int, str] | None,
     voxel_mm: float | Vector | None,
-    keep: bool,
     priority: Sequence[float] = (),
 ) -> Phantom:
     """Convert a sample of any kind to a phantom; see `as_phantom` for the kinds.
@@ -217,7 +219,6 @@ def _one(
 
     Args:
         sample, material, voxel_mm, priority: as for `as_phantom`.
-        keep: leave meshes at their own places. Parts of a sequence always are.
 
     Raises:
         PhantomError: another kind of value.
@@ -226,7 +227,7 @@ def _one(
     if isinstance(material, Mapping):
         return _labelled(sample, material, voxel_mm)
     if isinstance(sample, str | os.PathLike):
-        return _named(os.fspath(sample), material, keep)
+        return _named(os.fspath(sample), material)
     if isinstance(sample, Volume):
         return voxel_phantom(
             sample.data, sample.voxel_xyz, center_mm=sample.center_mm, material=material
@@ -234,13 +235,13 @@ def _one(
     if isinstance(sample, np.ndarray):
         return _array(sample, material, voxel_mm)
     if hasattr(sample, "vertices") and hasattr(sample, "faces"):
-        return _mesh(given, material, keep)
+        return _mesh(given, material)
     if (
         isinstance(sample, tuple)
         and len(sample) == 2
         and isinstance(sample[1], str | Mapping)
     ):
-        return _one(sample[0], sample[1], voxel_mm, keep)
+        return _one(sample[0], sample[1], voxel_mm)
     _require_none(material, f"a {type(sample).__name__}")
     if isinstance(sample, Phantom):
         return sample
@@ -251,7 +252,7 @@ def _one(
             return files.phantom_of(given)
         return _solids(Scene(files.solids_of(sample, "sample")))
     if isinstance(sample, Sequence) and sample:
-        parts = [_one(each, None, voxel_mm, keep=True) for each in sample]
+        parts = [_one(each, None, voxel_mm) for each in sample]
         return assemble("scene", parts, priority=priority)
     raise PhantomError.instead(
         f"a sample cannot be {_shown(sample)}", _shown(sample), ALLOWED_FORMS
@@ -265,7 +266,7 @@ def _require_none(material: str | None, what: str) -> None:
         raise PhantomError(message, {"asked": material, "allowed": None})
 
 
-def _named(word: str, material: str | None, keep: bool) -> Phantom:
+def _named(word: str, material: str | None) -> Phantom:
     """Make the phantom of a path or a shipped name.
 
     In order: a mesh by its suffix (material `abs` unless stated), a shipped name, a text
@@ -274,7 +275,6 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
     Args:
         word: path of a file, or name.
         material: of a mesh.
-        keep: leave a mesh where it is instead of centring it.
 
     Raises:
         UnknownNameError: neither a file nor a shipped name.
@@ -284,7 +284,7 @@ def _named(word: str, material: str | None, keep: bool) -> Phantom:
     kind = path.suffix.lower()
     if kind.lstrip(".") in FORMATS:
         made_of = "abs" if material is None else material
-        return mesh_phantom(path, material=made_of, place="keep" if keep else "center")
+        return mesh_phantom(path, material=made_of)
     _require_none(material, repr(word))
     if is_shipped(word):
         return load_phantom(word)
@@ -389,14 +389,13 @@ def _labelled(
     return replace(phantom, voxels=replace(phantom.voxels, labels=index, materials=kinds))
 
 
-def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
+def _mesh(mesh: Any, material: str | None) -> Phantom:
     """Make the phantom of an object with vertices [mm] and faces, filled with one
     material.
 
     Args:
         mesh: has (n, 3) vertices and (m, 3) faces; not changed.
         material: None is `abs`.
-        keep: leave it where it is instead of centring it.
 
     Raises:
         PhantomError: it is not closed, or its size is 0 or too large.
@@ -407,7 +406,6 @@ def _mesh(mesh: Any, material: str | None, keep: bool) -> Phantom:
     return filled_mesh(
         trimesh.Trimesh(vertices, np.array(mesh.faces), process=False),
         material="abs" if material is None else material,
-        place="keep" if keep else "center",
     )
 
 

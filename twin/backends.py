@@ -14,14 +14,13 @@ from typing import Any, Final
 BACKENDS: Final = {
     "dry-run pages": "flexdt.library.dry_run_page",
     "geometry files": "flexdt.library.geometry_formats",
-    "materials": "flexdt.phantoms.materials",
     "notebook": "flexdt.library.notebook.notebook_show",
     "plots": "flexdt.library.plots",
     "scripts": "flexdt.library.scripts",
     "volume files": "flexdt.library.reconstruction.volume_files",
     "xarray": "flexdt.library.xarray_forms",
 }
-"""Subject -> module of the library or of the phantoms, imported when a method first needs
+"""Subject -> module of the library, imported when a method first needs
 it."""
 
 

@@ -66,6 +66,18 @@ class ReconstructSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SampleSettings(Settings):
+    """`flexdt sample`.
+
+    Attributes:
+        place: Stand a mesh so: keep (as its file has it), centred (on the axis).
+    """
+
+    command = "sample"
+    place: Literal["keep", "centred"] = option("keep")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ScriptNewSettings(Settings):
     """`flexdt script new`.
 

@@ -31,6 +31,7 @@ from flexdt.clients.cli.command_settings import (
     MachineNewSettings,
     PhantomMakeSettings,
     ReconstructSettings,
+    SampleSettings,
     ScriptNewSettings,
 )
 from flexdt.library.failure import CommandError
@@ -83,6 +84,7 @@ TABLES: Final[Mapping[str, type[Settings]]] = {
         MachineNewSettings,
         PhantomMakeSettings,
         ReconstructSettings,
+        SampleSettings,
         ScriptNewSettings,
     )
 }

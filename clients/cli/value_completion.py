@@ -50,7 +50,7 @@ def calibration_targets(typed: str) -> list[str]:
 
 def material_names(typed: str) -> list[str]:
     """List materials of the table, as completions."""
-    from flexdt.phantoms.materials import materials
+    from flexdt.twin.attenuation.materials import materials
 
     return _beginning(typed, materials())
 

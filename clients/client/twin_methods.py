@@ -316,6 +316,7 @@ def upload_mesh(
     *,
     format: str | None = None,
     unit: scanner.LengthUnit | None = None,
+    place: scanner.SamplePlace = "keep",
     material: str | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Flow[scanner.UploadResult]:
@@ -326,6 +327,8 @@ def upload_mesh(
         name: it gets; the file's own if left out.
         format: stl, obj, ply, glb or off; the file's ending if left out.
         unit: of the mesh's coordinates; m for glb and mm for the others if left out.
+        place: "keep" takes its coordinates for those of the object's frame; "centred"
+            puts the middle of its box on the axis.
         material: it is made of.
         progress: called with bytes sent and bytes in all.
 
@@ -357,6 +360,7 @@ def upload_mesh(
         "kind": "mesh",
         "format": format,
         "unit": unit,
+        "place": place,
         "material": material,
     }
     return _upload(head, data, progress)

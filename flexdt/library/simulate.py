@@ -27,6 +27,7 @@ from flexdt.phantoms.channels import (
     line_integrals,
     scatter_object,
 )
+from flexdt.phantoms.placement import Place
 from flexdt.phantoms.samples import as_phantom
 from flexdt.twin import long_work
 from flexdt.twin.caller_warnings import warn_caller
@@ -197,6 +198,7 @@ def project(
     shape: tuple[int, int] | None = None,
     material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
+    place: Place = "keep",
     progress: Progress = None,
 ) -> Float32Array:
     """Project line integrals of attenuation, without tube, noise and detector; see
@@ -213,6 +215,8 @@ def project(
         shape: detector (rows, cols), where the geometry has none.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
+        place: the sample stays where it is; "centred" puts the middle of its box on the
+            axis.
         progress: a bar after two seconds; False for no bar, or a function of the fraction
             done.
 
@@ -234,12 +238,12 @@ def project(
     """
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)
-    plain = isinstance(sample, Volume) and material is None
+    plain = isinstance(sample, Volume) and material is None and place == "keep"
     body: Any
     if plain:
         body = sample
     else:
-        body = as_phantom(sample, material=material, voxel_mm=voxel_mm)
+        body = as_phantom(sample, material=material, voxel_mm=voxel_mm, place=place)
     findings = examine(
         Operation.PROJECT, cone, size, volume=_attenuation(body), boxes=body.boxes
     )
@@ -262,6 +266,7 @@ def simulate(
     shape: tuple[int, int] | None = None,
     material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
+    place: Place = "keep",
     rays: int | None = None,
     spot_points: int = 1,
     progress: Progress = None,
@@ -292,6 +297,8 @@ def simulate(
         shape: detector (rows, cols), where the geometry has none.
         material: of a mesh or an array; {1: "pmma", 2: "steel"} for an array of labels.
         voxel_mm: edge of an array's voxels [mm].
+        place: the sample stays where it is; "centred" puts the middle of its box on the
+            axis.
         rays: along each side of a pixel, 1 to 16; their signals are averaged, as a pixel
             does. With one, the default but for scenarios (3), edges along rows or columns
             come out in steps, of which `align` has wider sigmas.
@@ -336,7 +343,7 @@ def simulate(
     panel, camera = _panel(detector, scanner, size, *_pitch(cone))
     design = settings.model(None if scanner is None else tube_of(scanner.tube))
     with long_work.during("simulating", progress) as advance:
-        phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm)
+        phantom = as_phantom(sample, material=material, voxel_mm=voxel_mm, place=place)
         findings = examine(
             Operation.SIMULATE,
             cone,

@@ -15,16 +15,17 @@ import warnings
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, assert_never
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import PhantomError
 from flexdt.phantoms.files.shells import filled_twice
-from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
+from flexdt.phantoms.placement import Place, placed
+from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Solid, Vector
@@ -88,7 +89,7 @@ def mesh_phantom(
     material: str = "abs",
     file_type: str | None = None,
     name: str | None = None,
-    place: Literal["center", "keep"] = "center",
+    place: Place = "keep",
     at_mm: Vector = (0.0, 0.0, 0.0),
 ) -> Phantom:
     """Make a phantom filled with one material inside a closed mesh.
@@ -102,8 +103,9 @@ def mesh_phantom(
         file_type: one of `FORMATS`, in either case; default: by the path's suffix (bytes
             need it).
         name: default: the path's stem, or "mesh".
-        place: "center" puts the middle of its box on the axis at the reference height;
-            "keep" takes the file's origin for that point.
+        place: "keep": its coordinates are those of the object's frame; "centred" puts the
+            middle of its box on the axis at the reference height. The description says
+            by how much it was moved.
         at_mm: moves it from there, along x, y, z of the object's frame [mm].
 
     Returns:
@@ -143,7 +145,7 @@ def filled_mesh(
     material: str = "abs",
     name: str = "mesh",
     label: str = "mesh",
-    place: Literal["center", "keep"] = "center",
+    place: Place = "keep",
     at_mm: Vector = (0.0, 0.0, 0.0),
 ) -> Phantom:
     """Make a phantom filled with one material inside a closed mesh that has been read already.
@@ -176,17 +178,6 @@ def filled_mesh(
             f"at most {MAX_EXTENT_MM:g} mm. Is the unit right ({', '.join(UNITS_MM)})?",
             {"asked": float((high - low).max()), "allowed": MAX_EXTENT_MM},
         )
-    match place:
-        case "center":
-            middle = (low + high) / 2.0
-        case "keep":
-            middle = np.zeros(3)
-        case _:
-            assert_never(place)
-    shift = middle - np.asarray(at_mm)
-    vertices = vertices - shift
-    low = low - shift
-    high = high - shift
     x, y, z = (2.0 * np.maximum(np.abs(low), np.abs(high))).tolist()
     solid = _convex(mesh, vertices)
     description = (
@@ -201,7 +192,7 @@ def filled_mesh(
             "cavities inwards",
             stacklevel=2,
         )
-    return Phantom(
+    made = Phantom(
         name,
         description,
         Scene(() if solid is None else (Solid(solid, material, mu),)),
@@ -210,6 +201,7 @@ def filled_mesh(
         if solid is not None
         else (Surface(vertices, mesh.faces, material, mu),),
     )
+    return placed(made, place, at_mm)
 
 
 def read_mesh(source: bytes | str | os.PathLike[str]) -> trimesh.Trimesh:

@@ -24,9 +24,9 @@ from flexdt.phantoms import checked_reading as reading
 from flexdt.phantoms.beads import cuboid_with_beads, spiral_positions, worst_overlap
 from flexdt.phantoms.checked_reading import MAX_SOLIDS, PhantomError, shape_from_dict
 from flexdt.phantoms.files.mesh_files import MAX_EXTENT_MM, MAX_FACES, mesh_phantom
-from flexdt.phantoms.materials import material as material_of
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
+from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.json_text import BYTE_ORDER_MARK, parse_json
 from flexdt.twin.length_units import UNITS_MM
@@ -269,7 +269,7 @@ def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, floa
         folder / given["file"],
         unit=given.get("unit"),
         material=given["material"],
-        place="keep" if at is None else "center",
+        place="keep" if at is None else "centred",
         at_mm=at or (0.0, 0.0, 0.0),
     )
     return mesh, given.get("priority", 0.0)

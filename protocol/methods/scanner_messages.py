@@ -37,6 +37,7 @@ Bytes = Annotated[int, Ge(0), Le(2**53), Integral]
 MESH_CHUNK = 4 << 20
 """Longest part of a mesh in one answer [bytes]; its base64 fits into a frame."""
 LengthUnit = Literal["um", "mm", "cm", "m", "inch"]
+SamplePlace = Literal["keep", "centred"]
 MeshFormat = Literal["stl", "obj", "ply", "glb", "off"]
 VoxelFormat = Literal["raw"]
 SceneFormat = Literal["json", "toml"]
@@ -202,6 +203,9 @@ class SampleUpload(f.Params):
     data: f.Payload
     unit: LengthUnit | None = None
     """of mesh coordinates; left out: m for glb, mm for the others"""
+    place: SamplePlace | None = None
+    """of a mesh: as its coordinates have it (left out), or with the middle of its box on the
+    axis"""
     material: f.Material | None = None
     shape: f.VoxelShape | None = None
     """(z, y, x) of voxels"""

@@ -23,7 +23,6 @@ import numpy.typing as npt
 
 from flexdt.phantoms import Phantom, exposure_forecast
 from flexdt.phantoms.channels import chain_through
-from flexdt.phantoms.materials import only_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
@@ -46,7 +45,7 @@ from flexdt.twin.physics.chain import (
 )
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
-from flexdt.twin.physics.predicted_beam import CountShares, Physics
+from flexdt.twin.physics.predicted_beam import CountShares, Physics, only_keV
 from flexdt.twin.physics.readout import Expected, expected_counts, read_out
 from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
 from flexdt.twin.scanner.state import Sample

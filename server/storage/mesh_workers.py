@@ -23,7 +23,7 @@ MEMORY_BYTES = 3 << 30
 
 
 def mesh_apart(
-    raw: bytes, *, unit: str, material: str, file_type: str, name: str
+    raw: bytes, *, unit: str, material: str, file_type: str, name: str, place: str
 ) -> Phantom:
     """Read a mesh from untrusted bytes, as `flexdt.phantoms.mesh_phantom`; blocks.
 
@@ -31,7 +31,13 @@ def mesh_apart(
         PhantomError: as there, unknown material, or reading it takes too much time or
             memory.
     """
-    how = {"unit": unit, "material": material, "file_type": file_type, "name": name}
+    how = {
+        "unit": unit,
+        "material": material,
+        "file_type": file_type,
+        "name": name,
+        "place": place,
+    }
     return _apart(phantoms.mesh_phantom, how, raw)
 
 

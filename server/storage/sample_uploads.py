@@ -18,7 +18,11 @@ from pydantic import Field, StringConstraints
 
 from flexdt.phantoms.files.mesh_files import default_unit
 from flexdt.protocol.fields import Payload
-from flexdt.protocol.methods.scanner_messages import LengthUnit, SampleUpload
+from flexdt.protocol.methods.scanner_messages import (
+    LengthUnit,
+    SamplePlace,
+    SampleUpload,
+)
 from flexdt.runtime.files.directory import Directory, writing
 from flexdt.runtime.log import log
 from flexdt.server.storage.disk_room import DiskRoom, require_last
@@ -35,6 +39,7 @@ class UploadHead(SampleUpload):
 
     Attributes:
         unit: of mesh coordinates.
+        place: of a mesh; those of older servers were all centred.
         revision: names the content, in the document; those of older servers have none.
         observer: whether it came while another client had control; in the document.
     """
@@ -42,18 +47,18 @@ class UploadHead(SampleUpload):
     schema_version: Literal[1] = Field(default=1, alias="schema")
     data: Payload = b""
     unit: LengthUnit = "mm"
+    place: SamplePlace = "centred"
     revision: Annotated[str, StringConstraints(pattern="^[0-9a-f]{16}$")] | None = None
     observer: bool = False
 
     @classmethod
     def of(cls, chunk: SampleUpload) -> UploadHead:
         """Make the description of the upload that a chunk belongs to; a missing unit
-        becomes the default of the format.
+        becomes the default of the format, and a missing place "keep".
         """
         given = chunk.model_dump(exclude={"start", "data"})
-        return cls.model_validate(
-            given | {"unit": chunk.unit or default_unit(chunk.format)}
-        )
+        unit = chunk.unit or default_unit(chunk.format)
+        return cls.model_validate(given | {"unit": unit, "place": chunk.place or "keep"})
 
 
 @dataclass

@@ -499,8 +499,10 @@ def _bytes_of(phantom: Phantom) -> int:
 
 def _revision(head: UploadHead, raw: bytes) -> str:
     """Hash a content, its bytes and how they are read, to 16 hexadecimal digits; not its name."""
-    how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}".encode()
-    content = hashlib.sha256(how + b"\0")
+    how = f"{head.kind} {head.format} {head.unit} {head.shape} {head.voxel_mm}"
+    if head.kind == "mesh" and head.place != "centred":
+        how += f" {head.place}"  # appended: revisions of older servers stay what they are
+    content = hashlib.sha256(how.encode() + b"\0")
     content.update(raw)
     return content.hexdigest()[:16]
 
@@ -536,6 +538,7 @@ def _parse(head: UploadHead, raw: bytes, material: str | None) -> Phantom:
                 material=DEFAULT_MATERIAL if material is None else material,
                 file_type=head.format,
                 name=head.name,
+                place=head.place,
             )
         case "scene":
             return scene_apart(raw, name=head.name)

@@ -9,7 +9,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli import main
-from flexdt.phantoms.materials import material, stated_keV
+from flexdt.twin.attenuation.materials import material, stated_keV
 from flexdt.twin.reconstruction import Polychromatic, sirt
 
 pytestmark = pytest.mark.usefixtures("on_processor")

@@ -31,15 +31,17 @@ def stl(mesh: trimesh.Trimesh) -> bytes:
 
 
 @pytest.mark.parametrize("file_type", ["stl", "obj"])
-def test_units_scale_and_the_box_is_centred(file_type: str) -> None:
+def test_units_scale_and_the_box_is_centred_where_asked(file_type: str) -> None:
     mesh = trimesh.creation.torus(0.6, 0.2)
     mesh.apply_translation((3.0, 4.0, 5.0))
     raw = mesh.export(file_type=file_type)
     raw = raw if isinstance(raw, bytes) else raw.encode()
-    p = mesh_phantom(raw, unit="cm", file_type=file_type, material="aluminium")
+    p = mesh_phantom(
+        raw, unit="cm", file_type=file_type, material="aluminium", place="centred"
+    )
     assert p.size_mm == pytest.approx((16.0, 16.0, 4.0), rel=1e-3)
     assert p.mesh().bounds == pytest.approx(np.array([[-8, -8, -2], [8, 8, 2]]), rel=1e-3)
-    kept = mesh_phantom(raw, unit="cm", file_type=file_type, place="keep")
+    kept = mesh_phantom(raw, unit="cm", file_type=file_type)
     assert kept.mesh().center_mass == pytest.approx([30, 40, 50], abs=0.05)
 
 
@@ -139,7 +141,8 @@ def test_all_solids_of_a_text_file_are_read(solids: int) -> None:
         box = trimesh.creation.box((1.0, 1.0, 1.0))
         box.apply_translation((3.0 * number, 0.0, 0.0))
         boxes.append(trimesh.exchange.stl.export_stl_ascii(box))
-    phantom = mesh_phantom("\n".join(boxes).encode(), file_type="stl")
+    text = "\n".join(boxes).encode()
+    phantom = mesh_phantom(text, file_type="stl", place="centred")
     assert phantom.mesh().volume == pytest.approx(solids)
     assert phantom.size_mm[0] == pytest.approx(3.0 * solids - 2.0)
 

@@ -204,7 +204,7 @@ def test_a_hostile_glb_is_refused_before_it_costs_memory(
 
 
 def test_an_honest_document_of_the_same_making_is_read() -> None:
-    p = mesh_phantom(glb(*one()), file_type="glb", unit="cm")
+    p = mesh_phantom(glb(*one()), file_type="glb", unit="cm", place="centred")
     assert p.size_mm == pytest.approx((10.0, 10.0, 10.0))
 
 

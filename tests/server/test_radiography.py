@@ -25,7 +25,6 @@ from flexdt.phantoms import (
     voxel_phantom,
 )
 from flexdt.phantoms.channels import chain_through, channels, scatter_object
-from flexdt.phantoms.materials import stated_keV
 from flexdt.protocol import Codec
 from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods.scanner_messages import TubeSet
@@ -47,6 +46,7 @@ from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers.motion_methods import set_tube
 from flexdt.testing.in_process import DirectProjector
+from flexdt.twin.attenuation.materials import stated_keV
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, MachineFileError
 from flexdt.twin.geometry.cone_vec import ConeVec

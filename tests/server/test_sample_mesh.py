@@ -8,6 +8,7 @@ import struct
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
 from lab import Process, Wire, twin
@@ -46,19 +47,20 @@ def test_the_shape_of_an_upload_comes_back_and_its_revision_changes(
         with pytest.raises(RpcError, match="nothing stands on the stage"):
             client.sample_mesh()
         revisions = []
-        for height in (8.0, 8.0, 9.0):
+        for height, place in ((8.0, "centred"), (8.0, "centred"), (9.0, "keep")):
             mesh = angle(height)
-            client.upload_mesh(
-                mesh.export(file_type="stl"), "angle", format="stl", unit="mm"
-            )
+            raw = mesh.export(file_type="stl")
+            sent = client.upload_mesh(raw, "angle", format="stl", unit="mm", place=place)
             client.set_sample(file="angle")
             revisions.append(client.state().sample.revision)
             got = read(client.sample_mesh())
             assert got.volume == pytest.approx(mesh.volume, rel=1e-5)
-            # The middle of its box stands on the axis at the reference height.
-            half = [15.0, 10.0, height / 2]
-            assert got.bounds[1] == pytest.approx(half, abs=1e-4)
-            assert got.bounds[0] == pytest.approx([-x for x in half], abs=1e-4)
+            # The middle of its box stands on the axis at the reference height, if asked for.
+            half = np.array([15.0, 10.0, height / 2])
+            by = -half if place == "centred" else 0.0 * half
+            assert got.bounds == pytest.approx(mesh.bounds + by, abs=1e-4)
+            said = sent.sample.description if sent.sample else ""
+            assert ("moved by (-15, -10, -4) mm" in said) == (place == "centred")
         assert revisions[0] == revisions[1] != revisions[2]
         client.set_sample("normal-3")
         assert client.state().sample.revision is None
@@ -75,7 +77,7 @@ def test_every_format_that_the_wire_names_is_read(server: Process, form: str) ->
     with TwinClient(port=server.port) as client:
         assert form in MESH_FORMATS
         done = client.upload_mesh(
-            raw, f"as-{form}", format=form, unit="mm", material="pmma"
+            raw, f"as-{form}", format=form, unit="mm", place="centred", material="pmma"
         )
         assert done.complete
         client.set_sample(file=f"as-{form}")
@@ -86,7 +88,8 @@ def test_every_format_that_the_wire_names_is_read(server: Process, form: str) ->
         if form == "stl":
             done = client.upload_mesh(raw, "unsaid", format=form)
             assert done.sample is not None
-            assert done.sample.size_mm == pytest.approx((30.0, 20.0, 8.0), rel=1e-5)
+            # Of the box about the origin, at which the L has its corner.
+            assert done.sample.size_mm == pytest.approx((60.0, 40.0, 16.0), rel=1e-5)
         elif form == "glb":  # metres
             with pytest.raises(RpcError, match="30000 mm in unit 'm'"):
                 client.upload_mesh(raw, "unsaid", format=form)

@@ -111,7 +111,7 @@ def test_spectrum_at_90_kv():
 def test_one_energy_is_not_that_of_a_bin(
     formula: str, energy_keV: float, mass: float
 ) -> None:
-    found = Substance.of(formula, formula, 10.0).attenuation_at(energy_keV)
+    found = 10.0 * Substance.of(formula, formula, 1.0).attenuation_at(energy_keV)
     assert found == pytest.approx(mass, rel=2e-3)
 
 
@@ -124,8 +124,8 @@ def test_one_energy_is_on_its_own_side_of_an_edge() -> None:
         ]
         near = [e + d for e in edges for d in (-0.2, -0.01, 0.01, 0.2)]
         for energy in (*near, *random.uniform(20.0, 235.0, 40)):
-            found = Substance.of(symbol, symbol, 10.0).attenuation_at(energy)
-            assert found == pytest.approx(xraydb.mu_elam(symbol, energy * 1e3), rel=3e-3)
+            found = 10.0 * Substance.of(symbol, symbol, 1.0).attenuation_at(energy)
+            assert found == pytest.approx(xraydb.mu_elam(symbol, energy * 1e3), rel=5e-4)
 
 
 def test_voltages_between_the_tables():
@@ -161,7 +161,7 @@ def test_attenuation_equals_its_source():
     for formula, density in (("Fe", 7.8), ("H2O", 1.0), ("C8H8", 1.05), ("WC", 15.6)):
         ours = Substance.of("it", formula, density).attenuation()
         theirs = xraydb.material_mu(formula, energy * 1e3, density) / 10
-        np.testing.assert_allclose(ours, theirs, rtol=1e-5)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4)
 
 
 def test_spectra_equal_their_source():

@@ -30,7 +30,7 @@ from flexdt.clients.viewer.scenes.meshes.painted_meshes import glb
 from flexdt.clients.viewer.scenes.meshes.part_looks import pieces_of
 from flexdt.clients.viewer.scenes.name_tags import names_of_image
 from flexdt.clients.viewer.scenes.sample_looks import (
-    COLORS,
+    OTHER_COLOR,
     MeshCache,
     SampleLook,
     Skin,
@@ -241,8 +241,14 @@ def test_only_the_close_up_shows_the_gear_a_fifth_of_a_panes_height(
     assert share_of_height(views["iso"].at(0.73), gear_m) < 0.05
 
 
-def test_every_material_has_a_colour() -> None:
-    assert [*COLORS] == [*materials()]
+def test_a_material_has_the_colour_of_the_list() -> None:
+    cube = trimesh.creation.box((10, 10, 10)).export(file_type="stl")
+    for name in (*materials(), "Sn@7.29"):
+        sample = SampleState(name="cube", revision=name, material=name)
+        looks = MeshCache()
+        looks.add(sample, cube)
+        own = materials()[name].color if name in materials() else None
+        assert looks.look(sample).skins[0].color == (own or OTHER_COLOR), name
 
 
 def test_the_name_of_the_sample_stands_above_it() -> None:

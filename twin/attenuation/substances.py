@@ -1,10 +1,10 @@
-"""Attenuation of a substance at each photon energy, from its chemical formula and density.
+"""Attenuation of a substance at each photon energy, from its composition and density.
 
-Mixtures add up by mass fraction. An element without a shipped table is an error. `tables`
-has the shipped attenuation by element, and tungsten spectra by kV, on one energy grid;
-`docs/tools/physics_tables.py` made them, and their provenance travels inside the file.
-They are read once; spectra work on their bins, and one energy by itself is interpolated
-between edges.
+Mixtures add up by mass fraction. An element without a shipped table is an error. `tables` has
+what ships: tube spectra by kV on one grid of energies, and the attenuation of the elements
+between nodes, straight lines on logarithmic axes (xraydb's Elam tables within 1e-4, edges
+included), so one energy by itself is as exact as the bins of a spectrum.
+`docs/tools/physics_tables.py` made both files, whose provenance travels inside them.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from importlib import resources
 
 import numpy as np
 
-from flexdt.twin.backends import backend
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray
 
 _TOKEN = re.compile(r"([A-Z][a-z]?|\(|\))(\d+(?:\.\d+)?)?")
 MAX_DENSITY_G_CM3 = 25.0
 """Largest density that is accepted [g/cm3]; denser than any element."""
-ABSORPTION_EXPONENT = -2.7
-"""Exponent of an element's attenuation over energy where absorption outweighs scattering."""
+MAX_PACKING = 3.5
+"""Largest density of a compound over that of its elements side by side, liquid or solid; the
+densest at ordinary pressure have 3.0 (cubic boron nitride), 2.9 (stishovite), 2.4 (water)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +35,16 @@ class Tables:
     """The shipped tables; all arrays are read-only.
 
     Attributes:
-        energy_keV: (e,) centres of the bins [keV].
+        energy_keV: (e,) centres of the bins of spectra [keV].
         kV: (k,) tube voltages of the spectra, growing.
         fluence: (k, e) photons per cm2 and mAs in each bin, 1 m from a tungsten anode, no
             filter.
         elements: symbol -> row of `total`.
         molar_mass: (z,) [g/mol].
-        total: (z, e) mass attenuation with coherent scattering [cm2/g].
-        edges_keV: (z, n) absorption edges above 5 keV, growing, NaN where there are
-            fewer.
+        packed_g_cm3: (z,) density of the element as a solid, of gases as a liquid.
+        nodes: of each element logarithms of energies [keV] and mass attenuation with
+            coherent scattering [cm2/g], (2, n); an absorption edge has two nodes.
+        total: (z, e) mass attenuation at the bins [cm2/g].
         provenance: where the numbers come from.
     """
 
@@ -52,29 +53,43 @@ class Tables:
     fluence: FloatArray
     elements: Mapping[str, int]
     molar_mass: FloatArray
+    packed_g_cm3: FloatArray
+    nodes: tuple[FloatArray, ...]
     total: FloatArray
-    edges_keV: FloatArray
     provenance: Mapping[str, str]
+
+    @property
+    def range_keV(self) -> tuple[float, float]:
+        """Lowest and highest energy of the elements' attenuation [keV]."""
+        logs = self.nodes[0][0]
+        return round(math.exp(logs[0]), 3), round(math.exp(logs[-1]), 3)
 
 
 @lru_cache
 def tables() -> Tables:
-    """Load the shipped tables: energies [keV], tube spectra by kV, and molar mass,
-    attenuation and edges by element, with their provenance.
+    """Load the shipped tables: energies [keV], tube spectra by kV, and molar mass, density
+    and attenuation by element, with their provenance.
 
     Later calls return the same value; its arrays are read-only.
     """
-    arrays, provenance = stored_arrays("tables.npz")
-    symbols = [str(s) for s in arrays["symbols"]]
+    spectra, of_spectra = stored_arrays("spectra.npz")
+    elements, of_elements = stored_arrays("elements.npz")
+    logs = np.log([elements["node_keV"], elements["node_cm2_g"]])
+    ends = np.cumsum(elements["node_counts"]).astype(int)[:-1]
+    nodes = tuple(np.split(logs, ends, axis=1))
+    bins = np.log(spectra["energy_keV"])
+    total = np.exp([np.interp(bins, *of_one) for of_one in nodes])
+    logs.flags.writeable = total.flags.writeable = False
     return Tables(
-        arrays["energy_keV"],
-        arrays["kV"],
-        arrays["fluence"],
-        {symbol: row for row, symbol in enumerate(symbols)},
-        arrays["molar_mass"],
-        arrays["total"],
-        arrays["edges_keV"],
-        provenance,
+        spectra["energy_keV"],
+        spectra["kV"],
+        spectra["fluence"],
+        {str(symbol): row for row, symbol in enumerate(elements["symbols"])},
+        elements["molar_mass"],
+        elements["packed_g_cm3"],
+        nodes,
+        total,
+        {**of_spectra, **of_elements},
     )
 
 
@@ -124,18 +139,14 @@ class Substance:
     def __post_init__(self) -> None:
         """Check density, mass fractions and elements.
 
-        The density is above 0 and at most `MAX_DENSITY_G_CM3`; each fraction is above 0;
-        their sum may be off 1 by 0.002.
+        The density is above 0, and at most `MAX_DENSITY_G_CM3` and `MAX_PACKING` times
+        that of the packed elements; each fraction is above 0; their sum may be off 1 by
+        0.002.
 
         Raises:
             LimitError: a value is not allowed.
             UnknownNameError: an element without tables.
         """
-        if not 0.0 < (density := self.density_g_cm3) <= MAX_DENSITY_G_CM3:
-            message = f"{self.name}: density {density:g} g/cm3"
-            raise LimitError.instead(
-                message, density, f"above 0 and at most {MAX_DENSITY_G_CM3:g}"
-            )
         for symbol, part in self.fractions:
             _row(symbol)
             if not part > 0.0:
@@ -146,6 +157,18 @@ class Substance:
             raise LimitError.instead(
                 f"{self.name}: mass fractions add up to {total:g}", total, 1.0
             )
+        density = self.density_g_cm3
+        most = min(MAX_PACKING * self.packed_g_cm3, MAX_DENSITY_G_CM3)
+        if not 0.0 < density <= most:
+            made_of = ", ".join(f"{s} {100 * w:.3g} %" for s, w in self.fractions)
+            message = f"{self.name}: density {density:g} g/cm3 of {made_of}"
+            raise LimitError.instead(message, density, f"above 0 and at most {most:.3g}")
+
+    @property
+    def packed_g_cm3(self) -> float:
+        """Density of its elements side by side, as solids or liquids [g/cm3]."""
+        volume = sum(part / tables().packed_g_cm3[row] for row, part in self.parts)
+        return float(1.0 / volume)
 
     @property
     def parts(self) -> list[tuple[int, float]]:
@@ -184,27 +207,6 @@ class Substance:
             raise LimitError.instead(f"material {text!r}", text, allowed) from None
         return cls.of(text, formula.strip(), value)
 
-    @classmethod
-    def called(cls, text: str) -> Substance:
-        """Look up a substance by the name of a sample's material, such as aluminium; a
-        text with @ is parsed as FORMULA@DENSITY.
-
-        The text with @ is the substance's name then.
-
-        Raises:
-            UnknownNameError: lists the materials there are; or an element without a
-                table.
-            LimitError: as `parse`.
-
-        Example:
-            >>> Substance.called("copper").density_g_cm3, Substance.called("Al@2.70").name
-            (8.96, 'Al@2.70')
-        """
-        if "@" in text:
-            return cls.parse(text)
-        substance: Substance = backend("materials").material(text).substance
-        return substance
-
     def mass_attenuation(self) -> FloatArray:
         """Compute mu/rho at the energies of the tables, (e,) [cm2/g]."""
         return np.asarray(sum(part * tables().total[row] for row, part in self.parts))
@@ -215,39 +217,19 @@ class Substance:
         return self.mass_attenuation() * (self.density_g_cm3 / 10.0)
 
     def attenuation_at(self, energy_keV: float) -> float:
-        """Interpolate the linear attenuation coefficient at one energy [1/mm], within the
-        same absorption edges.
+        """Compute the linear attenuation coefficient at one energy [1/mm].
+
+        Raises:
+            LimitError: the energy is outside the elements' tables.
         """
-        mu = sum(part * _mass_at(row, energy_keV) for row, part in self.parts)
+        low, high = tables().range_keV
+        if not low <= energy_keV <= high:
+            message = f"{self.name}: {energy_keV:g} keV is outside the tables"
+            raise LimitError.instead(message, energy_keV, f"[{low:g}, {high:g}] keV")
+        at = math.log(energy_keV)
+        nodes = tables().nodes
+        mu = sum(part * math.exp(np.interp(at, *nodes[row])) for row, part in self.parts)
         return float(mu * self.density_g_cm3 / 10.0)
-
-
-def _mass_at(row: int, energy_keV: float) -> float:
-    """Interpolate mu/rho of an element log-log from the two nearest bins that no
-    absorption edge separates from the energy.
-
-    With one such bin the slope is `ABSORPTION_EXPONENT`; without any the nearest bin is
-    used, with that slope. Energies beyond the bins are extrapolated.
-
-    Args:
-        row: of the element in the tables.
-        energy_keV: photon energy.
-
-    Returns:
-        mu/rho [cm2/g].
-    """
-    bins = tables().energy_keV
-    edges = tables().edges_keV[row]
-    total = tables().total[row]
-    alike = np.searchsorted(edges, bins, "right") == np.searchsorted(
-        edges, energy_keV, "right"
-    )
-    away = np.abs(bins - energy_keV)
-    near, far = np.argsort(np.where(alike, away, np.inf) if alike.any() else away)[:2]
-    slope = ABSORPTION_EXPONENT  # if there is only one bin between two edges
-    if alike[near] and alike[far]:
-        slope = math.log(total[far] / total[near]) / math.log(bins[far] / bins[near])
-    return float(total[near] * (energy_keV / bins[near]) ** slope)
 
 
 def parse_formula(formula: str) -> dict[str, float]:

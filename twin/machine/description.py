@@ -364,9 +364,9 @@ class FilterSpec(_Frozen):
             UnknownNameError: no material of that name.
             LimitError: a formula or density that is not possible.
         """
-        from flexdt.twin.attenuation.substances import Substance
+        from flexdt.twin.attenuation.materials import material
 
-        Substance.called(text)
+        material(text)
         return text
 
 

@@ -8,6 +8,7 @@ from typing import Final, Literal, assert_never
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.attenuation.materials import stated_keV
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings
@@ -26,6 +27,19 @@ BRIGHTEST_FILL: Final = 0.9
 """Part of the panel's range that the open beam may fill in a proposed setting."""
 LEAST_COUNTS: Final = 20.0 * ideal.FEW_COUNTS
 """Open beam [counts above dark] below which a sample that lets 1/20 through is starved."""
+
+
+def only_keV(physics: Physics) -> float | None:
+    """Return the energy of all photons [keV], `stated_keV` for "mono"; None for physics
+    without one energy.
+    """
+    match physics:
+        case "mono":
+            return stated_keV()
+        case "ideal" | "poly":
+            return None
+        case _:
+            assert_never(physics)
 
 
 @dataclass(frozen=True)

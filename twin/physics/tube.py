@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from flexdt.twin.attenuation.materials import material
 from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.geometry.conventions import FloatArray
@@ -98,7 +99,7 @@ class TubeModel:
         }
         return cls(
             tuple(
-                Filter(Substance.called(name), thick) for name, thick in layers.items()
+                Filter(material(name).substance, thick) for name, thick in layers.items()
             ),
             figures["tube_spot_mm_per_W"],
             figures["tube_smallest_spot_mm"],
@@ -111,7 +112,9 @@ def tube_of(spec: TubeSpec) -> TubeModel:
     points.
     """
     return TubeModel(
-        tuple(Filter(Substance.called(f.material), f.thickness_mm) for f in spec.filters),
+        tuple(
+            Filter(material(f.material).substance, f.thickness_mm) for f in spec.filters
+        ),
         spec.spot_mm_per_W,
         spec.smallest_spot_mm,
         spec.spot_points,
@@ -296,7 +299,7 @@ def _filter(layer: tuple[str, float] | Filter) -> Filter:
         UnknownNameError: an unknown material.
     """
     if not isinstance(layer, Filter):
-        layer = Filter(Substance.called(layer[0]), float(layer[1]))
+        layer = Filter(material(layer[0]).substance, float(layer[1]))
     name = f"Tube: filter {layer.substance.name}"
     require_within(name, layer.thickness_mm, 0.0, 1e3, "mm")
     return layer

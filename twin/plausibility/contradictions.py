@@ -77,6 +77,11 @@ class PlausibilityCode(FindingCode):
     )
     DUPLICATE = "duplicate", ERROR, "two files with one number"
     GAP = "gap", WARNING, "a number missing between those of other files"
+    DENSITY = (
+        "density",
+        WARNING,
+        "a solid as thin as a gas, or a gas as dense as a liquid",
+    )
     OTHER_NAME = "other name", WARNING, "a file named otherwise than the other images"
 
 

@@ -16,8 +16,10 @@ import typer
 
 from flexdt.clients.cli import option_values, options, value_completion
 from flexdt.clients.cli.boundary import REFUSED
+from flexdt.clients.cli.command_settings import SampleSettings
 from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, argument, option
+from flexdt.clients.cli.settings_file import chosen
 from flexdt.library.failure import CommandError
 from flexdt.runtime import process_settings
 from flexdt.twin.length_units import UNITS_MM
@@ -467,7 +469,10 @@ def sample(
                 sent = client.upload_scene(file)
             else:
                 in_unit = cast("LengthUnit | None", unit)
-                sent = client.upload_mesh(file, unit=in_unit, material=material)
+                place = chosen(SampleSettings).place
+                sent = client.upload_mesh(
+                    file, unit=in_unit, place=place, material=material
+                )
             now = client.set_sample(file=sent.name)
         else:
             now = _named_sample(client, name)

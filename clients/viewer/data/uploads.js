@@ -119,6 +119,7 @@ async function send(chosen, mine) {
     format,
     total,
     unit: /** @type {SampleUpload["unit"]} */ (unit.value),
+    place: /** @type {SampleUpload["place"]} */ ($select("#mesh-place").value),
     material: $select("#mesh-material").value || null,
   };
   /** @type {UploadResult | null} */

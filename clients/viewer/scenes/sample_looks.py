@@ -21,29 +21,14 @@ import trimesh
 from flexdt.clients.client.flows import adrive, sample_shape
 from flexdt.clients.viewer.scenes.meshes.painted_meshes import SMOOTH_RAD, plain
 from flexdt.clients.viewer.scenes.world import MM
-from flexdt.phantoms import Phantom, load_phantom, mesh_phantom
+from flexdt.phantoms import Phantom, load_phantom, materials, mesh_phantom
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SampleState
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
 OTHER_COLOR: Final = (214, 170, 90)
-"""Of materials by formula, and of those without a colour of their own."""
-COLORS: Final[Mapping[str, tuple[int, int, int]]] = {
-    "abs": (222, 66, 48),
-    "pmma": (150, 205, 230),
-    "steel": (206, 212, 220),
-    "aluminium": (188, 198, 210),
-    "water": (110, 170, 235),
-    "air": OTHER_COLOR,
-    "tungsten-carbide": OTHER_COLOR,
-    "bone": (240, 226, 196),
-    "copper": OTHER_COLOR,
-    "titanium": OTHER_COLOR,
-    "glass": OTHER_COLOR,
-    "wood": OTHER_COLOR,
-}
-"""Material -> colour (r, g, b)."""
+"""Of materials by formula, and of those without a colour of their own (r, g, b)."""
 MAX_LOOKS: Final = 8
 MAX_FACES: Final = 200_000
 DEFAULT_MATERIAL: Final = "abs"
@@ -208,9 +193,9 @@ def _skins(phantom: Phantom) -> SampleLook:
         vertices, faces = plain(mesh)
         name = "".join(c if c.isalnum() else "_" for c in material)
         dense = material == "steel" and len(groups) > 1
-        skins.append(
-            Skin(name, vertices, faces, COLORS.get(material, OTHER_COLOR), dense)
-        )
+        named = materials().get(material)
+        color = (named and named.color) or OTHER_COLOR
+        skins.append(Skin(name, vertices, faces, color, dense))
     return SampleLook(tuple(skins), np.asarray(phantom.beads))
 
 

@@ -218,8 +218,8 @@ export type SampleUpload = {
   name: string; kind?: "mesh" | "voxels" | "scene";
   format: "stl" | "obj" | "ply" | "glb" | "off" | "raw" | "json" | "toml"; total: number;
   start?: number; data: string; unit?: "um" | "mm" | "cm" | "m" | "inch" | null;
-  material?: string | null; shape?: [number, number, number] | null;
-  voxel_mm?: [number, number, number] | null
+  place?: "keep" | "centred" | null; material?: string | null;
+  shape?: [number, number, number] | null; voxel_mm?: [number, number, number] | null
 };
 export type Scene = {
   schema: 1; flexdt?: string; name?: string; saved?: string; machine: string; profile: string;

@@ -586,9 +586,7 @@ class ScenarioImages:
 
 def _made_of(substance: Substance) -> Material:
     """Wrap a substance for the scatter's grid, which needs nothing else."""
-    return Material(
-        substance.name, "", substance.density_g_cm3, 0.0, (), "", substance.fractions
-    )
+    return Material(substance.name, "", substance, 0.0, "")
 
 
 def dataset(path: str | os.PathLike[str], seed: int | None, rays: int) -> DataSet:

@@ -817,7 +817,7 @@ def _apply_corrections(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
     if request.rings:
         views = replace(views, rings=scan_rings(views.view, views.cone_vec, views.shape))
     if request.material is not None:
-        from flexdt.phantoms.materials import material, stated_keV
+        from flexdt.twin.attenuation.materials import material, stated_keV
 
         made_of = [material(name) for name in _names(request.material)]
         kV, tube, mono_keV = _source(views.dataset, request)
