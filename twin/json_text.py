@@ -5,18 +5,34 @@ from __future__ import annotations
 import json
 from typing import Any, Final
 
+from flexdt.twin.input_limits import require_json
+
 BYTE_ORDER_MARK: Final = "\ufeff"
 
 
-def parse_json(text: str, kind: type[dict[str, Any]] = dict) -> Any:
+def parse_json(
+    text: str,
+    kind: type[dict[str, Any]] = dict,
+    *,
+    file: str = "the document",
+    form: str = "json",
+) -> Any:
     """Parse a JSON document, after an optional byte order mark; objects become `kind`.
 
     `kind` is called with each object's list of (name, value) pairs.
 
+    Args:
+        text: that is parsed.
+        kind: dict, or a class of it.
+        file: name for the message about its size.
+        form: row of the table of input limits.
+
     Raises:
+        InputLimitError: it is too long or has too many values.
         ValueError: with the reason: no JSON (JSONDecodeError), nested too deep, or a
             whole number of thousands of digits.
     """
+    require_json(text, file, form)
     try:
         return json.loads(text.removeprefix(BYTE_ORDER_MARK), object_pairs_hook=kind)
     except json.JSONDecodeError:

@@ -20,7 +20,6 @@ variable is not set, or the one that FLEXDT_CONFIG names.
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -168,8 +167,11 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
     Raises:
         CommandError: unreadable, not TOML, an unknown key, or a value that is no text.
     """
+    from flexdt.runtime.files.limited_files import limited_text
+    from flexdt.twin.input_limits import InputLimitError, parse_toml
+
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        document = parse_toml(limited_text(path, "toml", "utf-8-sig"), str(path))
     except (FileNotFoundError, NotADirectoryError):
         if required:
             raise CommandError(f"{path}: no such file (FLEXDT_CONFIG names it)") from None
@@ -177,7 +179,9 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "not UTF-8 text"
         raise CommandError(f"{path}: {why}") from None
-    except tomllib.TOMLDecodeError as error:
+    except InputLimitError as error:
+        raise CommandError(error.message) from None
+    except ValueError as error:
         raise CommandError(f"{path}: not valid TOML: {error}") from None
     tables = {key: value for key, value in document.items() if key in TABLES}
     for key, table in tables.items():

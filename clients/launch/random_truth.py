@@ -7,12 +7,13 @@ set records can reveal it. Only the comparison after the calibration reads it.
 from __future__ import annotations
 
 import random
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from flexdt.library.failure import CommandError
+from flexdt.runtime.files.limited_files import limited_text
+from flexdt.twin.input_limits import InputLimitError, parse_toml
 
 RANGES: Final[Mapping[str, float]] = {
     "dO_x": 1.0,
@@ -59,7 +60,9 @@ def read(path: Path) -> dict[str, float]:
     from flexdt.twin.geometry.offsets import NAMES
 
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = parse_toml(limited_text(path, "toml"), str(path))
+    except InputLimitError as error:
+        raise CommandError(error.message) from None
     except ValueError as error:
         raise CommandError(f"{path}: not valid TOML: {error}") from None
     problems = []

@@ -25,6 +25,7 @@ from flexdt.library.failure import CommandError
 from flexdt.library.reading.folders import load_dataset, read_settings
 from flexdt.library.report_page import heading, page, table
 from flexdt.runtime.files.dataset_folder import list_folder, read_image, read_text
+from flexdt.runtime.files.limited_files import limited_bytes, limited_text
 from flexdt.twin import commissioning as tells
 from flexdt.twin.collision.home_check import check_home
 from flexdt.twin.commissioning import PastScan, Question
@@ -94,7 +95,7 @@ class Base(NamedTuple):
         name = word or machines.DEFAULT_MACHINE
         machine = machines.machine(name)
         if machines.is_file(name):
-            text = Path(name).read_text("utf-8")
+            text = limited_text(Path(name), "toml")
         else:
             text = d.builtin_machine_text(name)
         return cls(machine, text, name, named)
@@ -469,7 +470,7 @@ def _with_script(
         try:
             log = read_log(file, machine)
         except CommandError as error:
-            script, problems = read_script(file.read_bytes())
+            script, problems = read_script(limited_bytes(file, "log"))
             if not script.commands or problems.errors:
                 questions.append(Question(scan.name, "; ".join(error.lines)))
             else:

@@ -6,6 +6,8 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexdt.runtime.files.limited_files import limited_text
+
 if TYPE_CHECKING:
     from flexdt.twin.machine.description import Machine, Profile
 
@@ -34,7 +36,7 @@ def machine(word: str | PathLike[str] | None = None) -> Machine:
     else:
         name = fspath(word)
     if is_file(name):
-        return parsed(Path(name).read_text(encoding="utf-8"), name)
+        return parsed(limited_text(Path(name), "toml"), name)
     return builtin_machine(name)
 
 
@@ -89,7 +91,7 @@ def profile(
     if isinstance(word, Profile):
         chosen = word
     elif is_file(name):
-        chosen = parse_profile(Path(name).read_text(encoding="utf-8"), name)
+        chosen = parse_profile(limited_text(Path(name), "toml"), name)
     elif word is None:
         chosen = default_profile(of, file or DEFAULT_MACHINE)
     else:

@@ -14,6 +14,7 @@ from flexdt.library.machines import machine as find_machine
 from flexdt.library.machines import profile as find_profile
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.samples import as_phantom
+from flexdt.runtime.files.limited_files import limited_bytes
 from flexdt.twin.collision.convex_pieces import convex_pieces
 from flexdt.twin.collision.plan_report import collision_check
 from flexdt.twin.machine.description import Machine, Profile
@@ -129,7 +130,7 @@ def collisions(phantom: Phantom | None) -> CollisionCheck:
 
 def read(path: File) -> bytes:
     """Read the bytes of a script's file."""
-    return Path(path).read_bytes()
+    return limited_bytes(Path(path), "script")
 
 
 def _names_a_file(text: str) -> bool:

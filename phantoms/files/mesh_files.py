@@ -8,8 +8,8 @@ closed.
 from __future__ import annotations
 
 import io
-import json
 import os
+import re
 import struct
 import warnings
 from collections.abc import Mapping
@@ -27,6 +27,8 @@ from flexdt.phantoms.pieces import Surface, Voxels
 from flexdt.phantoms.placement import Place, placed
 from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.input_limits import LIMITS
+from flexdt.twin.json_text import parse_json
 from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.projection.analytic_solids import ConvexPolyhedron, Scene, Solid, Vector
 from flexdt.twin.signatures import public
@@ -38,9 +40,9 @@ FORMATS: Final = ("stl", "obj", "ply", "glb", "off")
 """Formats of mesh files; the wire has the same names (`MeshFormat` of the protocol)."""
 DEFAULT_UNIT: Final[Mapping[str, str]] = {"glb": "m"}
 """Unit of the formats that have one; the others are in mm unless a unit is given."""
-MAX_BYTES: Final = 256 << 20
+MAX_BYTES: Final = LIMITS["stl"].file_bytes
 """Largest mesh file [bytes]."""
-MAX_FACES: Final = 4_000_000
+MAX_FACES: Final = LIMITS["stl"].parts
 MAX_EXTENT_MM: Final = 2000.0
 PART_FORMATS: Final = ("glb", "stl")
 MAX_PART_BYTES: Final = 32 << 20
@@ -49,7 +51,7 @@ MAX_PART_MM: Final = 20_000.0
 """Largest extent of a machine's part [mm]; browsers draw a dozen parts at once."""
 MAX_PLY_HEADER: Final = 1 << 16
 MAX_GLB_DOCUMENT: Final = 32 << 20
-MAX_PARTS: Final = 1000
+MAX_PARTS: Final = LIMITS["glb"].parts
 """Largest number of nodes and primitives of a GLB file, each counted as often as the
 scene has it.
 
@@ -74,6 +76,9 @@ ITEM_COLUMNS: Final = {
 }
 """Sizes of glTF's component types and element types (glTF 2.0 specification, 3.6.2)."""
 TRIANGLE_FAN: Final = 6
+OBJ_PART: Final = re.compile(rb"^[ \t]*(?:usemtl|mtllib|o|g|s)\b[^\n]*", re.MULTILINE)
+"""A line of an OBJ file at which a group or a material begins; all are filled with one
+material here, and trimesh's work grows with the square of their number."""
 STL_HEAD_BYTES: Final = 84
 STL_TRIANGLE_BYTES: Final = 50
 """Bytes of a triangle of a binary STL, after a head of `STL_HEAD_BYTES`."""
@@ -377,6 +382,8 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
     try:
         if kind in _CHECKS:
             _CHECKS[kind](raw)
+        if kind == "obj":
+            raw = OBJ_PART.sub(b"", raw)
         # Parts that are too far away are rejected below, as vertices that are not finite.
         with np.errstate(all="ignore" if kind == "glb" else None):
             mesh = trimesh.load(
@@ -461,7 +468,9 @@ def _check_glb(raw: bytes) -> None:
         )
         raise ValueError(message)
     try:
-        _check_gltf(json.loads(raw[20 : 20 + size]), len(raw))
+        _check_gltf(
+            parse_json(raw[20 : 20 + size].decode(), file="its document"), len(raw)
+        )
     except (AttributeError, LookupError, TypeError, RecursionError) as error:
         raise ValueError(f"its document does not hold together: {error!r}") from None
 
@@ -568,7 +577,11 @@ def _check_stl(raw: bytes) -> None:
         )
 
 
-_CHECKS: Final = {"glb": _check_glb, "ply": _check_ply, "stl": _check_stl}
+_CHECKS: Final = {
+    "glb": _check_glb,
+    "ply": _check_ply,
+    "stl": _check_stl,
+}
 """Format -> check of a file's claims before trimesh reads it."""
 
 

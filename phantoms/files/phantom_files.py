@@ -11,7 +11,6 @@ and solids, triangles and extent are bounded.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -28,6 +27,7 @@ from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
 from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.input_limits import InputLimitError, parse_toml, read_limited
 from flexdt.twin.json_text import BYTE_ORDER_MARK, parse_json
 from flexdt.twin.length_units import UNITS_MM
 from flexdt.twin.projection import TriangleMesh
@@ -53,7 +53,10 @@ def read_phantom_file(path: Path) -> Phantom:
         PhantomError: names file, key path, value and allowed values.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as stream:
+            text = read_limited(stream, "json", str(path)).decode("utf-8")
+    except InputLimitError as error:
+        raise PhantomError(error.message, error.data) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise PhantomError(f"cannot read {path}: {reason}", {"path": str(path)}) from None
@@ -79,10 +82,12 @@ def load_phantom_file(
     try:
         text = text.removeprefix(BYTE_ORDER_MARK)
         if text.lstrip()[:1] == "{":
-            document = parse_json(text)
+            document = parse_json(text, file=file)
         else:
-            document = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+            document = parse_toml(text, file)
+    except InputLimitError as error:
+        raise PhantomError(error.message, {"file": file, **error.data}) from None
+    except ValueError as error:
         raise PhantomError(
             f"{file}: not valid TOML or JSON: {error}", {"file": file}
         ) from None

@@ -35,11 +35,12 @@ from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_d
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.input_limits import LIMITS, InputLimitError, require_strips
 
 Shape = tuple[int, int]
-MAX_TEXT_BYTES: Final = 1 << 30
+MAX_TEXT_BYTES: Final = LIMITS[DOCUMENT].file_bytes
 """Largest text file of a data set [bytes]."""
-MAX_IMAGE_BYTES: Final = 1 << 29
+MAX_IMAGE_BYTES: Final = LIMITS["tiff"].decoded_bytes
 """Largest image [bytes]; that of our largest detector has 6 MB."""
 BLANK_SAMPLE_BYTES: Final = 4096
 """Bytes in the middle of an image's file that are examined first for other values than 0."""
@@ -391,6 +392,10 @@ def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
             message = f"{path} claims {shape[1]} x {shape[0]} pixels"
             most = f"{MAX_IMAGE_BYTES} bytes"
             raise ds.DatasetFormatError.instead(message, size, most, path=str(path))
+        try:
+            require_strips(page.databytecounts, raw.seek(0, os.SEEK_END), str(path))
+        except InputLimitError as error:
+            raise ds.DatasetFormatError(error.message, error.data) from None
         wanted = np.float32 if kind.kind == "f" else np.uint16
         packing = tifffile.COMPRESSION
         values: npt.NDArray[Any]

@@ -21,7 +21,6 @@ import asyncio
 import hashlib
 import json
 import math
-import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
@@ -35,6 +34,7 @@ from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_obj
 from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError
 from flexdt.protocol.rpc_errors import too_large
+from flexdt.runtime.files.limited_files import limited_text
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.volume_store import memory_of
 from flexdt.server.storage.stored_samples import SampleStore
@@ -43,6 +43,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec, check_cone_vec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.input_limits import InputLimitError, parse_toml
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.sampled_views import spot_views
@@ -148,11 +149,13 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
             {"file": str(path), "allowed": "outside the data directory"},
         )
     try:
-        values = tomllib.loads(file.read_text(encoding="utf-8"))
+        values = parse_toml(limited_text(file, "toml"), str(path))
     except OSError as error:
         raise MachineFileError(
             f"cannot read {path}: {error.strerror}", {"file": str(path)}
         ) from None
+    except InputLimitError as error:
+        raise MachineFileError(error.message, {"file": str(path)}) from None
     except ValueError:
         raise MachineFileError(f"{path}: not valid TOML", {"file": str(path)}) from None
     for name, value in values.items():

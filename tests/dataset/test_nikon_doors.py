@@ -119,7 +119,7 @@ def test_a_text_of_any_length_is_refused(tmp_path, monkeypatch):
     path = xtekct(tmp_path)
     with path.open("ab") as file:
         file.truncate(17 << 20)
-    with pytest.raises(DatasetError, match="bytes of text"):
+    with pytest.raises(DatasetError, match="at most 16777216 bytes"):
         fx.open(path)
 
 

@@ -20,13 +20,21 @@ from datetime import datetime, timedelta
 from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    FailFast,
+    Field,
+    ValidationError,
+)
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetNameError
 from flexdt.twin.dataset.file_names import DOCUMENT, plain_name
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.input_limits import InputLimitError
 from flexdt.twin.json_text import parse_json
 from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
@@ -386,7 +394,7 @@ class FrameEntry(_Model):
     xrays_on: bool
     positions: dict[str, float]
     """Motor -> position [mm, deg], script's sign."""
-    cone_vec: Row
+    cone_vec: Annotated[Row, FailFast()]
     """Nominal, uncorrected: source, detector centre, u, v in the object's frame [mm]."""
 
     @classmethod
@@ -525,7 +533,8 @@ class DatasetDocument(_Model):
     """Counts of each setting of the projections, predicted at submission; empty in older
     files.
     """
-    frames: list[FrameEntry]
+    frames: Annotated[list[FrameEntry], FailFast()]
+    """The images; the first that does not hold ends their validation."""
 
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:
@@ -701,7 +710,9 @@ def parse_document(text: str, file: str = DOCUMENT) -> DatasetDocument:
         DatasetFormatError: names file, key path, value and allowed values.
     """
     try:
-        content = parse_json(text)
+        content = parse_json(text, file=file, form=DOCUMENT)
+    except InputLimitError as error:
+        raise DatasetFormatError(error.message, error.data) from None
     except ValueError as error:
         raise DatasetFormatError(
             f"{file} is not valid JSON: {error}", {"path": file}

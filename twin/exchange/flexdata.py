@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
+from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange import geometry as g
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import cone_vec_of
@@ -25,6 +25,7 @@ from flexdt.twin.geometry.conventions import (
     rotation_y,
     rotation_z,
 )
+from flexdt.twin.input_limits import parse_toml
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
@@ -162,8 +163,10 @@ def read_flexdata(
     # flexDATA writes tuples, which are no TOML, and repairs them itself on reading.
     repaired = text.lstrip("\ufeff").translate(str.maketrans("()", "[]"))
     try:
-        records = tomllib.loads(repaired)
-    except tomllib.TOMLDecodeError as error:
+        records = parse_toml(repaired, file)
+    except TwinError as error:
+        raise ExchangeError(error.message, error.data) from None
+    except ValueError as error:
         raise ExchangeError(
             f"{file} is not valid TOML: {error}", {"path": file}
         ) from None

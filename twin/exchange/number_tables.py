@@ -19,6 +19,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from flexdt.twin.dataset.provenance import Provenance
+from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
@@ -388,7 +389,9 @@ def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[s
         ExchangeError: the text is not a JSON object.
     """
     try:
-        document = parse_json(text, kind)
+        document = parse_json(text, kind, file=file)
+    except TwinError as error:
+        raise ExchangeError(error.message, error.data) from None
     except ValueError as error:
         raise ExchangeError(
             f"{file} is not valid JSON: {error}", {"path": file}

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_panel
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import (
@@ -24,6 +25,7 @@ from flexdt.twin.geometry.conventions import (
     rotation_y,
     rotation_z,
 )
+from flexdt.twin.input_limits import require_bytes, require_parts
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
@@ -170,6 +172,11 @@ def read_rtk(
             parallel view, a matrix that contradicts the numbers of its view, or an unknown
             element that is not 0, such as a curved detector.
     """
+    try:
+        require_bytes("xml", len(text), file)
+        require_parts("xml", text.count("<"), file)
+    except TwinError as error:
+        raise ExchangeError(error.message, error.data) from None
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:

@@ -29,6 +29,7 @@ from pydantic_core import PydanticCustomError
 
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.offsets import NAMES
+from flexdt.twin.input_limits import NAMED_PROBLEMS, InputLimitError, parse_toml
 from flexdt.twin.machine.camera import (
     MODE_FORM,
     CameraSettings,
@@ -1368,8 +1369,10 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
             data has file and, after a validation, problems (path, message, value).
     """
     try:
-        content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+        content = parse_toml(text, file)
+    except InputLimitError as error:
+        raise MachineFileError(error.message, {"file": file, **error.data}) from None
+    except ValueError as error:
         raise MachineFileError(
             f"{file}: not valid TOML: {error}", {"file": file}
         ) from None
@@ -1384,7 +1387,7 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
     except ValidationError as error:
         lines = []
         data = []
-        for e in error.errors():
+        for e in error.errors(include_url=False)[:NAMED_PROBLEMS]:
             at = e.get("ctx", {}).get("at")
             path = ".".join(str(p) for p in (*e["loc"], *([] if at is None else [at])))
             if e["type"] == "missing":
@@ -1402,6 +1405,8 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
                 message += _limit(path)
             lines.append(f"{file}: {path}: {message} (value: {value!r})")
             data.append({"path": path, "message": message, "value": repr(value)})
+        if error.error_count() > NAMED_PROBLEMS:
+            lines.append(f"{file}: and {error.error_count() - NAMED_PROBLEMS} more")
         raise MachineFileError(
             "\n".join(lines), {"file": file, "problems": data}
         ) from None

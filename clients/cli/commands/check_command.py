@@ -20,6 +20,7 @@ from flexdt.clients.cli.console import table
 from flexdt.clients.cli.options import Answer, option
 from flexdt.library import machines
 from flexdt.library.failure import CommandError
+from flexdt.runtime.files.limited_files import limited_bytes
 
 if TYPE_CHECKING:
     from flexdt.twin.script import CheckReport
@@ -58,7 +59,7 @@ def check(
     from flexdt.phantoms.samples import as_phantom
     from flexdt.twin.script import check_script
 
-    data = script.read_bytes()
+    data = limited_bytes(script, "script")
     scanner = machines.machine(machine)
     if sample is None:
         phantom = None
@@ -109,7 +110,7 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
 
     known = machines.machine(machine)
     lines = read_log_file(log, known)
-    data = script.read_bytes()
+    data = limited_bytes(script, "script")
     if not is_log(data):
         different = first_difference(parse_script(data).commands, lines)
         if different is not None:

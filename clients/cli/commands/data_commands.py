@@ -6,7 +6,6 @@ The work is in `flexdt.library.reconstruction` and `flexdt.library.datasets.exch
 
 from __future__ import annotations
 
-import json as json_text
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -22,9 +21,12 @@ from flexdt.clients.cli.options import Answer, Twin, argument, option
 from flexdt.clients.cli.settings_file import chosen
 from flexdt.library.datasets.exchange_formats import FORMATS, exported, imported
 from flexdt.library.failure import CommandError
+from flexdt.runtime.files.limited_files import limited_text
 from flexdt.runtime.files.whole_files import bytes_of
 from flexdt.twin import long_work
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT
+from flexdt.twin.input_limits import InputLimitError
+from flexdt.twin.json_text import parse_json
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -411,7 +413,9 @@ def read_report(path: Path) -> Report:
     from flexdt.twin.geometry.offsets import Offsets
 
     try:
-        document = json_text.loads(path.read_text(encoding="utf-8"))
+        document = parse_json(limited_text(path, "json"), file=str(path))
+    except InputLimitError:
+        raise
     except ValueError as error:
         raise CommandError(f"{path}: not JSON: {error}") from None
     if isinstance(document, dict):

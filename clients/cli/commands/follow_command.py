@@ -14,6 +14,7 @@ from flexdt.clients.cli.console import note, say
 from flexdt.clients.cli.options import Answer, argument, option
 from flexdt.library import machines
 from flexdt.library.failure import CommandError
+from flexdt.runtime.files.limited_files import limited_bytes
 
 if TYPE_CHECKING:
     from flexdt.clients.following.frames_beside import FramesBeside
@@ -72,7 +73,7 @@ def follow(
     else:
         session.tell = partial(_say, session)
     if replay is not None:
-        recording = replay.read_bytes()
+        recording = limited_bytes(replay, "log")
         if STAMP.match(recording) is None:
             raise CommandError(f"{replay}: no message [hh:mm:ss] {{...}}", INVALID)
         session.replay(recording)
@@ -152,7 +153,7 @@ def _follower(
     return Follower(
         chosen,
         machines.profile(profile, chosen, machine),
-        None if script is None else parse_script(script.read_bytes()),
+        None if script is None else parse_script(limited_bytes(script, "script")),
         size_of(phantom),
         collisions(phantom),
     )

@@ -21,6 +21,7 @@ from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, option
 from flexdt.library.failure import CommandError
 from flexdt.runtime import process_settings
+from flexdt.runtime.files.limited_files import limited_bytes
 from flexdt.twin import long_work
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def run(
     """
     from flexdt.protocol.rpc_errors import RpcError
 
-    data = script.read_bytes()
+    data = limited_bytes(script, "script")
     with twin() as client:
         if sample is not None:
             client.set_sample(sample)

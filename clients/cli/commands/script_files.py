@@ -10,6 +10,7 @@ import typer
 from flexdt.clients.cli.boundary import INVALID, verdict
 from flexdt.clients.cli.console import note
 from flexdt.library.failure import CommandError
+from flexdt.runtime.files.limited_files import limited_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,7 +44,7 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
     from flexdt.twin.script.executed_log import COLUMNS, read_log
     from flexdt.twin.script.parse import is_log
 
-    data = log.read_bytes()
+    data = limited_bytes(log, "log")
     if STAMP.match(data):
         from flexdt.clients.following.session import executed_script
 

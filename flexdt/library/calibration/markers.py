@@ -25,6 +25,7 @@ import numpy.typing as npt
 from flexdt.library.calibration.exposure_share import exposure_share
 from flexdt.library.datasets.image_set import Images, ImageSet
 from flexdt.phantoms import Phantom
+from flexdt.runtime.files.array_files import read_arrays
 from flexdt.runtime.files.dataset_folder import read_text
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
@@ -56,6 +57,7 @@ from flexdt.twin.findings import Findings, error
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.input_limits import LIMITS, InputLimitError
 from flexdt.twin.projection.analytic_solids import Scene
 
 ASSUMED_SIGMA_PX: Final = 0.5
@@ -176,9 +178,12 @@ def _of_array(path: Path, views: int) -> Markers:
         TwinError: unreadable, another shape, or pixels too far away.
     """
     try:
-        stored = np.load(path, allow_pickle=False)
-        tracks = stored.astype(np.float64, casting="same_kind")
-    except (AttributeError, OSError, TypeError, ValueError) as error:
+        tracks = read_arrays(path)["array"].astype(np.float64, casting="same_kind")
+    except InputLimitError:
+        raise
+    except KeyError:
+        raise TwinError(f"cannot read {path}: it holds several arrays") from None
+    except (OSError, TypeError, ValueError) as error:
         raise TwinError(f"cannot read {path}: {error}") from None
     if tracks.ndim != 3 or tracks.shape[0] != views or tracks.shape[2] != 2:
         raise TwinError.of_shape(
@@ -208,7 +213,7 @@ def _of_table(path: Path, views: int) -> Markers:
             line.
     """
     try:
-        rows = list(csv.reader(io.StringIO(read_text(path))))
+        rows = list(csv.reader(io.StringIO(read_text(path, LIMITS["table"].file_bytes))))
     except csv.Error as error:
         raise TwinError(f"cannot read {path}: {error}") from None
     if rows:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from flexdt.library.datasets.image_set import ImageSet
+from flexdt.runtime.files.array_files import read_arrays
+from flexdt.runtime.files.limited_files import limited_text
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
-
-MAX_BYTES: Final = 256 << 20
-"""Of a text; no geometry is longer."""
+from flexdt.twin.input_limits import InputLimitError
 
 
 @dataclass(frozen=True)
@@ -53,13 +52,13 @@ def text_of(path: Path) -> str:
     """Read a file's UTF-8 text; a byte order mark is removed.
 
     Raises:
-        ExchangeError: it has more than `MAX_BYTES`, or is no UTF-8.
+        ExchangeError: it is longer than a table may be, or is no UTF-8.
         OSError: it cannot be read.
     """
-    if path.stat().st_size > MAX_BYTES:
-        raise ExchangeError(f"{path}: {path.stat().st_size} bytes; allowed: {MAX_BYTES}")
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return limited_text(path, "table", "utf-8-sig")
+    except InputLimitError as error:
+        raise ExchangeError(error.message, error.data) from None
     except UnicodeDecodeError:
         raise ExchangeError(f"{path} is no UTF-8 text", {"path": str(path)}) from None
 
@@ -70,16 +69,14 @@ def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
     Pickled objects are not read.
 
     Raises:
-        ExchangeError: it is no such file, or holds pickled objects.
+        ExchangeError: it is no such file, larger than one may be, or holds pickled objects.
         OSError: it cannot be read.
     """
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return {"array": loaded}
-        with loaded:
-            return {name: loaded[name] for name in loaded.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        return read_arrays(path)
+    except InputLimitError as error:
+        raise ExchangeError(error.message, error.data) from None
+    except ValueError as error:
         raise ExchangeError(
             f"{path} is no NumPy file: {error}", {"path": str(path)}
         ) from None

@@ -57,6 +57,7 @@ from flexdt.twin.dataset.xre_reading import parse_xre
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.number_tables import read_geometry_text
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.input_limits import LIMITS
 from flexdt.twin.machine.description import (
     Machine,
     Profile,
@@ -75,7 +76,7 @@ FLAT_NAME: Final = re.compile(r"flat|white|bright|open|blank|gain|^io", re.IGNOR
 """Words in the names of flat images."""
 AGREE_MM: Final = 1e-6
 """Largest difference of a file's cone_vec from the one of its motor positions [mm]."""
-MAX_SETTINGS_BYTES: Final = 16 << 20
+MAX_SETTINGS_BYTES: Final = LIMITS["settings"].file_bytes
 """Largest settings text [bytes]; a larger file is none."""
 
 

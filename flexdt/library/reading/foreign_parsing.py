@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Final
 
 from flexdt.runtime.files.directory import memory_bytes
+from flexdt.runtime.files.limited_files import limited_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.errors import TwinError, words_of
+from flexdt.twin.input_limits import InputLimitError
 
-MAX_HEAD_BYTES: Final = 16 << 20
-"""Of a text that describes a scan."""
 UTF_16_MARKS: Final = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks of UTF-16, as programs of Windows begin a text."""
 
@@ -45,23 +45,20 @@ def parsing(path: Path, form: str) -> Iterator[None]:
         raise DatasetFormatError(said, {"path": str(path)}) from error
 
 
-def head_text(path: Path, most: int = MAX_HEAD_BYTES) -> str:
+def head_text(path: Path) -> str:
     """Read a text that describes a scan, as UTF-8 with or without a byte order mark, or as
     UTF-16 with one.
 
     Bytes that have no character become replacement characters.
 
     Raises:
-        DatasetFormatError: it has more than `most` bytes; nothing is read.
+        DatasetFormatError: it is larger than the settings of a scan may be.
         OSError: it cannot be read.
     """
-    size = path.stat().st_size
-    if size > most:
-        said = f"{path} has {size} bytes"
-        raise DatasetFormatError.instead(
-            said, size, f"{most} bytes of text", path=str(path)
-        )
-    raw = path.read_bytes()
+    try:
+        raw = limited_bytes(path, "settings")
+    except InputLimitError as error:
+        raise DatasetFormatError(error.message, error.data) from None
     encoding = "utf-16" if raw[:2] in UTF_16_MARKS else "utf-8-sig"
     return "\n".join(raw.decode(encoding, "replace").splitlines())
 
