@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flexdt.twin.input_limits import read_limited
-
 
 def limited_bytes(path: Path, form: str) -> bytes:
     """Read a file of a format of `LIMITS`.
@@ -14,6 +12,8 @@ def limited_bytes(path: Path, form: str) -> bytes:
         InputLimitError: it has more bytes than its format may have.
         OSError: it cannot be read.
     """
+    from flexdt.twin.input_limits import read_limited
+
     with path.open("rb") as file:
         return read_limited(file, form, str(path))
 

@@ -25,8 +25,6 @@ from flexdt.runtime.files.limited_files import limited_text
 from flexdt.runtime.files.whole_files import bytes_of
 from flexdt.twin import long_work
 from flexdt.twin.algorithms import ALGORITHMS, DEFAULT
-from flexdt.twin.input_limits import InputLimitError
-from flexdt.twin.json_text import parse_json
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -411,6 +409,8 @@ def read_report(path: Path) -> Report:
         CommandError: not JSON, no correction in it, or a value that is not a number.
     """
     from flexdt.twin.geometry.offsets import Offsets
+    from flexdt.twin.input_limits import InputLimitError
+    from flexdt.twin.json_text import parse_json
 
     try:
         document = parse_json(limited_text(path, "json"), file=str(path))
