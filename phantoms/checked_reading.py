@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
+from flexdt.twin.calibration.bead_model import Tolerance
 from flexdt.twin.errors import TwinError
 from flexdt.twin.projection import analytic_solids as analytic
 
@@ -159,6 +160,44 @@ def vector(value: object, where: str) -> analytic.Vector:
 def lengths(value: object, where: str) -> analytic.Vector:
     """Return `value` as three numbers above 0 [mm]; raise PhantomError otherwise."""
     return _three(value, where, positive)
+
+
+def spread(value: object, where: str) -> float:
+    """Return `value` as a standard deviation, 0 or more; raise PhantomError otherwise."""
+    found = number(value, where)
+    if found < 0.0:
+        raise wrong(value, where, f"a standard deviation from 0 to {MAX_NUMBER:g}")
+    return found
+
+
+def tolerance(value: object, where: str) -> Tolerance:
+    """Read how well a phantom is known: its source, and bead_mm (one figure, or a list of one
+    for each bead), scale, or both.
+
+    Raises:
+        PhantomError: names the key path, the value and the allowed ones.
+    """
+    if isinstance(value, Tolerance):
+        return value
+
+    def beads(own: object, at: str) -> float | tuple[float, ...]:
+        """Read the figure of all beads, or those of each."""
+        if isinstance(own, list | tuple):
+            return each(own, at, spread)
+        return spread(own, at)
+
+    given = fields(value, where, {"source": string}, {"bead_mm": beads, "scale": spread})
+    try:
+        return Tolerance(**given)
+    except TwinError as error:
+        raise PhantomError(f"{where}: {error.message}", {"path": where}) from None
+
+
+def tolerance_document(stated: Tolerance) -> dict[str, object]:
+    """Return a document of which `tolerance` makes an equal value."""
+    own = {"bead_mm": stated.bead_mm, "scale": stated.scale}
+    given = {name: value for name, value in own.items() if value is not None}
+    return {"source": stated.source, **given}
 
 
 def unit(value: object, where: str) -> analytic.Vector:

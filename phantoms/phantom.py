@@ -25,6 +25,7 @@ from flexdt.phantoms.mesh_booleans import cut
 from flexdt.phantoms.pieces import Surface, Voxels, boxes, freeze
 from flexdt.phantoms.solid_meshes import SurfacePart, joined, parts_of
 from flexdt.phantoms.voxelise import as_volume, voxelise
+from flexdt.twin.calibration.bead_model import Tolerance
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.projection.analytic_solids import Scene
@@ -54,6 +55,13 @@ _RADII = PlainValidator(
 )
 
 
+_Tolerance = Annotated[
+    Tolerance,
+    PlainValidator(partial(reading.tolerance, where="phantom.tolerance")),
+    PlainSerializer(reading.tolerance_document, when_used="json"),
+]
+
+
 @dataclass(frozen=True, eq=False)
 class Phantom(ArrayValue):
     """A named object to scan.
@@ -66,6 +74,7 @@ class Phantom(ArrayValue):
         beads: float64 (k, 3) bead centres [mm], object frame, read-only; k may be 0.
         bead_radius_mm: float64 (k,) [mm], read-only.
         assumed: facts without a public source.
+        tolerance: how well the places of its beads are known; None: not stated.
         surfaces: filled triangle meshes, for a phantom that came as one or several.
         voxels: ready grid, for a phantom that came as one.
     """
@@ -83,13 +92,14 @@ class Phantom(ArrayValue):
     assumed: tuple[reading.Text, ...] = ()
     surfaces: tuple[Surface, ...] = ()
     voxels: Voxels | None = None
+    tolerance: _Tolerance | None = None
 
     def __post_init__(self) -> None:
         """Copy beads (k, 3) and their radii (k,) [mm] as read-only float64.
 
         Raises:
-            PhantomError: their numbers differ, or a position or size is not finite (radii
-                are not checked for that).
+            PhantomError: their numbers differ, a position or size is not finite (radii are
+                not checked for that), or tolerances are not one for each bead.
         """
         beads = np.array(self.beads, dtype=np.float64).reshape(-1, 3)
         radii = np.array(self.bead_radius_mm, dtype=np.float64).reshape(-1)
@@ -97,6 +107,11 @@ class Phantom(ArrayValue):
             raise PhantomError(f"{self.name}: {len(beads)} beads but {len(radii)} radii")
         if not (np.isfinite(beads).all() and np.isfinite(self.size_mm).all()):
             raise PhantomError(f"{self.name}: positions and sizes must be finite")
+        own = None if self.tolerance is None else self.tolerance.bead_mm
+        if isinstance(own, tuple) and len(own) != len(beads):
+            raise PhantomError(
+                f"{self.name}: {len(beads)} beads but {len(own)} tolerances of beads"
+            )
         freeze(self, beads=beads, bead_radius_mm=radii)
 
     def __repr__(self) -> str:

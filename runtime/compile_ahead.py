@@ -56,7 +56,7 @@ def _fit() -> None:
     radii = np.zeros(1)
     radii.flags.writeable = False  # as a phantom's
     data = fit_kernels.Data(
-        np.zeros((0, 18)),
+        np.zeros((0, fit_kernels.GEOMETRY)),
         ints[:0],
         1.0,
         radii,

@@ -291,9 +291,9 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
     """Make the phantom of a bead file: a body with beads, or with a spiral of them.
 
     Without a body the beads are in air and the size is that around them about the origin.
-    Exactly one of beads and spiral must be given. Only listed beads are checked for
-    overlap. The default description counts the beads and names the body's material or
-    air.
+    Exactly one of beads and spiral must be given, and a tolerance may be. Only listed
+    beads are checked for overlap. The default description counts the beads and names the
+    body's material or air.
 
     Args:
         document: of the file.
@@ -307,7 +307,13 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
         document,
         "phantom",
         {"schema": _version, "name": reading.string},
-        {"description": reading.string, "body": _body, "bead": _beads, "spiral": _spiral},
+        {
+            "description": reading.string,
+            "body": _body,
+            "bead": _beads,
+            "spiral": _spiral,
+            "tolerance": reading.tolerance,
+        },
     )
     if ("bead" in given) == ("spiral" in given):
         raise PhantomError("phantom: give either [[bead]] tables or one [spiral]")
@@ -335,7 +341,7 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
     if size is None:
         size = tuple((2.0 * np.max(np.abs(centers) + radii[:, None], axis=0)).tolist())
     description = given.get("description", f"{len(centers)} beads in {body or 'air'}")
-    return cuboid_with_beads(
+    phantom = cuboid_with_beads(
         given["name"],
         size,
         centers,
@@ -344,6 +350,7 @@ def _bead_file(document: Mapping[str, object]) -> Phantom:
         bead_materials=metals,
         description=description,
     )
+    return replace(phantom, tolerance=given.get("tolerance"))
 
 
 def _body(value: object, where: str) -> tuple[Vector, str]:

@@ -29,10 +29,11 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
 )
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry, image_quantities
-from flexdt.twin.calibration.fit.priors import ASSUMED, exact
+from flexdt.twin.calibration.fit.priors import OFFSETS, exact
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.geometry.told_lengths import TOLD
 
 Array = npt.NDArray[np.float64]
 
@@ -217,7 +218,7 @@ def drawn(rng: np.random.Generator, wider: float, skewed: bool) -> dict[str, flo
     mean square.
     """
     truth = {n: float(rng.uniform(-r, r)) for n, r in REACH.items()}
-    for name, width in ASSUMED.items():
+    for name, width in OFFSETS.items():
         value = rng.exponential() / math.sqrt(2) if skewed else rng.normal()
         truth[name] = float(value * width * wider)
     return truth
@@ -246,7 +247,7 @@ def scan(
     sods = [SOD, 0.75 * SOD][:count]
     turn = np.radians(angles)
     poses = [Poses.upright([0, 0, 0], [0, s, 0], [0, SDD, 0], PIXEL, turn) for s in sods]
-    priors = exact() if sure else ASSUMED
+    priors = exact() if sure else OFFSETS  # lengths are told right
     seen = axis_in_image(truth, float(angles[0]))
     if images:
         scans = [
@@ -319,7 +320,7 @@ def study(
     errors: dict[str, list[float]] = {n: [] for n in REACH}
     for i in range(scans):
         rng = np.random.default_rng([seed, i])
-        truth = drawn(rng, wider, skewed)
+        truth = drawn(rng, wider, skewed) | dict.fromkeys(TOLD, 0.0)
         fit, wider_priors, seen = scan(rng, truth, frames, count, sure, images)
         if fit is None:
             refused += 1

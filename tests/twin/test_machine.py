@@ -161,7 +161,7 @@ def test_what_a_file_leaves_out() -> None:
         ("xyzr_cabinet", "[estop]\ncategory = 0\ncoasting = { X = 1, Y = 1, Z = 1, R = 1 }", ""),
         ("xyzr_cabinet", "components = [1]", "components must be tables"),
         ("xyzr_cabinet", "components = [{ name = 'panel' }, 1]", "components must be tables"),
-        ("xyzr_cabinet", "[priors]\ndQ = 1.0", "must be a known offset: dO_x"),
+        ("xyzr_cabinet", "[priors]\ndQ = 1.0", "known offset, told length or cause: dO_x"),
         # The source is 120 x 200 x 120 mm about (0, -100, 0); its front may be the focal spot.
         ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [0.0, -100.0, 60.0]", ""),
         ("micro_ct", "[[components]]\nname = 'source'\ncenter_mm = [0.0, -100.0, 60.1]",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,9 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
+
+LEAST_SPREAD_MM: Final = 1e-6
+"""Standard deviation of a bead that is exact where others are not [mm]."""
 
 
 @runtime_checkable
@@ -32,6 +35,53 @@ class BeadPhantom(Protocol):
         """Bead radii, (k,) or one for all [mm]."""
 
 
+@dataclass(frozen=True)
+class Tolerance:
+    """How well a phantom is known, as its file states it.
+
+    Attributes:
+        source: of the figures, in words, such as a certificate's number.
+        bead_mm: standard deviation of each coordinate of each bead [mm], of all or of each;
+            None: not stated.
+        scale: standard deviation of the phantom's scale [1]; None: not stated.
+    """
+
+    source: str
+    bead_mm: float | tuple[float, ...] | None = None
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the figures.
+
+        Raises:
+            TwinError: none at all, one that is below 0 or not finite, or no source.
+        """
+        own = () if self.bead_mm is None else np.ravel(self.bead_mm).tolist()
+        figures = [*own, *(() if self.scale is None else (self.scale,))]
+        if not figures:
+            raise TwinError(
+                "a tolerance states nothing; allowed: bead_mm, scale, or both"
+            )
+        for figure in figures:
+            if not 0.0 <= figure < np.inf:
+                raise TwinError.instead(
+                    f"a tolerance of {figure:g}",
+                    figure,
+                    "a standard deviation, 0 or more",
+                )
+        if not self.source.strip():
+            raise TwinError(
+                "a tolerance without its source; allowed: words, such as a certificate"
+            )
+
+    @property
+    def typical_mm(self) -> float | None:
+        """Root mean square of the beads' standard deviations [mm]; None: not stated."""
+        if self.bead_mm is None:
+            return None
+        return float(np.sqrt(np.mean(np.square(self.bead_mm))))
+
+
 @dataclass(frozen=True, eq=False)
 class BeadModel:
     """The beads of a phantom, read-only float64.
@@ -44,6 +94,7 @@ class BeadModel:
         name: for reports.
         contrast: (k,) line integral through each bead's middle above its surroundings;
             None: all are of one material.
+        stated: how well the phantom is known by its file; None: it does not say.
     """
 
     beads: FloatArray
@@ -51,6 +102,7 @@ class BeadModel:
     tolerance_mm: float = 0.0
     name: str = "phantom"
     contrast: FloatArray | None = None
+    stated: Tolerance | None = None
 
     def __post_init__(self) -> None:
         """Check the beads and store them as read-only arrays, one radius a bead.
@@ -58,7 +110,8 @@ class BeadModel:
         One radius counts for all beads. Contrasts are not checked here.
 
         Raises:
-            TwinError: `beads` is not (k, 3), finite, k >= 1, or a radius is not positive.
+            TwinError: `beads` is not (k, 3), finite, k >= 1, a radius is not positive, or the
+                tolerances are not one for each bead.
         """
         beads = np.array(self.beads, dtype=np.float64, ndmin=2, order="C")
         if beads.shape[1:] != (3,) or len(beads) == 0 or not np.isfinite(beads).all():
@@ -69,6 +122,9 @@ class BeadModel:
         ).copy()
         if not (radius > 0).all():
             raise TwinError("bead radii must be positive", {"asked": radius.tolist()})
+        stated = None if self.stated is None else self.stated.bead_mm
+        if isinstance(stated, tuple) and len(stated) != len(beads):
+            raise TwinError.of_shape("tolerances of beads", (len(stated),), (len(beads),))
         beads.setflags(write=False)
         radius.setflags(write=False)
         object.__setattr__(self, "beads", beads)
@@ -76,6 +132,14 @@ class BeadModel:
 
     def __len__(self) -> int:
         return len(self.beads)
+
+    @property
+    def spreads(self) -> FloatArray:
+        """Standard deviation of each bead's coordinates over their root mean square, (k,)."""
+        stated = None if self.stated is None else self.stated.bead_mm
+        if not isinstance(stated, tuple) or not any(stated):
+            return np.ones(len(self))
+        return np.maximum(stated, LEAST_SPREAD_MM) / np.sqrt(np.mean(np.square(stated)))
 
     @property
     def contrasts(self) -> FloatArray:
@@ -101,8 +165,8 @@ def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
     """Make the bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm,
     exact).
 
-    A bead model is returned as it is. Of a phantom, tolerance, name and scene are
-    optional (0, "phantom", none); the scene gives the contrast (`with_contrast`).
+    A bead model is returned as it is. Of a phantom, tolerances, name and scene are
+    optional (not stated, "phantom", none); the scene gives the contrast (`with_contrast`).
 
     Raises:
         TwinError: no beads, a shape other than (k, 3), a coordinate that is not finite,
@@ -117,6 +181,7 @@ def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
                 np.asarray(phantom.bead_radius_mm, dtype=np.float64),
                 float(getattr(phantom, "bead_tolerance_mm", 0.0)),
                 str(getattr(phantom, "name", "phantom")),
+                stated=getattr(phantom, "tolerance", None),
             )
             return with_contrast(model, getattr(phantom, "scene", None))
         case _:

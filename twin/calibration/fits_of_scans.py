@@ -48,7 +48,9 @@ def fit_with_loose_priors(
         request: free parameters and priors.
         wide: the last fit, perhaps with freed beads.
     """
-    wide_priors = loosened({**request.priors, **priors_of(state.scans, request)})
+    wide_priors = loosened(
+        {**request.priors, **priors_of(state.scans, request, state.model)}
+    )
     loose = replace(request, priors=wide_priors, bound=math.inf)
     out = refit_scans(state, loose, wide)
     if request.bead_tolerance_mm is None:
@@ -140,7 +142,7 @@ def fit_scans(
         sampling_px=max((m.sampling_px for m in state.measured), default=0.0),
         common_px=_common(state),
         solver=MEASURED if weighed else FOUND,
-        priors=priors_of(state.scans, request),
+        priors=priors_of(state.scans, request, state.model),
         prior_centre=request.start,
         bound=request.bound,
         centre=np.concatenate([s.bias for s in seen]),

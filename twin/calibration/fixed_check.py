@@ -53,6 +53,7 @@ from flexdt.twin.calibration.request import (
 )
 from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.offsets import NAMES
+from flexdt.twin.machine.stated_causes import limits_of
 
 OF_FRAME = ("dO_y", "alpha", "tau_x", "tau_z")
 """Gauge parameters when bead positions are free: they only choose the frame of the object."""
@@ -82,6 +83,7 @@ def explain(
         (MEASURED if weighed else Solver()).floor_px,
         _stated_arc(state),
         _arc_left(state),
+        limits_of([scan.priors for scan in state.scans], request.priors),
     )
     return explain_residuals(
         fit,
@@ -154,7 +156,7 @@ def check_fixed(
     found = []
     if verdict.factor > 1.0:
         found.append(narrow_priors(verdict))
-        given = {**asked.priors, **priors_of(state.scans, asked)}
+        given = {**asked.priors, **priors_of(state.scans, asked, state.model)}
         asked = replace(asked, priors=loosened(given, verdict.factor))
     before = fit
     if found or fit is not free_fit:
@@ -217,14 +219,14 @@ def _exact_judged(
 
 
 def _centre(asked: CalibrationRequest) -> dict[str, float]:
-    """Return the centres of a request's priors, in edge units."""
+    """Return the centres of a request's priors, in edge units; told lengths have 0."""
     return from_printed_reading(asked.start, asked.reading).to_edge()
 
 
 def _fixed_values(state: Calibration, asked: CalibrationRequest) -> dict[str, float]:
     """Return the fixed main parameters with their values."""
     centre = _centre(asked)
-    known = priors_of(state.scans, asked)
+    known = priors_of(state.scans, asked, state.model)
     return {n: centre[n] for n in SIX if n not in asked.free and n not in known}
 
 
@@ -276,13 +278,13 @@ def _with_usual_priors(
         The request with those priors, and the values that were exact, edge units; empty
         if there are none.
     """
-    stated = stated_priors(state.scans, asked)
+    stated = stated_priors(state.scans, asked, state.model)
     defined = OF_FRAME if (asked.bead_tolerance_mm or 0.0) >= ANYWHERE else ()
     usual = {**FIXED, **ASSUMED}
     widths = {n: w for n, w in usual.items() if stated.get(n) == 0 and n not in defined}
     centre = _centre(asked)
     request = replace(asked, priors={**asked.priors, **widths})
-    return request, {n: centre[n] for n in widths}
+    return request, {n: centre.get(n, 0.0) for n in widths}
 
 
 def _left_by_priors(
@@ -304,7 +306,7 @@ def _left_by_priors(
     Returns:
         Findings without "misfit".
     """
-    priors = loosened({**usual.priors, **priors_of(state.scans, usual)})
+    priors = loosened({**usual.priors, **priors_of(state.scans, usual, state.model)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
     moved = Findings()
     if loose_fit.bead_prior_mm:
@@ -362,7 +364,7 @@ def _fit_with_fixed(
         fit: gives the start of the others, and distortion, strain and arc.
     """
     fixed = from_printed_reading(request.start, request.reading)
-    known = {*request.free, *priors_of(state.scans, request)}
+    known = {*request.free, *priors_of(state.scans, request, state.model)}
     values = {n: getattr(fixed, n) for n in NAMES if n not in known}
     start = []
     for offsets in fit.group_parameters:

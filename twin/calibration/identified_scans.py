@@ -24,11 +24,12 @@ from flexdt.twin.calibration.diagnose.data import (
 from flexdt.twin.calibration.diagnose.fitted import OF_MOTION
 from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers, frame_numbers
 from flexdt.twin.calibration.diagnose.measured_spots import shadows_drawn_out
+from flexdt.twin.calibration.fit.priors import known
 from flexdt.twin.calibration.fit.problem import usual_step
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, nothing
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
-from flexdt.twin.calibration.request import CalibrationRequest, stated_priors
+from flexdt.twin.calibration.request import CalibrationRequest
 from flexdt.twin.calibration.rivals import judge_rivals
 from flexdt.twin.calibration.second_measurement import seen_arc
 from flexdt.twin.findings import Finding, Findings
@@ -155,7 +156,7 @@ def _stated_turn(scan: Scan, request: CalibrationRequest) -> float:
     """Return how far alpha may be from the request's start [rad], `TURN_SIGMAS` of its
     prior but no less than `LEAST_TURN_DEG`; inf: it has no prior.
     """
-    priors = stated_priors([scan], request)
+    priors = known(request.free, request.priors, [scan.priors])
     if "alpha" not in priors:
         return math.inf
     return math.radians(max(TURN_SIGMAS * priors["alpha"], LEAST_TURN_DEG))

@@ -27,7 +27,7 @@ from flexdt.twin.calibration.bead_model import (
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.calibration.fit.forecast import visible_beads
-from flexdt.twin.calibration.fit.priors import ASSUMED
+from flexdt.twin.calibration.fit.priors import OFFSETS
 from flexdt.twin.calibration.fit.problem import SIX, FitProblem, as_poses, build_problem
 from flexdt.twin.calibration.symmetries import Symmetry, spacing, symmetry
 from flexdt.twin.errors import TwinError
@@ -288,7 +288,7 @@ def identify(
             free=SIX,
             shape=shapes,
             start=start,
-            priors={n: LOOSE_FACTOR * w for n, w in ASSUMED.items()} | dict(loose or {}),
+            priors={n: LOOSE_FACTOR * w for n, w in OFFSETS.items()} | dict(loose or {}),
         )
         finals = _best_first(_finish(whole, scene, h, how, wide_px=60.0) for h in finals)
     finals = _with_turned(whole, scene, finals, alike, how)
@@ -945,7 +945,8 @@ def _columns(problem: FitProblem) -> list[str]:
 
 
 def _at(problem: FitProblem, x: FloatArray, start: Offsets) -> Offsets:
-    return replace(start, **dict(zip(_columns(problem), x.tolist(), strict=True)))
+    values = dict(zip(problem.layout.names, x.tolist(), strict=True))
+    return replace(start, **{n: v for n, v in values.items() if n in NAMES})
 
 
 def overlapping(predicted: FloatArray, radii: FloatArray) -> npt.NDArray[np.bool_]:

@@ -57,7 +57,7 @@ def fit_with_motion(
         )
         return replace(state, scans=scans, motion=motion)
 
-    stated = stated_priors(state.scans, request)
+    stated = stated_priors(state.scans, request, state.model)
     fit, found = follow_motion(
         fit,
         request.per_frame,

@@ -42,7 +42,11 @@ from flexdt.twin.calibration.motion_of_scans import (
     settle_motion,
 )
 from flexdt.twin.calibration.outcome import Calibration
-from flexdt.twin.calibration.request import CalibrationRequest, with_free
+from flexdt.twin.calibration.request import (
+    CalibrationRequest,
+    with_free,
+    with_stated,
+)
 from flexdt.twin.calibration.rivals import asked_of, with_rivals
 from flexdt.twin.calibration.scans_to_calibrate import require_different, require_scans
 from flexdt.twin.calibration.second_measurement import measure_again
@@ -125,7 +129,9 @@ def calibrate(
     else:
         solids = scene
     require_scans(scans)
-    state = _detected(scans, with_contrast(bead_model(phantom), solids), detector)
+    model = with_contrast(bead_model(phantom), solids)
+    asked = with_stated(asked, model)
+    state = _detected(scans, model, detector)
     if state.errors:
         return state
     state = identify_scans(state, asked)

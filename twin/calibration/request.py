@@ -6,7 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.fit.priors import known, known_strain, require_widths
+from flexdt.twin.calibration.fit.priors import (
+    known,
+    known_scale,
+    known_strain,
+    require_widths,
+    with_tolerance,
+)
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Reading,
@@ -21,6 +27,7 @@ from flexdt.twin.calibration.frame_source import (
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.motion import require_movable
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.told_lengths import PHANTOM
 
 ANYWHERE = 1e3
 """Prior [mm, deg] so wide that the images alone determine its parameter."""
@@ -99,16 +106,34 @@ class CalibrationRequest:
             raise TwinError(f"bound {self.bound:g}; allowed: a sigma above 0 [mm, deg]")
 
 
-def priors_of(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, float]:
+def priors_of(
+    scans: Sequence[Scan], request: CalibrationRequest, model: BeadModel
+) -> dict[str, float]:
     """Return every prior of the fit [mm, deg, 1]."""
-    return {n: w for n, w in stated_priors(scans, request).items() if w > 0}
+    return {n: w for n, w in stated_priors(scans, request, model).items() if w > 0}
 
 
-def stated_priors(scans: Sequence[Scan], request: CalibrationRequest) -> dict[str, float]:
+def stated_priors(
+    scans: Sequence[Scan], request: CalibrationRequest, model: BeadModel
+) -> dict[str, float]:
     """Return the request's priors, and the widest of the scans' for parameters that are
-    not free; 0: exact.
+    not free; 0: exact. The phantom's scale has one, too, unless it is free.
     """
-    return known(request.free, request.priors, [scan.priors for scan in scans])
+    out = known(request.free, request.priors, [scan.priors for scan in scans])
+    if PHANTOM in request.free:
+        return out
+    scale = known_scale(model, request.free, request.priors, request.bead_tolerance_mm)
+    return out | {PHANTOM: scale}
+
+
+def with_stated(request: CalibrationRequest, model: BeadModel) -> CalibrationRequest:
+    """Return the request with the tolerances that the phantom's file states, where the request
+    states none.
+    """
+    given, tolerance = with_tolerance(model, request.priors, request.bead_tolerance_mm)
+    assert isinstance(given, Mapping)
+    given = {n: w for n, w in given.items() if w > 0 or n not in request.free}
+    return replace(request, priors=given, bead_tolerance_mm=tolerance)
 
 
 def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:

@@ -28,7 +28,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
-from flexdt.twin.geometry.offsets import NAMES
+from flexdt.twin.geometry.told_lengths import PARAMETERS, PHANTOM
 from flexdt.twin.input_limits import NAMED_PROBLEMS, InputLimitError, parse_toml
 from flexdt.twin.machine.camera import (
     MODE_FORM,
@@ -40,6 +40,7 @@ from flexdt.twin.machine.camera import (
     no_mode,
     without_number,
 )
+from flexdt.twin.machine.stated_causes import CAUSES
 from flexdt.twin.values import message_of
 
 Positive = Annotated[float, Field(gt=0, le=1e6)]
@@ -593,22 +594,26 @@ class EStop(_Frozen):
     """Motor -> deceleration without power [mm/s2, deg/s2]; every motor's, for category 0."""
 
 
+OF_SCANNER: Final = (*(name for name in PARAMETERS if name != PHANTOM), *CAUSES)
+"""Offsets, told lengths and causes whose priors a scanner may state."""
+
+
 def _known_offsets(priors: dict[str, float]) -> dict[str, float]:
-    """Return priors, offset -> standard deviation, unchanged if all name offsets
-    (`NAMES`); raise PydanticCustomError for the first that does not.
-    """
+    """Return priors, name -> standard deviation, unchanged if all name what a scanner has;
+    raise PydanticCustomError for the first that does not."""
     for name in priors:
-        if name not in NAMES:
-            raise _refused(name, priors[name], f"a known offset: {', '.join(NAMES)}")
+        if name not in OF_SCANNER:
+            allowed = f"a known offset, told length or cause: {', '.join(OF_SCANNER)}"
+            raise _refused(name, priors[name], allowed)
     return priors
 
 
 Priors = Annotated[
     dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_known_offsets)
 ]
-"""Offset -> standard deviation of the knowledge before a calibration
-[mm, deg; 1 for angle_scale]; 0 is exactly known, and those left out are
-as `flexdt.twin.calibration.fit.priors` assumes."""
+"""Offset, told length or cause (`stated_causes`) -> standard deviation of the knowledge before
+a calibration [mm, deg; 1 for angle_scale, ways and pitch]; 0 is exactly known, a cause of 0
+cannot be, and those left out are as `flexdt.twin.calibration.fit.priors` assumes."""
 
 
 class Profile(_Frozen):

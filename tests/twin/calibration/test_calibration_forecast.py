@@ -23,12 +23,19 @@ from flexdt.twin.calibration import (
 )
 from flexdt.twin.calibration.fit.fit import image_quantities
 from flexdt.twin.calibration.fit.forecast import MOST, Stated, forecast
-from flexdt.twin.calibration.fit.priors import Given, exact, known, known_strain
+from flexdt.twin.calibration.fit.priors import (
+    Given,
+    exact,
+    known,
+    known_scale,
+    known_strain,
+)
 from flexdt.twin.calibration.fit.problem import build_problem
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.geometry.told_lengths import PHANTOM
 
 FRAMES = 36
 ANGLES = 360.0 * np.arange(FRAMES) / FRAMES
@@ -81,7 +88,8 @@ def test_points(kind: str, priors: Given | None) -> None:
     tracks = tracks + rng.normal(0, own.NOISE_PX, tracks.shape)
     model = BeadModel(beads, np.full(len(beads), own.RADIUS))
     fit = estimate_geometry(
-        tracks, model, POSES, shape=own.SHAPE, priors=known(given=priors),
+        tracks, model, POSES, shape=own.SHAPE,
+        priors=known(given=priors) | {PHANTOM: known_scale(model, given=priors)},
         strain=known_strain(model, given=priors),
     )  # fmt: skip
     assert_as_forecast(fit, model, priors, causes=False)

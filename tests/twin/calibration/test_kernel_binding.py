@@ -2,7 +2,7 @@
 
 Offsets meet geometry twice: in `Poses.cone_vec`, for everything that is projected, and in the
 fit's compiled kernel, which needs derivatives. Random off-nominal cases bind the second to the
-first for all seventeen parameters, values and derivatives.
+first for all seventeen parameters and the told lengths, values and derivatives.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ from flexdt.twin.calibration.fit import fit_kernels
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NAMES, Offsets
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.geometry.told_lengths import PARAMETERS
 
 SHAPE = (60, 80)
 FRAMES, BEADS = 3, 2
 BIAS = 0.8
 HUBER = 1.5
 UNUSED = (1, 1)  # frame, bead
+COUNT = len(PARAMETERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,7 @@ class Case:
 
     poses: Poses
     offsets: Offsets
+    told: np.ndarray
     pivot: float
     beads: np.ndarray
     radius: np.ndarray
@@ -67,7 +70,8 @@ def case(seed: int) -> Case:
     values[lengths] *= 20.0
     values[-1] = 1.0 + 0.1 * values[-1]
     case = Case(
-        poses, Offsets(*values), float(seed % 2), rng.uniform(-30.0, 30.0, (BEADS, 3)),
+        poses, Offsets(*values), 0.1 * rng.uniform(0.5, 1.0, COUNT - len(NAMES)),
+        float(seed % 2), rng.uniform(-30.0, 30.0, (BEADS, 3)),
         rng.uniform(20.0, 40.0, BEADS), np.empty(0), rng.uniform(0.2, 0.7, (FRAMES, BEADS, 3)),
         rng.normal(size=(FRAMES, BEADS, 2, 2)), np.array([0.7, -1.2]),
     )  # fmt: skip
@@ -77,17 +81,38 @@ def case(seed: int) -> Case:
 
 
 def cone_of(case: Case, x: np.ndarray) -> ConeVec:
-    p = Offsets(*x)
+    p = Offsets(*x[: len(NAMES)])
     if case.pivot == 0.0:  # the other reading of eq. 5.4: the axis stays where it is
         p = replace(p, dO_x=p.dO_x - p.tau_x, dO_z=p.dO_z - p.tau_z)
-    return case.poses.cone_vec(p)
+    told = dict(zip(PARAMETERS[len(NAMES) :], x[len(NAMES) :], strict=True))
+    return as_told(case.poses, told).cone_vec(p)
+
+
+def as_told(poses: Poses, told: dict[str, float]) -> Poses:
+    """Poses where told lengths are off by parts, and places by millimetres."""
+    # Unity's x, y, z are the world's x, z, y.
+    grown = 1.0 + np.array([told[f"travel_{a}"] for a in "xzy"])
+    panel = 1.0 + np.array([told[f"panel_travel_{a}"] for a in "xzy"])
+    place = np.array([told[f"place_{a}"] for a in "xzy"])
+
+    def stretched(points: np.ndarray, factor: np.ndarray) -> np.ndarray:
+        ways = points - poses.source
+        return poses.source + ways.mean(axis=0) + factor * (ways - ways.mean(axis=0))
+
+    return replace(
+        poses,
+        axis=stretched(poses.axis, grown) + place,
+        detector=stretched(poses.detector, panel),
+        u=poses.u * (1.0 + told["pixel"]),
+        v=poses.v * (1.0 + told["pixel"]),
+    )
 
 
 def expected(case: Case, x: np.ndarray | None = None) -> np.ndarray:
     """Spots from the detector's centre [px], (frames, beads, 2), by way of `Poses.cone_vec`."""
     x = columns_of(case) if x is None else x
-    beads = x[len(NAMES) : -2].reshape(-1, 3)
-    cone = cone_of(case, x[: len(NAMES)])
+    beads = x[COUNT:-2].reshape(-1, 3) * (1.0 + x[PARAMETERS.index("phantom")])
+    cone = cone_of(case, x[:COUNT])
     rows, cols = SHAPE
     middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
     points = cone.project_points(beads, SHAPE) - middle
@@ -107,7 +132,9 @@ def expected(case: Case, x: np.ndarray | None = None) -> np.ndarray:
 
 
 def columns_of(case: Case) -> np.ndarray:
-    return np.concatenate([astuple(case.offsets), case.beads.ravel(), case.panel])
+    return np.concatenate(
+        [astuple(case.offsets), case.told, case.beads.ravel(), case.panel]
+    )
 
 
 def differences(case: Case) -> np.ndarray:
@@ -161,6 +188,10 @@ def reference(case: Case) -> Reference:
 def check(kernels: object, want: Reference) -> None:
     """Compare a kernel's outputs with the reference."""
     case, poses = want.case, want.case.poses
+
+    def ways(points: np.ndarray) -> np.ndarray:
+        return (points - poses.source) - (points - poses.source).mean(axis=0)
+
     geometry = np.column_stack(
         [
             poses.source,
@@ -170,9 +201,11 @@ def check(kernels: object, want: Reference) -> None:
             poses.v,
             poses.angle,
             poses.mount[:, :2],
+            ways(poses.axis),
+            ways(poses.detector),
         ]
     )
-    columns = len(NAMES) + 3 * BEADS + 2
+    columns = COUNT + 3 * BEADS + 2
     use = np.ones((FRAMES, BEADS), dtype=bool)
     use[UNUSED] = False
     for mode in (2, 1):
@@ -183,12 +216,12 @@ def check(kernels: object, want: Reference) -> None:
         data = fit_kernels.Data(
             geometry, np.zeros(FRAMES, np.int64), case.pivot, case.radius,
             np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
-            np.arange(len(NAMES)), np.arange(len(NAMES))[None], len(NAMES),
+            np.arange(COUNT), np.arange(COUNT)[None], COUNT,
             case.terms,
         )  # fmt: skip
         cost = kernels.evaluate(  # type: ignore[attr-defined]
-            data, np.array([astuple(case.offsets)]), case.beads, case.panel, use, HUBER,
-            mode, predicted, norms, jac, hess, grad,
+            data, np.array([[*astuple(case.offsets), *case.told]]), case.beads, case.panel,
+            use, HUBER, mode, predicted, norms, jac, hess, grad,
         )  # fmt: skip
         assert_allclose(predicted, want.predicted, rtol=1e-9, atol=1e-9)
         assert_allclose(norms, want.norms, rtol=1e-9, atol=1e-9)

@@ -58,7 +58,7 @@ def test_what_is_drawn_is_what_the_calibration_assumes() -> None:
     assert faults_drawn.MOTION_SIGMAS == every_cause.MOTION_WIDTHS
     assert faults_drawn.MOTION_SHAPES == columns.WAVES
     assert faults_drawn.ARC_WIDTH == problem.ARC_PRIOR
-    assert faults_drawn.UNSEEN == priors.ASSUMED
+    assert faults_drawn.UNSEEN == priors.OFFSETS
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.named_motion import moving, named_turn
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
 from flexdt.twin.calibration.fit.fitted_motion import MotionFit
-from flexdt.twin.calibration.fit.priors import ASSUMED
+from flexdt.twin.calibration.fit.priors import OFFSETS
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan
 from flexdt.twin.calibration.identify import Identification, Search, attempt
@@ -625,7 +625,7 @@ def _in_motion(
             shape=shape,
             start=still,
             centre=found.bias,
-            priors=ASSUMED,
+            priors=OFFSETS,
             prior_centre=start,
             bound=math.inf,
         )

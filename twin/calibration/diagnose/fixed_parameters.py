@@ -20,9 +20,9 @@ from scipy.special import chdtri, fdtrc
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.fit.certificate import Estimate, widened
 from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.problem import edge_factor
 from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.geometry.offsets import to_edge
 
 HELD_SIGMAS: Final = 5.0
 """How far, in standard deviations, the data may have a fixed parameter from where it is
@@ -226,7 +226,7 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     at, names, found = map(list, zip(*known, strict=True))
     width = np.array([e.prior for e in found])
     centres = zip(names, loose.problem.prior_mean[at].tolist(), strict=True)
-    means = np.array([to_edge(name.split("@")[0], mean) for name, mean in centres])
+    means = np.array([edge_factor(name) * mean for name, mean in centres])
     moved = (np.array([e.value for e in found]) - means) / width
     values, vectors = np.linalg.eigh(
         c.covariance[np.ix_(at, at)] / np.outer(width, width)
@@ -377,7 +377,7 @@ def doubtful(
         The same values with wider intervals; `fit` itself without causes. Fits that are
         not determined are ignored.
     """
-    for name in judged.causes:
+    for name in dict.fromkeys(cause.split("@")[0] for cause in judged.causes):
         other = without(name)
         if other.determined:
             off = {n: other.values.get(n, v) - v for n, v in fit.values.items()}

@@ -18,7 +18,14 @@ from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.foreseen import foreseen
 from flexdt.twin.calibration.fit.certificate import beyond_bound
 from flexdt.twin.calibration.fit.forecast import Forecast, forecast, visible_beads
-from flexdt.twin.calibration.fit.priors import NOISE_PX, Given, known, known_strain
+from flexdt.twin.calibration.fit.priors import (
+    NOISE_PX,
+    Given,
+    known,
+    known_scale,
+    known_strain,
+    with_tolerance,
+)
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Shape,
@@ -32,6 +39,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.geometry.told_lengths import PHANTOM
 
 _Plan = tuple[BeadModel, Poses, FloatArray]
 
@@ -147,9 +155,10 @@ def identifiability(
     >>> identifiability(bead_phantom("normal", 1), poses, shape=(760, 956)).identifiable
     False
     """
+    model = bead_model(phantom)
+    priors, bead_tolerance_mm = with_tolerance(model, priors, bead_tolerance_mm)
     tolerance = bead_tolerance_mm or 0.0
     require_tolerance(tolerance)
-    model = bead_model(phantom)
     poses = as_poses(geometry)
 
     widths = known(free, priors)
@@ -185,7 +194,8 @@ def identifiability(
             free_beads=tolerance > 0,
             start=at,
             bead_tolerance_mm=tolerance,
-            priors=widths,
+            priors=widths
+            | {PHANTOM: known_scale(beads, free, priors, bead_tolerance_mm)},
             strain=strain,
         )
         fitted = forecast(problem, bound)
@@ -249,7 +259,12 @@ def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Pl
     centre = (model.beads.max(axis=0) + model.beads.min(axis=0)) / 2
     extra = centre + spread * np.array([[-0.5, 0.25, 0.3], [0.4, -0.5, -0.4]])
     radius = np.append(model.bead_radius_mm, [model.bead_radius_mm.mean()] * 2)
-    beads = BeadModel(np.concatenate([model.beads, extra]), radius, model.tolerance_mm)
+    stated = model.stated
+    if stated is not None and isinstance(stated.bead_mm, tuple):
+        stated = replace(stated, bead_mm=stated.typical_mm)
+    beads = BeadModel(
+        np.concatenate([model.beads, extra]), radius, model.tolerance_mm, stated=stated
+    )
     sod = float(np.median(poses.sod))
     near = -round(0.25 * sod / 10) * 10
     place = "add a placement"

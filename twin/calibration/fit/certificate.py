@@ -43,6 +43,7 @@ from flexdt.twin.calibration.fit.weak_directions import (
     weak_direction,
 )
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.told_lengths import PHANTOM, TOLD_SOURCES
 
 RANK_TOLERANCE = 1e-8
 """Singular values of the column-scaled Jacobian below this share of the largest are zero."""
@@ -59,7 +60,7 @@ ROUNDING_OF_COLUMNS = 1e-13
 """Least eigenvalue of the scaled normal equations; directions below it are undetermined."""
 SOURCES = {
     "bead": "beads",
-    "strain": "the phantom's scale",
+    "strain": "the phantom's shape",
     "arc": "the exposure's arc",
     "rows": "the turn while rows are read",
     "panel": "the panel's distortion",
@@ -67,9 +68,9 @@ SOURCES = {
 """First word of a column's name that is no parameter -> its source, in words."""
 MEASUREMENT_ADVICE = {
     SOURCES["bead"]: "beads measured more exactly would tell more",
-    SOURCES[
-        "strain"
-    ]: "a measured distance of two beads, and --bead-tolerance, would tell more",
+    TOLD_SOURCES[PHANTOM]: (
+        "a measured distance of two beads, and --prior phantom=SIGMA, would tell more"
+    ),
 }
 """Source that limits a sigma -> the measurement that would reduce it."""
 WEAK_CONDITION = 500.0
@@ -772,7 +773,7 @@ def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, f
     square: dict[str, float] = {}
     for name, value in zip(names, pull.tolist(), strict=True):
         kind = name.split(" ")[0]
-        source = SOURCES.get(kind, name)
+        source = SOURCES.get(kind) or TOLD_SOURCES.get(name.split("@")[0], name)
         square[source] = square.get(source, 0.0) + value**2
     ordered = sorted(square.items(), key=lambda item: -item[1])
     return {n: math.sqrt(s) for n, s in ordered if s > 0.01 * sigma**2}

@@ -510,7 +510,7 @@ def estimate_geometry(
         phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3)
             [mm].
         geometry: nominal geometry of each of the n frames.
-        free: parameters to estimate, of `geometry.offsets.NAMES`; parameters without a
+        free: parameters to estimate, of `told_lengths.PARAMETERS`; parameters without a
             prior either stay at `start`. If source, stage and detector shifts of one
             direction are all free, the source is fixed.
         shape: detector (rows, cols); None is the default machine's camera.
@@ -897,7 +897,8 @@ def image_slopes(
 def _axis_at(problem: FitProblem, x: FloatArray, group: int) -> FloatArray:
     frame = int(np.flatnonzero(problem.group == group)[0])
     offsets = problem.parameters(x)[group]
-    return axis_in_image(problem.poses[frame : frame + 1], offsets, problem.origin[frame])
+    poses = problem.poses_at(x)
+    return axis_in_image(poses[frame : frame + 1], offsets, problem.origin[frame])
 
 
 def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArray:

@@ -1,9 +1,10 @@
 """Compiled kernels of the fit: residuals, exact derivatives, normal equations.
 
-For any subset of the seventeen parameters, and for the beads themselves, they compute the
-same as `Poses.cone_vec(parameters).project_points(beads)`. That makes this the second
-place where offsets meet geometry: tests/twin/calibration/test_kernel_binding.py compares
-values and derivatives of all seventeen with `Poses.cone_vec`, and fails if any one sign
+For any subset of the seventeen offsets, of the told lengths (`geometry.told_lengths`), and for the
+beads themselves, they compute the same as
+`Poses.cone_vec(parameters).project_points(beads)`. That makes this
+the second place where offsets meet geometry: tests/twin/calibration/test_kernel_binding.py
+compares values and derivatives of all with `Poses.cone_vec`, and fails if any one sign
 here is flipped. `fit.problem` builds and checks the arguments.
 
 Forward model of frame n and bead b, in the world frame: q = c + T R (b + m - tau), c = O
@@ -35,13 +36,29 @@ import numpy.typing as npt
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection.kernels.compiling import linked, serial
 
-PARAMETERS = 17
-# Places of the parameters in a row of `params`: the order of `offsets.NAMES`. Unity's axes are
-# in the names: _x is the world's x, _y its z, _z its y. numba compiles globals in as constants.
+OFFSETS = 17
+PARAMETERS = 28
+# Places of the parameters in a row of `params`: the order of `offsets.NAMES`, then that of
+# `geometry.told_lengths.TOLD`. Unity's axes are in the names: _x is the world's x, _y its z, _z
+# its y.
+# numba compiles globals in as constants.
 DO_X, DO_Y, DO_Z, ALPHA, TAU_X, TAU_Z, DD_X, DD_Y, DD_Z, DS_X, DS_Y = range(11)
-ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, PARAMETERS)
+ROLL, PITCH, YAW, TILT_X, TILT_Z, ANGLE_SCALE = range(11, OFFSETS)
+TRAVEL, PANEL_TRAVEL, PLACE, PIXEL, PHANTOM = (
+    17,
+    20,
+    23,
+    26,
+    27,
+)  # the first three: x, y, z
 # First columns of a row of `geometry`.
-SOURCE, AXIS, DETECTOR, U, V, ANGLE, MOUNT = 0, 3, 6, 9, 12, 15, 16
+SOURCE, AXIS, DETECTOR, U, V, ANGLE, MOUNT, WAY, PANEL_WAY = (
+    0, 3, 6, 9, 12, 15, 16, 18, 21,
+)  # fmt: skip
+GEOMETRY = 24
+"""Columns of `geometry`."""
+UNITY = 0, 2, 1
+"""Axis of the world of each of Unity's x, y, z, and the other way round."""
 IMAGINARY_STEP = 1e-30
 """Imaginary part of a parameter for its derivative: its square is negligible."""
 
@@ -93,20 +110,24 @@ def panel_rows(p, geo, rows, steps):  # type: ignore[no-untyped-def]
     Angles are [rad], lengths [mm]; complex numbers serve for derivatives.
 
     Args:
-        p: (17,) complex parameters.
-        geo: (18,) complex, see `Data`.
+        p: (28,) complex parameters.
+        geo: (24,) complex, see `Data`.
         rows: (3, 3) written; the last is the panel's unit normal.
         steps: (2, 3) the steps of a pixel to the right and down, over the pixel's area [1/mm];
             written.
     """
     g = (
-        geo[DETECTOR] + p[DD_X] - geo[SOURCE] - p[DS_X],
-        geo[DETECTOR + 1] + p[DD_Z] - geo[SOURCE + 1],
-        geo[DETECTOR + 2] + p[DD_Y] - geo[SOURCE + 2] - p[DS_Y],
-    )
+        geo[DETECTOR] + p[DD_X] + p[PANEL_TRAVEL] * geo[PANEL_WAY]
+        - geo[SOURCE] - p[DS_X],
+        geo[DETECTOR + 1] + p[DD_Z] + p[PANEL_TRAVEL + 2] * geo[PANEL_WAY + 1]
+        - geo[SOURCE + 1],
+        geo[DETECTOR + 2] + p[DD_Y] + p[PANEL_TRAVEL + 1] * geo[PANEL_WAY + 2]
+        - geo[SOURCE + 2] - p[DS_Y],
+    )  # fmt: skip
     # As `conventions.turn_detector` has it.
-    v = geo[V], geo[V + 1], geo[V + 2]
-    u = geo[U], geo[U + 1], geo[U + 2]
+    wide = 1.0 + p[PIXEL]
+    v = wide * geo[V], wide * geo[V + 1], wide * geo[V + 2]
+    u = wide * geo[U], wide * geo[U + 1], wide * geo[U + 2]
     # Complex numbers: an angle of 0 with a step for its derivative is not 0, and turns.
     if p[YAW] != 0.0 or p[PITCH] != 0.0 or p[ROLL] != 0.0:
         u = _turned(u, v, p[YAW])
@@ -129,8 +150,8 @@ def object_columns(p, geo, pivot, columns):  # type: ignore[no-untyped-def]
     from the source [mm].
 
     Args:
-        p: (17,) parameters.
-        geo: (18,) see `Data`.
+        p: (28,) parameters; a phantom that grows has the same columns, see `evaluate`.
+        geo: (24,) see `Data`.
         pivot: 1.0 or 0.0, see the module.
         columns: (4, 3) written.
     """
@@ -145,10 +166,11 @@ def object_columns(p, geo, pivot, columns):  # type: ignore[no-untyped-def]
     bx, by = geo[MOUNT] - p[TAU_X], geo[MOUNT + 1] - p[TAU_Z]
     still = (
         x[0] * bx + y[0] * by + geo[AXIS] + p[DO_X] + pivot * p[TAU_X]
-        - geo[SOURCE] - p[DS_X],
+        + p[PLACE] + p[TRAVEL] * geo[WAY] - geo[SOURCE] - p[DS_X],
         x[1] * bx + y[1] * by + geo[AXIS + 1] + p[DO_Z] + pivot * p[TAU_Z]
-        - geo[SOURCE + 1],
-        x[2] * bx + y[2] * by + geo[AXIS + 2] + p[DO_Y] - geo[SOURCE + 2] - p[DS_Y],
+        + p[PLACE + 2] + p[TRAVEL + 2] * geo[WAY + 1] - geo[SOURCE + 1],
+        x[2] * bx + y[2] * by + geo[AXIS + 2] + p[DO_Y]
+        + p[PLACE + 1] + p[TRAVEL + 1] * geo[WAY + 2] - geo[SOURCE + 2] - p[DS_Y],
     )  # fmt: skip
     for c, column in enumerate((x, y, z, still)):
         for a in range(3):
@@ -201,6 +223,11 @@ def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped
             slopes[1, a] = ca * z[a]
             slopes[2, a] = sa * x[a] - ca * y[a]
             slopes[3, a] = slopes[0, a] * bx + slopes[1, a] * by
+    elif PLACE <= i < PLACE + 3:
+        slopes[3, UNITY[i - PLACE]] = 1.0
+    elif TRAVEL <= i < TRAVEL + 3:
+        along = UNITY[i - TRAVEL]
+        slopes[3, along] = geo[WAY + along]
     elif i == TILT_Z:
         for c in range(3):
             # The outermost turn, about the world's y: it turns all columns alike.
@@ -233,7 +260,13 @@ def panel_slopes(i, p, geo, steps, rows, slopes):  # type: ignore[no-untyped-def
         away = -1.0, 0.0, 0.0
     elif i == DS_Y:
         away = 0.0, 0.0, -1.0
-    elif i in (ROLL, PITCH, YAW):
+    elif i == PANEL_TRAVEL:
+        away = geo[PANEL_WAY].real, 0.0, 0.0
+    elif i == PANEL_TRAVEL + 1:
+        away = 0.0, 0.0, geo[PANEL_WAY + 2].real
+    elif i == PANEL_TRAVEL + 2:
+        away = 0.0, geo[PANEL_WAY + 1].real, 0.0
+    elif i in (ROLL, PITCH, YAW, PIXEL):
         turned = p.copy()
         turned[i] += IMAGINARY_STEP * 1j
         panel_rows(turned, geo, rows, np.empty((2, 3), np.complex128))
@@ -249,8 +282,8 @@ class Data(NamedTuple):
     """The data of a fit, C-contiguous; n frames, k beads.
 
     Attributes:
-        geometry: (n, 18) nominal source, axis, detector, u, v [mm], angle [rad] and the mount's
-            x and y [mm]; see `SOURCE`.
+        geometry: (n, 24) nominal source, axis, detector, u, v [mm], angle [rad], the mount's
+            x and y, and the ways of axis and panel from their middles [mm]; see `SOURCE`.
         group: (n,) index of each frame's parameter set.
         pivot: 1.0 or 0.0, see the module.
         radius: (k,) [mm].
@@ -258,7 +291,7 @@ class Data(NamedTuple):
         measured: (n, k, 2) pixels from the detector's centre.
         whiten: (n, k, 3): rows (w0, w1; 0, w2) that turn residuals into unit variance.
         active: indices of the parameters to differentiate by.
-        colmap: (groups, 17) column of each parameter or -1.
+        colmap: (groups, 28) column of each parameter or -1.
         bead_col: first column of the beads' coordinates or -1.
         terms: (n, k, 2, t) shifts by a coefficient of 1 of each term of the panel's distortion,
             whose columns are the last.
@@ -288,7 +321,7 @@ def evaluate(  # type: ignore[no-untyped-def]
 
     Args:
         data: see `Data`.
-        params: (groups, 17) values [mm, rad], in the order of `offsets.NAMES`.
+        params: (groups, 28) values [mm, rad, 1], in the order of `told_lengths.PARAMETERS`.
         beads: (k, 3) centres in the object's frame [mm].
         panel: (t,) coefficients of the panel's distortion.
         use: (n, k) which observations count; others are predicted alone.
@@ -340,12 +373,15 @@ def evaluate(  # type: ignore[no-untyped-def]
         panel_rows(complex_values, complex_geo, turned, turned_steps)
         rows[:], steps[:] = turned.real, turned_steps.real
         object_columns(values, geo, pivot, columns)
+        grown = 1.0 + values[PHANTOM]
         for r in range(3):
             # The foot of the source's perpendicular, away from which a ball's spot is
             # displaced: where a ray along the unit normal, rows[2], meets the panel.
             at[r] = _dot(rows[r], rows[2])
             for c in range(4):
                 now[r, c] = _dot(rows[r], columns[c])
+                if c < 3:
+                    now[r, c] *= grown
         own = 0
         for i in active:
             if want > 0 and colmap[group[f], i] >= 0:
@@ -359,6 +395,10 @@ def evaluate(  # type: ignore[no-untyped-def]
                         slope[own, r, c] = _dot(rows_slope[r], columns[c]) + _dot(
                             rows[r], columns_slope[c]
                         )
+                        if c < 3:
+                            slope[own, r, c] *= grown
+                            if i == PHANTOM:
+                                slope[own, r, c] = now[r, c] / grown
                 cols[own] = colmap[group[f], i]
                 own += 1
         if bead_col >= 0:

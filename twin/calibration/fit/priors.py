@@ -17,11 +17,29 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.problem import SIX, UNSTRAINED, Strain, require_names
+from flexdt.twin.calibration.fit.weak_directions import unit_of
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.offsets import UNITS
+from flexdt.twin.geometry.told_lengths import (
+    PANEL_TRAVEL,
+    PHANTOM,
+    PIXEL,
+    PLACES,
+    TRAVEL,
+)
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.stated_causes import CAUSES
 
-ASSUMED: Final[Mapping[str, float]] = {
+WAY: Final = 7e-4
+"""Standard deviation of a way over its told length: a ball screw of grade 10 is within 210 um in
+300 mm (ISO 3408-3); a screw's grade is assumed."""
+PLACE_MM: Final = 0.02
+"""Standard deviation with which a stage comes back to a place [mm]; assumed, of a stepper motor
+with a screw."""
+PITCH: Final = 3e-5
+"""Standard deviation of the pixel pitch over the told one; assumed: panels are made by
+photolithography, to a pixel in some 30 000. A pitch that is told wrong is another cause
+(`diagnose.pixel_pitch`)."""
+OFFSETS: Final[Mapping[str, float]] = {
     "dD_x": 2.0,
     "dD_y": 2.0,
     "dD_z": 1.0,
@@ -34,6 +52,13 @@ ASSUMED: Final[Mapping[str, float]] = {
 """Assumed: widths [mm, deg] for a scanner that states none of its own. Left out, so
 exactly known, are dS_x and dS_y (the source is the origin of the frame) and angle_scale
 (a turn of the stage closes on itself; wrong steps are found separately)."""
+ASSUMED: Final[Mapping[str, float]] = {
+    **OFFSETS,
+    **dict.fromkeys((*TRAVEL, *PANEL_TRAVEL), WAY),
+    **dict.fromkeys(PLACES, PLACE_MM),
+    PIXEL: PITCH,
+}
+"""The same with its told lengths (`told_lengths`), but for the phantom's (`known_scale`)."""
 FIXED: Final[Mapping[str, float]] = dict.fromkeys(SIX, 0.3)
 """The same for the operator's choices, where they are not estimated: read from motors and
 a mount, they are not exact either."""
@@ -82,7 +107,8 @@ def known(
             if name not in free:
                 out[name] = max(out.get(name, 0.0), width)
     own = require_widths(given or {})
-    return out | {n: w for n, w in own.items() if w > 0 or n not in free}
+    out |= {n: w for n, w in own.items() if w > 0 or n not in free}
+    return {n: w for n, w in out.items() if n not in CAUSES}
 
 
 def known_strain(
@@ -91,7 +117,8 @@ def known_strain(
     given: Given | None = None,
     bead_tolerance_mm: float | None = None,
 ) -> Strain:
-    """Compute standard deviations [1] of the phantom's stretches and shears: `STRAIN`, or
+    """Compute standard deviations [1] of the phantom's stretches and shears, beside those of
+    its scale: `STRAIN`, or
     the beads' tolerance over the phantom's size (root mean square distance of beads) if
     that is less.
 
@@ -106,27 +133,71 @@ def known_strain(
             not stated.
 
     Returns:
-        Of stretches, and of shears, equal. `UNSTRAINED` (0, 0) if the beads are stated to
-        be exact or anywhere in the phantom, or every offset of the scanner that is not
-        free is stated as exact.
+        Of stretches, and of shears, equal, no more than a stated scale's. `UNSTRAINED` (0,
+        0) if the beads are stated to be exact or anywhere in the phantom, beads and scale
+        are stated, or every offset of the scanner that is not free is stated as exact.
     """
     stated = exact(free) if given == "none" else given or {}
-    if all(stated.get(name) == 0.0 for name in ASSUMED if name not in free):
+    if all(stated.get(name) == 0.0 for name in OFFSETS if name not in free):
         return UNSTRAINED
     reach = float(np.sqrt(np.mean(np.sum(model.beads**2, axis=1))))
+    scale = stated.get(PHANTOM)
     if bead_tolerance_mm is None:
         tolerance = model.tolerance_mm or math.inf
     else:
         tolerance = bead_tolerance_mm
-        if not 0.0 < tolerance < reach:
-            return UNSTRAINED
+        if not 0.0 < tolerance < reach or scale is not None:
+            return UNSTRAINED  # With a stated scale, errors are each bead's own.
     width = min(STRAIN, tolerance / reach) if reach > 0 else STRAIN
+    if scale is not None:
+        width = min(width, scale)
     return width, width
+
+
+def known_scale(
+    model: BeadModel,
+    free: Container[str] = SIX,
+    given: Given | None = None,
+    bead_tolerance_mm: float | None = None,
+) -> float:
+    """Compute the standard deviation [1] of the phantom's scale: the stated one, else that of
+    a stretch (`known_strain`, whose arguments these are).
+
+    Returns:
+        0 where it is exact, or where beads are anywhere in the phantom.
+    """
+    if isinstance(given, Mapping) and PHANTOM in given:
+        return given[PHANTOM]
+    return known_strain(model, free, given, bead_tolerance_mm)[0]
+
+
+def with_tolerance(
+    model: BeadModel, given: Given | None, bead_tolerance_mm: float | None
+) -> tuple[Given | None, float | None]:
+    """Add what a phantom's file states of its scale and beads to what a user states; a user's
+    tolerance replaces both.
+
+    Args:
+        model: the phantom's beads.
+        given: widths that a user states.
+        bead_tolerance_mm: of the beads, stated by a user; None: not stated.
+
+    Returns:
+        The widths, with the phantom's scale, and the tolerance, each as given where the
+        phantom does not say.
+    """
+    stated = model.stated
+    if stated is None or bead_tolerance_mm is not None or given == "none":
+        return given, bead_tolerance_mm
+    if stated.scale is not None:
+        given = {PHANTOM: stated.scale, **(given or {})}
+    return given, stated.typical_mm
 
 
 def exact(free: Container[str] = SIX) -> dict[str, float]:
     """Return priors by which all parameters that are not in `free` are exactly known."""
-    return {name: 0.0 for name in (*SIX, *ASSUMED) if name not in free}
+    names = (*SIX, *ASSUMED, PHANTOM)
+    return {name: 0.0 for name in names if name not in free}
 
 
 def prior_widths(
@@ -153,17 +224,17 @@ def prior_widths(
 
 
 def require_widths(priors: Mapping[str, float]) -> Mapping[str, float]:
-    """Check that each prior is the standard deviation of a parameter, and return them as
-    they are.
+    """Check that each prior is the standard deviation of a parameter, or of a cause
+    (`stated_causes`), and return them as they are.
 
     Raises:
-        UnknownNameError: a name that is no parameter.
+        UnknownNameError: a name that is neither.
         TwinError: negative, infinite or not a number; names the first.
     """
-    require_names(priors)
+    require_names(priors, CAUSES)
     for name, width in priors.items():
         if not 0.0 <= width < math.inf:
-            unit = UNITS[name]
+            unit = CAUSES.get(name) or unit_of(name)
             raise TwinError(
                 f"prior of {name}: {width:g} {unit}; allowed: 0 (exactly known) or more",
                 {"asked": width, "allowed": ">= 0"},

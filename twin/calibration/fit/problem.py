@@ -23,6 +23,15 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets, to_edge, to_internal
 from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.geometry.told_lengths import (
+    PARAMETERS,
+    PLACES,
+    TOLD,
+    offsets_in,
+    poses_at,
+    told_by,
+    ways,
+)
 from flexdt.twin.machine.description import builtin_machine
 
 Shape = tuple[int, int] | FloatArray | None
@@ -34,10 +43,10 @@ SIX = ("dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z")
 EIGHT = (*SIX, "dD_x", "dD_y")
 """The thesis's extended vector, eq. 5.19."""
 
-STRAINS = ("scale", "xx", "yy", "zz", "xy", "yx", "xz", "zx", "yz", "zy")
-"""Growth of the phantom, and displacements of beads along the first axis proportional to
-the second coordinate."""
-STRETCHES = 4
+STRAINS = ("xx", "yy", "zz", "xy", "yx", "xz", "zx", "yz", "zy")
+"""Displacements of beads along the first axis proportional to the second coordinate. The
+phantom's scale is a told length (`geometry.told_lengths.PHANTOM`)."""
+STRETCHES = 3
 """Number of stretches at the start of STRAINS; the others are shears."""
 Strain = tuple[float, float]
 """Standard deviations of stretches and of shears [1]; 0: without them."""
@@ -97,7 +106,7 @@ class ColumnLayout:
         names: label of each column: a parameter, `parameter@group`, `bead k x|y|z`, `strain ab`,
             `arc`, `rows`, or `panel term`.
         asked: number of requested columns; those after them are there for their prior.
-        colmap: (groups, 17) column of each group's parameter, -1 if not free.
+        colmap: (groups, 28) column of each group's parameter, -1 if not free.
         bead_column: first column of the beads' coordinates, -1 if fixed.
         strain_column: first column of the phantom's strain, -1 without strain.
         arc_column: of the exposure's arc, -1 without arc.
@@ -150,16 +159,17 @@ class ColumnLayout:
         return self.panel_column
 
 
-def require_names(names: Iterable[str]) -> None:
-    """Check that every name is a parameter; returns nothing.
+def require_names(names: Iterable[str], others: Iterable[str] = ()) -> None:
+    """Check that every name is a parameter, or one of the others; returns nothing.
 
     Raises:
         UnknownNameError: the first that is not; lists the allowed names.
     """
+    allowed = (*PARAMETERS, *others)
     for name in names:
-        if name not in NAMES:
+        if name not in allowed:
             raise UnknownNameError.among(
-                f"unknown parameter {name!r}; allowed", name, NAMES
+                f"unknown parameter {name!r}; allowed", name, allowed
             )
 
 
@@ -192,7 +202,7 @@ def layout(
     rows: bool = False,
 ) -> ColumnLayout:
     """Assign columns: parameters (requested, then those with a prior alone) in the order
-    of NAMES, then beads, strain, arc, rows, panel.
+    of PARAMETERS, then beads, strain, arc, rows, panel. Told places have one in each group.
 
     Where source, object and detector could shift together without priors, the source is
     held. With one group `per_group` has no effect.
@@ -222,9 +232,9 @@ def layout(
             )
     held = _held_sources(free, priors)
     unasked = {source for source, _ in held}
-    wanted = [n for n in NAMES if n in free and n not in unasked]
-    extra = [n for n in NAMES if n in priors and n not in free]
-    each = per_group if groups > 1 else ()
+    wanted = [n for n in PARAMETERS if n in free and n not in unasked]
+    extra = [n for n in PARAMETERS if n in priors and n not in free]
+    each = (*per_group, *PLACES) if groups > 1 else ()
     names, colmap = _parameter_columns((*wanted, *extra), each, groups)
     asked = sum(groups if name in each else 1 for name in wanted)
     count = len(names)
@@ -242,7 +252,7 @@ def layout(
     arc_column = appended(["arc"], arc)
     rows_column = appended(["rows"], rows)
     panel_column = appended([f"panel {term}" for term in panel], there=True)
-    active = np.array([NAMES.index(n) for n in (*wanted, *extra)], dtype=np.int64)
+    active = np.array([PARAMETERS.index(n) for n in (*wanted, *extra)], dtype=np.int64)
     return ColumnLayout(
         tuple(names),
         asked,
@@ -264,13 +274,13 @@ def _parameter_columns(
     """Assign columns to parameters in their order: one, or one a group to those of `each`.
 
     Returns:
-        The columns' names, and (groups, 17) the column of each parameter, -1 without.
+        The columns' names, and (groups, 28) the column of each parameter, -1 without.
     """
     names: list[str] = []
-    colmap = np.full((groups, len(NAMES)), -1, dtype=np.int64)
+    colmap = np.full((groups, len(PARAMETERS)), -1, dtype=np.int64)
     for name in parameters:
         own = [f"{name}@{g}" for g in range(groups)] if name in each else [name]
-        colmap[:, NAMES.index(name)] = len(names) + np.arange(len(own))
+        colmap[:, PARAMETERS.index(name)] = len(names) + np.arange(len(own))
         names += own
     return names, colmap
 
@@ -304,7 +314,8 @@ class FitProblem:
         whiten: (n, k, 3) upper triangle (w0, w1; 0, w2) that makes residuals unit variance.
         seen: (n, k) which positions were measured.
         group: (n,) group of each frame.
-        base: one start per group, internal units, in the chosen reading.
+        base: one start per group, (groups, 28) of PARAMETERS, internal units, in the chosen
+            reading.
         layout: columns.
         reading: of eq. 5.4.
         bias: (n, k) sphere-centre bias factor of each position.
@@ -362,7 +373,16 @@ class FitProblem:
         p = self.poses
         return kernels.Data(
             np.column_stack(
-                [p.source, p.axis, p.detector, p.u, p.v, p.angle, p.mount[:, :2]]
+                [
+                    p.source,
+                    p.axis,
+                    p.detector,
+                    p.u,
+                    p.v,
+                    p.angle,
+                    p.mount[:, :2],
+                    *ways(p),
+                ]
             ),
             self.group,
             self.reading.pivot,
@@ -383,13 +403,10 @@ class FitProblem:
 
     @cached_property
     def strain_basis(self) -> FloatArray:
-        """Displacement (3 k, 10) of the beads' coordinates [mm] by a unit of each strain:
-        uniform scale, then the single terms.
-        """
+        """Displacement (3 k, 9) of the beads' coordinates [mm] by a unit of each strain."""
         beads = self.model.beads
         out = np.zeros((len(beads), 3, len(STRAINS)))
-        out[..., 0] = beads
-        for i, term in enumerate(STRAINS[1:], 1):
+        for i, term in enumerate(STRAINS):
             out[:, "xyz".index(term[0]), i] = beads[:, "xyz".index(term[1])]
         return out.reshape(-1, len(STRAINS))
 
@@ -448,8 +465,8 @@ class FitProblem:
         taken, moved by the strain if that is fitted.
 
         Returns:
-            (groups, 17) internal units, in the problem's reading, and a new array (k, 3)
-            [mm].
+            (groups, 28) of PARAMETERS, internal units, in the problem's reading, and a new
+            array (k, 3) [mm], without the phantom's growth.
         """
         columns = self.layout.colmap
         own = self.layout.bead_column
@@ -488,7 +505,12 @@ class FitProblem:
         corrections.
         """
         params, _ = self.spread(x)
-        return tuple(to_printed_reading(Offsets(*row), self.reading) for row in params)
+        return tuple(to_printed_reading(offsets_in(row), self.reading) for row in params)
+
+    def poses_at(self, x: FloatArray) -> Poses:
+        """Return the poses with the told lengths of column values `x`, offsets not applied."""
+        params, _ = self.spread(x)
+        return poses_at(self.poses, params[self.group])
 
     def residuals(
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
@@ -614,7 +636,7 @@ class FitProblem:
         """
         params, beads = self.spread(x)
         paths = turning_shifts(
-            self.poses,
+            self.poses_at(x),
             beads,
             params,
             self.group,
@@ -627,7 +649,7 @@ class FitProblem:
         )
 
     def with_base(self, base: FloatArray) -> FitProblem:
-        """Return the problem with other starts, one row of seventeen values for each group."""
+        """Return the problem with other starts, one row of PARAMETERS for each group."""
         return replace(self, base=base)
 
 
@@ -648,7 +670,7 @@ def _groups(labels: npt.ArrayLike | None, n: int) -> npt.NDArray[np.int64]:
 def _bases(
     start: Offsets | Sequence[Offsets], groups: int, reading: Reading
 ) -> FloatArray:
-    """Return the start of each group, (groups, 17), internal units, in a reading.
+    """Return the start of each group, (groups, 28), internal units, in a reading.
 
     Raises:
         TwinError: several starts, but not one a group.
@@ -745,7 +767,12 @@ def build_problem(
     measured = np.where(seen[:, :, None], t - origin[:, None, :], 0.0)
     group = _groups(groups, n)
     base = _bases(start, int(group.max()) + 1 if n else 1, reading)
-    widths = {n: to_internal(n, w) for n, w in (priors or {}).items() if w > 0}
+    acting = told_by(poses, group, per_group)
+    widths = {
+        n: w if n in TOLD else to_internal(n, w)
+        for n, w in (priors or {}).items()
+        if w > 0 and (n in acting or n in NAMES)
+    }
     terms, of_terms = ((), ()) if panel is None else (panel.names, panel.sigmas)
     strained = max(strain) > 0
     columns = layout(
@@ -764,7 +791,7 @@ def build_problem(
         places = panel_heights(measured, origin)
         paths = turning_shifts(poses, model.beads, base, group, reading, places)
         turning = _with_columns(paths, columns.arc_column, columns.rows_column)
-    mean = [centres[NAMES.index(n)] for n in bases]
+    mean = [centres[PARAMETERS.index(n)] for n in bases]
     sigma = [widths.get(n, math.inf) for n in bases]
     return FitProblem(
         poses=poses,
@@ -788,7 +815,7 @@ def build_problem(
         prior_sigma=np.concatenate(
             [
                 sigma,
-                np.full(beads, bead_tolerance_mm),
+                np.repeat(bead_tolerance_mm * model.spreads, 3)[:beads],
                 strains,
                 np.full(int(arc), ARC_PRIOR),
                 np.full(int(rows), ROWS_PRIOR),
@@ -803,7 +830,7 @@ def build_problem(
 
 
 def strain_widths(strain: Strain) -> FloatArray:
-    """Return the standard deviation of each of STRAINS, (10,)."""
+    """Return the standard deviation of each of STRAINS, (9,)."""
     stretch, shear = (max(width, LEAST_STRAIN) for width in strain)
     return np.array([stretch] * STRETCHES + [shear] * (len(STRAINS) - STRETCHES))
 
@@ -847,7 +874,7 @@ def turning_shifts(
     Args:
         poses: nominal geometry of the n frames.
         beads: (k, 3) centres [mm].
-        base: (groups, 17) offsets, internal units, in the reading.
+        base: (groups, 28) values of PARAMETERS, internal units, in the reading.
         group: (n,) of each frame.
         reading: of eq. 5.4.
         places: (n, k) row of each position, from the panel's middle, in panel heights.
@@ -863,7 +890,7 @@ def turning_shifts(
         if len(some) < 2:
             continue
         step = usual_step(some.angle)
-        offsets = to_printed_reading(Offsets(*row), reading)
+        offsets = to_printed_reading(offsets_in(row), reading)
         slope, bent, twisted = _path_derivatives(some, offsets, beads)
         out[mine, ..., 0] = bent * step**2 / 24.0
         way = float(np.sign(np.median(np.diff(some.angle))))
@@ -994,8 +1021,10 @@ def whitening(
 
 
 def values_in(p: Offsets) -> FloatArray:
-    """List the seventeen values of `p` in the order of NAMES, internal units."""
-    return np.array([getattr(p, name) for name in NAMES])
+    """List values in the order of PARAMETERS, internal units: those of `p`, and told lengths
+    that are right.
+    """
+    return np.array([getattr(p, name) for name in NAMES] + [0.0] * len(TOLD))
 
 
 def to_printed_reading(p: Offsets, reading: Reading) -> Offsets:

@@ -15,6 +15,7 @@ import numpy as np
 
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import UNITS
+from flexdt.twin.geometry.told_lengths import TOLD_UNITS
 
 TOLERANCE = {"mm": 0.2, "deg": 0.2, "1": 5e-4}
 """Unit -> standard deviation above which a parameter counts as weak: the thesis calls a
@@ -124,7 +125,7 @@ class Direction:
 
 def unit_of(column: str) -> str:
     """Return the edge unit of a column; bead coordinates are in mm."""
-    return UNITS.get(column.split("@")[0], "mm")
+    return {**UNITS, **TOLD_UNITS}.get(column.split("@")[0], "mm")
 
 
 def tolerance_of(column: str) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from flexdt.twin.calibration.diagnose.causes.cause import (
     MOTION_OF,
     REPEATING,
+    TOLD,
     Choice,
     Known,
     border_name,
@@ -25,6 +26,7 @@ from flexdt.twin.calibration.diagnose.causes.columns import (
     motion_columns,
     panel_of,
     repeating_columns,
+    told_columns,
     visible_shares,
     with_every_column,
 )
@@ -91,7 +93,9 @@ class Candidates:
         self.share = np.repeat(clipped(lengths, self.noise), 2)
         motions = motion_columns(problem, x, self.use)
         waves = [repeating_columns(problem, self.use)] if repeating else []
-        table = np.concatenate([rows, *motions.values(), *waves], axis=1)
+        told = told_columns(problem)
+        again = [rows[:, [problem.layout.names.index(name) for name in told]]]
+        table = np.concatenate([rows, *motions.values(), *waves, *again], axis=1)
         causes = there - everything.start
         causes[: self.count] = 0.0
         values = left.ravel() + rows @ causes
@@ -107,8 +111,9 @@ class Candidates:
             known,
             self.noise,
             motions,
-            table.shape[1] - last,
+            sum(wave.shape[1] for wave in waves),
             self._border_chances(everything.panel),
+            told,
         )
         self._judged: dict[Choice, Judged | None] = {}
         self.means = np.zeros(table.shape[1])
@@ -321,7 +326,7 @@ class Candidates:
         Args:
             choice: must be separable.
         """
-        besides = [c.name.startswith((MOTION_OF, REPEATING)) for c in self.causes]
+        besides = [c.name.startswith((MOTION_OF, REPEATING, TOLD)) for c in self.causes]
         still = tuple(0.0 if m else w for m, w in zip(besides, choice, strict=True))
         model = self.judged(still) or self.judged(choice)
         assert model is not None
@@ -409,8 +414,8 @@ class Candidates:
         return correlation_length(left, self.use, self.problem.group)
 
     def strain(self, choice: Choice) -> tuple[FloatArray, FloatArray] | None:
-        """Return the phantom's strain (10,) in a choice, in the order of STRAINS, and its
-        covariance (10, 10); None if a stated strain is 0 or the choice cannot be judged.
+        """Return the phantom's strain (9,) in a choice, in the order of STRAINS, and its
+        covariance (9, 9); None if a stated strain is 0 or the choice cannot be judged.
         """
         at = self.judged(choice)
         if at is None or not min(self.known.strain) > 0:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -20,7 +20,9 @@ APART: Final = " between scans"
 """End of the name of a motion from scan to scan."""
 REPEATING: Final = "errors of spots"
 """The cause that each bead's spots have errors of their own, smooth in the angle."""
-RIVALS: Final = (MOTION_OF, REPEATING, "priors")
+TOLD: Final = "told "
+"""Begin of the cause that a told length is quite another."""
+RIVALS: Final = (MOTION_OF, REPEATING, TOLD, "priors")
 """Causes that only compete: they are followed elsewhere."""
 
 
@@ -55,7 +57,7 @@ class Found:
         odds: logarithm of the odds of each cause, by name; borders by their place.
         applied: names of causes that are columns of the fit.
         open: names of causes that the data neither show nor exclude.
-        strain: of the phantom, (10,) and its covariance (10, 10); None: it is not judged.
+        strain: of the phantom, (9,) and its covariance (9, 9); None: it is not judged.
         beside_motion: the fit with causes that are likely where something moves, too, and
             those causes; None where that is not so.
     """
@@ -85,6 +87,7 @@ class Known:
         arc_left: standard deviation of the squared share of a step of which the positions
             are not those of the middle of an exposure, by the spots' smear; None: the arc was
             not measured.
+        limits: largest standard deviation of causes (`stated_causes`), 0: excluded.
     """
 
     strain: Strain
@@ -92,6 +95,7 @@ class Known:
     floor: float
     arc: float | None = None
     arc_left: float | None = None
+    limits: Mapping[str, float] = field(default_factory=dict)
 
 
 Refit = Callable[..., FitResult]

@@ -27,6 +27,7 @@ from flexdt.twin.calibration.fit.residual_structure import (
 )
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.panel import Border, PanelModel
+from flexdt.twin.geometry.told_lengths import PANEL_TRAVEL, PHANTOM, TRAVEL
 
 LEAST_VISIBLE: Final = 1e-3
 """Part of a motion that the geometry must leave, for it to be told."""
@@ -70,7 +71,9 @@ def motion_columns(
             if len(frames) >= MIN_MOVING_FRAMES:
                 where = f" in scan {scan + 1}" if len(scans) > 1 else ""
                 some[where] = _waves(frames, n)
-        if len(scans) > 1 and name in shared:
+        # Scans that stand apart have told places, with a prior of their own.
+        placed = f"{name.replace('dO', 'place')}@0" in shared
+        if len(scans) > 1 and name in shared and not placed:
             some[APART] = np.equal.outer(problem.group, range(len(scans)))
         for where, shapes in some.items():
             columns = (slope[:, :, None] * shapes[:, None]).reshape(2 * n * k, -1)
@@ -102,6 +105,21 @@ def repeating_columns(problem: FitProblem, use: npt.NDArray[np.bool_]) -> FloatA
     own = np.einsum("nw,bc->nbwc", waves, np.eye(2 * k))
     rows = own.reshape(n * 2 * k, -1)
     return np.asarray(rows[np.repeat(use.ravel(), 2)])
+
+
+def told_columns(problem: FitProblem) -> list[str]:
+    """List the columns of told lengths that may be quite others: ways, the places of three or
+    more scans, and the phantom's scale beside one of them.
+
+    Without a way nothing in the images tells the phantom's scale.
+    """
+    names = problem.layout.names[: problem.layout.parameter_count]
+    lengths = [n for n in names if n in (*TRAVEL, *PANEL_TRAVEL)]
+    if problem.group.max(initial=0) > 1:
+        lengths += [n for n in names if n.split("@")[0] == "place_z"]
+    if lengths and PHANTOM in names:
+        lengths.append(PHANTOM)
+    return lengths
 
 
 def visible_shares(

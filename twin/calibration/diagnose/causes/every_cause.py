@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from flexdt.twin.calibration.diagnose.causes.cause import (
+    MOTION_OF,
     REPEATING,
     SHAPES,
+    TOLD,
     Cause,
     Known,
     border_name,
@@ -39,6 +42,23 @@ PRIOR_FACTORS: Final = (3.0, 10.0)
 PRIOR_LOG_CHANCE: Final = math.log(1e-3)
 """Logarithm of the probability that the scanner is so many times further off than stated;
 assumed."""
+STATED: Final = (
+    ("tile", "gap"),
+    ("panel", "distortion"),
+    ("stretch", "shape"),
+    ("shear", "shape"),
+    ("beads", "beads"),
+    ("arc", "arc"),
+    ("rows", "rows"),
+    (f"{MOTION_OF}alpha", "angles"),
+    (MOTION_OF, "motion"),
+    (REPEATING, "spots"),
+)
+"""Begin of a cause's name, and the name by which it is stated; the first counts."""
+SAME_UNIT: Final = ("gap", "distortion", "shape", "beads")
+"""Stated causes whose widths here have the stated unit."""
+TOLD_WIDTHS: Final = (5e-3, 2e-2, 5e-2)
+"""Widths of a told length that is quite another, over the told one; of a place over the SOD."""
 REPEATING_WIDTHS: Final = (0.1, 0.2, 0.4, 0.8, 1.6)
 """Widths of a wave of such errors, in standard deviations of a position."""
 
@@ -50,9 +70,10 @@ def list_causes(
     motions: Mapping[str, FloatArray],
     repeating: int,
     chances: Sequence[float],
+    told: Sequence[str] = (),
 ) -> tuple[Cause, ...]:
     """List the causes of a table: shape, beads, arc, rows, panel, borders, motion, errors of
-    spots and priors, in this order.
+    spots, told lengths and priors, in this order.
 
     Exact beads have no cause of shape or position, a stage at rest none of arc or rows;
     beads need three at least; panel and borders only where the problem has a panel.
@@ -63,23 +84,51 @@ def list_causes(
         known: statements on the phantom and the positions.
         noise: standard deviation of whitened residuals.
         motions: their columns, which follow.
-        repeating: number of columns of errors of spots, the last ones; 0: no cause.
+        repeating: number of columns of errors of spots, which follow; 0: no cause.
         chances: logarithm of each border's probability before the scan is seen.
+        told: lengths that may be quite others (`columns.told_columns`), the last columns.
 
     Returns:
         Causes with their columns, the widths to try, and a width that always holds.
     """
     layout = everything.layout
     first = len(layout.names)
-    return (
+    last = first + sum(m.shape[1] for m in motions.values()) + repeating
+    sod = float(np.median(everything.poses.sod))
+    listed = (
         *_of_phantom(everything, known),
         *_arc(layout.arc_column, known),
         *_rows(layout.rows_column, known.arc),
         *_of_panel(everything, chances),
         *_motions(first, noise, motions),
         *_repeating(first + sum(m.shape[1] for m in motions.values()), noise, repeating),
+        *(
+            Cause(
+                TOLD + name,
+                (last + i,),
+                tuple(
+                    w * (sod if name.startswith("place") else 1.0) for w in TOLD_WIDTHS
+                ),
+            )
+            for i, name in enumerate(told)
+        ),
         Cause("priors", (), PRIOR_FACTORS, PRIOR_LOG_CHANCE),
     )
+    return tuple(_limited(cause, known.limits) for cause in listed)
+
+
+def _limited(cause: Cause, limits: Mapping[str, float]) -> Cause:
+    """Return a cause with the widths up to a stated limit; of a size that is stated in
+    another unit than its columns', only 0 is one.
+    """
+    name = next((stated for begin, stated in STATED if cause.name.startswith(begin)), "")
+    limit = limits.get(name)
+    if limit is None or (limit > 0.0 and name not in SAME_UNIT):
+        return cause
+    widths = tuple(width for width in cause.widths if width <= limit)
+    if limit > 0.0 and cause.widths and not widths:
+        widths = (limit,)
+    return replace(cause, widths=widths)
 
 
 def _of_phantom(everything: FitProblem, known: Known) -> list[Cause]:
