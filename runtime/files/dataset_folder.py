@@ -5,24 +5,22 @@ Images are written as TIFF bytes by `tiff_bytes`.
 
 from __future__ import annotations
 
-import logging
-import math
 import os
 import re
 import struct
-import zlib
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.image_files import Pixels, as_counts, read_pixels
+from flexdt.runtime.files.reading_within import opened, within
 from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.file_names import (
     DOCUMENT,
@@ -35,19 +33,14 @@ from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_d
 from flexdt.twin.dataset.scan_settings_text import format_scan_settings
 from flexdt.twin.dataset.xre import format_xre
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.input_limits import LIMITS, InputLimitError, require_strips
+from flexdt.twin.input_limits import LIMITS
 
 Shape = tuple[int, int]
 MAX_TEXT_BYTES: Final = LIMITS[DOCUMENT].file_bytes
 """Largest text file of a data set [bytes]."""
-MAX_IMAGE_BYTES: Final = LIMITS["tiff"].decoded_bytes
-"""Largest image [bytes]; that of our largest detector has 6 MB."""
 BLANK_SAMPLE_BYTES: Final = 4096
 """Bytes in the middle of an image's file that are examined first for other values than 0."""
 _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
-
-# Our error has the reason of a damaged file; tifffile's log is for callers that set up logging.
-logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True)
@@ -179,54 +172,6 @@ class Folder:
         }
 
 
-_confined: Directory | None = None
-
-
-@contextmanager
-def confined(root: Directory) -> Iterator[None]:
-    """Let this process, all threads included, read nothing through a link below `root`
-    within the context; contexts nest.
-
-    A user's own folders may well have links in them; paths that strangers request of a
-    server may not.
-    """
-    global _confined
-    before = _confined
-    _confined = root
-    try:
-        yield
-    finally:
-        _confined = before
-
-
-def _within(path: Path) -> Directory | None:
-    """Return the directory at a path that is below the one that reading is `confined` to;
-    nothing is looked up on the disk.
-
-    Returns:
-        The directory; None if reading is not confined or the path is elsewhere.
-    """
-    if _confined is None or not path.is_relative_to(_confined.path):
-        return None
-    directory = _confined
-    for name in path.relative_to(_confined.path).parts:
-        directory = directory.folder(name)
-    return directory
-
-
-def opened(path: Path) -> BinaryIO:
-    """Open a file of a data set for reading; where reading is `confined`, links are not
-    followed.
-
-    Raises:
-        OSError: there is none, or (confined) it is no regular file.
-    """
-    folder = _within(path.parent)
-    if folder is None:
-        return path.open("rb")
-    return folder.open(path.name)
-
-
 def list_folder(path: Path) -> Folder:
     """List the files of a folder, without its folders; where reading is `confined`, links
     are left out, too.
@@ -237,10 +182,10 @@ def list_folder(path: Path) -> Folder:
     Raises:
         DatasetMissingError: there is no such folder, or it cannot be read.
     """
-    within = _within(path)
+    inside = within(path)
     try:
-        with os.scandir(path) if within is None else within.entries() as entries:
-            links = within is None
+        with os.scandir(path) if inside is None else inside.entries() as entries:
+            links = inside is None
             names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
         message = f"cannot read folder {path}: {error.strerror}"
@@ -304,177 +249,53 @@ def read_document(folder: Directory) -> DatasetDocument:
     return parse_document(text, str(path))
 
 
-COUNTS: Final = ("u2", "u1", "i2")
-"""Kinds of numbers in TIFFs that are read as counts; none may be below 0."""
-
-
 def read_image(
-    path: Path, shape: tuple[int, int] | None = None
+    path: Path, shape: tuple[int, int] | None = None, image: int | None = None
 ) -> npt.NDArray[np.uint16]:
-    """Read one TIFF image, uint16 (rows, cols); raises as `read_values`."""
-    return np.asarray(read_values(path, shape, "u"), dtype=np.uint16)
+    """Read an image of counts, uint16 (rows, cols); other whole numbers are counts, too, where
+    they are from 0 to 65535. Arguments and errors as those of `read_values`.
+    """
+    values, head = _read(path, shape, image)
+    return as_counts(path, values, head)
 
 
 def read_values(
-    path: Path, shape: tuple[int, int] | None = None, kinds: str = "uf"
-) -> npt.NDArray[np.uint16 | np.float32]:
-    """Read the first image of a TIFF file: counts as uint16 or, where `kinds` has an f,
-    other values as float32.
+    path: Path, shape: tuple[int, int] | None = None, image: int | None = None
+) -> npt.NDArray[Any]:
+    """Read an image of real numbers of any kind, grey values with row 0 on top.
 
     Args:
-        path: of the file.
+        path: of the file, of any of `IMAGE_FORMATS`.
         shape: (rows, cols) that the image must have; None: any.
-        kinds: of values that are allowed: u (counts), f (other numbers).
+        image: index of the image in the file; None: its only one.
 
     Returns:
-        uint16 or float32 (rows, cols).
+        (rows, cols), in this machine's byte order.
 
     Raises:
         DatasetMissingError: it is not there.
         DatasetFormatError: it is no such image, or cannot be decoded; names path and
             reason.
     """
-    try:
-        image = _decoded(path, kinds)
-    except ds.DatasetFormatError:
-        raise
-    except FileNotFoundError:
-        raise ds.DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
-    except OSError as error:
+    return _read(path, shape, image)[0]
+
+
+def _read(path: Path, shape: tuple[int, int] | None, image: int | None) -> Pixels:
+    """Read an image and the head of its file; see `read_values`."""
+    values, head = read_pixels(path, image or 0)
+    if image is None and head.images > 1:
         raise ds.DatasetFormatError(
-            f"cannot read {path}: {error}", {"path": str(path)}
-        ) from None
-    except ValueError as error:  # TiffFileError is one
-        message = f"{path} is not a readable TIFF image: {error}"
-        raise ds.DatasetFormatError(message, {"path": str(path)}) from None
-    except Exception:  # a third party's parser raises anything on a damaged file
-        size = path.stat().st_size
-        message = f"{path} is not a readable TIFF image: its {size} bytes are cut off or damaged"
-        raise ds.DatasetFormatError(message, {"path": str(path)}) from None
-    if shape is not None and image.shape != shape:
+            f"{path} holds {head.images} images; allowed: one. All of them: "
+            "fx.read_tiffs(FILE, geometry)",
+            {"path": str(path), "asked": head.images, "allowed": 1},
+        )
+    if shape is not None and values.shape != shape:
         raise ds.DatasetFormatError(
-            f"{path} has {image.shape[1]} x {image.shape[0]} pixels, "
+            f"{path} has {values.shape[1]} x {values.shape[0]} pixels, "
             f"the data set has {shape[1]} x {shape[0]}",
-            {"path": str(path), "asked": list(image.shape), "allowed": list(shape)},
+            {"path": str(path), "asked": list(values.shape), "allowed": list(shape)},
         )
-    return image
-
-
-def _decoded(path: Path, kinds: str) -> npt.NDArray[np.uint16 | np.float32]:
-    """Decode the first image of a TIFF file, after a check of its kind and size.
-
-    A file of a few bytes may claim any size, and inflate to any: both are checked before
-    memory is taken. Signed counts are allowed if none is negative. Compression other than
-    deflate is decoded by OpenCV.
-
-    Args:
-        path: of the file.
-        kinds: of values that are allowed: u, f.
-
-    Returns:
-        uint16 or float32 (rows, cols).
-
-    Raises:
-        DatasetFormatError: another kind of image, or more than `MAX_IMAGE_BYTES`.
-        ValueError: pixels that cannot be decoded.
-    """
-    import tifffile
-
-    # A file may name others as its images, wherever they are: only the file itself is read.
-    with opened(path) as raw, tifffile.TiffFile(raw, _multifile=False) as file:
-        series = file.series[0]
-        shape = tuple(series.shape)
-        kind = series.dtype
-        page = file.pages[0]
-        _check_kind(path, shape, kind, kinds)
-        size = kind.itemsize * math.prod(shape)
-        if size > MAX_IMAGE_BYTES:
-            message = f"{path} claims {shape[1]} x {shape[0]} pixels"
-            most = f"{MAX_IMAGE_BYTES} bytes"
-            raise ds.DatasetFormatError.instead(message, size, most, path=str(path))
-        try:
-            require_strips(page.databytecounts, raw.seek(0, os.SEEK_END), str(path))
-        except InputLimitError as error:
-            raise ds.DatasetFormatError(error.message, error.data) from None
-        wanted = np.float32 if kind.kind == "f" else np.uint16
-        packing = tifffile.COMPRESSION
-        values: npt.NDArray[Any]
-        if page.compression in (packing.NONE, packing.ADOBE_DEFLATE, packing.DEFLATE):
-            if page.compression != packing.NONE:
-                _check_inflation(path, raw, page, size)
-            values = series.asarray()
-        else:  # LZW and others, which tifffile leaves to a codec
-            import cv2
-
-            raw.seek(0)
-            image = cv2.imdecode(
-                np.frombuffer(raw.read(), np.uint8), cv2.IMREAD_UNCHANGED
-            )
-            if (
-                image is None
-                or image.shape != shape
-                or image.dtype != kind.newbyteorder("=")
-            ):
-                raise ValueError(
-                    f"its compression ({page.compression!r}) cannot be undone"
-                )
-            values = image
-        if kind.kind == "i" and values.size and values.min() < 0:
-            said = f"{path} holds counts down to {values.min()}"
-            raise ds.DatasetFormatError.instead(said, int(values.min()), "0 or more")
-        return np.asarray(values, dtype=wanted)
-
-
-def _check_kind(
-    path: Path, shape: tuple[int, ...], kind: np.dtype[Any], kinds: str
-) -> None:
-    """Check that a TIFF holds one image of counts or, where `kinds` has an f, of other
-    values.
-
-    Counts are whole numbers of `COUNTS`, in either byte order.
-
-    Args:
-        path: of the file, for the message.
-        shape: that its head states.
-        kind: type of its values.
-        kinds: that are allowed: u, f.
-
-    Raises:
-        DatasetFormatError: another type or number of dimensions; names the allowed ones,
-            and how several images in one file are read.
-    """
-    allowed = [np.dtype(k) for k in (*COUNTS, "f4", "f8") if k[0] in kinds or k in COUNTS]
-    if len(shape) == 2 and kind.newbyteorder("=") in allowed:
-        return
-    words = ", ".join(map(str, allowed))
-    way = ""
-    if len(shape) == 3:
-        call = "fx.DataSet.from_arrays(tifffile.imread(FILE), geometry)"
-        way = f"; several images in one file: {call}"
-    raise ds.DatasetFormatError(
-        f"{path} is {kind} of shape {shape}; allowed: {words} (rows, columns){way}",
-        {"path": str(path), "asked": [str(kind), list(shape)]},
-    )
-
-
-def _check_inflation(path: Path, raw: BinaryIO, page: Any, size: int) -> None:
-    """Check that no strip of a deflated page inflates to more than the image's `size`
-    [bytes]; at most one byte more is inflated.
-
-    Raises:
-        DatasetFormatError: a strip inflates to more.
-    """
-    raw.seek(0)
-    content = raw.read()
-    for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
-        inflated = zlib.decompressobj().decompress(
-            content[start : start + length], size + 1
-        )
-        if len(inflated) > size:
-            raise ds.DatasetFormatError(
-                f"{path} inflates to more than its {size} bytes of pixels",
-                {"path": str(path)},
-            )
+    return values, head
 
 
 def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
@@ -507,10 +328,12 @@ def _blank(path: Path) -> bool:
 
 
 def mean_image(paths: Sequence[Path], shape: tuple[int, int]) -> Float32Array:
-    """Average one or more images, (rows, cols) float32; raises as `read_image`."""
+    """Average one or more images of real numbers, (rows, cols) float32; raises as
+    `read_values`.
+    """
     total = np.zeros(shape, dtype=np.float64)
     for path in paths:
-        total += read_image(path, shape)
+        total += read_values(path, shape)
     return (total / len(paths)).astype(np.float32)
 
 

@@ -29,6 +29,7 @@ from flexdt.protocol.methods.calibration_messages import CalibrationAlign, Calib
 from flexdt.protocol.rpc_errors import too_large
 from flexdt.runtime.files import dataset_folder as files
 from flexdt.runtime.files.directory import Directory
+from flexdt.runtime.files.reading_within import confined, opened
 from flexdt.runtime.wire_errors import from_root
 from flexdt.runtime.workers import Workers
 from flexdt.server.storage import dataset_fits
@@ -151,7 +152,7 @@ def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[
     """
     try:
         directory = Directory(root)
-        with directory, files.confined(directory):
+        with directory, confined(directory):
             result = _ANSWERS[type(asked)](directory, asked, context, codec)
     except OSError as error:  # it has gone meanwhile, or the disk fails
         name = getattr(asked, "name", "the data directory")
@@ -742,7 +743,7 @@ def _script(folder: files.Folder) -> str:
         raise ds.DatasetMissingError(
             f"{folder.path.name}: no script lies with this data set"
         )
-    with files.opened(folder.path / SCRIPT) as file:
+    with opened(folder.path / SCRIPT) as file:
         if (size := os.fstat(file.fileno()).st_size) > MAX_SCRIPT_BYTES:
             raise too_large("the script of a data set", size, MAX_SCRIPT_BYTES)
         return file.read().decode("utf-8", "replace")

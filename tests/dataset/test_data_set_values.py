@@ -130,7 +130,7 @@ def test_what_the_patterns_took_is_said(tmp_path: Path) -> None:
         tifffile.imwrite(tmp_path / name, np.full((2, 3), 7, np.uint16))
     scan = fx.ConeVec.circular(sod=60, sdd=100, angles=2, pixel=1.0)
     with pytest.raises(
-        DatasetMissingError, match=r"dark='di\*' and flat='io\*' took diamond_0"
+        DatasetMissingError, match=r"dark \(di\* .*\) and flat \(io\*\) took diamond_0"
     ):
         fx.read_tiffs(tmp_path, scan)
     assert len(fx.read_tiffs(tmp_path, scan, dark="", flat="")) == 2

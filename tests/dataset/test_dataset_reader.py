@@ -215,14 +215,14 @@ def image(shape: tuple[int, ...], dtype: str = "uint16") -> bytes:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "not a readable TIFF|cannot read"),
-        (b"II*\0\x08\0\0\0", "not a readable TIFF|allowed: uint16"),
-        (b"\x80\x04cposix\nsystem\n.", "not a readable TIFF"),
-        (image((24, 30))[:-100], "not a readable TIFF|cannot read"),
-        (b"II*\0", "its 4 bytes are cut off or damaged"),
+        (b"", "is empty"),
+        (b"II*\0\x08\0\0\0", "not a readable TIFF image: its pixels are cut off"),
+        (b"\x80\x04cposix\nsystem\n.", "is no TIFF file: it begins with other bytes"),
+        (image((24, 30))[:-100], "not a readable TIFF image: its pixels are cut off"),
+        (b"II*\0", "not a readable TIFF image: its pixels are cut off"),
         (image((24, 31)), "has 31 x 24 pixels, the data set has 30 x 24"),
         (image((24, 30), "float32"), "float32"),
-        (image((24, 30, 3)), r"shape \(24, 30, 3\)"),
+        (image((5, 24, 30)), "holds 5 images; allowed: one"),
     ],
     ids=range(8),
 )

@@ -213,11 +213,13 @@ def test_lists_that_may_not_import_each_other_are_the_same(
 
 
 def test_packages_that_files_need_are_those_of_the_extra() -> None:
-    sources = (DOCS.parent / "flexdt").rglob("*.py")
-    called = re.compile(r"""\bpackage\(\s*"(\w+)"(?:,\s*"[^"]*")?\)""")
-    needed = {
-        name for path in sources for name in called.findall(path.read_text("utf-8"))
-    }
+    rooms = ("flexdt", "runtime")
+    sources = [path for room in rooms for path in (DOCS.parent / room).rglob("*.py")]
+    called = re.compile(
+        r"""\bpackage\(\s*"(\w+)"(?:,\s*f?"[^"]*")?\)|needs (\w+): pip install 'flexdt\[io\]'"""
+    )
+    found = (one for path in sources for one in called.findall(path.read_text("utf-8")))
+    needed = {name or said for name, said in found}
     project = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))
     brought = project["project"]["optional-dependencies"]["io"]
     assert needed == {re.split(r"\W", one)[0] for one in brought}

@@ -7,34 +7,61 @@ warning in `warnings`. Missing frames are listed, and reading one is an error.
 
 from __future__ import annotations
 
-import fnmatch
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Unpack, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
+from flexdt.library.datasets.cutting import cut
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_doubts import SATURATED
+from flexdt.library.datasets.image_sources import (
+    Reference,
+    hdf5_numbers,
+    hdf5_place,
+    matches,
+)
 from flexdt.library.datasets.saving import unfinished
+from flexdt.library.datasets.scan_inputs import (
+    NO_DARK,
+    NO_FLAT,
+    Geometry,
+    geometry_said,
+    placed,
+    references_said,
+    with_options,
+)
+from flexdt.library.datasets.scan_options import ScanOptions
 from flexdt.library.reading.foreign_files import (
     SCAN_FORMATS,
     format_of,
     open_file,
     refuse_distances,
 )
-from flexdt.library.reading.listed_images import NO_DARK, in_order, listed
+from flexdt.library.reading.listed_images import (
+    in_memory,
+    in_order,
+    listed,
+    of_places,
+    without_flat,
+)
 from flexdt.runtime.files.dataset_folder import (
     Folder,
     list_folder,
-    read_image,
     read_text,
     read_values,
+)
+from flexdt.runtime.files.image_files import (
+    IMAGE_ENDINGS,
+    IMAGE_FORMATS,
+    ImageHead,
+    image_head,
+    is_image_name,
 )
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
@@ -49,7 +76,6 @@ from flexdt.twin.dataset.file_names import (
     XRE_SETTINGS,
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
-from flexdt.twin.dataset.normalise import of_intensities
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
@@ -70,10 +96,11 @@ from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.image_order import duplicate
 from flexdt.twin.plausibility.scan_geometry import azimuths
 from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import public, with_options_of
 
-FLAT_NAME: Final = re.compile(r"flat|white|bright|open|blank|gain|^io", re.IGNORECASE)
-"""Words in the names of flat images."""
+DARK_PATTERN: Final = "di*"
+FLAT_PATTERN: Final = "io*"
+"""Names of dark and flat images where nothing is said of them: the scanner's."""
 AGREE_MM: Final = 1e-6
 """Largest difference of a file's cone_vec from the one of its motor positions [mm]."""
 MAX_SETTINGS_BYTES: Final = LIMITS["settings"].file_bytes
@@ -81,37 +108,41 @@ MAX_SETTINGS_BYTES: Final = LIMITS["settings"].file_bytes
 
 
 @public
+@with_options_of(ScanOptions)
 def load_dataset(
     folder: str | PathLike[str],
     *,
     machine: Machine | None = None,
     profile: Profile | None = None,
     ignore_document: bool = False,
-    geometry: ConeVec | None = None,
+    geometry: ConeVec | npt.ArrayLike | str | PathLike[str] | None = None,
     distances: tuple[float, float] | None = None,
+    **options: Unpack[ScanOptions],
 ) -> DataSet:
     """Open a data set.
 
     A folder is read by the first of these that it has: the only file of a supported
     format of another program (in a folder without a document, geometry or projections of
     flexdt's names), flexdt.json, the geometry that `DataSet.save` wrote, a scanner's
-    settings texts; with a `geometry` anybody's TIFFs, as `read_tiffs` does.
+    settings texts; with a `geometry` anybody's images, as `read_tiffs` does.
 
     Args:
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts;
             Nikon's .xtekct, SkyScan's .log, phoenix's .pca or YXLON's
             ScanParameter.xml with its TIFFs; Zeiss's .txrm; a Data Exchange or NXtomo
-            file; or a folder with one of these.
+            file; or a folder with one of these; with a `geometry` a file of images, too.
         machine: the scanner, for texts that do not name one that ships with the package.
             Ignored, like `profile`, unless flexdt.json or texts are read.
         profile: zero offsets to use; default: those of the file, or the profile that
             reproduces the printed figures.
         ignore_document: use the texts alone even if flexdt.json or a saved geometry is
             there.
-        geometry: one view for each projection, in place of the stated one, with no
-            correction in force, or where an NXtomo or .txrm file has none.
+        geometry: one view for each projection, or a file that `ConeVec.load` reads, in place
+            of the stated one, with no correction in force, or where an NXtomo or .txrm file
+            has none.
         distances: source to axis and source to panel [mm], of an NXtomo file that has
             angles and pixels only. Ignored where `geometry` is given.
+        options: OPTIONS
 
     Raises:
         DatasetError: the data set is invalid, its folder was not saved to the end, or
@@ -122,9 +153,15 @@ def load_dataset(
         >>> data = load_dataset("my-scans/lego")  # doctest: +SKIP
         >>> len(data), data.shape  # doctest: +SKIP
     """
-    if Path(folder).is_file():
-        return open_file(Path(folder), geometry, distances)
-    content = list_folder(Path(folder))
+    source = Path(folder)
+    if geometry is not None and _holds_images(source):
+        return read_tiffs(folder, geometry, **options)
+    if source.is_file():
+        # Angles of a geometry of one view make the others.
+        given = None if geometry is None else geometry_said(geometry, options)
+        kept = options if given is None else _without_angles(options)
+        return with_options(open_file(source, given, distances), kept)
+    content = list_folder(source)
     if UNFINISHED in content.names:
         raise DatasetMissingError(
             f"{unfinished(content.path)}; save it once more with resume=True, or remove the folder",
@@ -132,7 +169,7 @@ def load_dataset(
         )
     foreign = _foreign_file(content)
     if foreign is not None:
-        return open_file(foreign, geometry, distances)
+        return load_dataset(foreign, geometry=geometry, distances=distances, **options)
     if distances is not None:
         refuse_distances(content.path, "flexdt or a scanner", distances)
     if content.document is not None and not ignore_document:
@@ -140,12 +177,23 @@ def load_dataset(
     elif content.geometry is not None and not ignore_document:
         data = _from_geometry(content)
     elif geometry is not None and not (content.scan_settings or content.xre_settings):
-        return read_tiffs(folder, geometry)
+        return read_tiffs(folder, geometry, **options)
     else:
         data = _from_texts(content, machine, profile)
     if geometry is None:
-        return data
-    return _with_given(data, geometry)
+        return with_options(data, options)
+    given = geometry_said(geometry, options, data.shape, content.path)
+    return with_options(_with_given(data, given), _without_angles(options))
+
+
+def _holds_images(source: Path) -> bool:
+    """Return whether this is a file of images, not a scan of another program."""
+    return is_image_name(source.name) and source.is_file() and format_of(source) is None
+
+
+def _without_angles(options: ScanOptions) -> ScanOptions:
+    """Return the options without the angles, which the geometry has by now."""
+    return cast(ScanOptions, {k: v for k, v in options.items() if k != "angles"})
 
 
 def _with_given(data: DataSet, geometry: ConeVec) -> DataSet:
@@ -166,26 +214,30 @@ def _with_given(data: DataSet, geometry: ConeVec) -> DataSet:
 
 
 @public
+@with_options_of(ScanOptions)
 def read_tiffs(
     folder: str | PathLike[str],
     geometry: ConeVec | npt.ArrayLike | str | PathLike[str],
     *,
-    frames: str = "*.tif*",
-    dark: str = "di*",
-    flat: str = "io*",
+    frames: str | None = None,
+    **options: Unpack[ScanOptions],
 ) -> DataSet:
-    """Read TIFF images in a folder, with a geometry for them.
+    """Read images in a folder, or all images of one file, with a geometry for them.
 
-    Images are counts (uint16), or floats: counts too if there is a flat image, else line
-    integrals. Floats are kept in memory as counts of an open beam of 60000, or down to
-    20000 where pixels are brighter than it; a warning gives the number beyond that range.
+    Formats are TIFF, PNG, BMP, EDF, MetaImage, NRRD and NumPy's. Images are counts, or other
+    numbers: intensities if there is a flat image, else line integrals where they are floats.
+    Line integrals are kept in memory as counts of an open beam of 60000, or down to 20000
+    where pixels are brighter than it; a warning gives the number beyond that range.
 
     Args:
-        folder: where the images are.
+        folder: where the images are, or a file of several.
         geometry: one view for each projection, in the order of their names, where 10 comes
             after 9; or a file that `ConeVec.load` reads.
-        frames, dark, flat: patterns of the names of projections, dark and flat images.
-            Dark and flat images are no projections.
+        frames: pattern of the names of projections, in either case; default: all images of
+            the folder's first format that are not dark or flat.
+        options: OPTIONS
+
+    Without `dark`, `flat` and `open_beam` the files di* and io* are dark and flat images.
 
     Raises:
         DatasetError: no images, or another number or shape of them than the geometry has.
@@ -201,93 +253,154 @@ def read_tiffs(
         >>> data.geometry.shape, round(float(data[0][0, 0]), 4)
         ((3, 4, 5), 0.6931)
     """
-    if Path(folder).is_file():
-        raise DatasetFormatError(
-            f"{folder} is a file; allowed: a folder of images. Several images in one file: "
-            "fx.DataSet.from_arrays(tifffile.imread(FILE), geometry)",
-            {"path": str(folder)},
-        )
-    content = list_folder(Path(folder))
-    names = sorted(content.names)
-    darks, flats = (fnmatch.filter(names, pattern) for pattern in (dark, flat))
-    others = {*darks, *flats}
-    chosen = [n for n in fnmatch.filter(names, frames) if n not in others]
-    if not chosen:
-        taken = f": dark={dark!r} and flat={flat!r} took {', '.join(sorted(others)[:3])}"
-        there = f"; there are {', '.join(names[:3])} ..." if names else "; it is empty"
-        raise DatasetMissingError(
-            f"{content.path}: no projections match {frames!r}{taken if others else there}",
-            {"path": str(content.path), "missing": [frames]},
-        )
-    first = read_values(content.path / chosen[0])
-    if isinstance(geometry, str | PathLike):
-        geometry = ConeVec.load(geometry, shape=first.shape)
-    if isinstance(geometry, ConeVec):
-        cone = geometry
+    source = Path(folder)
+    if (place := hdf5_place(str(folder))) is not None:
+        data = _of_hdf5(*place, geometry, options)
+    elif source.is_file():
+        dark, flat = references_said(options, source.parent)
+        data = _of_stacks([source], source.stem, geometry, options, dark, flat)
     else:
-        cone = ConeVec(np.asarray(geometry))
-    chosen, doubts = in_order(content, chosen, len(cone))
-    if first.dtype != np.uint16:
-        made = _of_floats(content.path, cone, chosen, darks, flats)
+        data = _of_folder(list_folder(source), geometry, frames, options)
+    return cut(data, options.get("crop"), options.get("binning"), options.get("views"))
+
+
+def _of_hdf5(
+    path: Path, inside: str, geometry: Geometry, options: ScanOptions
+) -> DataSet:
+    """Read the images of a data set of an HDF5 file into memory."""
+    images = hdf5_numbers(path, inside)[0]
+    if images.ndim != 3 or 0 in images.shape:
+        raise DatasetFormatError.of_shape(
+            f"{path}:{inside}", images.shape, ("n", "rows", "cols")
+        )
+    dark, flat = references_said(options, path.parent)
+    cone = geometry_said(geometry, options, images.shape[1:], path.parent)
+    return in_memory(images, cone, dark, flat, path.stem)
+
+
+def _of_folder(
+    content: Folder, geometry: Geometry, frames: str | None, options: ScanOptions
+) -> DataSet:
+    """Read the images of a folder; see `read_tiffs`."""
+    names = sorted(content.names)
+    dark, flat = references_said(options, content.path)
+    if dark is None:
+        dark = _by_pattern(content, names, DARK_PATTERN)
+    if flat is None:
+        flat = _by_pattern(content, names, FLAT_PATTERN)
+    others = {p.name for p in (*dark.named, *flat.named) if p.parent == content.path}
+    chosen = [n for n in _frame_names(names, frames, others) if n not in others]
+    if not chosen:
+        raise _no_projections(content.path, names, frames, others)
+    head = image_head(content.path / chosen[0])
+    cone = geometry_said(geometry, options, head.shape, content.path)
+    if head.images > 1:
+        several, doubts = in_order(content, chosen, -1)
+        paths = [content.path / name for name in several]
+        made = _of_stacks(paths, content.path.name, cone, {}, dark, flat)
         return replace(made, warnings=(*made.warnings, *doubts))
-    if not flats:
-        doubts = [*doubts, _without_flat(content.path.name, names, flat)]
-    return listed(content, cone, chosen, darks, flats, warnings=doubts)
+    chosen, doubts = in_order(content, chosen, len(cone))
+    if not flat:
+        doubts = [*doubts, without_flat(content.path.name, names)]
+    if not (head.counts and _countable(content.path / chosen[0], head)):
+        images = _finite_images(content.path, chosen, head.shape)
+        made = in_memory(images, cone, dark, flat, content.path.name)
+        told = (
+            doubts
+            if images.dtype.kind in "ui"
+            else [d for d in doubts if NO_FLAT not in d]
+        )
+        return replace(made, warnings=(*made.warnings, *told))
+    made = listed(content, cone, chosen, (), (), warnings=doubts, dark_told=not dark)
+    return placed(made, dark, flat)
 
 
-def _without_flat(folder: str, names: Sequence[str], pattern: str) -> str:
-    """Write the warning that a scan lacks flat images, with the first file that looks
-    like one.
+def _by_pattern(content: Folder, names: Sequence[str], pattern: str) -> Reference:
+    """Return the images of a folder whose names match a pattern."""
+    found = [n for n in names if matches(n, pattern) and is_image_name(n)]
+    return Reference.of_files([content.path / name for name in found])
 
-    Args:
-        folder: name of the folder.
-        names: of all files in it, sorted.
-        pattern: that no file matches.
-    """
-    some = [name for name in names if FLAT_NAME.search(name)]
-    guess = f"; {some[0]} looks like one" if some else ""
-    return (
-        f"{folder}: no flat image matches flat={pattern!r}{guess}; counts become line "
-        "integrals by one"
+
+def _frame_names(names: Sequence[str], frames: str | None, others: Set[str]) -> list[str]:
+    """List the names that match a pattern, or those of the first image format of which there
+    are some beside the dark and flat images."""
+    if frames is not None:
+        return [n for n in names if matches(n, frames)]
+    for form in IMAGE_FORMATS:
+        found = [n for n in names if n.lower().endswith(form.endings)]
+        if set(found) - others:
+            return found
+    return []
+
+
+def _no_projections(
+    folder: Path, names: Sequence[str], frames: str | None, others: Set[str]
+) -> DatasetMissingError:
+    """Make the error for a folder in which no projection is found; it says what there is."""
+    if not names:
+        why = "it is empty"
+    elif others and all(n in others for n in names if is_image_name(n)):
+        why = (
+            f"dark ({DARK_PATTERN} unless said) and flat ({FLAT_PATTERN}) took "
+            f"{', '.join(sorted(others)[:3])}"
+        )
+    else:
+        why = f"there are {', '.join(names[:3])} ..."
+    wanted = (
+        f"match {frames!r}"
+        if frames is not None
+        else f"end with {', '.join(IMAGE_ENDINGS)}"
+    )
+    return DatasetMissingError(
+        f"{folder}: no projections {wanted}; {why}",
+        {"path": str(folder), "missing": [frames or "images"]},
     )
 
 
-def _of_floats(
-    folder: Path,
-    geometry: ConeVec,
-    names: Sequence[str],
-    darks: Sequence[str],
-    flats: Sequence[str],
+def _of_stacks(
+    paths: Sequence[Path],
+    name: str,
+    geometry: Geometry,
+    options: ScanOptions,
+    dark: Reference | None,
+    flat: Reference | None,
 ) -> DataSet:
-    """Read float images into a data set in memory.
+    """Read files of several images each; counts when they are needed, other numbers now."""
+    heads = [image_head(path) for path in paths]
+    if len({head.shape for head in heads}) > 1:
+        sizes = ", ".join(f"{h.shape[1]} x {h.shape[0]}" for h in heads[:3])
+        raise DatasetFormatError(f"{paths[0].parent}: files of images of {sizes} pixels")
+    cone = geometry_said(geometry, options, heads[0].shape, paths[0].parent)
+    many = sum(head.images for head in heads)
+    if many != len(cone):
+        raise DatasetFormatError.instead(
+            f"{paths[0]}: {many} projections and {len(cone)} views", len(cone), many
+        )
+    if not all(head.counts for head in heads) or not _countable(paths[0], heads[0]):
+        images = np.concatenate(
+            [
+                [read_values(path, head.shape, i) for i in range(head.images)]
+                for path, head in zip(paths, heads, strict=True)
+            ]
+        )
+        return in_memory(images, cone, dark, flat, name)
+    places = [
+        (p, i) for p, head in zip(paths, heads, strict=True) for i in range(head.images)
+    ]
+    doubts = [] if flat else [without_flat(name, [])]
+    made = of_places(places, heads[0].shape, cone, name, doubts, dark_told=not dark)
+    return placed(made, dark or Reference(), flat or Reference())
 
-    With flat images they are intensities, converted to line integrals; without dark ones
-    dark is 0.
 
-    Args:
-        folder: of the images.
-        geometry: one view for each projection.
-        names, darks, flats: of the images; without flat images they are line integrals.
-
-    Raises:
-        DatasetFormatError: a pixel is not finite.
-    """
-    rows, cols = read_values(folder / names[0]).shape
-    shape = (rows, cols)
-    images = _finite_images(folder, names, shape)
-    if flats:
-        dark: npt.NDArray[np.float32] | float = 0.0
-        if darks:
-            dark = _finite_images(folder, darks, shape).mean(axis=0)
-        flat = _finite_images(folder, flats, shape).mean(axis=0)
-        images = of_intensities(images, dark, flat)
-    return DataSet.from_arrays(images, geometry, name=folder.name)
+def _countable(path: Path, head: ImageHead) -> bool:
+    """Return whether the first image of a file has no number below 0."""
+    return head.dtype.kind == "u" or int(read_values(path, head.shape, 0).min()) >= 0
 
 
 def _finite_images(
     folder: Path, names: Sequence[str], shape: tuple[int, int]
-) -> npt.NDArray[np.float32]:
-    """Read float images of a folder, (n, rows, cols).
+) -> npt.NDArray[Any]:
+    """Read images of a folder that are no counts, (n, rows, cols).
 
     Args:
         folder: of the images.
@@ -297,7 +410,7 @@ def _finite_images(
     Raises:
         DatasetFormatError: a pixel is not finite, or an image has another shape.
     """
-    images = np.stack([read_values(folder / n, shape) for n in names]).astype(np.float32)
+    images = np.stack([read_values(folder / n, shape) for n in names])
     bad = np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))
     if len(bad):
         raise DatasetFormatError(
@@ -502,8 +615,7 @@ def _from_texts(
     _require_one_circle(content)
     count = max(content.last_index + 1, settings.projections or 0)
     first = next(iter(content.projections.values()))
-    rows, cols = read_image(content.path / first).shape
-    shape = (rows, cols)
+    shape = image_head(content.path / first).shape
     if machine:
         machines = [machine]
     else:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, overload
+
+import numpy as np
+import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.image_doubts import (
@@ -14,14 +18,35 @@ from flexdt.library.datasets.image_doubts import (
     SATURATED,
     first_look,
 )
+from flexdt.library.datasets.image_set import Arrays, Counts, CountsReader
+from flexdt.library.datasets.image_sources import Reference
+from flexdt.library.datasets.scan_inputs import NO_DARK, NO_FLAT
 from flexdt.runtime.files.dataset_folder import Folder, Frame, blank_images, read_image
+from flexdt.runtime.files.image_files import image_head, is_image_name
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.plausibility import Operation, examine, settled
 from flexdt.twin.plausibility.image_order import ordered, other_name
 
-NO_DARK: Final = "no dark image"
+FLAT_NAME: Final = re.compile(r"flat|white|bright|open|blank|gain|^io", re.IGNORECASE)
+"""Words in the names of flat images."""
+
+
+def without_flat(name: str, names: Sequence[str]) -> str:
+    """Write the warning that a scan lacks flat images, with the first file that looks like
+    one.
+
+    Args:
+        name: of the scan.
+        names: of all files beside it, sorted.
+    """
+    some = [n for n in names if FLAT_NAME.search(n) and is_image_name(n)]
+    guess = f"; {some[0]} looks like one" if some else ""
+    return (
+        f"{name}: {NO_FLAT}{guess}; counts become line integrals by one, or by the count of the "
+        "open beam"
+    )
 
 
 def in_order(
@@ -81,6 +106,7 @@ def listed(
     reasons: Sequence[str] = (),
     warnings: Sequence[str] = (),
     full_scale: int | None = None,
+    dark_told: bool | None = None,
     **known: Any,
 ) -> DataSet:
     """Make the data set of images named one by one.
@@ -99,6 +125,7 @@ def listed(
         reasons: why it is not complete.
         warnings: doubts about it.
         full_scale: largest count of the panel, to find saturated images; None: unknown.
+        dark_told: whether a lack of dark images is told; None: where `darks` is empty.
         known: further members of `DataSet`.
 
     Raises:
@@ -116,9 +143,9 @@ def listed(
         if len(names) != len(geometry):
             said = f"{content.path}: {len(names)} projections and {len(geometry)} views"
             raise DatasetFormatError.instead(said, len(geometry), len(names))
-        rows, cols = read_image(content.path / there[0]).shape
-        geometry = geometry.with_shape(geometry.of_shape((rows, cols)))
-        shapes = [(rows, cols)] * len(names)
+        shape = image_head(content.path / there[0]).shape
+        geometry = geometry.with_shape(geometry.of_shape(shape))
+        shapes = [shape] * len(names)
     warnings = [*warnings, *doubts_of(content, geometry, shapes[0])]
     lost = content.lost((*darks, *flats, *names))
     blank = blank_images(content, names)
@@ -140,11 +167,111 @@ def listed(
         reason="; ".join(reasons),
         warnings=(
             *warnings,
-            *([] if darks else [f"{NO_DARK} (di000000.tif): zero is taken"]),
+            *(
+                [f"{NO_DARK} (di000000.tif): zero is taken"]
+                if (not darks if dark_told is None else dark_told)
+                else []
+            ),
         ),
         full_scale=full_scale,
         **known,
     )
+
+
+class PlacedCounts:
+    """Counts of images in files of several, read when they are needed; an array of (n, rows,
+    cols) as far as indexing.
+
+    Args:
+        places: file and index in it of each image.
+        shape: (rows, cols) of each.
+    """
+
+    def __init__(
+        self, places: Sequence[tuple[Path, int]], shape: tuple[int, int]
+    ) -> None:
+        """Take the places; nothing is read."""
+        self._places = tuple(places)
+        self._shape = shape
+
+    @overload
+    def __getitem__(self, index: int) -> Counts: ...
+    @overload
+    def __getitem__(self, index: npt.NDArray[np.int64]) -> CountsReader: ...
+    def __getitem__(self, index: int | npt.NDArray[np.int64]) -> Counts | CountsReader:
+        """Read an image, or select some."""
+        if isinstance(index, int | np.integer):
+            path, image = self._places[index]
+            return read_image(path, self._shape, image)
+        return PlacedCounts([self._places[i] for i in index], self._shape)
+
+
+def of_places(
+    places: Sequence[tuple[Path, int]],
+    shape: tuple[int, int],
+    geometry: ConeVec,
+    name: str,
+    warnings: Sequence[str],
+    *,
+    dark_told: bool,
+) -> DataSet:
+    """Make the data set of images in files of several, which are read when they are needed.
+
+    Images at the end that are zero everywhere make it incomplete.
+
+    Args:
+        places: file and index in it of each projection.
+        shape: (rows, cols) of each.
+        geometry: one view for each.
+        name: of the data set.
+        warnings: doubts about it.
+        dark_told: whether a lack of dark images is told.
+
+    Raises:
+        DatasetError: no scanner has the geometry, or it is of another shape.
+    """
+    cone = geometry.with_shape(geometry.of_shape(shape))
+    doubts = settled(examine(Operation.OPEN, cone, shape), DatasetFormatError, name)
+    counts = PlacedCounts(places, shape)
+    last = len(places)
+    while last and not counts[last - 1].any():
+        last -= 1
+    frames = tuple(
+        Frame(i, f"scan_{i:06d}.tif", None, i < last, shape) for i in range(len(places))
+    )
+    blank = [frame.file for frame in frames if not frame.present]
+    return DataSet(
+        name,
+        frames,
+        shape,
+        cone,
+        arrays=Arrays(counts),
+        complete=not blank,
+        reason=nothing_in(blank),
+        warnings=(
+            *([f"{NO_DARK}: zero is taken"] if dark_told else []),
+            *doubts,
+            *warnings,
+        ),
+    )
+
+
+def in_memory(
+    images: npt.NDArray[Any],
+    geometry: ConeVec,
+    dark: Reference | None,
+    flat: Reference | None,
+    name: str,
+) -> DataSet:
+    """Make a data set of images in memory (n, rows, cols), which are no counts of uint16 or
+    came in one piece; see `DataSet.from_arrays`.
+    """
+    shape = images.shape[1], images.shape[2]
+    before = None if dark is None else dark.read(shape, "dark")
+    opened = None if flat is None else flat.read(shape, "flat")
+    if before is None and opened is not None and images.dtype.kind == "f":
+        before = np.zeros((1, *shape))  # of intensities that are no counts
+    return DataSet.from_arrays(images, geometry, dark=before, flat=opened, name=name)
 
 
 def _first_look(

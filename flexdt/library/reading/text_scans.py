@@ -12,7 +12,8 @@ import numpy as np
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.image_set import Arrays
-from flexdt.library.reading.listed_images import NO_DARK, listed
+from flexdt.library.datasets.scan_inputs import NO_DARK
+from flexdt.library.reading.listed_images import listed
 from flexdt.runtime.files.dataset_folder import Folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from flexdt.library.data_set import DataSet
 from flexdt.library.extras import package
 from flexdt.library.reading.zeiss_table import ZEISS
-from flexdt.runtime.files.dataset_folder import opened
+from flexdt.runtime.files.reading_within import opened
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.errors import TwinError

@@ -1,0 +1,253 @@
+"""Read image files of any format that flexdt knows, told by their first bytes.
+
+`IMAGE_FORMATS` is the only list of them. Whatever the format, an image comes out as grey
+values with row 0 on top and column 0 at the left, or not at all, with the cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.runtime.files import plain_images, tiff_images
+from flexdt.runtime.files.image_meaning import ImageFact, ImageHead, UnreadImageError
+from flexdt.runtime.files.reading_within import opened
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
+
+__all__ = [
+    "IMAGE_ENDINGS",
+    "IMAGE_FORMATS",
+    "ImageFact",
+    "ImageHead",
+    "image_head",
+    "read_pixels",
+]
+
+Pixels = tuple[npt.NDArray[Any], ImageHead]
+
+
+@dataclass(frozen=True)
+class ImageFormat:
+    """A format of image files.
+
+    Attributes:
+        name: of the format.
+        endings: usual ones of its files, in lower case.
+        begins: first bytes of each of its files, one of these.
+        head: from an open file and its path, what it says of its images.
+        read: from these and the index of an image, its pixels.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    begins: tuple[bytes, ...]
+    head: Callable[[BinaryIO, Path], ImageHead]
+    read: Callable[[BinaryIO, Path, int], Pixels]
+
+
+def _tiff_head(file: BinaryIO, path: Path) -> ImageHead:
+    return tiff_images.tiff_head(file)
+
+
+def _tiff(file: BinaryIO, path: Path, image: int) -> Pixels:
+    return tiff_images.read_tiff(file, image)
+
+
+def _png_head(file: BinaryIO, path: Path) -> ImageHead:
+    return plain_images.png_head(file)[0]
+
+
+def _bmp_head(file: BinaryIO, path: Path) -> ImageHead:
+    return plain_images.read_bmp(file)[1]
+
+
+def _single(
+    read: Callable[[BinaryIO], Pixels],
+) -> Callable[[BinaryIO, Path, int], Pixels]:
+    """Return the reader of a format whose files hold one image."""
+
+    def read_first(file: BinaryIO, path: Path, image: int) -> Pixels:
+        """Read the image; raises UnreadImageError for any but the first."""
+        if image != 0:
+            raise UnreadImageError(f"holds 1 image; asked for number {image + 1}")
+        return read(file)
+
+    return read_first
+
+
+def _stack(
+    layout: Callable[[Path], plain_images.Stack],
+) -> tuple[
+    Callable[[BinaryIO, Path], ImageHead], Callable[[BinaryIO, Path, int], Pixels]
+]:
+    """Return head and reader of a format of plain numbers behind a header."""
+
+    def read(file: BinaryIO, path: Path, image: int) -> Pixels:
+        """Read an image of the file, and its head."""
+        found = layout(path)
+        return found.read(image), found.head
+
+    return lambda file, path: layout(path).head, read
+
+
+IMAGE_FORMATS: Final = (
+    ImageFormat("TIFF", (".tif", ".tiff"), tiff_images.MAGICS, _tiff_head, _tiff),
+    ImageFormat(
+        "PNG",
+        (".png",),
+        (b"\x89PNG\r\n\x1a\n",),
+        _png_head,
+        _single(plain_images.read_png),
+    ),
+    ImageFormat("BMP", (".bmp",), (b"BM",), _bmp_head, _single(plain_images.read_bmp)),
+    ImageFormat("EDF", (".edf",), (b"{",), *_stack(plain_images.edf_image)),
+    ImageFormat(
+        "MetaImage",
+        (".mhd", ".mha"),
+        (b"ObjectType", b"NDims", b"Comment", b"ObjectSubType"),
+        *_stack(plain_images.meta_image),
+    ),
+    ImageFormat(
+        "NRRD", (".nhdr", ".nrrd"), (b"NRRD000",), *_stack(plain_images.nrrd_image)
+    ),
+    ImageFormat("NumPy", (".npy",), (b"\x93NUMPY",), *_stack(plain_images.numpy_image)),
+)
+"""In the order in which they are listed."""
+IMAGE_ENDINGS: Final = tuple(end for form in IMAGE_FORMATS for end in form.endings)
+OTHER_FORMATS: Final = {
+    b"\xff\xd8\xff": "a JPEG image",
+    b"GIF8": "a GIF image",
+    b"\x89HDF": "an HDF5 file",
+    b"\0\0\0\x0cjP": "a JPEG 2000 image",
+    b"SIMPLE  =": "a FITS file",
+    b"PK\x03\x04": "an archive (zip)",
+    b"\x1f\x8b": "a file compressed by gzip",
+    b"\xd0\xcf\x11\xe0": "a compound document, as Zeiss's .txrm",
+    b"%PDF": "a PDF document",
+}
+"""First bytes of formats that are named and not read -> the words for them."""
+MOST_BEGIN: Final = 16
+"""First bytes that are looked at."""
+
+
+def image_head(path: Path) -> ImageHead:
+    """Read what a file says of its images, without their pixels.
+
+    Raises:
+        DatasetMissingError: it is not there.
+        DatasetFormatError: it holds no image that is read; names path and reason.
+    """
+    return _answered(path, lambda form, file: form.head(file, path))
+
+
+def read_pixels(path: Path, image: int = 0) -> Pixels:
+    """Read an image of a file, grey values (rows, cols) in this machine's byte order, and its
+    head.
+
+    Args:
+        path: of the file.
+        image: index of the image in the file.
+
+    Raises:
+        DatasetMissingError: it is not there.
+        DatasetFormatError: it holds no image that is read; names path and reason.
+    """
+    return _answered(path, lambda form, file: form.read(file, path, image))
+
+
+def _answered(path: Path, ask: Callable[[ImageFormat, BinaryIO], Any]) -> Any:
+    """Return the answer of the format of a file.
+
+    Raises:
+        DatasetMissingError: it is not there.
+        DatasetFormatError: another format, or any error of its reader.
+    """
+    known = _KNOWN_BY_ENDING.get(path.suffix.lower())
+    try:
+        with opened(path) as file:
+            begin = file.read(MOST_BEGIN)
+            form = next((f for f in IMAGE_FORMATS if begin.startswith(f.begins)), None)
+            if form is None:
+                raise UnreadImageError(_no_image(begin, known))
+            file.seek(0)
+            return ask(form, file)
+    except UnreadImageError as error:
+        reason = str(error)
+        if reason.startswith("its "):
+            name = next((f.name for f in IMAGE_FORMATS if begin.startswith(f.begins)), "")
+            reason = f"is not a readable {name} image: {reason}"
+        raise DatasetFormatError(f"{path} {reason}", {"path": str(path)}) from None
+    except FileNotFoundError:
+        raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise DatasetFormatError(
+            f"cannot read {path}: {reason}", {"path": str(path)}
+        ) from None
+    except MemoryError:
+        said = f"{path} takes more memory than there is"
+        raise DatasetFormatError(said, {"path": str(path)}) from None
+    except Exception:  # a third party's parser raises anything on a damaged file
+        said = f"{path} is no readable image: its bytes are cut off or damaged"
+        raise DatasetFormatError(said, {"path": str(path)}) from None
+
+
+def _no_image(begin: bytes, known: str | None) -> str:
+    """Explain first bytes that no format has.
+
+    Args:
+        begin: of the file.
+        known: name of the format that its ending means; None for another ending.
+    """
+    allowed = ", ".join(form.name for form in IMAGE_FORMATS)
+    if not begin:
+        return "is empty"
+    if not any(begin):
+        return "is no image: it begins with zeros, as a file that was never written"
+    for start, name in OTHER_FORMATS.items():
+        if begin.startswith(start):
+            return f"is {name}; allowed: {allowed}"
+    if known is not None:
+        return f"is no {known} file: it begins with other bytes"
+    return f"is no image of a known format; allowed: {allowed}"
+
+
+_KNOWN_BY_ENDING: Final = {
+    end: form.name for form in IMAGE_FORMATS for end in form.endings
+}
+
+
+def is_image_name(name: str) -> bool:
+    """Return whether a file's ending, in either case, is that of an image format."""
+    return name.lower().endswith(IMAGE_ENDINGS)
+
+
+def as_counts(
+    path: Path, values: npt.NDArray[Any], head: ImageHead
+) -> npt.NDArray[np.uint16]:
+    """Return an image as counts, uint16.
+
+    Raises:
+        DatasetFormatError: values that are no whole numbers from 0 to 65535.
+    """
+    if values.dtype == np.uint16:
+        return values
+    facts = {"path": str(path), "asked": str(values.dtype), "allowed": "uint16"}
+    if values.dtype.kind not in "ui":
+        raise DatasetFormatError(
+            f"{path} holds {values.dtype} numbers; allowed: uint16, or other whole numbers from "
+            "0 to 65535",
+            facts,
+        )
+    if values.size and head.dtype != np.uint8:
+        low, high = int(values.min()), int(values.max())
+        if low < 0 or high > np.iinfo(np.uint16).max:
+            raise DatasetFormatError(
+                f"{path} holds counts from {low} to {high}; allowed: 0 to 65535", facts
+            )
+    return values.astype(np.uint16)
