@@ -13,7 +13,6 @@ from typing import Final
 
 from flexdt.library.failure import CommandError
 from flexdt.runtime.files.limited_files import limited_text
-from flexdt.twin.input_limits import InputLimitError, parse_toml
 
 RANGES: Final[Mapping[str, float]] = {
     "dO_x": 1.0,
@@ -58,6 +57,7 @@ def read(path: Path) -> dict[str, float]:
         CommandError: not TOML, an unknown parameter, or a value that is not a number.
     """
     from flexdt.twin.geometry.offsets import NAMES
+    from flexdt.twin.input_limits import InputLimitError, parse_toml
 
     try:
         content = parse_toml(limited_text(path, "toml"), str(path))
