@@ -23,7 +23,7 @@ import logging
 import ssl as tls
 import time
 from collections.abc import Coroutine, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, TypeVar, cast
 
 from flexdt.protocol import (
@@ -43,9 +43,9 @@ from flexdt.protocol.fields import Params
 from flexdt.protocol.method import parse_params, require_compatible
 from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import ProtocolError, RpcError
-from flexdt.runtime import waiting_room
+from flexdt.runtime import descriptors, waiting_room
 from flexdt.runtime.access import ConnectionLimits, check_bind
-from flexdt.runtime.log import Sparing
+from flexdt.runtime.log import Sparing, log
 from flexdt.runtime.process import ListeningServer, tune
 from flexdt.runtime.waiting_room import Guesses, WaitingList, neighbourhood
 from flexdt.server.network import admission, batches, deadlines, loop_turns, outbox
@@ -90,9 +90,19 @@ class TcpServer(ListeningServer):
     read: parts.Read | None = None
 
     def __post_init__(self) -> None:
-        """Begin without connections and with empty waiting rooms; nothing listens yet."""
+        """Begin without connections and with empty waiting rooms; nothing listens yet.
+
+        There are fewer places where the process may have few descriptors.
+        """
         self.links: set[_Link] = set()
-        self.waiting = WaitingList[_Link](waiting_room.MAX_WAITING)
+        wanted = self.limits.max_clients, waiting_room.MAX_WAITING
+        clients, waiting = descriptors.fitted(
+            *wanted, RESERVED_PLACES, descriptors.limit()
+        )
+        if (clients, waiting) != wanted:
+            self.limits = replace(self.limits, max_clients=clients)
+            log("few descriptors", logging.WARNING, clients=clients, waiting=waiting)
+        self.waiting = WaitingList[_Link](waiting)
         self.reserved = WaitingList[_Link](RESERVED_PLACES)
         self.lines = Sparing()
         self.guesses = Guesses(self.lines)

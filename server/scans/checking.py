@@ -257,12 +257,15 @@ class Checks:
         else:
             said, *parts = await self._workers.ask(in_pieces, _bare(check_input))
             warnings = json.loads(said)
+            one_twin = isinstance(asyncio.get_running_loop(), ServerLoop)
+            if one_twin:
+                # What is garbage would be kept for ever by `freeze`. This pass looks at what
+                # was made since the last one alone, some milliseconds.
+                gc.collect()
             plan = await asyncio.to_thread(
                 _rebuilt_plan, parts, check_input.machine, check_input.profile
             )
-            if isinstance(
-                asyncio.get_running_loop(), ServerLoop
-            ):  # a process of one twin
+            if one_twin:
                 gc.freeze()  # a million objects that are no garbage, see `announce`
         self._last = Checked(check_input, plan, warnings)
         return self._last

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from flexdt.clients.cli.console import note
 from flexdt.clients.cli.options import Answer
-from flexdt.twin.errors import TwinError
 
 
 def compile() -> Answer:
@@ -16,6 +15,7 @@ def compile() -> Answer:
         As `_described`.
     """
     from flexdt.runtime import compile_ahead, kernel_files
+    from flexdt.twin.errors import TwinError
 
     compile_ahead.compile_ahead(list(compile_ahead.GROUPS), note)
     folder = kernel_files.kept_in()
