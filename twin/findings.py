@@ -90,10 +90,12 @@ class Advice:
     Attributes:
         free: parameters to estimate, too.
         per_frame: parameters to give a value in each frame.
+        priors: standard deviations of which one settles it, (parameter, value).
     """
 
     free: tuple[str, ...] = ()
     per_frame: tuple[str, ...] = ()
+    priors: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -179,9 +181,10 @@ def error(
     figure: float = 0.0,
     free: Iterable[str] = (),
     per_frame: Iterable[str] = (),
+    priors: Iterable[tuple[str, float]] = (),
 ) -> Finding:
     """Make an error; arguments as those of `Finding` and `Advice`."""
-    advice = Advice(tuple(free), tuple(per_frame))
+    advice = Advice(tuple(free), tuple(per_frame), tuple(priors))
     return Finding(code, ERROR, message, remedy, place, figure, advice)
 
 

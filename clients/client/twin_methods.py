@@ -1035,6 +1035,8 @@ def fit_calibration(
     free: Sequence[str] | None = None,
     *,
     priors: Mapping[str, float] | None = None,
+    exclude: Sequence[str] = (),
+    bead_tolerance: float | None = None,
     per_frame: Sequence[str] = (),
     steps: int = 0,
     residuals: bool = False,
@@ -1052,7 +1054,9 @@ def fit_calibration(
             in unknown places.
         free: parameters to estimate; default: the six of a phantom on a stage, dO_x of unknown
             markers.
-        priors: name -> standard deviation [mm, deg]; 0 is exactly known.
+        priors: name -> standard deviation [mm, deg, 1]; 0 is exactly known.
+        exclude: causes that cannot be, such as "gap".
+        bead_tolerance: of the beads' places, which are estimated, too [mm].
         per_frame: parameters that may also move.
         steps: include the covariance after so many parts of the frames.
         residuals: include those of every bead in every frame.
@@ -1085,6 +1089,8 @@ def fit_calibration(
         phantom=phantom,
         free=free and list(free),
         priors=dict(priors or {}),
+        exclude=list(exclude),
+        bead_tolerance=bead_tolerance,
         per_frame=list(per_frame),
         steps=steps,
         residuals=residuals,

@@ -217,10 +217,16 @@ class CalibrationFit(f.Params):
     unknown places, in one data set"""
     free: Annotated[Parameters, MinLen(1)] | None = None
     """estimated parameters; default: dO_x, dO_y, dO_z, alpha, tau_*, of unknown markers dO_x"""
-    priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(17), few(17)] = Field(
+    priors: Annotated[dict[f.AxisName, f.NonNegative], MaxLen(37), few(37)] = Field(
         default_factory=dict
     )
-    """name -> standard deviation [mm or deg]; 0: exactly known"""
+    """name of an offset, told length or cause -> standard deviation [mm, deg or 1]; 0: exactly
+    known, of a cause: excluded"""
+    exclude: Annotated[list[f.AxisName], MaxLen(9)] = Field(default_factory=list)
+    """causes of residuals that cannot be: gap, distortion, shape, beads, arc, rows, angles,
+    motion, spots"""
+    bead_tolerance: f.NonNegative | None = None
+    """standard deviation of the beads' places [mm], which are estimated, too; 0: exact"""
     per_frame: Parameters = Field(default_factory=list)
     """parameters that may also move during the scan"""
     steps: Annotated[int, Ge(0), Le(50), Integral] = 0

@@ -58,6 +58,8 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
         phantom,
         free=asked.free,
         priors=asked.priors,
+        exclude=asked.exclude,
+        bead_tolerance=asked.bead_tolerance,
         per_frame=asked.per_frame,
         markers=marks,
         scale=asked.scale,

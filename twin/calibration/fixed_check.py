@@ -29,7 +29,7 @@ from flexdt.twin.calibration.diagnose.named_motion import moving
 from flexdt.twin.calibration.diagnose.pixel_pitch import with_rival_pitch
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, Solver
-from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, known
+from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, gives_room, known
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     from_printed_reading,
@@ -53,7 +53,8 @@ from flexdt.twin.calibration.request import (
 )
 from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.geometry.offsets import NAMES
-from flexdt.twin.machine.stated_causes import limits_of
+from flexdt.twin.geometry.told_lengths import TOLD
+from flexdt.twin.machine.stated_causes import TOLD_RIVALS, limits_of
 
 OF_FRAME = ("dO_y", "alpha", "tau_x", "tau_z")
 """Gauge parameters when bead positions are free: they only choose the frame of the object."""
@@ -83,7 +84,7 @@ def explain(
         (MEASURED if weighed else Solver()).floor_px,
         _stated_arc(state),
         _arc_left(state),
-        limits_of([scan.priors for scan in state.scans], request.priors),
+        _limits(state, request),
     )
     return explain_residuals(
         fit,
@@ -92,6 +93,17 @@ def explain(
         sigmas_known=weighed,
         misfit_px=request.misfit_px,
     )
+
+
+def _limits(state: Calibration, request: CalibrationRequest) -> dict[str, float]:
+    """Return the largest standard deviation of causes, 0: excluded. Where the request frees a
+    told length, or gives it room, it says which may be off, and no other is a rival.
+    """
+    limits = limits_of([scan.priors for scan in state.scans], request.priors)
+    roomy = any(gives_room(name, width) for name, width in request.priors.items())
+    if roomy or any(name in TOLD for name in request.free):
+        limits[TOLD_RIVALS] = 0.0
+    return limits
 
 
 def _stated_arc(state: Calibration) -> float | None:
@@ -153,15 +165,15 @@ def check_fixed(
     if verdict.finding is not None and errors <= OF_RESIDUALS | {CalibrationCode.MISFIT}:
         left = _left_by_priors(state, usual, loose_fit, explained)
         return fit, _with_priors_off(state, asked, fit, left, verdict.finding)
-    found = []
+    found = listed(verdict.lengths)
     if verdict.factor > 1.0:
         found.append(narrow_priors(verdict))
         given = {**asked.priors, **priors_of(state.scans, asked, state.model)}
         asked = replace(asked, priors=loosened(given, verdict.factor))
     before = fit
-    if found or fit is not free_fit:
+    if verdict.factor > 1.0 or fit is not free_fit:
         fit, explained = explain(state, asked, _fit_with_fixed(state, asked, fit))
-    if found:
+    if verdict.factor > 1.0:
         fit = _with_stated_priors(fit, before)
     fit = _doubted(fit, free_fit, fixed)
     if exact:

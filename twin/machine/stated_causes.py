@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final
 
+from flexdt.twin.errors import UnknownNameError
+
 CAUSES: Final[Mapping[str, str]] = {
     "gap": "px",
     "distortion": "px",
@@ -17,6 +19,8 @@ CAUSES: Final[Mapping[str, str]] = {
     "spots": "px",
 }
 """Name of a cause -> unit of its size."""
+TOLD_RIVALS: Final = "told"
+"""Name of the cause that a told length is quite another, which is stated by its prior."""
 CAUSE_MEANINGS: Final[Mapping[str, str]] = {
     "gap": "gaps between tiles of the panel (0: it is in one piece)",
     "distortion": "a panel that distorts its picture smoothly",
@@ -29,6 +33,19 @@ CAUSE_MEANINGS: Final[Mapping[str, str]] = {
     "spots": "errors of spots that repeat with the turn",
 }
 """Meaning of each in words."""
+
+
+def require_causes(names: Iterable[str]) -> tuple[str, ...]:
+    """Check that every name is a cause, and return them.
+
+    Raises:
+        UnknownNameError: the first that is not; lists the allowed names.
+    """
+    listed = tuple(names)
+    for name in listed:
+        if name not in CAUSES:
+            raise UnknownNameError.among(f"unknown cause {name!r}; allowed", name, CAUSES)
+    return listed
 
 
 def limits_of(

@@ -53,7 +53,9 @@ def calibrate(
     tracks: Path | None = option(None, metavar="FILE.json", written=True),
     geometry: list[Path] | None = option(None, metavar="FILE"),
     bead_tolerance: float | None = option(None, metavar="MM"),
-    prior: list[str] | None = option(None, metavar="P=SIGMA,..."),
+    prior: list[str] | None = option(
+        None, "--prior", "--exclude", metavar="P=SIGMA or CAUSE,..."
+    ),
     frames: Path | None = option(None, metavar="DIR"),
     shape: str | None = option(None, metavar="ROWS,COLS"),
     pixel: str | None = option(None, metavar="MM or U,V"),
@@ -78,7 +80,7 @@ def calibrate(
         tracks: Write the beads of every frame, seen, before and after.
         geometry: Start from this geometry; once for each data set, in order.
         bead_tolerance: Estimate the beads' places, too, known to this tolerance.
-        prior: State how well other offsets are known, 0 exactly; none: all exactly.
+        prior: State how well others are known, 0 exactly; none: all. Exclude a CAUSE.
         frames: Read any scanner's TIFFs, with --geometry.
         shape: Take this detector shape where FILE does not say it.
         pixel: Take this pixel pitch where FILE does not say it (RTK).
@@ -107,7 +109,7 @@ def calibrate(
         "per_frame": option_values.names(per_frame),
         "reading": reading,
         "bead_tolerance": bead_tolerance,
-        "priors": "none" if prior == ["none"] else _read_assignments(prior),
+        "priors": "none" if prior == ["none"] else _read_priors(prior),
         "start": _read_assignments(start),
         "bound": chosen(CalibrateSettings).bound,
         "markers": markers,
@@ -174,6 +176,16 @@ def _require_one_geometry(per_scan: str, folders: Collection[Path]) -> None:
 def _words(**options: object) -> dict[str, str]:
     """Return those of the command's options that were given, as they were typed."""
     return {name: str(value) for name, value in options.items() if value is not None}
+
+
+def _read_priors(given: list[str] | None) -> dict[str, float]:
+    """Read P=SIGMA,... of an option that may be given several times; a cause without a figure
+    is excluded, its figure is 0.
+    """
+    from flexdt.twin.machine.stated_causes import CAUSES
+
+    words = [word.strip() for one in given or () for word in one.split(",")]
+    return option_values.assignments(f"{w}=0" if w in CAUSES else w for w in words)
 
 
 def _read_assignments(given: list[str] | None) -> dict[str, float]:

@@ -61,6 +61,7 @@ from flexdt.twin.calibration.pipeline import (
     Scan,
     calibrate,
 )
+from flexdt.twin.calibration.told_ways import told_motions
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.findings import Finding, Findings, error, warning
@@ -396,15 +397,17 @@ def _outcome(
         phantom: that was scanned.
         typed: the words of the command.
     """
-    document["next"] = next_commands(result, typed)
+    following = next_commands(result, typed)
     for finding in result.findings.warnings:
-        document["next"] += list(angle_commands(finding, typed))
+        following += angle_commands(finding, typed)
+    document["next"] = following
     document["geometry"] = list(typed.geometry)
-    if result.identifiable and result.motions:
-        document["motion"] = [m.to_dict() for m in result.motions]
-        datasets = [
-            d.with_motion(m) for d, m in zip(datasets, result.motions, strict=True)
-        ]
+    motions = result.motions
+    if not motions and result.fit is not None:
+        motions = told_motions(result.fit)
+    if result.identifiable and motions:
+        document["motion"] = [m.to_dict() for m in motions]
+        datasets = [d.with_motion(m) for d, m in zip(datasets, motions, strict=True)]
     document["datasets"] = [d.where for d in datasets]
     document["phantom"] = phantom.name
     document["dataset_warnings"] = [w for d in datasets for w in d.warnings]

@@ -23,8 +23,11 @@ class CalibrationOptions(TypedDict, total=False):
             default), or as R (b - tau) + O ("mount").
         bead_tolerance: beads' places are estimated, too, known to this standard deviation [mm];
             0: they are exact; default: estimated where the residuals require it.
-        priors: how well other offsets are known, parameter -> standard deviation [mm, deg, 1],
-            in place of the machine's and the profile's; 0 is exactly, "none" is all exactly.
+        priors: how well other offsets and told lengths are known, parameter -> standard
+            deviation [mm, deg, 1], in place of the machine's and the profile's; 0 is exactly,
+            "none" is all exactly. Of a cause (`exclude`) its largest one.
+        exclude: causes of residuals that cannot be: gap (the panel is in one piece),
+            distortion, shape, beads, arc, rows, angles, motion, spots.
         start: offsets to begin with [mm, deg, 1], about which priors are centred.
         bound: sigma [mm, deg] above which the result is not identifiable; default: 5.
         markers: CSV or NumPy file with the pixels at which markers were seen, or such marks
@@ -40,6 +43,7 @@ class CalibrationOptions(TypedDict, total=False):
     reading: Literal["axis", "mount"] | None
     bead_tolerance: float | None
     priors: Mapping[str, float] | Literal["none"] | None
+    exclude: Sequence[str] | None
     start: Mapping[str, float] | None
     bound: float | None
     markers: str | PathLike[str] | Sequence[Any] | None

@@ -11,6 +11,7 @@ from flexdt.twin.calibration.fit.problem import SIX, Reading
 from flexdt.twin.calibration.request import CalibrationRequest
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.geometry.offsets import Offsets
+from flexdt.twin.machine.stated_causes import require_causes
 
 READINGS: Final[Mapping[str, Reading]] = {
     "axis": Reading.AXIS_AT_O_PLUS_TAU,
@@ -55,9 +56,10 @@ def request_of(phantom: object, options: CalibrationOptions) -> CalibrationReque
         for name, (attribute, make) in _IN_REQUEST.items()
         if name in given
     }
+    stated = exact(tuple(free)) if priors == "none" else dict(priors)
     return CalibrationRequest(
         free=tuple(free),
-        priors=exact(tuple(free)) if priors == "none" else priors,
+        priors=stated | dict.fromkeys(require_causes(given.get("exclude", ())), 0.0),
         **made,
     )
 

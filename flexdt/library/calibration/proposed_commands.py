@@ -183,5 +183,9 @@ def settling_commands(
                 left = {n: value for n, value in options.items() if n != "prior"}
                 typed = replace(typed, options=left)
         yield typed.command(**more)
-    if not (finding.advice.per_frame or finding.advice.free):
+    for name, width in finding.advice.priors:
+        held = options.get("prior", "")
+        kept = [w for w in held.split(",") if w and w.split("=")[0] not in (name, "none")]
+        yield typed.command(prior=",".join([*kept, f"{name}={width:g}"]))
+    if not (finding.advice.per_frame or finding.advice.free or finding.advice.priors):
         yield typed.command(report="report.html")

@@ -72,6 +72,11 @@ class CalibrationCode(FindingCode):
         WARNING,
         "detector and axis are further off than the priors",
     )
+    LENGTHS_DISAGREE = (
+        "lengths_disagree",
+        WARNING,
+        "told lengths, of motors or the phantom, disagree",
+    )
     BEAD_TOLERANCE = "bead_tolerance", WARNING, "beads that are a little off their model"
     BEADS_MOVED = "beads_moved", ERROR, "beads move against the others during the scan"
     BEAD_DISPLACED = (

@@ -23,6 +23,7 @@ from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import edge_factor
 from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.told_lengths import PLACES, TOLD, TOLD_SOURCES, TRAVEL
 
 HELD_SIGMAS: Final = 5.0
 """How far, in standard deviations, the data may have a fixed parameter from where it is
@@ -120,11 +121,13 @@ class PriorsJudged:
             images contradict them as much only once in a hundred scans.
         causes: parameters of which one alone, away from its prior, would explain the
             images, best first; empty unless dropping its prior explains DOUBT_SIGMAS.
+        lengths: a warning where told lengths are among them; else None.
     """
 
     finding: Finding | None
     factor: float
     causes: tuple[str, ...] = ()
+    lengths: Finding | None = None
 
 
 def loosened(
@@ -245,10 +248,6 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     scores = np.array([_deviate_of(ratio, c.dof) for ratio in ratios.tolist()])
     gains, alone = _without_each(values, vectors, some, moved)
     likely = _likely(gains)
-    if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
-        factor = math.sqrt(square / count) if chance < NARROW_CHANCE else 1.0
-        return PriorsJudged(None, factor, tuple(names[i] for i in likely))
-    # Something is off all the same: the likeliest is named.
     believed = [
         _Believed(
             names[i],
@@ -258,8 +257,14 @@ def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
             float(alone[i][1] * width[i]),
             found[i].unit,
         )
+        # Something may be off all the same: the likeliest is named.
         for i in likely or [int(np.argsort(gains)[-1])]
     ]
+    if max(float(scores.max()), _deviate(chance)) <= HELD_SIGMAS:
+        factor = math.sqrt(square / count) if chance < NARROW_CHANCE else 1.0
+        causes = tuple(names[i] for i in likely)
+        lengths = _lengths_disagree(believed) if likely else None
+        return PriorsJudged(None, factor, causes, lengths)
     causes = tuple(one.name for one in believed)
     return PriorsJudged(_priors_off(loose, believed, exact), 1.0, causes)
 
@@ -286,11 +291,98 @@ class _Believed:
     sigma: float
     unit: str
 
+    @property
+    def is_told(self) -> bool:
+        """It is a told length, not an offset."""
+        return self.name.split("@")[0] in TOLD
+
+    @property
+    def possible(self) -> float:
+        """A standard deviation by which it may be where the images say, to two digits."""
+        return float(f"{max(abs(self.value - self.centre), self.prior):.2g}")
+
+    @property
+    def text(self) -> str:
+        """The told length and what the images say of it, or the offset, in words."""
+        if not self.is_told:
+            return (
+                f"{self.name} is {self.value:.4g} +- {self.sigma:.1g} {self.unit} (known as "
+                f"{self.centre:g} +- {self.prior:g} {self.unit})"
+            )
+        source = TOLD_SOURCES[self.name.split("@")[0]]
+        if self.unit == "1":
+            value, sigma, unit = 100.0 * self.value, 100.0 * self.sigma, "%"
+            known = f"{100.0 * self.prior:.2g} %"
+        else:
+            value, sigma, unit = self.value, self.sigma, self.unit
+            known = f"{self.prior:.2g} {self.unit}"
+        way = "more" if value > 0.0 else "less"
+        return (
+            f"{source} is {abs(value):.2g} +- {sigma:.1g} {unit} {way} than told (known to "
+            f"{known})"
+        )
+
+
+def _alternatives(believed: Sequence[_Believed]) -> str:
+    """Write what may be off instead of what; a way stands for the places along it."""
+    ways = {one.name[-1] for one in believed if one.name in TRAVEL}
+    believed = [
+        one
+        for one in believed
+        if not (one.name.startswith(PLACES) and one.name.split("@")[0][-1] in ways)
+    ]
+    return "told lengths disagree: " + ", or ".join(one.text for one in believed)
+
+
+def _options(told: Sequence[_Believed]) -> list[tuple[str, float]]:
+    """List the told lengths of which one may have more room, with how much; a way stands for
+    the places along it.
+    """
+    widths: dict[str, float] = {}
+    for one in told:
+        name = one.name.split("@")[0]
+        widths[name] = max(one.possible, widths.get(name, 0.0))
+    ways = {name[-1] for name in widths if name in TRAVEL}
+    return [(n, w) for n, w in widths.items() if n not in PLACES or n[-1] not in ways]
+
+
+def _settling(told: Sequence[_Believed]) -> str:
+    """Write what settles which of several told lengths is off."""
+    options = " or ".join(f"--prior {name}={width:g}" for name, width in _options(told))
+    return f"measure one of them, and give the other more room: {options}"
+
+
+def _lengths_disagree(believed: Sequence[_Believed]) -> Finding | None:
+    """Make the warning that told lengths disagree; None where all others are likelier."""
+    told = [one for one in believed if one.is_told]
+    if not told:
+        return None
+    return warning(
+        CalibrationCode.LENGTHS_DISAGREE,
+        f"{_alternatives(believed)}; the intervals of lengths and of the magnification allow "
+        "for each, the axis in the images does not change",
+        _settling(told),
+    )
+
 
 def _priors_off(
     fit: FitResult, believed: Sequence[_Believed], exact: Container[str]
 ) -> Finding:
-    """Make the error that images contradict priors, of which each of these may be wrong."""
+    """Make the error that images contradict priors, of which each of these may be wrong.
+
+    Told lengths are witnesses of one millimetre: freed together they would say nothing.
+    """
+    told = [one for one in believed if one.is_told]
+    if told:
+        others = [one.name for one in believed if not one.is_told]
+        return error(
+            CalibrationCode.HELD_PARAMETER,
+            f"{_alternatives(believed)}: one of them is not as told, and until it is known "
+            "which, no length is",
+            _settling(told),
+            free=others,
+            priors=_options(told),
+        )
     texts = []
     for one in believed:
         known = "exactly" if one.name in exact else f"+- {one.prior:g} {one.unit}"

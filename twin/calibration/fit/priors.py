@@ -24,6 +24,7 @@ from flexdt.twin.geometry.told_lengths import (
     PHANTOM,
     PIXEL,
     PLACES,
+    TOLD,
     TRAVEL,
 )
 from flexdt.twin.machine.description import Machine, Profile
@@ -66,6 +67,8 @@ a mount, they are not exact either."""
 STRAIN: Final = 1e-3
 """Assumed: standard deviation of the scale, the stretches and the shears of a phantom
 that states no tolerance; printed plastic shrinks by that and more."""
+MORE_ROOM: Final = 1.5
+"""Prior of a told length over the assumed one from which it says that the length may be off."""
 NOISE_PX: Final = 0.1
 """Assumed: standard deviation of a detected coordinate in forecasts [px]. Images of a
 good exposure determine it twenty times better, which priors hide in the offsets and which
@@ -169,6 +172,14 @@ def known_scale(
     if isinstance(given, Mapping) and PHANTOM in given:
         return given[PHANTOM]
     return known_strain(model, free, given, bead_tolerance_mm)[0]
+
+
+def gives_room(name: str, width: float) -> bool:
+    """Check whether a prior gives a told length more room than is assumed: it says that this
+    one may be off.
+    """
+    usual = STRAIN if name == PHANTOM else ASSUMED.get(name, math.inf)
+    return name in TOLD and width > MORE_ROOM * usual
 
 
 def with_tolerance(

@@ -26,6 +26,7 @@ from flexdt.twin.calibration.fit.problem import (
     FitProblem,
 )
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.machine.stated_causes import TOLD_RIVALS
 
 STATED_LOG_CHANCE: Final = math.log(0.5)
 """The same for a cause that the script states: images may be made of instants; assumed."""
@@ -53,6 +54,7 @@ STATED: Final = (
     (f"{MOTION_OF}alpha", "angles"),
     (MOTION_OF, "motion"),
     (REPEATING, "spots"),
+    (TOLD, TOLD_RIVALS),
 )
 """Begin of a cause's name, and the name by which it is stated; the first counts."""
 SAME_UNIT: Final = ("gap", "distortion", "shape", "beads")
