@@ -18,6 +18,7 @@ from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import from_printed_reading, values_in
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
+from flexdt.twin.geometry.told_lengths import TOLD
 
 TRACK_DECIMALS: Final = 3
 """Decimals of pixel positions in a file of tracks."""
@@ -37,6 +38,9 @@ def predictions(fit: FitResult, geometry: Sequence[Offsets]) -> FloatArray:
     x = problem.start
     first = problem.layout.parameter_count  # then the beads, and the panel's distortion
     x[first:] = fit.solution.x[first:]
+    for i, name in enumerate(problem.layout.names[:first]):
+        if name.split("@")[0] in TOLD:
+            x[i] = fit.solution.x[i]
     return problem.residuals(x, np.ones_like(problem.seen))[0]
 
 

@@ -629,8 +629,8 @@ def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:
     Args:
         outcome: of a calibration.
         truth: offset -> value in edge units [mm, deg]; offsets that it leaves out are
-            nominal. alpha is compared modulo a turn. A parameter of several scans is
-            compared in each.
+            nominal, and lengths as told. alpha is compared modulo a turn. A parameter of
+            several scans is compared in each.
 
     Returns:
         False also where nothing is identifiable, or where a parameter that was neither
@@ -643,7 +643,7 @@ def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:
     values = {}
     for name, estimate in fit.certificate.estimates.items():
         base = name.split("@")[0]
-        values[name] = true[base]
+        values[name] = true.get(base, 0.0)  # lengths are as told
         if base == "alpha":
             # Whole turns of the start angle are the same geometry.
             off = math.remainder(true[base] - estimate.value, 360.0)

@@ -36,9 +36,9 @@ WAY: Final = 7e-4
 PLACE_MM: Final = 0.02
 """Standard deviation with which a stage comes back to a place [mm]; assumed, of a stepper motor
 with a screw."""
-PITCH: Final = 3e-5
+PITCH: Final = 3e-6
 """Standard deviation of the pixel pitch over the told one; assumed: panels are made by
-photolithography, to a pixel in some 30 000. A pitch that is told wrong is another cause
+photolithography, to 1 um in 0.3 m. A pitch that is told wrong is another cause
 (`diagnose.pixel_pitch`)."""
 OFFSETS: Final[Mapping[str, float]] = {
     "dD_x": 2.0,
