@@ -286,7 +286,7 @@ class Core:
         await self.transport.open()
         link = Link(self.transport, self._deliver, self._notify_end)
         try:
-            hello = await self._introduce(link)
+            await self.introduce(link)
             for wanted in list(self._listeners.values()):
                 await link.request("state.subscribe", wanted, self.timeout_s)
             if self.closed:  # by another thread or task, meanwhile
@@ -297,14 +297,12 @@ class Core:
                 # The server said why it ends the connection: trying again is no help.
                 raise link.calls.reason from None
             raise
-        self.hello = hello
         return link
 
-    async def _introduce(self, link: Link) -> HelloResult:
-        """Greet the server and check that it is a twin.
+    async def introduce(self, link: Link) -> None:
+        """Greet the server with this client's name, check that it is a twin, and keep its hello.
 
-        Returns the server's hello; a hello without a machine is that of another program.
-        The error's `sent` is that of the lost request.
+        A hello without a machine is that of another program. The error's `sent` is that of the lost request.
 
         Raises:
             ConnectionLost: the server ended the connection.
@@ -331,7 +329,7 @@ class Core:
         hello = parse_result(HelloResult, answer)
         if not hello.machine:
             raise NoTwinError(f"{place} is no twin: it is {hello.server}")
-        return hello
+        self.hello = hello
 
 
 def _require_same(

@@ -153,6 +153,19 @@ class KeptConnection:
         finally:
             await core.disconnect()
 
+    async def rename(self, name: str) -> None:
+        """Take another name: at once where there is a connection, and in every later hello.
+
+        Raises:
+            RpcError: the twin refuses it.
+            ConnectionLost: the connection was lost meanwhile; the next one has the name.
+        """
+        self.name = self._client.core.name = name
+        link = self._client.core.link
+        if link is not None and link.alive:
+            await self._client.core.introduce(link)
+            self._on_change()
+
     async def request(
         self, method: str, params: Mapping[str, object] | None = None
     ) -> object:

@@ -59,6 +59,7 @@ QUICK_S: Final = 0.02
 HIDDEN: Final = frozenset({"session.hello", "state.subscribe", "state.unsubscribe"})
 """Methods of the wire that a page does not use: its viewer does."""
 
+MAX_NAME: Final = 40
 Local = Callable[["Page", Mapping[str, Any]], Awaitable[object]]
 """A method of the viewer itself."""
 
@@ -109,7 +110,9 @@ class Page:
         """The key of the last block of a volume offered to the page."""
         self._connection = connection
         self._local = local
-        self.link = KeptConnection(address, person, on_change=self._link_changed)
+        self.link = KeptConnection(
+            address, person_name(person), on_change=self._link_changed
+        )
         self._notes: deque[str] = deque()
         self._newest: dict[str, str | bytes] = {}
         self._sent_at: dict[str, deque[float]] = {slot: deque() for slot in ON_THE_WAY}
@@ -379,6 +382,12 @@ class Page:
     def _link_changed(self) -> None:
         hello = self.link.hello
         self.say("session", connected=hello is not None, session=hello and hello.session)
+
+
+def person_name(text: str) -> str:
+    """Return a person's name as others see it: printable, at most `MAX_NAME` characters, or
+    "a visitor"."""
+    return "".join(c for c in text if c.isprintable()).strip()[:MAX_NAME] or "a visitor"
 
 
 def _words(error: RpcError | ConnectionLost) -> str:

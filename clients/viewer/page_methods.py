@@ -31,7 +31,7 @@ from flexdt.clients.viewer import exports
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.exports import Form
 from flexdt.clients.viewer.front import Download
-from flexdt.clients.viewer.page import Page, without_bytes
+from flexdt.clients.viewer.page import Page, person_name, without_bytes
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import LAYERS
 from flexdt.clients.viewer.scenes.views import FREE
@@ -94,6 +94,12 @@ def layers_model() -> type[Params]:
     switches: Any = {layer.name: (bool | None, None) for layer in LAYERS}
     opacity: Any = (Annotated[float, Ge(0.05), Le(1)] | None, None)
     return create_model("Layers", __base__=Params, **switches, opacity=opacity)
+
+
+class Person(Params):
+    """The name of the page's user, for the others."""
+
+    name: str = ""
 
 
 class Theme(Params):
@@ -260,6 +266,12 @@ async def layers(viewer: Viewer, page: Page, params: Params) -> object:
         viewer.lab.draw_ranges(viewer.state)
     viewer.show_layers()
     page.say("layers", **page.shown.told)
+    return {}
+
+
+async def person(viewer: Viewer, page: Page, params: Person) -> object:
+    """Give the page's user another name, over the open connections; control stays; returns {}."""
+    await page.link.rename(person_name(params.name))
     return {}
 
 
@@ -944,6 +956,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "calibration.fit": (CalibrationFit, estimate),
     "calibration.align": (CalibrationAlign, estimate),
     "viewer.layers": (layers_model(), layers),
+    "viewer.person": (Person, person),
     "viewer.theme": (Theme, theme),
     "viewer.camera": (Camera, camera),
     "viewer.preset": (Preset, preset),

@@ -641,10 +641,8 @@ class Viewer:
             asked = parse_qs(urlsplit(connection.request.path).query)
         else:
             asked = {}
-        person = "".join(
-            c for c in asked.get("person", [""])[0] if c.isprintable()
-        ).strip()[:40]
-        page = Page(id, connection, self.twin_address, self._local, person or "a visitor")
+        person = asked.get("person", [""])[0]
+        page = Page(id, connection, self.twin_address, self._local, person)
         self.opened += 1
         self.open_pages.add(page)
         self.pages[id] = page

@@ -145,6 +145,11 @@ class ControlLease:
         if self.holder == who:
             self.holder = None
 
+    def rename(self, before: str, now: str) -> None:
+        """Let control go along with a client that has another name now."""
+        if self.holder == before:
+            self.holder = now
+
     def force(self, who: str) -> str | None:
         """Give control to `who` and renew its lease; return the holder who loses it, or None."""
         loser = None

@@ -43,6 +43,7 @@ export const OLD_S = 1;
 const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5);
 const LOOK_MS = 200;
 const REST_MS = 500;
+const RETRY_MS = 500;
 const TRY_AGAIN = 1013;
 /** @typedef {{ [E in keyof Events]?: Array<(...args: Events[E]) => unknown> }} Listeners */
 
@@ -50,14 +51,67 @@ const TRY_AGAIN = 1013;
 const listeners = {};
 
 /**
+ * A request that has no answer yet.
  * @typedef {object} Waiting
+ * @property {string} text as it is sent
  * @property {(result: never) => void} resolve
  * @property {(why: Failure) => void} reject
  * @property {number} since
+ * @property {string | null} urgent what a person pressed
+ * @property {boolean} sent over the present connection
  */
 
 /** @type {Map<number, Waiting>} */
 const waiting = new Map();
+/** @type {Record<string, string>} */
+const URGENT = { "safety.estop": "E-STOP", "axes.stop": "Stop", "job.abort": "Abort" };
+/** Code of an answer that says that no connection has brought the request to the twin. */
+const LINK_DOWN = -32011;
+
+/**
+ * What a person pressed with a request that makes the machine quiet: it is kept until the twin has
+ * answered it.
+ * @param {string} method
+ * @param {{ on?: unknown }} params
+ * @returns {string | null}
+ */
+function urgent(method, params) {
+  if (method === "tube.set" && params.on === false) return "X-rays off";
+  return URGENT[method] ?? null;
+}
+
+/**
+ * The oldest urgent request that has not been answered, and its age in seconds.
+ * @returns {{ what: string, age: number } | null}
+ */
+export function unanswered() {
+  const now = performance.now();
+  let oldest = null;
+  for (const w of waiting.values())
+    if (w.urgent && (!oldest || w.since < oldest.since)) oldest = w;
+  return oldest && { what: oldest.urgent ?? "", age: (now - oldest.since) / 1000 };
+}
+
+/** Send what is urgent and has not been sent over this connection, with its age as a note. */
+function sendUrgent() {
+  for (const [id, w] of waiting) {
+    if (!w.urgent || w.sent) continue;
+    const age = (performance.now() - w.since) / 1000;
+    if (age > OLD_S)
+      emit("note", "warn", `${w.urgent}, pressed ${age.toFixed(0)} s ago, is sent now`, "");
+    send(id, w);
+  }
+}
+
+/**
+ * @param {number} id
+ * @param {Waiting} w
+ */
+function send(id, w) {
+  waiting.set(id, w);
+  w.sent = socket?.readyState === WebSocket.OPEN;
+  if (w.sent) socket?.send(w.text);
+}
 
 /** Why a request was refused; code 0: nobody answered it. */
 export class Failure extends Error {
@@ -111,13 +165,15 @@ export function emit(what, ...args) {
  */
 export function call(method, params = {}) {
   return new Promise((resolve, reject) => {
-    if (!socket || socket.readyState !== WebSocket.OPEN) {
+    const pressed = urgent(method, params);
+    if (!pressed && socket?.readyState !== WebSocket.OPEN) {
       reject(new Failure(0, "no connection to the viewer"));
       return;
     }
     const id = nextId++;
-    waiting.set(id, { resolve, reject, since: performance.now() });
-    socket.send(JSON.stringify({ id, method, params }));
+    const text = JSON.stringify({ id, method, params });
+    const since = performance.now();
+    send(id, { text, resolve, reject, since, urgent: pressed, sent: false });
   });
 }
 
@@ -145,7 +201,7 @@ export const person = () => localStorage.getItem(PERSON) ?? "";
 /** @param {string} name */
 export function rename(name) {
   keep(PERSON, name.trim());
-  socket?.close();
+  void call("viewer.person", { name: name.trim() }).catch(() => null); // the next connection brings it
 }
 export function connect() {
   // Below the page's own address: a proxy may have put it anywhere.
@@ -171,8 +227,12 @@ export function connect() {
     store.viewer = false;
     store.twin = false;
     store.session = null;
-    for (const { reject } of waiting.values()) reject(new Failure(0, "the viewer has gone"));
-    waiting.clear();
+    for (const [id, w] of waiting) {
+      w.sent = false;
+      if (w.urgent) continue;
+      waiting.delete(id);
+      w.reject(new Failure(0, "the viewer has gone"));
+    }
     if (was) emit("connection");
     setTimeout(connect, pause);
     pause = Math.min(2 * pause, 2000);
@@ -183,6 +243,11 @@ export function connect() {
 const handlers = {
   answer(m) {
     const w = waiting.get(m.id);
+    if (w?.urgent && m.error?.code === LINK_DOWN) {
+      w.sent = false; // the next session with the twin takes it along, or this one
+      setTimeout(() => store.session && sendUrgent(), RETRY_MS);
+      return;
+    }
     waiting.delete(m.id);
     if (m.error) w?.reject(new Failure(m.error.code, m.error.message, m.error.data));
     else w?.resolve(/** @type {never} */ (m.result));
@@ -219,7 +284,9 @@ const handlers = {
   session(m) {
     store.session = m.session;
     emit("connection");
-    if (m.connected) emit("session");
+    if (!m.connected) return;
+    sendUrgent();
+    emit("session");
   },
   volume(m) {
     took("volume");
@@ -318,7 +385,7 @@ setInterval(() => {
   look();
   if (store.age <= SILENT_S) return;
   for (const [id, w] of waiting)
-    if (now - w.since > 1000 * SILENT_S) {
+    if (!w.urgent && now - w.since > 1000 * SILENT_S) {
       waiting.delete(id);
       w.reject(new Failure(0, `no answer for ${SILENT_S} s; it may still take effect`));
     }

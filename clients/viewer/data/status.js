@@ -3,7 +3,7 @@
 import { $, $$, $button, $dialog, $input, el, fixed, setText } from "./dom.js";
 import { listed, sampleOf } from "./fingerprint.js";
 import { toYou } from "./names.js";
-import { command, imageMade, OLD_S, on, person, rename, store } from "./link.js";
+import { command, imageMade, OLD_S, on, person, rename, store, unanswered } from "./link.js";
 import { isDown, stopped } from "./warnings.js";
 import "./readouts.js";
 /** @import { ClockState, State } from "../web/viewer.d.ts" */
@@ -208,13 +208,17 @@ function connection() {
   const found = missing();
   const connecting = greets(found);
   const told = connecting ? null : found;
-  const unconfirmed = pressed !== null && performance.now() - pressed.at > 1000 * OLD_S;
+  const kept = unanswered();
+  const waits = kept !== null && kept.age > OLD_S ? `${kept.what} not confirmed` : null;
+  const estopWaits = pressed !== null && performance.now() - pressed.at > 1000 * OLD_S;
+  const unconfirmed = estopWaits ? UNCONFIRMED : waits;
   bar(told, connecting);
   document.body.dataset.old = String(told !== null);
-  $("#estop").toggleAttribute("data-dead", !store.viewer || !store.twin);
+  $("#estop").toggleAttribute("data-dead", store.hello === null);
   $("#veil").hidden = told === null && !unconfirmed;
+  $("#veil").dataset.urgent = String(unconfirmed !== null);
   const title = told?.title ?? "";
-  setText($("#veil-title"), unconfirmed ? `${UNCONFIRMED}${title && `. ${title}`}` : title);
+  setText($("#veil-title"), unconfirmed ? `${unconfirmed}${title && `. ${title}`}` : title);
   const why = [told?.why, BUTTON].filter(Boolean).join("; ");
   setText($("#veil-text"), unconfirmed || told ? why : "");
 }

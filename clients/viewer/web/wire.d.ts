@@ -167,6 +167,7 @@ export type MoveResult = {
   duration_s: number; warnings: Array<string>; moves: Array<Record<string, number>> | null;
   arrived: boolean | null
 };
+export type Person = { name?: string };
 export type Placement = {
   x?: number; y?: number; z?: number; rx?: number; ry?: number; rz?: number
 };
@@ -316,6 +317,7 @@ export interface Methods {
   "scene.save": [SceneSave, SceneResult];
   "scene.load": [SceneLoad, SceneLoaded];
   "viewer.layers": [Layers, object];
+  "viewer.person": [Person, object];
   "viewer.theme": [Theme, object];
   "viewer.camera": [Camera, object];
   "viewer.preset": [Preset, object];

@@ -29,7 +29,7 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
     """Check the protocol's version, note the client's program name, and return the facts
     of the server.
 
-    A later hello does not change the program, by which control goes. The token has been
+    A later hello may bring another name, and control goes along with it. The token has been
     checked before, by `network.shell_parts.TokenCheck`.
 
     Returns:
@@ -40,7 +40,11 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
         RpcError: another version of the protocol.
     """
     require_compatible(params.protocol)
-    client.program = client.program or params.client  # control goes by the name
+    before = client.name
+    client.program = params.client
+    if client.name != before:
+        twin.control.rename(before, client.name)
+        twin.feed.changed()
     return p.HelloResult(
         protocol=PROTOCOL,
         server=f"flexdt {twin.version}",
