@@ -300,9 +300,11 @@ class Core:
         return link
 
     async def introduce(self, link: Link) -> None:
-        """Greet the server with this client's name, check that it is a twin, and keep its hello.
+        """Greet the server with this client's name, check that it is a twin, and keep its
+        hello.
 
-        A hello without a machine is that of another program. The error's `sent` is that of the lost request.
+        A hello without a machine is that of another program. The error's `sent` is that of
+        the lost request.
 
         Raises:
             ConnectionLost: the server ended the connection.
