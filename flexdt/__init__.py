@@ -19,6 +19,7 @@ if _typing.TYPE_CHECKING:
     from flexdt.library.analysis import align as align
     from flexdt.library.analysis import calibrate as calibrate
     from flexdt.library.analysis import reconstruct as reconstruct
+    from flexdt.library.convention import find_convention as find_convention
     from flexdt.library.data_set import DataSet as DataSet
     from flexdt.library.expose import expose as expose
     from flexdt.library.reading.folders import load_dataset
@@ -102,6 +103,7 @@ _HOMES: _typing.Final = {
     "cgls": "flexdt.twin.reconstruction.iterative",
     "expose": "flexdt.library.expose",
     "fdk": "flexdt.twin.reconstruction.checked_fdk",
+    "find_convention": "flexdt.library.convention",
     "forward": "flexdt.twin.projection.operators",
     "machine": "flexdt.library.scripts",
     "open": "flexdt.library.reading.folders:load_dataset",

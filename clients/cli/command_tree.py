@@ -59,7 +59,7 @@ COMMANDS: Final[Mapping[str, Callable[..., object]]] = {
         (exposure, "expose"),
         (scanner, "state tube camera clock move jog stop estop reset sample snap"),
         (geometry, "calibrate align compare"),
-        (data, "reconstruct export import_"),
+        (data, "reconstruct describe export import_"),
         (following, "follow"),
         (commissioning, "commission"),
     )
@@ -73,6 +73,7 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
         "What a twin keeps, deleted.",
         {"sample": scanner.delete_sample, "correction": scanner.delete_correction},
     ),
+    "geometry": ("The geometry of images.", {"guess": data.guess}),
     "phantom": (
         "Phantoms: objects to scan.",
         {"list": phantoms.list_phantoms, "make": phantoms.make},
@@ -132,6 +133,8 @@ SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
         "calibrate",
         "align",
         "compare",
+        "describe",
+        "geometry",
         "reconstruct",
         "export",
         "import",

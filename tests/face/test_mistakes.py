@@ -51,6 +51,7 @@ RIGHT: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "DataSet.align": (DATA.align, {"per_frame": False}),
     "DataSet.save": (DATA.save, {"folder": "somewhere"}),
     "Detector": (fx.Detector, {"bits": 14, "blur_mm": 0.1, "scintillator": "CsI@4.51"}),
+    "find_convention": (fx.find_convention, {"images": IMAGES, "geometry": SCAN}),
     "Grid": (fx.Grid, {"shape": (4, 4, 4), "voxel_mm": 0.5, "center_mm": (0.0, 0.0, 0.0)}),
     "LocalTwin": (fx.LocalTwin, {"data": "x", "sample": "lego", "machine": "flexray"}),
     "Operator": (fx.Operator, {"geometry": SCAN, "like": GRID, "shape": (6, 8)}),

@@ -25,6 +25,7 @@ def integrals(
     sdd: float = SDD,
     pitch: float = PITCH,
     shape: tuple[int, int] = SHAPE,
+    balls: FloatArray = BALLS,
 ) -> FloatArray:
     """Line integrals (n, rows, cols), seen from the source, row 0 at the top.
 
@@ -35,6 +36,7 @@ def integrals(
         heights: of the sample [mm], (n,).
         sod, sdd, pitch: source to axis and panel, and the pixel [mm].
         shape: of an image (rows, cols).
+        balls: x, y, z and radius of each [mm].
     """
     angles = np.deg2rad(np.asarray(angles_deg, dtype=np.float64))
     raised = np.broadcast_to(heights, angles.shape)
@@ -48,7 +50,7 @@ def integrals(
     out = np.zeros((len(angles), rows, cols))
     for image, angle, height in zip(out, angles, raised, strict=True):
         c, s = np.cos(angle), np.sin(angle)
-        for bx, by, bz, radius in BALLS:
+        for bx, by, bz, radius in balls:
             place = np.array([c * bx + s * by, sod - s * bx + c * by, bz + height])
             near = place @ place - (ray @ place) ** 2
             image += 2.0 * MU * np.sqrt(np.maximum(radius**2 - near, 0.0))

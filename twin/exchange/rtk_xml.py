@@ -232,6 +232,11 @@ def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
     sod, sdd = (pairs * np.sign(pairs[:, 1:])).T
     if ((sod <= 0.0) | (sod > sdd * (1 + ROUNDING_TOLERANCE))).all():
         names = ("SourceToIsocenterDistance", "SourceToDetectorDistance")
+        first, second = (float(one) for one in pairs[0])
+        if first * second < 0.0:
+            problem = f"{file}: {names[0]} is {first:g} mm and {names[1]} {second:g} mm"
+            allowed = f"0 < {names[0]} <= {names[1]}, or both with the other sign"
+            raise ExchangeError.instead(problem, [first, second], allowed)
         impossible = distance_findings(float(sod[0]), float(sdd[0]), 0.1 * sdd[0], names)
         settled(impossible, ExchangeError, file)
 

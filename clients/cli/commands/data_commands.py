@@ -561,6 +561,61 @@ def export(
     yield f"{out}: {len(written)} views of {width} x {height} pixels, {what}, {format}"
 
 
+def describe(dataset: Path = argument(..., "DATASET")) -> Answer:
+    """Show every value of a scan's files with its use.
+
+    Used, contradicted (another statement was taken) or ignored, with what follows.
+
+    Yields:
+        The document of --json (name, projections, shape, complete, warnings, provenance),
+        then a line of the data set and the table. Warnings go to standard error.
+    """
+    data = scan_of(dataset, False, None)
+    warn(data.warnings, dataset)
+    yield {
+        "name": data.name,
+        "projections": len(data),
+        "shape": list(data.shape),
+        "complete": data.complete,
+        "warnings": list(data.warnings),
+        "provenance": data.provenance.to_list(),
+    }
+    rows, columns = data.shape
+    yield f"{data.name}: {len(data)} projections of {columns} x {rows} pixels"
+    yield from data.provenance.lines
+
+
+def guess(
+    dataset: Path = argument(..., "DATASET"),
+    geometry: Path | None = argument(None, "GEOMETRY"),
+) -> Answer:
+    """Find which flips, sense of rotation and signs of offsets fit a scan's images.
+
+    GEOMETRY is a file, in place of the data set's own. Exit code 5 where the images do not
+    decide.
+
+    Yields:
+        The document of --json (decided, names, odds, sentence), then a line for each
+        convention with its odds.
+    """
+    from flexdt.library.convention import find_convention
+    from flexdt.twin.errors import NotIdentifiableError
+
+    data = scan_of(dataset, False, None, geometry)
+    found = find_convention(data)
+    yield {
+        "decided": found.decided,
+        "names": list(found.names),
+        "odds": dict(found.odds),
+        "sentence": str(found),
+    }
+    for name, odds in found.odds.items():
+        yield f"{odds:8.2g}  {name}"
+    if not found.decided:
+        raise NotIdentifiableError(str(found))
+    yield str(found)
+
+
 def import_(
     file: Path = argument(..., "FILE"),
     format: str = option(..., among=imported),

@@ -207,3 +207,18 @@ def test_noise_in_arrays_is_refused(values: dict[str, Any]) -> None:
     for read in (read_cil, read_tigre, read_leap):
         with pytest.raises(ExchangeError):
             read(arrays)
+
+
+@pytest.mark.parametrize(("sid", "sdd"), [(120.0, -240.0), (-120.0, 240.0)])
+def test_rtks_distances_of_two_signs_are_told_as_they_stand(
+    sid: float, sdd: float
+) -> None:
+    text = (
+        '<?xml version="1.0"?><RTKThreeDCircularGeometry version="3"><Projection>'
+        f"<SourceToIsocenterDistance>{sid}</SourceToIsocenterDistance>"
+        f"<SourceToDetectorDistance>{sdd}</SourceToDetectorDistance>"
+        "</Projection></RTKThreeDCircularGeometry>"
+    )
+    said = rf"IsocenterDistance is {sid:g} mm and SourceToDetectorDistance {sdd:g} mm"
+    with pytest.raises(ExchangeError, match=said):
+        read_rtk(text, (0.5, 0.5))

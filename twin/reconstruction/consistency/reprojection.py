@@ -65,7 +65,7 @@ class Reprojection:
         """Reconstruct images as of a geometry, and project the volume again coarsely; NaN
         voxels count as 0.
 
-        The object is raised meanwhile by at most half a layer of the grid (`_layers_off`).
+        The object is raised meanwhile by at most half a layer of the grid (`layers_off`).
 
         Args:
             scan: gives the grid.
@@ -81,7 +81,7 @@ class Reprojection:
             None where FDK cannot use the geometry.
         """
         straight = images if shifts is None else shifted_back(images, shifts)
-        layers = _layers_off(scan, cone_vec)
+        layers = layers_off(scan, cone_vec)
         if layers:
             up_mm = [0.0, 0.0, layers * scan.grid.voxel_xyz[2]]
             cone_vec = cone_vec.moved(np.eye(3), up_mm)
@@ -182,7 +182,7 @@ class Reprojection:
         return noise_of(self.again) if self.own_noise is None else self.own_noise
 
 
-def _layers_off(scan: CoarseScan, cone_vec: ConeVec) -> float:
+def layers_off(scan: CoarseScan, cone_vec: ConeVec) -> float:
     """Compute by how much the object has to be raised so that a geometry's rows fall on the
     grid's layers as those of the scan do [layers, at most 0.5 up or down].
 
