@@ -7,11 +7,19 @@ the method is first called: detection, kernels and figures are heavy.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Unpack
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Self, Unpack
+
+import numpy as np
+import numpy.typing as npt
 
 from flexdt.library.calibration.calibration_options import CalibrationOptions
+from flexdt.library.datasets.cutting import cut
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_set import ImageSet
+from flexdt.library.datasets.reference_look import looked_at, order_doubts
+from flexdt.library.datasets.scan_inputs import geometry_said, references_said
+from flexdt.library.datasets.scan_options import ScanOptions
 from flexdt.twin import long_work
 from flexdt.twin.algorithms import DEFAULT, PLAIN
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -66,6 +74,63 @@ class DataSet(ImageSet):
         >>> round(float(data[0][0, 0]), 4), len(data[1:])
         (0.6931, 2)
     """
+
+    @classmethod
+    @with_options_of(ScanOptions)
+    def from_arrays(  # type: ignore[override]
+        cls,
+        counts: npt.ArrayLike,
+        geometry: ConeVec | npt.ArrayLike | File,
+        *,
+        name: str = "arrays",
+        warnings: Sequence[str] = (),
+        truth: Any = None,
+        **options: Unpack[ScanOptions],
+    ) -> Self:
+        """Make a data set in memory.
+
+        Args:
+            counts: (n, rows, cols), integers from 0 to 65535; with a flat image also
+                images of any other scale, such as floats, or negative values after a dark
+                image was subtracted; or line integrals, which are floats without a flat
+                image. Line integrals are kept as they are, and as counts of an open beam
+                of 60000, or down to 20000 where pixels are brighter than it, for
+                functions of counts; a warning gives the number beyond the range of
+                counts.
+            geometry: one view for each image, or a file that `ConeVec.load` reads.
+            name: of the data set.
+            warnings: doubts about it.
+            truth: sample and settings of a simulation.
+            options: OPTIONS
+
+        Without a flat image or an open beam, counts have no line integrals.
+
+        Raises:
+            DatasetFormatError: shapes that do not fit, values that are no counts, line
+                integrals that are not finite, or an implausible geometry. Images that are
+                zero everywhere make the data set incomplete.
+
+        Example:
+            >>> import numpy as np
+            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
+            >>> DataSet.from_arrays(np.full((3, 4, 5), 500), scan, name="mine")
+            <DataSet 'mine': 3 projections of 4 x 5 (rows x columns), complete, 1 warning>
+        """
+        values = np.asarray(counts)
+        shape = values.shape[1:] if values.ndim == 3 else None
+        before, opened = references_said(options)
+        made = super().from_arrays(
+            values,
+            geometry_said(geometry, options, shape),
+            dark=before.read(shape, "dark") if before and shape else None,
+            flat=opened.read(shape, "flat") if opened and shape else None,
+            name=name,
+            warnings=warnings,
+            truth=truth,
+        )
+        made = looked_at(replace(made, warnings=(*made.warnings, *order_doubts(made))))
+        kept = {key: options.get(key) for key in ("crop", "binning", "views")}
+        return cut(made, **kept)  # type: ignore[arg-type]
 
     @with_options_of(CalibrationOptions)
     def calibrate(

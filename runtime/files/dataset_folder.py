@@ -45,14 +45,20 @@ _IMAGE: Final = re.compile(r"(di|io|scan)[_-]?(\d+)\.tiff?", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Frame:
-    """One projection: index in the scan, file name, path (None in memory), whether it
+    """One projection: index in the scan, file name, its folder (None in memory), whether it
     exists, (rows, cols)."""
 
     index: int
     file: str
-    path: Path | None
+    folder: Path | None
     present: bool
     shape: Shape
+
+    @property
+    def path(self) -> Path | None:
+        """Path of its file; None in memory."""
+        # Made when it is asked for: it is a third of the time to open a long scan.
+        return None if self.folder is None else self.folder / self.file
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +121,7 @@ class Folder:
         its path, and whether the listing has its file.
         """
         return tuple(
-            Frame(i, name, self.path / name, name in self.names, shape)
+            Frame(i, name, self.path, name in self.names, shape)
             for i, (name, shape) in enumerate(zip(files, shapes, strict=True))
         )
 

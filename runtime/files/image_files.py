@@ -160,6 +160,31 @@ def read_pixels(path: Path, image: int = 0) -> Pixels:
     return _answered(path, lambda form, file: form.read(file, path, image))
 
 
+def read_rows(
+    path: Path, shape: tuple[int, int], rows: npt.NDArray[np.intp]
+) -> npt.NDArray[Any]:
+    """Read some rows of the only image of a file, (rows, cols).
+
+    Of a plain TIFF with the same tags as one that was read before no other row is read.
+
+    Args:
+        path: of the file.
+        shape: (rows, cols) that the image must have.
+        rows: indices of rows.
+
+    Raises:
+        DatasetError: as `read_pixels`, or another shape.
+    """
+    with opened(path) as file:
+        some = tiff_images.read_tiff_rows(file, rows)
+    if some is not None and some.shape[1] == shape[1]:
+        return some
+    values, _ = read_pixels(path)
+    if values.shape != shape:
+        raise DatasetFormatError(f"{path} has another shape", {"path": str(path)})
+    return values[rows]
+
+
 def _answered(path: Path, ask: Callable[[ImageFormat, BinaryIO], Any]) -> Any:
     """Return the answer of the format of a file.
 

@@ -156,6 +156,28 @@ def read_tiff(file: BinaryIO, image: int) -> tuple[npt.NDArray[Any], ImageHead]:
         return values, head
 
 
+def read_tiff_rows(file: BinaryIO, rows: npt.NDArray[np.intp]) -> npt.NDArray[Any] | None:
+    """Read rows of a plain TIFF with the tags of one that was read before, (rows, cols).
+
+    Returns:
+        None for any other file; nothing of it is decoded.
+    """
+    known = _plain.get(os.fstat(file.fileno()).st_size)
+    if known is None:
+        return None
+    for at, part in known.parts:
+        file.seek(at)
+        if file.read(len(part)) != part:
+            return None
+    cols = known.head.shape[1]
+    size = cols * known.stored.itemsize
+    out = np.empty((len(rows), cols), known.head.dtype)
+    for k, row in enumerate(rows):
+        file.seek(known.offset + int(row) * size)
+        out[k] = np.frombuffer(file.read(size), known.stored)
+    return out
+
+
 class _tidied:  # noqa: N801
     """Turn any error of tifffile's or a codec's parser into ours, without its words."""
 

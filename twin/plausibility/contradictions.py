@@ -57,6 +57,12 @@ class PlausibilityCode(FindingCode):
     NEGATIVE = "negative", WARNING, "line integrals or attenuation of the other sign"
     SCALED = "scaled", ERROR, "line integrals that no panel can measure"
     FLATS_DISAGREE = "flats disagree", WARNING, "flat images of different beams"
+    DARKS_DISAGREE = "darks disagree", WARNING, "dark images of different signals"
+    DARK_NOT_DARK = (
+        "dark not dark",
+        WARNING,
+        "projections that are darker than the dark image",
+    )
     GRID_NOT_SEEN = "grid not seen", ERROR, "voxels beside the field of view"
     VOXEL_SIZE = "voxel size", ERROR, "voxels too large for the field of view"
     ANGLES_DISAGREE = (

@@ -1,4 +1,4 @@
-"""Comparison of flat images with each other and with the open beam at the object's side."""
+"""Comparison of dark and flat images with each other and with the projections."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ MAX_BEAM_DIFFERENCE: Final = 0.03
 drift."""
 NOISE_SIGMAS: Final = 6.0
 """Differences below this many standard deviations count as noise."""
+DARK_BLOCK: Final = 8
+"""Pixels of a row whose mean is compared with the dark image's."""
+MIN_BLOCKS_SHARE: Final = 1e-3
+"""Share of blocks that dead pixels may bring below the dark image."""
 STRIP_PART: Final = 0.03
 """Width of a strip at an image's edge, as a share of its columns."""
 MAX_STRIP_DIFFERENCE: Final = 0.004
@@ -60,6 +64,64 @@ def flat_findings(flats: npt.NDArray[Any], dark: npt.NDArray[Any]) -> Iterator[F
         )
         remedy = "was the current changed between them? use those that belong to the scan"
         yield warning(PlausibilityCode.FLATS_DISAGREE, cause, remedy, figure=apart)
+
+
+def dark_findings(darks: npt.NDArray[Any], opened: npt.NDArray[Any]) -> Iterator[Finding]:
+    """Find dark images of different signals.
+
+    Compares each image's median distance from the first with the open beam. Yields at most one
+    warning, its figure the difference as a share of the open beam, if that exceeds
+    `MAX_FLAT_DIFFERENCE`, as for flat images, and `NOISE_SIGMAS` of noise; nothing for one
+    image or without an open beam.
+
+    Args:
+        darks: (k, rows, cols) [counts].
+        opened: open beam (rows, cols), flat less dark images, of any dark [counts].
+    """
+    if len(darks) < 2:
+        return
+    beam = float(np.median(np.abs(opened)))
+    apart = np.asarray(darks, dtype=np.float32).reshape(len(darks), -1)
+    apart = apart - apart[0]
+    level = np.median(apart, axis=1)
+    spread = np.median(np.abs(apart - level[:, None]), axis=1)
+    noise = float((1.4826 * 1.2533 * spread).max() / np.sqrt(apart.shape[1]))
+    off = float(np.ptp(level))
+    if beam > 0.0 and off > max(MAX_FLAT_DIFFERENCE * beam, NOISE_SIGMAS * noise):
+        cause = (
+            f"the dark images differ by {off:.4g} counts, {100 * off / beam:.3g} % of the open "
+            "beam"
+        )
+        remedy = "was the tube off in all of them? leave out those that are not dark"
+        yield warning(PlausibilityCode.DARKS_DISAGREE, cause, remedy, figure=off / beam)
+
+
+def below_dark_findings(
+    views: npt.NDArray[Any], dark: npt.NDArray[Any]
+) -> Iterator[Finding]:
+    """Find projections that are darker than the dark image.
+
+    Without X-rays a panel counts least: a block of `DARK_BLOCK` pixels of a row whose mean is
+    below the dark image's by more than `NOISE_SIGMAS` standard errors, and by a count,
+    contradicts it. Noise is that of neighbours in a row. Yields at most one warning, its figure
+    the share of such blocks, above `MIN_BLOCKS_SHARE`.
+
+    Args:
+        views: (k, rows, cols) [counts].
+        dark: mean dark image (rows, cols) [counts].
+    """
+    cols = views.shape[2] // DARK_BLOCK * DARK_BLOCK
+    if not cols or not len(views):
+        return
+    below = np.asarray(views, dtype=np.float32)[..., :cols] - dark[:, :cols]
+    steps = np.median(np.abs(np.diff(below, axis=2)))
+    error = 1.4826 * float(steps) / np.sqrt(2.0 * DARK_BLOCK)
+    means = below.reshape(*below.shape[:2], -1, DARK_BLOCK).mean(axis=-1)
+    share = float((means < -max(NOISE_SIGMAS * error, 1.0)).mean())
+    if share > MIN_BLOCKS_SHARE:
+        cause = f"{100 * share:.3g} % of the projections is darker than the dark image"
+        remedy = "was the tube off in it, at the projections' exposure?"
+        yield warning(PlausibilityCode.DARK_NOT_DARK, cause, remedy, figure=share)
 
 
 def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:

@@ -10,14 +10,14 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.datasets.image_set import Counts, ImageSet, flats_of
+from flexdt.library.datasets.image_set import Counts, ImageSet
+from flexdt.library.datasets.reference_look import looked_at
 from flexdt.runtime.files.dataset_folder import read_image
 from flexdt.twin.dataset.dataset_errors import DatasetError, DatasetFormatError
 from flexdt.twin.physics.exposure import FEW_COUNTS, WARNING_SHARE
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.reference_images import (
     beam_findings,
-    flat_findings,
     open_beam,
 )
 
@@ -75,8 +75,8 @@ def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
 def image_doubts(
     scan: ImageSet, *, needed: bool = False, counts: Callable[[int], Counts] | None = None
 ) -> list[str]:
-    """Find saturated or starved pixels, and changes of the beam or between flat images,
-    that make a scan's line integrals doubtful.
+    """Find saturated or starved pixels and changes of the beam that make a scan's line
+    integrals doubtful; what opening told of its reference images is told once more.
 
     Saturated pixels are those with the panel's largest count. Where that is not known, it
     is the largest among the images if it is one at which converters end (2^bits - 1). All
@@ -112,8 +112,8 @@ def image_doubts(
         held = min(shares.saturated.values()) <= 1.0 - WARNING_SHARE
         doubts = [*_sentences(shares, unlit)]
         if held:
-            compared = *flat_findings(flats_of(scan), dark), *beam_findings(shares.beam)
-            doubts += settled(compared, DatasetFormatError)
+            told = scan.references or looked_at(scan).references or ()
+            doubts += settled(told or beam_findings(shares.beam), DatasetFormatError)
     if needed and not held:
         raise DatasetFormatError(
             f"{scan.where}: the images hold no line integrals; {'; '.join(doubts)}",

@@ -19,12 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.datasets.notebook_html import facts_table, thumbnail
-from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image
+from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image, read_values
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.normalise import LineIntegrals, of_intensities
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.dataset.scan_settings import ScanSettings
+from flexdt.twin.findings import Findings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.motion import Motion
@@ -115,6 +116,7 @@ class ImageSet:
         provenance: every value of the scan's files, and whether it is used, contradicted or
             ignored; a table.
         full_scale: largest count of the panel; None where it is not known.
+        references: what its dark and flat images contradict, told at opening; None: nothing.
         truth: of a simulated data set, its sample and settings.
         interpolated: pixels whose line integrals are interpolated, (rows, cols); None: dead
             ones.
@@ -149,6 +151,7 @@ class ImageSet:
     warnings: tuple[str, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
     full_scale: int | None = None
+    references: Findings | None = None
     truth: Any = None
     interpolated: npt.NDArray[np.bool_] | None = None
 
@@ -515,8 +518,8 @@ class ImageSet:
         if flat is None:
             raise DatasetMissingError(
                 f"{self.where}: no flat field (io000000.tif, images of key 1 in an NXtomo "
-                "file, or those that `flat` of fx.read_tiffs and from_arrays names); without "
-                "one there are no line integrals",
+                "file); without flat images or the count of an open beam there are no line "
+                "integrals",
                 {"path": self.where, "missing": ["io000000.tif"]},
             )
         return flat
@@ -745,25 +748,25 @@ def _image_stack(
     return values
 
 
-def flats_of(data: ImageSet) -> npt.NDArray[Any]:
-    """Return the flat images, (k, rows, cols): those in memory, else those of files if
-    there are several. A single file is not read: an empty array then, as without any.
-    """
-    if data.arrays is not None and data.arrays.flats is not None:
-        return data.arrays.flats
-    several = data.flats if len(data.flats) > 1 else ()
-    return np.array([read_image(path, data.shape) for path in several])
-
-
 def references(data: ImageSet) -> list[tuple[str, Counts]]:
     """List dark, then flat images as (file name, counts). Those in memory get names
     (di000000.tif, io000000.tif, ...) and are rounded to uint16.
     """
-    if data.arrays is None:
-        return [(path.name, read_image(path)) for path in (*data.darks, *data.flats)]
-    kinds = (("di", data.arrays.darks), ("io", data.arrays.flats))
-    return [
-        (f"{kind}{i:06d}.tif", np.rint(image).astype(np.uint16))
-        for kind, images in kinds
-        for i, image in enumerate(() if images is None else images)
-    ]
+    held = data.arrays or Arrays(None)
+    named: list[tuple[str, Counts]] = []
+    for kind, files, images in (
+        ("di", data.darks, held.darks),
+        ("io", data.flats, held.flats),
+    ):
+        if images is None:
+            named += [(path.name, _rounded(read_values(path))) for path in files]
+        else:
+            named += [
+                (f"{kind}{i:06d}.tif", _rounded(image)) for i, image in enumerate(images)
+            ]
+    return named
+
+
+def _rounded(image: npt.NDArray[Any]) -> Counts:
+    """Round an image to counts."""
+    return np.rint(np.clip(image, 0, np.iinfo(np.uint16).max)).astype(np.uint16)

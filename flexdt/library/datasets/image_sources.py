@@ -5,7 +5,8 @@ from __future__ import annotations
 import fnmatch
 import glob
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -62,11 +63,10 @@ class Reference:
         if self.images.shape == (1, 1, 1):
             return np.broadcast_to(self.images, (1, *shape))
         if self.images.shape[1:] != shape:
-            rows, cols = self.images.shape[1:]
-            raise DatasetFormatError(
-                f"{what} images of {cols} x {rows} pixels; the projections have "
-                f"{shape[1]} x {shape[0]}",
-                {"asked": [rows, cols], "allowed": list(shape)},
+            raise DatasetFormatError.instead(
+                f"{what} images of shape {self.images.shape[1:]}",
+                list(self.images.shape[1:]),
+                f"{tuple(shape)}, as the projections",
             )
         return self.images
 
@@ -213,7 +213,7 @@ def named_paths(text: str, folder: Path | None) -> list[Path]:
     """
     if folder is not None:
         names = sorted(list_folder(folder).names)
-        found = [n for n in names if matches(n, text)]
+        found = matching(names, text)
         if found:
             return [folder / name for name in found]
         if (folder / text).is_file():
@@ -226,9 +226,10 @@ def named_paths(text: str, folder: Path | None) -> list[Path]:
     return []
 
 
-def matches(name: str, pattern: str) -> bool:
-    """Return whether a file name matches a pattern, in either case."""
-    return fnmatch.fnmatchcase(name.lower(), pattern.lower())
+def matching(names: Iterable[str], pattern: str) -> list[str]:
+    """List the file names that match a pattern, in either case."""
+    fits = re.compile(fnmatch.translate(pattern), re.IGNORECASE).match
+    return [name for name in names if fits(name)]
 
 
 def hdf5_place(text: str, folder: Path | None = None) -> tuple[Path, str] | None:

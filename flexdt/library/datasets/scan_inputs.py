@@ -141,12 +141,15 @@ def placed(data: Images, dark: Reference | None, flat: Reference | None) -> Imag
     held = data.arrays or Arrays(None)
     if dark is not None:
         held = replace(held, darks=dark.of_shape(data.shape, "dark"))
-        data = replace(data, darks=dark.files)
     if flat is not None:
         held = replace(held, flats=flat.of_shape(data.shape, "flat"))
-        data = replace(data, flats=flat.files)
     empty = held.counts is None and held.darks is None and held.flats is None
-    return replace(data, arrays=None if empty else held)
+    return replace(
+        data,
+        arrays=None if empty else held,
+        darks=data.darks if dark is None else dark.files,
+        flats=data.flats if flat is None else flat.files,
+    )
 
 
 def with_options(data: Images, options: ScanOptions) -> Images:

@@ -24,8 +24,9 @@ from flexdt.library.datasets.image_sources import (
     Reference,
     hdf5_numbers,
     hdf5_place,
-    matches,
+    matching,
 )
+from flexdt.library.datasets.reference_look import looked_at
 from flexdt.library.datasets.saving import unfinished
 from flexdt.library.datasets.scan_inputs import (
     NO_DARK,
@@ -160,7 +161,7 @@ def load_dataset(
         # Angles of a geometry of one view make the others.
         given = None if geometry is None else geometry_said(geometry, options)
         kept = options if given is None else _without_angles(options)
-        return with_options(open_file(source, given, distances), kept)
+        return looked_at(with_options(open_file(source, given, distances), kept))
     content = list_folder(source)
     if UNFINISHED in content.names:
         raise DatasetMissingError(
@@ -181,9 +182,9 @@ def load_dataset(
     else:
         data = _from_texts(content, machine, profile)
     if geometry is None:
-        return with_options(data, options)
+        return looked_at(with_options(data, options))
     given = geometry_said(geometry, options, data.shape, content.path)
-    return with_options(_with_given(data, given), _without_angles(options))
+    return looked_at(with_options(_with_given(data, given), _without_angles(options)))
 
 
 def _holds_images(source: Path) -> bool:
@@ -261,7 +262,8 @@ def read_tiffs(
         data = _of_stacks([source], source.stem, geometry, options, dark, flat)
     else:
         data = _of_folder(list_folder(source), geometry, frames, options)
-    return cut(data, options.get("crop"), options.get("binning"), options.get("views"))
+    kept = cut(data, options.get("crop"), options.get("binning"), options.get("views"))
+    return looked_at(kept)
 
 
 def _of_hdf5(
@@ -311,13 +313,12 @@ def _of_folder(
             else [d for d in doubts if NO_FLAT not in d]
         )
         return replace(made, warnings=(*made.warnings, *told))
-    made = listed(content, cone, chosen, (), (), warnings=doubts, dark_told=not dark)
-    return placed(made, dark, flat)
+    return listed(content, cone, chosen, (), (), warnings=doubts, references=(dark, flat))
 
 
 def _by_pattern(content: Folder, names: Sequence[str], pattern: str) -> Reference:
     """Return the images of a folder whose names match a pattern."""
-    found = [n for n in names if matches(n, pattern) and is_image_name(n)]
+    found = [n for n in matching(names, pattern) if is_image_name(n)]
     return Reference.of_files([content.path / name for name in found])
 
 
@@ -325,7 +326,7 @@ def _frame_names(names: Sequence[str], frames: str | None, others: Set[str]) -> 
     """List the names that match a pattern, or those of the first image format of which there
     are some beside the dark and flat images."""
     if frames is not None:
-        return [n for n in names if matches(n, frames)]
+        return matching(names, frames)
     for form in IMAGE_FORMATS:
         found = [n for n in names if n.lower().endswith(form.endings)]
         if set(found) - others:
@@ -480,7 +481,12 @@ def _from_document(
         full_scale=(1 << machine.detector.bits) - 1,
     )
     return replace(
-        made, warnings=(*made.warnings, *_predicted_doubts(doc, made.warnings))
+        made,
+        warnings=(
+            *made.warnings,
+            *_predicted_doubts(doc, made.warnings),
+            *_exposure_doubts(doc),
+        ),
     )
 
 
@@ -532,6 +538,27 @@ def _other_scan(content: Folder) -> str:
     return ""
 
 
+def _exposure_doubts(doc: DatasetDocument) -> list[str]:
+    """List doubts about the exposures that a document states of dark and flat images."""
+    times = {
+        kind: {one.exposure_ms for one in doc.frames if one.kind == kind}
+        for kind in ("dark", "flat", "projection")
+    }
+    usual = times["projection"]
+    doubts = []
+    for kind in ("dark", "flat"):
+        if times[kind] and usual and not times[kind] <= usual:
+            listed_ms = ", ".join(f"{ms:g}" for ms in sorted(times[kind])[:3])
+            doubts.append(
+                f"the {kind} images were exposed for {listed_ms} ms, the projections for "
+                f"{', '.join(f'{ms:g}' for ms in sorted(usual)[:3])} ms"
+            )
+    lit = [one.file for one in doc.frames if one.kind == "dark" and one.xrays_on]
+    if lit:
+        doubts.append(f"the tube was on in {len(lit)} dark images, such as {lit[0]}")
+    return doubts
+
+
 def _predicted_doubts(doc: DatasetDocument, seen: Sequence[str]) -> list[str]:
     """List the doubts predicted at submission about a scan's exposure; those of
     saturation are left out if its images show it already (`seen`).
@@ -571,7 +598,18 @@ def _from_geometry(content: Folder) -> DataSet:
         warnings=notes,
         full_scale=geometry.full_scale,
         provenance=geometry.provenance,
+        settings=_settings_beside(content),
     )
+
+
+def _settings_beside(content: Folder) -> ScanSettings | None:
+    """Read the settings of a scanner's text beside a saved geometry, such as the tube's
+    voltage; None without one that can be read, which nothing here depends on.
+    """
+    try:
+        return read_settings(content, [])
+    except DatasetError:
+        return None
 
 
 def _from_texts(

@@ -106,7 +106,7 @@ def listed(
     reasons: Sequence[str] = (),
     warnings: Sequence[str] = (),
     full_scale: int | None = None,
-    dark_told: bool | None = None,
+    references: tuple[Reference, Reference] | None = None,
     **known: Any,
 ) -> DataSet:
     """Make the data set of images named one by one.
@@ -125,7 +125,7 @@ def listed(
         reasons: why it is not complete.
         warnings: doubts about it.
         full_scale: largest count of the panel, to find saturated images; None: unknown.
-        dark_told: whether a lack of dark images is told; None: where `darks` is empty.
+        references: dark and flat images in place of `darks` and `flats`, wherever they are.
         known: further members of `DataSet`.
 
     Raises:
@@ -152,26 +152,30 @@ def listed(
     reasons = [reason for reason in (*reasons, lost, nothing_in(blank)) if reason]
     content = replace(content, names=content.names.difference(blank))
     frames = content.frames(names, shapes)
-    flat_paths = content.paths(flats)
+    dark, flat = references or (
+        Reference(content.paths(darks)),
+        Reference(content.paths(flats)),
+    )
+    held = Arrays(
+        None, dark.of_shape(shapes[0], "dark"), flat.of_shape(shapes[0], "flat")
+    )
+    if held.darks is not None or held.flats is not None:
+        known["arrays"] = held
     if not any(SATURATED in told for told in warnings):
-        warnings = [*warnings, *_first_look(frames, flat_paths, full_scale)]
+        warnings = [*warnings, *_first_look(frames, flat.files, full_scale)]
     return DataSet(
         name or content.path.name,
         frames,
         shapes[0],
         geometry,
         folder=content.path,
-        darks=content.paths(darks),
-        flats=flat_paths,
+        darks=dark.files,
+        flats=flat.files,
         complete=not reasons,
         reason="; ".join(reasons),
         warnings=(
             *warnings,
-            *(
-                [f"{NO_DARK} (di000000.tif): zero is taken"]
-                if (not darks if dark_told is None else dark_told)
-                else []
-            ),
+            *([f"{NO_DARK} (di000000.tif): zero is taken"] if not dark else []),
         ),
         full_scale=full_scale,
         **known,
@@ -284,10 +288,13 @@ def _first_look(
     Returns:
         Warnings; [] without images or doubts.
     """
-    taken = [frame.path for frame in frames if frame.present and frame.path is not None]
-    kinds = {FLAT_IMAGE: [*flats], RADIOGRAPHS: taken[len(taken) // 2 :]}
+    if full_scale is None:
+        return []
+    taken = [frame for frame in frames if frame.present]
+    middle = taken[len(taken) // 2].path if taken else None
+    kinds = {FLAT_IMAGE: next(iter(flats), None), RADIOGRAPHS: middle}
     return first_look(
-        {what: paths[0] for what, paths in kinds.items() if paths}, full_scale
+        {what: path for what, path in kinds.items() if path is not None}, full_scale
     )
 
 

@@ -913,7 +913,8 @@ def _source(
     if kV is None:
         raise LimitError(
             f"{dataset.where} does not say its tube voltage, "
-            "which corrections of beam hardening and scatter need; give kV= or tube=",
+            "which corrections of beam hardening and scatter need; give the tube, as "
+            "tube=fx.Tube(kV=...), or its voltage with --kv",
             {"missing": "kV"},
         )
     figures = {} if dataset.document is None else dataset.document.noise.model
