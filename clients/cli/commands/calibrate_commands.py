@@ -7,7 +7,7 @@ and choose the exit code.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -472,10 +472,16 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
     if document["identifiable"]:
         heads = ("parameter", "value", "sigma", "of images", "unit")
         yield table(parameter_rows(document), heads)
-        yield "(name): not asked for; of images: the part of sigma that is the images' noise"
+        others = sum(not p["asked"] for p in document["parameters"].values())
+        yield (
+            "of images: the part of sigma that is the images' noise; --report lists the "
+            f"{others} others that are estimated along"
+        )
     rms = _number(document["rms_px"], 4)
     seconds = _number(document["seconds"], 2)
     yield f"{seen}, {len(document['outliers'])} of these left out, rms {rms} px, {seconds} s"
+    if picture := frames_picture(document["rms_per_frame_px"]):
+        yield picture
     from flexdt.library.calibration.calibrate import ranges
 
     frames: dict[int, list[int]] = {}
@@ -517,19 +523,38 @@ def motions(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def parameter_rows(document: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Make rows of text of the parameters: name, value, sigma, its part from the
-    images, unit. Parameters estimated by their prior alone come last, in brackets.
-
-    Otherwise they are in the report's order; numbers have the digits that sigma leaves.
+    """Make rows of text of the parameters that were asked for, in the report's order: name,
+    value, sigma, its part from the images, unit. Numbers have the digits that sigma leaves.
     """
     return [
         (
-            name if p["asked"] else f"({name})",
+            name,
             *_round_estimate(p, "value", "sigma", "images"),
             _unit(p["unit"]),
         )
         for name, p in document["parameters"].items()
+        if p["asked"]
     ]
+
+
+LEVELS = " .:-=+*#"
+"""Characters of a picture in one line, from 0 to the largest."""
+MOST_MARKS = 60
+"""Characters of such a picture at most."""
+
+
+def frames_picture(rms_px: Sequence[float | None]) -> str:
+    """Draw the residuals of frames in a line, each mark the largest of its frames; "" without
+    any.
+    """
+    known = [0.0 if rms is None else rms for rms in rms_px]
+    top = max(known, default=0.0)
+    if not top > 0.0:
+        return ""
+    size = -(-len(known) // MOST_MARKS)
+    parts = (max(known[i : i + size]) for i in range(0, len(known), size))
+    marks = "".join(LEVELS[round((len(LEVELS) - 1) * part / top)] for part in parts)
+    return f"residuals of frames [{marks}] up to {_number(top, 2)} px"
 
 
 def write_json(path: Path, document: Mapping[str, object]) -> None:

@@ -53,7 +53,7 @@ from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import FitResult, image_quantities
-from flexdt.twin.calibration.fit.priors import prior_widths
+from flexdt.twin.calibration.fit.priors import STRAIN, prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
 from flexdt.twin.calibration.pipeline import (
     Calibration,
@@ -66,6 +66,7 @@ from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.findings import Finding, Findings, error, warning
 from flexdt.twin.geometry.offsets import NAMES, Offsets
+from flexdt.twin.geometry.told_lengths import PHANTOM, TOLD_SOURCES
 from flexdt.twin.projection.analytic_solids import Scene
 from flexdt.twin.scanner.state import NamedCorrection
 
@@ -669,13 +670,24 @@ SECOND_SOD_RATIO: Final = 0.7
 act differently."""
 
 
+SPOILT: Final[Mapping[CalibrationCode, str]] = {
+    CalibrationCode.SATURATED: "the flat field is saturated",
+    CalibrationCode.ROWS_IN_TURN: "volumes are twisted, because rows are read in turn",
+}
+"""Finding beside which the images are not to be reconstructed -> why, in words."""
+LEAST_SCALE_SHARE: Final = 0.3
+"""Part of it that the phantom's scale has, from which that is told."""
+LEAST_LENGTH_PART: Final = 1e-6
+"""Relative standard deviation of lengths from which it is told."""
+
+
 def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> str:
-    """Return one sentence on use, and one on the limit of the calibration.
+    """Return one sentence on use, and two on the limits of the calibration.
 
     If it is not to be used, one sentence with the first error, weak direction or lack of
-    a fit. Sharp is an axis known to `SHARP_PX`. With a saturated flat field the images
-    are not to be reconstructed, sharp or not. The second sentence is about the least
-    certain requested length, and is left out if there is none.
+    a fit. Sharp is an axis known to `SHARP_PX`. With a finding of `SPOILT` the images are
+    not to be reconstructed, sharp or not. The second sentence is about the least certain
+    requested length, the third about lengths in volumes; each is left out if there is none.
 
     Args:
         result: of a calibration.
@@ -694,21 +706,43 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         use = "Too uncertain for a sharp volume"
     if result.findings.of(CalibrationCode.PANEL_DISTORTED):
         use += " with this correction, which undoes the panel's distortion"
-    if result.findings.of(CalibrationCode.SATURATED):
-        use = "Geometry to be used, images not to be reconstructed (the flat field is saturated)"
+    spoilt = [why for code, why in SPOILT.items() if result.findings.of(code)]
+    if spoilt:
+        use = f"Geometry to be used, images not to be reconstructed ({'; '.join(spoilt)})"
     first = f"{use}: the rotation axis is known to {rounded_up(column.sigma)} px."
     lengths = {
         n: e
         for n, e in result.fit.certificate.estimates.items()
         if e.asked and e.unit == "mm" and math.isfinite(e.sigma)
     }
+    third = _lengths_in_volumes(result, seen)
     if not lengths:
-        return first
+        return f"{first}{third}"
     name, widest = max(lengths.items(), key=lambda item: item[1].sigma)
     second = f" Absolute position: to {widest.sigma:.2g} mm ({name})"
     if _by_priors(widest):
         second += f", limited by what is not known of {', '.join(widest.priors)}"
-    return f"{first}{second}."
+    return f"{first}{second}.{third}"
+
+
+def _lengths_in_volumes(
+    result: Calibration, seen: Sequence[Mapping[str, Estimate]]
+) -> str:
+    """Write how well lengths in a volume are known, and which part of that is the phantom's
+    scale; "" where nothing limits them.
+    """
+    assert result.fit is not None
+    part = max(q["magnification"].sigma / q["magnification"].value for q in seen)
+    scale = result.fit.certificate.estimates.get(PHANTOM)
+    if not LEAST_LENGTH_PART < part < math.inf:
+        return ""
+    text = f" Lengths in volumes: to {100.0 * part:.2g} %"
+    own = 0.0 if scale is None else scale.priors.get(TOLD_SOURCES[PHANTOM], 0.0)
+    if scale is not None and own > LEAST_SCALE_SHARE * part:
+        assumed = result.model.stated is None and scale.prior == STRAIN
+        known = "assumed" if assumed else "stated"
+        text += f", of this {100.0 * own:.2g} % is the phantom's {known} scale"
+    return f"{text}."
 
 
 def _column(seen: Sequence[Mapping[str, Estimate]]) -> Estimate:
