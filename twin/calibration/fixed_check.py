@@ -9,11 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from flexdt.twin.calibration.diagnose import CalibrationCode, listed
-from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.fitted import (
     OF_MOTION,
     OF_RESIDUALS,
-    explain_residuals,
 )
 from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,
@@ -25,10 +23,12 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
     narrow_priors,
 )
-from flexdt.twin.calibration.diagnose.named_motion import moving
 from flexdt.twin.calibration.diagnose.pixel_pitch import with_rival_pitch
+from flexdt.twin.calibration.diagnose.table.group import Known
+from flexdt.twin.calibration.diagnose.table.verdict import judged
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, Solver
+from flexdt.twin.calibration.fit.fitted_motion import aware
 from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, gives_room, known
 from flexdt.twin.calibration.fit.problem import (
     SIX,
@@ -66,8 +66,8 @@ def explain(
     """Explain the residuals of a fit, and fit with beads or panel free where they are the
     cause.
 
-    See `explain_residuals`; this gives it the scans' strains, tolerance, floor of sigmas
-    and arc.
+    See `verdict.judged`; this gives it the scans' strains, tolerance, floor of sigmas and
+    arc.
 
     Args:
         state: the scans and their measurements.
@@ -84,15 +84,42 @@ def explain(
         (MEASURED if weighed else Solver()).floor_px,
         _stated_arc(state),
         _arc_left(state),
+        max((m.sampling_px for m in state.measured), default=0.0),
         _limits(state, request),
     )
-    return explain_residuals(
+    better, found = judged(
         fit,
-        known=known,
-        refit=lambda **changes: refit_scans(state, request, fit, **changes),
+        known,
+        followed=state.motion is not None,
         sigmas_known=weighed,
         misfit_px=request.misfit_px,
     )
+    if state.motion is not None:
+        better = aware(better, state.motion)
+    return better, found
+
+
+def without_groups(state: Calibration, fit: FitResult) -> Calibration:
+    """Return the state with what moves, and what else is no column of a fit, taken out of its
+    poses and positions: fits to it compare priors with images.
+
+    Args:
+        state: the scans and their measurements.
+        fit: with the groups that explain its residuals.
+    """
+    problem = fit.problem
+    tracks = problem.pixels
+    scans = []
+    found = []
+    seen = state.measured or state.identifications
+    first = 0
+    for scan, one in zip(state.scans, seen, strict=True):
+        own = slice(first, first + len(scan.poses))
+        first = own.stop
+        scans.append(replace(scan, poses=problem.poses[own]))
+        found.append(replace(one, tracks=tracks[own]))
+    moved = {"measured" if state.measured else "identifications": tuple(found)}
+    return replace(state, scans=tuple(scans), **moved)
 
 
 def _limits(state: Calibration, request: CalibrationRequest) -> dict[str, float]:
@@ -151,6 +178,8 @@ def check_fixed(
         The fit with those parameters fixed that are to be, and the findings that replace
         `explained`.
     """
+    whole = state
+    state = without_groups(whole, free_fit)
     fixed = _fixed_values(state, asked)
     fit = free_fit
     if set(free.free) - set(asked.free):
@@ -164,7 +193,7 @@ def check_fixed(
     errors = {f.code for f in explained if f.forbids}
     if verdict.finding is not None and errors <= OF_RESIDUALS | {CalibrationCode.MISFIT}:
         left = _left_by_priors(state, usual, loose_fit, explained)
-        return fit, _with_priors_off(state, asked, fit, left, verdict.finding)
+        return fit, [*left, verdict.finding]
     found = listed(verdict.lengths)
     if verdict.factor > 1.0:
         found.append(narrow_priors(verdict))
@@ -172,7 +201,7 @@ def check_fixed(
         asked = replace(asked, priors=loosened(given, verdict.factor))
     before = fit
     if verdict.factor > 1.0 or fit is not free_fit:
-        fit, explained = explain(state, asked, _fit_with_fixed(state, asked, fit))
+        fit, explained = explain(whole, asked, _fit_with_fixed(whole, asked, fit))
     if verdict.factor > 1.0:
         fit = _with_stated_priors(fit, before)
     fit = _doubted(fit, free_fit, fixed)
@@ -195,23 +224,6 @@ def check_fixed(
     if _moves(explained):  # What moves looks like other pixels in part.
         return fit, [*explained, *found]
     return fit, [*explained, *found, *listed(pitch)]
-
-
-def _with_priors_off(
-    state: Calibration,
-    asked: CalibrationRequest,
-    fit: FitResult,
-    left: list[Finding],
-    off: Finding,
-) -> list[Finding]:
-    """Return the findings where images contradict priors: those left, and that one; or
-    instead the motion that explains all there is beside the stated priors.
-    """
-    if Findings(left).of(*OF_MOTION):
-        moved = moving(fit, lambda motion: refit_scans(state, asked, fit, motion=motion))
-        if moved is not None:
-            return [*Findings(left).without(*OF_MOTION), moved]
-    return [*left, off]
 
 
 def _exact_judged(
@@ -327,8 +339,8 @@ def _left_by_priors(
 
 
 def _moves(findings: Sequence[Finding]) -> bool:
-    """Check whether a motion forbids the use of a fit."""
-    return bool(Findings(findings).errors.of(*OF_MOTION))
+    """Check whether something moves."""
+    return bool(Findings(findings).of(*OF_MOTION))
 
 
 def _doubted(

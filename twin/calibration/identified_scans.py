@@ -95,8 +95,8 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             and finding.code is CalibrationCode.WRONG_PHANTOM
         ):
             finding = _by_exposure(finding, found, state.model, scan, request)
-        if request.per_frame and finding is not None and finding.code in OF_MOTION:
-            # It may move, so its spots may be far from where one geometry has them.
+        if finding is not None and finding.code in OF_MOTION:
+            # It moves, so its spots may be far from where one geometry has them.
             wide = replace(search, gate_px=WIDE_GATE_PX)
             found = seek(detections, search=wide) or found
             finding = None

@@ -21,7 +21,7 @@ from flexdt.twin.calibration.detect.bead_contrast import detector_for
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.data import judge_emptiness, judge_frames
-from flexdt.twin.calibration.diagnose.fitted import OF_RESIDUALS, judge_offsets
+from flexdt.twin.calibration.diagnose.fitted import OF_MOTION, OF_RESIDUALS, judge_offsets
 from flexdt.twin.calibration.diagnose.frame_places import judge_places
 from flexdt.twin.calibration.diagnose.measured_spots import (
     beside_missing_light,
@@ -295,7 +295,8 @@ def _judged_places(
         The state with at most one further finding a scan, and without `extra_spots` where a
         displaced bead explains them.
     """
-    if not Findings(explained).errors.without(CalibrationCode.MISFIT):
+    told = Findings(explained)
+    if not told.errors.without(CalibrationCode.MISFIT) and not told.of(*OF_MOTION):
         # Of what moves, or turns otherwise than is said, all frames are elsewhere.
         state = state.with_findings(*judge_places(fit, state.looks))
     # Spots beside the phantom's are those of a bead that is displaced.

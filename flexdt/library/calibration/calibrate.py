@@ -665,6 +665,20 @@ def _finite(value: float) -> float | None:
 SHARP_PX: Final = 0.25
 """Largest sigma of the axis column with which a volume is as sharp as its voxels [px]; assumed:
 a column that is off by d makes an edge d pixels wider."""
+SPOILS: Final = {
+    **dict.fromkeys(
+        (
+            CalibrationCode.DRIFT,
+            CalibrationCode.VIBRATION,
+            CalibrationCode.WOBBLE,
+            CalibrationCode.ANGLES_WRONG,
+        ),
+        "it is that of the mean, and volumes of this scan are blurred by what moves",
+    ),
+    CalibrationCode.ROWS_IN_TURN: "volumes of this scan are twisted",
+    CalibrationCode.EXPOSURE_ARC: "volumes of this scan are blurred along the turn",
+}
+"""What spoils volumes of the scan, but not the geometry -> its consequence in words."""
 SECOND_SOD_RATIO: Final = 0.7
 """Source-object distance of a second placement over the first's: nearer, where offsets
 act differently."""
@@ -704,6 +718,10 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         use = "Safe to reconstruct"
     else:
         use = "Too uncertain for a sharp volume"
+    for code, words in SPOILS.items():
+        if result.findings.of(code):
+            use = f"Geometry to be used; {words}"
+            break
     if result.findings.of(CalibrationCode.PANEL_DISTORTED):
         use += " with this correction, which undoes the panel's distortion"
     spoilt = [why for code, why in SPOILT.items() if result.findings.of(code)]
@@ -778,12 +796,12 @@ def next_commands(result: Calibration, typed: Typed) -> list[str]:
         return list(settling_commands(result.errors[0], typed, free))
     limited = any(_by_priors(estimates[name]) for name in asked)
     sharp = result.fit is not None and result.identifiable and _is_sharp(result.fit)
+    for moving in result.findings:
+        if moving.advice.per_frame:
+            follow = list(settling_commands(moving, typed, free))
+            return [*follow, typed.use()] if sharp else follow
     if sharp and not limited:
         return [typed.use()]
-    if not sharp:
-        for moving in result.findings:
-            if moving.advice.per_frame:
-                return list(settling_commands(moving, typed, free))
     sod = float(result.scans[0].poses.sod.mean())
     both = typed.command(data=("PLACE-1", "PLACE-2"))
     if typed.geometry:

@@ -8,13 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from causes_named import calibrated, scored, worst_error
-from faults_drawn import drawn, right_draft, taken
+from faults_drawn import right_draft, taken
 from faults_paired import MILD, PAIRS, SETUPS, drawn_names, drawn_together, together
-
-from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.causes import Candidates, Known
-from flexdt.twin.calibration.fit.fit import estimate_geometry
-from flexdt.twin.geometry.poses import Poses
 
 
 def test_a_pair_has_both_of_its_faults() -> None:
@@ -189,28 +184,6 @@ def test_an_unusual_scan_that_is_right_is_offered(setup: str) -> None:
 @pytest.mark.parametrize(("kind", "seed"), drawn_names(48, 30_000))
 def test_no_drawn_pair_is_offered_wrong(kind: str, seed: int) -> None:
     assert not scored(kind, seed).wrong
-
-
-def test_a_motion_counts_by_what_the_geometry_leaves_of_it() -> None:
-    """The angle between a ramp and the span of the geometry, from a projection onto it."""
-    scan = drawn("nothing", 5)
-    b = scan.believed
-    turn = np.radians(60.0) * np.arange(24) / 24
-    poses = Poses.upright([0, 0, 0], [0, b.sod, 0], [0, b.sdd, 0], b.pixel, turn)
-    tracks = poses.cone_vec().project_points(b.beads, scan.shape)
-    tracks = tracks + 0.02 * np.random.default_rng(0).normal(size=tracks.shape)
-    fit = estimate_geometry(tracks, BeadModel(b.beads, b.radii), poses, shape=scan.shape)
-    candidates = Candidates(
-        fit.problem, fit.solution.x, Known((1e-3, 1e-3), None, 1e-3), ()
-    )
-    cause = next(c for c in candidates.causes if c.name == "motion of dO_x")
-    for column in cause.columns:
-        geometry = candidates.rows[:, : candidates.count]
-        moving = candidates.rows[:, column]
-        shares = np.linalg.lstsq(geometry, moving, rcond=None)[0]
-        left = np.linalg.norm(moving - geometry @ shares) / np.linalg.norm(moving)
-        assert candidates.visible[column] == pytest.approx(max(left, 1e-3), rel=1e-6)
-    assert candidates.visible[cause.columns[0]] < 0.05
 
 
 def test_a_phantom_that_shrinks_within_its_stated_tolerance_is_in_the_sigmas() -> None:

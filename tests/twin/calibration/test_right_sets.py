@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import faults_drawn
 import numpy as np
 import prior_coverage as own
 import pytest
-from causes_named import calibrated, scored
-from faults_drawn import drawn
+from causes_named import scored
 from right_sets import FAR_SIGMAS, LEVELS, contains_what_is_asked, covered
 from right_sets import off as off_of
 from scipy.special import fdtr
 
-from flexdt.twin.calibration.diagnose import fitted, tiles
-from flexdt.twin.calibration.diagnose.causes import cause, columns, every_cause
-from flexdt.twin.calibration.fit import evidence, priors, problem
 from flexdt.twin.calibration.fit.certificate import Certificate, Rival, widened
 from flexdt.twin.calibration.fit.curved_region import Bend
-from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
+from flexdt.twin.calibration.fit.fit import estimate_geometry
 from flexdt.twin.geometry.poses import Poses
 
 DEGREES = 300.0
@@ -42,23 +37,6 @@ def test_regions_of_another_size_are_told() -> None:
     assert all(abs(v) < FAR_SIGMAS for v in right.values()), right
     assert off_of(levels(1.3))[0.5] > FAR_SIGMAS
     assert off_of(levels(0.8))[0.95] < -FAR_SIGMAS
-
-
-def test_what_is_drawn_is_what_the_calibration_assumes() -> None:
-    """Both write it out: the draws import nothing of the fit."""
-    odds = np.log(faults_drawn.CAUSE_ODDS)
-    assert odds == pytest.approx(evidence.LOG_CHANCE)
-    assert faults_drawn.STRAIN == priors.STRAIN
-    assert every_cause.STRAIN_WIDTHS[1:] == faults_drawn.STRAIN_WIDTHS
-    assert faults_drawn.BEAD_SHARES == every_cause.BEAD_SHARES
-    assert faults_drawn.PANEL_WIDTHS_PX == every_cause.PANEL_WIDTHS_PX
-    assert faults_drawn.GAP_WIDTHS_PX == tiles.GAP_WIDTHS_PX
-    assert faults_drawn.LEAST_TILE == tiles.LEAST_TILE
-    assert faults_drawn.LEAST_SIDE == tiles.LEAST_SIDE
-    assert faults_drawn.MOTION_SIGMAS == every_cause.MOTION_WIDTHS
-    assert faults_drawn.MOTION_SHAPES == columns.WAVES
-    assert faults_drawn.ARC_WIDTH == problem.ARC_PRIOR
-    assert faults_drawn.UNSEEN == priors.OFFSETS
 
 
 @pytest.fixture(scope="module")
@@ -137,33 +115,3 @@ def test_a_cause_beside_which_nothing_is_determined_is_not_left_out() -> None:
     found = scored("with_causes", 70003)
     assert not found.offered, found
     assert any(s.startswith("phantom_strained") for s in found.said), found
-
-
-def test_a_doubtful_cause_beside_which_nothing_is_determined_widens(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The likeliest choice, but not beyond doubt: the fit without it is offered, with what
-    they differ by."""
-    search = fitted.explained_by_causes
-    found: list[tuple[FitResult, FitResult, cause.Found]] = []
-
-    def opened(fit: FitResult) -> FitResult:
-        certificate = fit.certificate
-        spectrum = replace(certificate.spectrum, rank=0)
-        return replace(fit, certificate=replace(certificate, spectrum=spectrum))
-
-    def explained(
-        fit: FitResult, known: cause.Known, refit: cause.Refit
-    ) -> tuple[FitResult, cause.Found]:
-        better, odds = search(fit, known, lambda **changes: opened(refit(**changes)))
-        found.append((fit, better, odds))
-        return better, odds
-
-    monkeypatch.setattr(fitted, "explained_by_causes", explained)
-    calibrated(drawn("as_assumed", 50018))
-    first, better, odds = found[0]
-    assert better.identifiable
-    assert better.values == first.values
-    assert not odds.applied
-    assert max(better.sigmas[n] / s for n, s in first.sigmas.items()) > 1.2
-    assert len(better.certificate.rivals) > 10

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -13,21 +14,26 @@ from faults_drawn import World, drawn, shadows
 from scipy.spatial.transform import Rotation
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.causes import Found
-from flexdt.twin.calibration.diagnose.named_causes import (
-    _strained,
+from flexdt.twin.calibration.diagnose.table.group import Found
+from flexdt.twin.calibration.diagnose.table.groups.strain import (
     lean_of,
     strain_words,
+    told,
 )
-from flexdt.twin.calibration.diagnose.tiles import alike_places, likely_border
 from flexdt.twin.calibration.fit.evidence import Table
-from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
+from flexdt.twin.calibration.fit.fit import (
+    FitResult,
+    estimate_geometry,
+    image_quantities,
+)
 from flexdt.twin.calibration.fit.problem import STRAINS, build_problem
-from flexdt.twin.geometry.panel import Border, PanelModel
+from flexdt.twin.geometry.panel import PanelModel
 from flexdt.twin.geometry.poses import Poses
 
 BEADS = np.array([[9, 4, -20], [-10, 6, -9], [4, -11, 1], [-3, 10, 12], [11, -2, 21.0]])
 SHAPE = (760, 956)
+NO_FIT = cast("FitResult", None)
+"""Words on a shape need no fit."""
 SAID = (
     "phantom_strained",
     "exposure_arc",
@@ -177,42 +183,6 @@ def test_evidence_differs_as_densities_do(seed: int) -> None:
         models.append((judged, density))
     (one, first), (two, second) = models
     assert one.evidence - two.evidence == pytest.approx(first - second, abs=1e-6)
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_tile_has_a_least_width(axis: int) -> None:
-    """A shift beyond a border is found there, but not so near the edge that no tile is
-    there."""
-    rng = np.random.default_rng(axis)
-    places = rng.uniform([0, 0], [956, 760], size=(400, 2))
-    whiten = np.tile([50.0, 0.0, 50.0], (400, 1))
-    rows = np.tile(np.eye(2), (400, 1))
-    side = (956, 760)[axis]
-    for share, seen in ((0.4, True), (0.02, False)):
-        shift = np.where(places[:, axis] > share * side, 0.5, 0.0)
-        values = np.stack([shift, np.zeros(400)], axis=1)[:, :: 1 - 2 * axis]
-        noisy = (50.0 * values + rng.normal(size=(400, 2))).ravel()
-        wide = np.full(2, np.inf)
-        found = likely_border(rows, noisy, wide, 1.0, places, whiten, SHAPE, ())
-        assert (found is not None and abs(found.at - share * side) < 8) == seen
-        if found is not None:
-            assert found.axis == axis
-            assert 95 <= found.at <= side - 95
-
-
-def test_borders_without_positions_between_them_are_one() -> None:
-    """Their probabilities over all borders of the panel add up to 1."""
-    rng = np.random.default_rng(5)
-    places = rng.uniform(0, 1, (30, 2)) ** 2 * SHAPE[::-1]
-    for axis in (0, 1):
-        side = SHAPE[1 - axis]
-        ends = np.sort(places[:, axis])
-        wide = np.diff(ends) > 1.0
-        middle = (0.5 * (ends[:-1] + ends[1:]))[wide]
-        shares = [alike_places(Border(axis, at), places, SHAPE) for at in middle.tolist()]
-        assert np.allclose(np.array(shares) * sum(SHAPE), np.diff(ends)[wide])
-        rim = alike_places(Border(axis, side - 0.5), places, SHAPE)
-        assert rim * sum(SHAPE) == pytest.approx(max(side - ends[-1], 1.0))
 
 
 @pytest.mark.parametrize(
@@ -371,15 +341,13 @@ def test_a_rigid_phantom_that_leans_is_no_phantom_of_another_shape() -> None:
     leans, rest = lean_of(mean, covariance)
     assert leans == pytest.approx({"+x": a, "-y": -b}, rel=1e-3)
     assert strain_words(rest, covariance, max(leans.values())) == ""
-    said = _strained(Found(strain=(mean, covariance)))
-    assert said is not None
+    (said,) = told(Found(NO_FIT, (), (), (mean, covariance)))
     assert said.text.startswith(
         "the phantom leans on the stage: by 2 deg towards its +x and by 1.1 deg towards its -y"
     )
     assert "not as its file says" not in said.text
     mean[STRAINS.index("zz")] = 0.02
-    said = _strained(Found(strain=(mean, covariance)))
-    assert said is not None
+    (said,) = told(Found(NO_FIT, (), (), (mean, covariance)))
     assert "not as its file says: 2 % taller" in said.text
 
 

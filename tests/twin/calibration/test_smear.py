@@ -24,8 +24,6 @@ from flexdt.twin.calibration.detect.windows import (
     render_windows,
     window_intensities,
 )
-from flexdt.twin.calibration.diagnose.causes import Known
-from flexdt.twin.calibration.diagnose.causes.every_cause import _arc
 from flexdt.twin.calibration.diagnose.measured_spots import judge_smear, shadows_drawn_out
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
@@ -206,15 +204,6 @@ def test_the_arc_is_found_where_steps_are_far_from_linear(true: float) -> None:
 
 def test_a_smear_that_no_arc_explains_is_none() -> None:
     assert solved(0.0, Step(0.3, 0.01), lambda square: Step(0.3, 0.01)) == UNMEASURED
-
-
-def test_what_smear_leaves_of_the_arc_is_in_every_model() -> None:
-    known = Known((1e-3, 1e-3), None, 0.3, None, 0.004)
-    (cause,) = _arc(5, known)
-    assert (cause.always, cause.widths) == (0.004, ())
-    (stated,) = _arc(5, replace(known, arc_left=None))
-    assert stated.always == 0.0
-    assert stated.widths
 
 
 def test_the_finding_gives_arc_and_share() -> None:

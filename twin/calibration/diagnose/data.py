@@ -18,11 +18,13 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose import CalibrationCode
-from flexdt.twin.calibration.diagnose.named_motion import moving, named_turn
-from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
-from flexdt.twin.calibration.fit.fitted_motion import MotionFit
+from flexdt.twin.calibration.diagnose.fitted import OF_MOTION
+from flexdt.twin.calibration.diagnose.named_motion import named_turn
+from flexdt.twin.calibration.diagnose.table.group import Known
+from flexdt.twin.calibration.diagnose.table.verdict import judged
+from flexdt.twin.calibration.fit.fit import Solver, estimate_geometry
 from flexdt.twin.calibration.fit.priors import OFFSETS
-from flexdt.twin.calibration.fit.problem import SIX
+from flexdt.twin.calibration.fit.problem import SIX, UNSTRAINED
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan
 from flexdt.twin.calibration.identify import Identification, Search, attempt
 from flexdt.twin.findings import Finding, error, warning
@@ -41,6 +43,13 @@ SOME_SPOTS = 0.95
 """Share of the spots that are beads below which a finding names other spots."""
 MOST_LEFT_OUT = 12
 """Beads of a phantom of which each is left out in turn to see whether it is the cause."""
+MOVED = OF_MOTION | {
+    CalibrationCode.ANGLE_STEP,
+    CalibrationCode.FRAME_NUMBERS,
+    CalibrationCode.ANGLE_SCALE,
+    CalibrationCode.ANGLE_ENDPOINT,
+}
+"""What explains that spots are far from where one geometry has them."""
 WIDE_GATE_PX = 25.0
 """Gate of an assignment to beads that may be moving [px]."""
 LEAST_TURN_DEG = 0.2
@@ -604,33 +613,24 @@ def _in_motion(
     if found is None or min(found.explained, found.found) < GOOD_SHARE:
         return None
     shape = np.array([d.shape for d in detections], dtype=np.float64)
-    here = poses
     # Of a large motion panel and axis have taken up a part: they begin where they should be.
     still = replace(start, **{name: getattr(found.parameters, name) for name in SIX})
-
-    def fitted(motion: MotionFit | None = None) -> FitResult:
-        """Fit all six parameters to the tracks, with the frames displaced by the first of
-        `motion`; None: at the stated poses.
-
-        Starts from the identified geometry; no bound on the offsets.
-        """
-        if motion is None:
-            moved = here
-        else:
-            moved = motion.motions[0].applied(here)
-        return estimate_geometry(
-            found.tracks,
-            model,
-            moved,
-            shape=shape,
-            start=still,
-            centre=found.bias,
-            priors=OFFSETS,
-            prior_centre=start,
-            bound=math.inf,
-        )
-
-    return moving(fitted(), fitted)
+    fit = estimate_geometry(
+        found.tracks,
+        model,
+        poses,
+        shape=shape,
+        start=still,
+        centre=found.bias,
+        priors=OFFSETS,
+        prior_centre=start,
+        bound=math.inf,
+    )
+    known = Known(UNSTRAINED, None, Solver().floor_px)
+    told = judged(fit, known, sigmas_known=False)[1]
+    if any(f.code is CalibrationCode.MISFIT for f in told):
+        return None
+    return next((f for f in told if f.code in MOVED), None)
 
 
 def _in_parts(

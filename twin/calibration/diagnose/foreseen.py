@@ -1,9 +1,8 @@
 """Certificates that scans of a plan will state, before there is one.
 
 What a calibration states depends on the noise: a cause that the noise looks like stays open
-and is stated, so does a drift. Scans of the plan are drawn (noise, strain of the phantom and
-offsets within their priors), to first order, and go through the search for causes and the
-tests of residuals that a calibration's go through.
+and is stated. Scans of the plan are drawn (noise, strain of the phantom and offsets within their
+priors), to first order, and go through the posterior that a calibration's go through.
 """
 
 from __future__ import annotations
@@ -12,32 +11,29 @@ from typing import Final
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose.causes import (
-    SHAPES,
-    Candidates,
-    Known,
-    left_open,
-    motions_alone,
+from flexdt.twin.calibration.diagnose.table.group import Known
+from flexdt.twin.calibration.diagnose.table.groups import every_family, strain
+from flexdt.twin.calibration.diagnose.table.linearised import (
+    Linearised,
+    State,
+    with_every_column,
 )
-from flexdt.twin.calibration.fit.certificate import widened_by_structure
+from flexdt.twin.calibration.diagnose.table.posterior import Search
 from flexdt.twin.calibration.fit.fit import image_slopes
 from flexdt.twin.calibration.fit.forecast import Stated
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factors
-from flexdt.twin.calibration.fit.residual_structure import Residuals, cross
 from flexdt.twin.geometry.conventions import FloatArray
 
 DRAWS: Final = 39
 """Number of scans that are drawn."""
 SEED: Final = 39
-FLOOR: Final = 0.3
-"""Least standard deviation of whitened residuals, as of a second measurement."""
 
 
 def foreseen(problem: FitProblem, known: Known) -> Stated:
     """Draw what scans of a plan state; the same in every call.
 
     The fit is linearised where a scanner and a phantom are (small offsets turn the image of
-    the axis by more than it is known), what causes and residuals add at the plan.
+    the axis by more than it is known), what causes add at the plan.
 
     Args:
         problem: planned, with its positions as predicted at the start; their whitened errors
@@ -48,44 +44,56 @@ def foreseen(problem: FitProblem, known: Known) -> Stated:
         `DRAWS` scans.
     """
     rng = np.random.default_rng(SEED)
-    candidates = Candidates(problem, problem.start, known, ())
-    spread = candidates.drawn
-    count = candidates.count
+    _, x = with_every_column(problem, problem.start)
+    still = State(x, {}, np.zeros((*problem.seen.shape, 2)))
+    table = Linearised(problem, still, known.floor)
+    families = every_family(table, known)
+    bases = [table.geometry]
+    widths = [np.where(table.precision > 0, table.precision, np.inf) ** -0.5]
+    shape: list[int] = []
+    for family in families:
+        if family.always and family.rows is not None:
+            bases.append(family.rows[0])
+            widths.append(np.full(family.rows.shape[2], family.always))
+            if family.cause == strain.NAME:
+                first = sum(map(len, widths[:-1]))
+                shape += range(first, first + family.rows.shape[2])
+    base = np.concatenate(bases, axis=1)
+    spread = np.concatenate(widths)
+    drawn = spread[:, None] * rng.normal(size=(len(spread), DRAWS))
+    noise = (
+        rng.normal(size=(len(base), DRAWS)) * np.repeat(table.weight.ravel(), 2)[:, None]
+    )
+    search = Search(table, families, 0.0, base @ drawn + noise)
+    search.keep_shapes()
+    count = table.parameters
     factor = edge_factors(problem.layout.names)
     unit = np.outer(factor[:count], factor[:count])
     precision = np.diag(1.0 / (problem.prior_sigma * factor) ** 2)
     keep = np.repeat(problem.seen.ravel(), 2)
-
-    def rows_at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Compute the rows of the fit (m, c) at column values, and their products (c, c),
-        edge units.
-        """
-        rows = np.asarray(problem.jacobian(x)[keep] / factor)
-        return rows, cross(rows, rows)
-
-    shape = [
-        c for cause in candidates.causes if cause.name in SHAPES for c in cause.columns
+    columns = [
+        *range(count),
+        *range(len(problem.layout.names))[problem.layout.strain_columns],
     ]
-    strain = range(len(problem.layout.names))[problem.layout.strain_columns]
-    own_columns = [*range(count), *strain]
-    table_columns = [*range(count), *shape[: len(strain)]]
-    rows, told = rows_at(problem.start)
+    sources = [*range(count), *shape[: len(columns) - count]]
     slopes = image_slopes(problem, problem.start, 0)[1]
     covariances = []
     images = []
-    for _ in range(DRAWS):
-        drawn = spread * rng.normal(size=len(spread))
-        values = candidates.rows @ drawn + rng.normal(size=len(rows))
-        scan = candidates.of_values(values, FLOOR)
-        own, more = left_open(scan, motions_alone(scan, scan.best()))[:2]
-        inverse = np.asarray(np.linalg.inv(told + own.noise**2 * precision))
-        residuals: FloatArray = values - rows @ (inverse @ (rows.T @ values))
-        left = Residuals(problem, rows, residuals, keep, inverse, own.noise)
-        whole = widened_by_structure(left, own.covariance(count) * unit) + more
-        more = whole - own.noise**2 * inverse[:count, :count]
+    for number in range(DRAWS):
+        search.draw(number)
+        model = search.model({}, 1.0)
+        posterior = search.mixture(model, search.further(model))
+        mean = model.solved.mean[:count]
+        wide = sum(
+            p.weight * (p.covariance + np.outer(p.mean - mean, p.mean - mean))
+            for p in posterior.parts
+        )
+        more = (np.asarray(wide) - model.solved.covariance[:count, :count]) * unit
         there = problem.start
-        there[own_columns] += drawn[table_columns]
-        here = np.linalg.inv(rows_at(there)[1] / own.noise**2 + precision)[:count, :count]
+        there[columns] += drawn[sources, number]
+        rows: FloatArray = problem.jacobian(there)[keep] / factor
+        told = rows.T @ rows / model.noise2
+        here = np.linalg.inv(told + precision)[:count, :count]
         turned = image_slopes(problem, there, 0)[1]
         covariances.append(here + more)
         images.append(

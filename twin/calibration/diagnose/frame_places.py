@@ -110,8 +110,7 @@ def _judged_scan(
             f"the camera reads of the panel: --per-frame {','.join(ASIDE)} follows it",
             per_frame=ASIDE,
         )
-    # A drift of something else leaves its ends out, too.
-    if block and all(d.column.split("@")[0] == "alpha" for d in fit.certificate.drifts):
+    if block:
         return error(
             CalibrationCode.ANGLE_STEP,
             f"in frames {places_of} of {n}{of_scan} the shadows are not where the others put "

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.diagnose.causes import Known
 from flexdt.twin.calibration.diagnose.foreseen import foreseen
+from flexdt.twin.calibration.diagnose.table.group import Known
 from flexdt.twin.calibration.fit.certificate import beyond_bound
 from flexdt.twin.calibration.fit.forecast import Forecast, forecast, visible_beads
 from flexdt.twin.calibration.fit.priors import (

@@ -2,8 +2,9 @@
 
 Everything is computed from the whitened Jacobian and the residuals at the solution. The
 covariance is s^2 (J'J)^-1 from reprojection residuals alone. Where residuals are
-correlated from frame to frame, it is enlarged by their correlation length, and the report
-states it. `diagnose` looks for the causes.
+correlated from frame to frame, that of a fit by itself is enlarged by their correlation length,
+and the report states it. `table` explains the residuals, and states the covariance over what
+they leave open.
 """
 
 from __future__ import annotations
@@ -18,20 +19,11 @@ import numpy.typing as npt
 from scipy.special import fdtr, stdtrit
 
 from flexdt.twin.calibration.fit.curved_region import Bend, bend_of
-from flexdt.twin.calibration.fit.frame_jitter import frame_jitter, joined
 from flexdt.twin.calibration.fit.problem import FitProblem, edge_factors
 from flexdt.twin.calibration.fit.residual_structure import (
-    FEWEST_CLUSTERS,
-    SIGNIFICANT,
-    Drift,
     Residuals,
-    cluster_covariance,
     correlation_length,
     cross,
-    drifts,
-    larger,
-    turning_errors,
-    with_lost_frames,
 )
 from flexdt.twin.calibration.fit.weak_directions import (
     BOUND,
@@ -318,11 +310,6 @@ class Certificate:
         noise: s, the spread of the whitened residuals; 1 means the stated noise explains them.
         rms_px: root mean square residual per coordinate.
         enlargement: factor on the covariance for residuals correlated from frame to frame.
-        shared: the beads of a frame err together; the covariance allows for it.
-        turning: root mean square of errors of single beads that repeat as the object turns,
-            in standard deviations of a position; 0: none. The covariance allows for them.
-        drifts: changes of parameters during the scan that the residuals show; each parameter's
-            sigma contains its own.
         residuals_px: (n, k, 2) measured minus predicted, nan where unseen.
         used: (n, k) positions in the fit.
         outliers: positions left out.
@@ -342,9 +329,6 @@ class Certificate:
     noise: float
     rms_px: float
     enlargement: float
-    shared: bool
-    turning: float
-    drifts: tuple[Drift, ...]
     residuals_px: FloatArray
     used: npt.NDArray[np.bool_]
     outliers: tuple[Outlier, ...]
@@ -553,9 +537,8 @@ def certify(
 
     The estimate x = U (J' y + W b) with U = (J'J + W)^-1 errs by U J' times the noise of
     the images and by U W times the error of the prior means b. The covariance is the sum
-    of both, and residuals beyond white noise (correlated, shared, turning, drifting)
-    enlarge only the first. Rank and condition are those of the requested columns, all
-    others given.
+    of both, and residuals that are correlated from frame to frame enlarge only the first.
+    Rank and condition are those of the requested columns, all others given.
 
     Args:
         problem: the data.
@@ -625,9 +608,6 @@ def certify(
     covariance = prior + enlargement * (
         noise**2 * spec.unit_covariance[:reported, :reported] - cross(gain.T, gain.T)
     )
-    shared = False
-    turning = 0.0
-    moving: tuple[Drift, ...] = ()
     bend: Callable[[], Bend] = partial(Bend.none, len(covariance))
     if spec.full and noise > MAX_ROUNDING:
         left = Residuals(
@@ -639,9 +619,7 @@ def certify(
             noise,
         )
         bend = partial(bend_of, left, x, factor, reported)
-        covariance, shared, turning, moving = _widened(
-            left, predicted, covariance, prior, sampling_px, _lost(left, x, use)
-        )
+        covariance = _with_common_shifts(left, predicted, covariance, sampling_px)
     images = np.sqrt(np.maximum(np.diag(covariance) - np.diag(prior), 0.0))
     sigma = np.sqrt(np.diag(covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -678,9 +656,6 @@ def certify(
         noise=noise,
         rms_px=float(np.sqrt(np.mean(used_residual**2))) if use.any() else math.nan,
         enlargement=enlargement,
-        shared=shared,
-        turning=turning,
-        drifts=moving,
         residuals_px=residual,
         used=use,
         outliers=outliers,
@@ -779,101 +754,17 @@ def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, f
     return {n: math.sqrt(s) for n, s in ordered if s > 0.01 * sigma**2}
 
 
-def _lost(left: Residuals, x: FloatArray, use: npt.NDArray[np.bool_]) -> Residuals | None:
-    """Return residuals of the frames that were mostly left out of the fit.
-
-    Args:
-        left: residuals of the fit.
-        x: column values, internal units.
-        use: (n, k) positions that counted.
-
-    Returns:
-        Those that did not count; None without any, or of `FEWEST_CLUSTERS` frames or more.
-    """
-    if len(use) >= FEWEST_CLUSTERS:
-        return None
-    problem = left.problem
-    more = with_lost_frames(problem.seen, use) & ~use
-    if not more.any():
-        return None
-    keep = np.repeat(more.ravel(), 2)
-    factor = edge_factors(problem.layout.names)
-    return replace(
-        left,
-        jacobian=problem.jacobian(x, more)[keep] / factor,
-        values=problem.whitened(x).ravel()[keep],
-        keep=keep,
-    )
-
-
-def _widened(
-    left: Residuals,
-    predicted: FloatArray,
-    covariance: FloatArray,
-    prior: FloatArray,
-    sampling_px: float,
-    lost: Residuals | None = None,
-) -> tuple[FloatArray, bool, float, tuple[Drift, ...]]:
-    """Enlarge the covariance by the structure of the residuals beyond white noise: errors
-    that beads share, places in the pixel grid, quantities that all frames share, errors that
-    repeat with the turn, and drifts.
-
-    A possible but uncertain drift widens the covariance, too, but is not listed.
+def _with_common_shifts(
+    left: Residuals, predicted: FloatArray, covariance: FloatArray, sampling_px: float
+) -> FloatArray:
+    """Add to a covariance what shifts make of it that have one size in all frames: those
+    of places in the pixel grid, and those of the problem.
 
     Args:
         left: residuals.
         predicted: (n, k, 2) [px].
         covariance: (p, p) nominal, edge units.
-        prior: (p, p) part of it that comes from priors.
         sampling_px: see `certify`; 0 for none.
-        lost: residuals of few frames that were left out; see `frame_jitter`.
-
-    Returns:
-        The covariance; whether the beads of a frame err together; errors that repeat with
-        the turn, in standard deviations of a position; and drifts, empty unless one is
-        `SIGNIFICANT` and more than scatter.
-    """
-    reported = len(covariance)
-    together = cluster_covariance(left)
-    if together is not None:
-        covariance = larger(covariance, together[:reported, :reported] + prior)
-    everything = left if lost is None else joined(left, lost)
-    moving = drifts(everything)
-    # The strongest tells: a drift of one parameter is scatter of another.
-    strongest = max(moving, key=lambda d: d.score, default=None)
-    if strongest is not None and strongest.score <= SIGNIFICANT:
-        strongest = None
-    shared = together is not None
-    scattered = strongest is not None and strongest.jitter
-    shaken = None
-    if len(left.problem.group) < FEWEST_CLUSTERS:
-        shaken = frame_jitter(left, everything, strongest)
-    if shaken is not None:
-        # With the frames' own shifts taken out, less of the residuals is white noise.
-        white = (shaken.noise / left.noise) ** 2 * (covariance - prior)
-        jitter = shaken.covariance[:reported, :reported]
-        covariance = larger(covariance, prior + white + jitter)
-        shared = shaken.clear
-        scattered = strongest is not None and not shaken.drifts
-        if scattered:
-            moving = ()
-    covariance = _with_common_shifts(left, predicted, covariance, sampling_px)
-    turning = turning_errors(left)
-    size = 0.0
-    if turning is not None:
-        covariance = covariance + turning.covariance[:reported, :reported]
-        size = turning.size
-    for drift in moving:
-        covariance = _with_drift(left, covariance, drift)
-    certain = moving if strongest is not None and not scattered else ()
-    return covariance, shared or scattered, size, certain
-
-
-def _with_common_shifts(
-    left: Residuals, predicted: FloatArray, covariance: FloatArray, sampling_px: float
-) -> FloatArray:
-    """Add to a covariance what shifts make of it that have one size in all frames: those
-    of places in the pixel grid, and those of the problem; arguments as of `_widened`.
     """
     reported = len(covariance)
     shifts = []
@@ -887,38 +778,6 @@ def _with_common_shifts(
         gain = left.unit_covariance[:reported] @ cross(left.jacobian, shift[left.keep])
         covariance = covariance + gain @ gain.T
     return covariance
-
-
-def _with_drift(left: Residuals, covariance: FloatArray, drift: Drift) -> FloatArray:
-    """Add to a covariance what a drift makes of the estimates, and its own size to the
-    parameter that drifts.
-    """
-    # The fit takes a part of the drift up, also in columns that do not drift.
-    bias = drift.bias[: len(covariance)]
-    covariance = covariance + np.outer(bias, bias)
-    i = left.problem.layout.names.index(drift.column)
-    if i < len(covariance):
-        # Which of the values it had is the parameter's is a matter of definition: the
-        # first, or, of a drift that may not be one, the middle.
-        steady = drift.score <= SIGNIFICANT and drift.step_at is None
-        covariance[i, i] += (0.5 * drift.size if steady else drift.size) ** 2
-    return covariance
-
-
-def widened_by_structure(left: Residuals, covariance: FloatArray) -> FloatArray:
-    """Enlarge a covariance by what residuals show beyond white noise, as `certify` does.
-
-    Args:
-        left: residuals.
-        covariance: (p, p) of the fit, edge units.
-
-    Returns:
-        (p, p).
-    """
-    widths = left.problem.prior_sigma * edge_factors(left.problem.layout.names)
-    pull = left.unit_covariance[: len(covariance)] * left.noise**2 / widths
-    nowhere = np.zeros((*left.problem.seen.shape, 2))
-    return _widened(left, nowhere, covariance, cross(pull.T, pull.T), 0.0)[0]
 
 
 def _whitened_shifts(problem: FitProblem, shifts: FloatArray) -> FloatArray:

@@ -1,0 +1,466 @@
+"""A fit with what its residuals show: the table made again until it stays, and its certificate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose.table.group import Acts, Family, Known
+from flexdt.twin.calibration.diagnose.table.groups import every_family, strain, tiles
+from flexdt.twin.calibration.diagnose.table.linearised import (
+    Linearised,
+    State,
+    image_shape,
+    moved,
+    with_every_column,
+)
+from flexdt.twin.calibration.diagnose.table.posterior import Group, Posterior, Search
+from flexdt.twin.calibration.fit.certificate import Certificate, Rival, certify, widened
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.problem import (
+    STRAINS,
+    FitProblem,
+    edge_factors,
+)
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.panel import Border, PanelModel
+
+MOST_TABLES: Final = 10
+"""Tables that are made one after another, at most."""
+FIRST_TABLES: Final = 3
+"""Of these, such whose outliers are told by the median of the residuals."""
+SETTLED_PART: Final = 0.1
+"""Root mean square change of the predicted positions, in standard deviations of their noise, at
+which a table stays."""
+LEAST_RIVAL: Final = 1e-4
+"""Least probability of an explanation that is kept by itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A fit, and what its residuals show.
+
+    Attributes:
+        fit: of the geometry with the groups of `posterior.best`.
+        posterior: over what is there.
+        table: the last one.
+        weights: group of the best model -> its weights, in their own unit.
+        strain: of the phantom, (10,) in the order of STRAINS, and its covariance.
+        moves_px: group -> root mean square of the shift that it makes, less what the geometry
+            would take up of it [px].
+    """
+
+    fit: FitResult
+    posterior: Posterior
+    table: Linearised
+    weights: dict[Group, FloatArray]
+    strain: tuple[FloatArray, FloatArray] | None
+    moves_px: dict[Group, float]
+
+    def of(self, cause: str) -> list[Group]:
+        """List the groups of a cause that the best model has."""
+        families = self.posterior.families
+        return [g for g in self.weights if families[g[0]].cause == cause]
+
+    def course(self, group: Group) -> FloatArray:
+        """Return the course of each slope of a group over the frames, (s, n)."""
+        family = self.posterior.families[group[0]]
+        assert family.courses is not None
+        own = family.courses[group[1] if len(family.courses) > 1 else 0]
+        return np.asarray(own @ self.weights[group])
+
+
+def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Explained:
+    """Explain the residuals of a fit by groups of columns.
+
+    Args:
+        fit: determined; without groups.
+        known: statements on the phantom and the positions.
+        families: causes that are left out.
+    """
+    plain = fit.problem
+    _, x = with_every_column(plain, fit.solution.x)
+    state = State(x, {}, np.zeros((*plain.seen.shape, 2)))
+    widths: dict[str, float] = {}
+    factor = 0
+    noise2 = 0.0
+    before: tuple[frozenset[str], int] | None = None
+    for turn in range(MOST_TABLES):
+        table = Linearised(plain, state, known.floor)
+        some = [f for f in every_family(table, known) if f.cause not in families]
+        search = Search(table, some, plain.expected_spread)
+        at = {
+            name: (i, g)
+            for i, f in enumerate(some)
+            if not f.always
+            for g, name in enumerate(f.names)
+        }
+        start = {
+            at[name]: width * float(search.products.units[at[name][0]][at[name][1]]) ** 2
+            for name, width in widths.items()
+            if name in at
+        }
+        model = search.model(start, noise2 or table.spread**2, factor)
+        if turn or not start:
+            model, further = search.climbed(model)
+        names = frozenset(_name(some, g) for g in model.widths)
+        step = table.geometry @ model.solved.mean[: table.parameters]
+        change = math.sqrt(float(step @ step) / max(table.count, 1.0))
+        state = _state(search, model.solved.mean, tuple(model.widths), state)
+        widths = {
+            _name(some, g): w / float(search.products.units[g[0]][g[1]]) ** 2
+            for g, w in model.widths.items()
+        }
+        noise2 = model.noise2
+        factor = model.factor
+        settled = change < SETTLED_PART * math.sqrt(noise2) or change < known.floor**2
+        if settled and (not names or before == (names, factor)):
+            break
+        before = (names, factor)
+    posterior = search.mixture(model, further)
+    return _made(fit, search, posterior, state, known)
+
+
+def _name(families: Sequence[Family], group: Group) -> str:
+    return families[group[0]].names[group[1]]
+
+
+def _group_weights(
+    search: Search, mean: FloatArray, groups: Sequence[Group]
+) -> dict[Group, FloatArray]:
+    """Split the weights of a model, in the groups' own units."""
+    out = {}
+    at = search.base_count
+    for f, g in groups:
+        count = search.products.own(f).shape[1]
+        out[f, g] = mean[at : at + count] / search.products.units[f][g]
+        at += count
+    return out
+
+
+def _state(
+    search: Search, mean: FloatArray, groups: Sequence[Group], before: State
+) -> State:
+    """Return the state that the weights of a model make.
+
+    Args:
+        search: its table.
+        mean: weights of all columns of the model.
+        groups: of the model.
+        before: the state with which the table was made.
+    """
+    table = search.table
+    families = search.products.families
+    x = table.problem.start
+    x[: table.parameters] = before.x[: table.parameters] + mean[: table.parameters]
+    frames: dict[str, FloatArray] = {}
+    shift = np.zeros((*table.problem.seen.shape, 2))
+    stated = [((f, 0), mean[own]) for f, own in search.always]
+    for (f, g), weights in [*stated, *_group_weights(search, mean, groups).items()]:
+        family = families[f]
+        place = family.places[g]
+        if family.acts is Acts.COLUMNS:
+            x[np.asarray(place, dtype=np.intp)] += weights
+        elif family.acts is Acts.FRAMES:
+            assert family.courses is not None
+            assert isinstance(place, tuple)
+            courses = family.courses[g if len(family.courses) > 1 else 0] @ weights
+            for name, course in zip(place[0], courses, strict=True):
+                frames[name] = frames.get(name, 0.0) + course
+        elif not family.always:
+            shift += table.shift_of(search.products.rows(f, g) @ weights)
+    found = tuple(families[f].places[g] for f, g in groups)
+    return State(x, frames, shift, found)
+
+
+def _made(
+    fit: FitResult, search: Search, posterior: Posterior, state: State, known: Known
+) -> Explained:
+    """Make the fit with the groups of the best model, with the posterior's covariance."""
+    table = search.table
+    best = posterior.best
+    groups = tuple(best.widths)
+    weights = _group_weights(search, best.solved.mean, groups)
+    count = table.parameters
+    certificate = fit.certificate
+    solution = fit.solution
+    problem = fit.problem
+    strained = fit.strain_prior
+    tolerance = fit.bead_prior_mm
+    own = math.sqrt(best.noise2)
+    if groups:
+        problem, x = _with_groups(fit.problem, search, posterior, state)
+        use = table.problem.seen & (table.lengths <= 5.0 * max(own, known.floor))
+        solution = replace(solution, x=x, use=use)
+        certificate = certify(problem, x, use, max(own, 1e-4), known.sampling_px,
+                              certificate.spectrum.bound)  # fmt: skip
+        named = {posterior.name(g): best.widths[g] for g in groups}
+        if any(name in named for name in strain.SHAPES):
+            strained = tuple(
+                max(fit.strain_prior[i], _own_width(search, posterior, name))
+                for i, name in enumerate(strain.SHAPES)
+            )  # type: ignore[assignment]
+        tolerance = max(tolerance, _own_width(search, posterior, "beads"))
+    factor = edge_factors(problem.layout.names[:count])
+    unit = np.outer(factor, factor)
+    rivals = _rivals(posterior, factor, best.solved.mean[:count])
+    wide = sum(r.weight * (r.covariance + np.outer(r.off, r.off)) for r in rivals)
+    freedom = max(table.count + search.freedom - count, 1.0)
+    certificate = _stated(
+        replace(certificate, dof=freedom, enlargement=1.0),
+        np.asarray(wide),
+        best.solved.covariance[:count, :count] * unit,
+        rivals,
+    )
+    groups_at = problem.parameters(solution.x)
+    made = replace(
+        fit,
+        parameters=groups_at[0],
+        group_parameters=groups_at,
+        beads=problem.spread(solution.x)[1],
+        certificate=certificate,
+        problem=problem,
+        solution=solution,
+        bead_prior_mm=tolerance,
+        strain_prior=strained,
+    )
+    return Explained(
+        made, posterior, table, weights, _strain(search, posterior),
+        {g: _effect(search, best, g, weights[g]) for g in groups},
+    )  # fmt: skip
+
+
+def _own_width(search: Search, posterior: Posterior, name: str) -> float:
+    """Return the width of a named group of the best model in its own unit; 0 without it."""
+    for (f, g), width in posterior.best.widths.items():
+        if posterior.name((f, g)) == name:
+            return math.sqrt(width) / float(search.products.units[f][g])
+    return 0.0
+
+
+def _rivals(
+    posterior: Posterior, factor: FloatArray, at: FloatArray
+) -> tuple[Rival, ...]:
+    """List the explanations about the best one's values, those of little weight as one."""
+    unit = np.outer(factor, factor)
+    kept = []
+    rest = 0.0
+    small = np.zeros_like(unit)
+    for part in posterior.parts:
+        off = (part.mean - at) * factor
+        covariance = part.covariance * unit
+        if part.weight >= LEAST_RIVAL:
+            kept.append(Rival(part.weight, off, covariance))
+        else:
+            rest += part.weight
+            small += part.weight * (covariance + np.outer(off, off))
+    if rest > 0.0:
+        kept.append(Rival(rest, np.zeros(len(at)), small / rest))
+    return tuple(kept)
+
+
+def _stated(
+    certificate: Certificate,
+    wide: FloatArray,
+    own: FloatArray,
+    rivals: tuple[Rival, ...],
+) -> Certificate:
+    """Return a certificate that states another covariance.
+
+    Args:
+        certificate: of the fit by itself.
+        wide: (p, p) of the mixture, edge units.
+        own: (p, p) of the best model.
+        rivals: its explanations.
+    """
+    out = widened(certificate, wide - certificate.covariance)
+    sigma = np.sqrt(np.maximum(np.diag(own), 0.0))
+    return replace(
+        out,
+        rivals=rivals if len(rivals) > 1 else (),
+        own=dict(zip(out.estimates, sigma.tolist(), strict=True)),
+    )
+
+
+def _with_groups(
+    plain: FitProblem, search: Search, posterior: Posterior, state: State
+) -> tuple[FitProblem, FloatArray]:
+    """Return the problem of a fit with those columns that groups of the best model have, the
+    other groups in its poses and positions, and the values of its columns.
+    """
+    every, x = moved(plain, state)
+    names = {posterior.name(g) for g in posterior.best.widths}
+    old = plain.layout
+    count = old.parameter_count
+    layout = every.layout
+    bent = "panel" in names
+    borders = tuple(
+        border
+        for g in posterior.best.widths
+        if posterior.families[g[0]].cause == tiles.NAME
+        and isinstance(border := posterior.families[g[0]].places[g[1]], Border)
+    )
+    free_beads = old.bead_column >= 0 or any(n.startswith("bead") for n in names)
+    strained = old.strain_column >= 0 or any(n in names for n in strain.SHAPES)
+    arc, rows = (old_ >= 0 or n in names for n, old_ in
+                 (("arc", old.arc_column), ("rows", old.rows_column)))  # fmt: skip
+    panel = None
+    terms: FloatArray = np.zeros(0)
+    shape = image_shape(plain)
+    if shape is not None and (bent or borders):
+        width = _own_width(search, posterior, "panel")
+        panel = PanelModel(max(width, 1e-4), shape, borders)
+        gaps = np.concatenate([np.zeros(0), *(
+            _gap(search, posterior, b) for b in borders
+        )])  # fmt: skip
+        terms = np.concatenate([x[layout.panel_column :], gaps])
+    from flexdt.twin.calibration.fit.problem import layout as assigned
+
+    columns = assigned(
+        _asked(old), len(every.base), _each(old), len(plain.model), free_beads,
+        _unasked(old), panel.names if panel else (), strained, arc, rows,
+    )  # fmt: skip
+    keep = [
+        *range(count),
+        *(range(*_ends(layout.bead_columns)) if free_beads else ()),
+        *(range(*_ends(layout.strain_columns)) if strained else ()),
+        *([layout.arc_column] if arc else ()),
+        *([layout.rows_column] if rows else ()),
+    ]
+    assert every.turning is not None
+    turning = None
+    if arc or rows:
+        turning = every.turning[..., [arc, *[rows] * (every.turning.shape[3] - 1)]]
+    widths = _widths(plain, search, posterior, keep, layout.names)
+    # A tile is a column of the problem now.
+    shifted = every.measured
+    if borders and panel is not None:
+        gap_terms = panel.terms(plain.measured + plain.origin[:, None, :])[
+            ..., -2 * len(borders) :
+        ]
+        shifted = (
+            every.measured
+            + gap_terms @ terms[-2 * len(borders) :] * every.seen[..., None]
+        )
+    means = np.concatenate(
+        [plain.prior_mean[:count], plain.model.beads.ravel() if free_beads else [],
+         np.zeros(len(keep) - count - 3 * len(plain.model) * free_beads + len(terms))]
+    )  # fmt: skip
+    problem = replace(
+        every,
+        layout=columns,
+        measured=np.ascontiguousarray(shifted),
+        panel=panel,
+        turning=turning,
+        prior_mean=means,
+        prior_sigma=np.concatenate([widths, panel.sigmas if panel else []]),
+    )
+    return problem, np.concatenate([x[keep], terms])
+
+
+def _ends(columns: slice) -> tuple[int, int]:
+    return columns.start, columns.stop
+
+
+def _asked(old: object) -> tuple[str, ...]:
+    names = old.names[: old.asked]  # type: ignore[attr-defined]
+    return tuple(dict.fromkeys(n.split("@")[0] for n in names))
+
+
+def _unasked(old: object) -> tuple[str, ...]:
+    names = old.names[old.asked : old.parameter_count]  # type: ignore[attr-defined]
+    return tuple(dict.fromkeys(n.split("@")[0] for n in names))
+
+
+def _each(old: object) -> tuple[str, ...]:
+    names = old.names[: old.asked]  # type: ignore[attr-defined]
+    return tuple(dict.fromkeys(n.split("@")[0] for n in names if "@" in n))
+
+
+def _widths(
+    plain: FitProblem,
+    search: Search,
+    posterior: Posterior,
+    keep: Sequence[int],
+    names: Sequence[str],
+) -> FloatArray:
+    """Return the widths of the priors of kept columns: of the fit, else of the groups."""
+    out = []
+    own = dict(zip(plain.layout.names, plain.prior_sigma.tolist(), strict=True))
+    groups = {
+        "bead": max(
+            [_own_width(search, posterior, posterior.name(g)) for g in posterior.best.widths
+             if posterior.name(g).startswith("bead") and "slips" not in posterior.name(g)],
+            default=0.0,
+        ),
+        "arc": _own_width(search, posterior, "arc"),
+        "rows": _own_width(search, posterior, "rows"),
+    }  # fmt: skip
+    shapes = [_own_width(search, posterior, name) for name in strain.SHAPES]
+    for at in keep:
+        name = names[at]
+        kind = name.split(" ")[0]
+        if kind == "strain":
+            first = STRAINS.index(name.split(" ")[1]) < 4
+            width = math.hypot(own.get(name, 0.0), shapes[0 if first else 1])
+        elif kind in groups:
+            width = math.hypot(own.get(name, 0.0), groups[kind])
+        else:
+            width = own[name]
+        out.append(max(width, 1e-9))
+    return np.array(out)
+
+
+def _gap(search: Search, posterior: Posterior, border: Border) -> FloatArray:
+    """Return the shift of a tile, (2,) [px]."""
+    weights = _group_weights(
+        search, posterior.best.solved.mean, tuple(posterior.best.widths)
+    )
+    for (f, g), weight in weights.items():
+        if posterior.families[f].places[g] == border:
+            return weight
+    raise AssertionError(border)
+
+
+def _strain(search: Search, posterior: Posterior) -> tuple[FloatArray, FloatArray] | None:
+    """Return the phantom's strain in the best model, in the order of STRAINS, and its
+    covariance; None if it has its stated shape.
+    """
+    solved = posterior.best.solved
+    first = search.table.problem.layout.strain_columns.start
+    sums = np.zeros((len(STRAINS), len(solved.mean)))
+    at = search.base_count
+    places: list[tuple[object, slice, float]] = [
+        (posterior.families[f].places[0], own, 1.0)
+        for f, own in search.always
+        if posterior.families[f].cause == strain.NAME
+    ]
+    for f, g in posterior.best.widths:
+        count = search.products.own(f).shape[1]
+        if posterior.families[f].cause == strain.NAME:
+            unit = float(search.products.units[f][g])
+            places.append(
+                (posterior.families[f].places[g], slice(at, at + count), 1 / unit)
+            )
+        at += count
+    for place, own, scale in places:
+        rows = np.asarray(place, dtype=np.intp) - first
+        sums[rows, range(own.start, own.stop)] = scale
+    if not places:
+        return None
+    return sums @ solved.mean, sums @ solved.covariance @ sums.T
+
+
+def _effect(search: Search, best: object, group: Group, weights: FloatArray) -> float:
+    """Compute the root mean square shift of the positions by a group, less what the geometry
+    takes up [whitened].
+    """
+    rows = search.products.rows(*group) @ weights
+    base = search.table.geometry
+    coefficients = np.linalg.lstsq(base, rows, rcond=1e-9)[0]
+    rest = rows - base @ coefficients
+    return math.sqrt(float(rest @ rest) / max(search.table.count, 1.0))

@@ -1,0 +1,280 @@
+"""Motion: object, source, panel or angle are elsewhere from frame to frame.
+
+A motion is a ramp, a jump, a wander (half waves that fade with their number) or a jitter (each
+frame by itself), of the object, the source or the panel along an axis, or of the angle. All have
+a mean of zero over the scan: the geometry is that of the mean.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose import CalibrationCode
+from flexdt.twin.calibration.diagnose.named_motion import (
+    ALIKE_MOTION,
+    MOTION_WORDS,
+    named_turn,
+)
+from flexdt.twin.calibration.diagnose.table.group import (
+    LOG_CHANCE,
+    Acts,
+    Family,
+    Found,
+    Known,
+    Seen,
+)
+from flexdt.twin.calibration.diagnose.table.linearised import PER_FRAME, Linearised
+from flexdt.twin.findings import Finding, error, warning
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.offsets import UNITS, to_edge
+
+NAME: Final = "motion"
+WORDS: Final = "something that moves during the scan"
+MOVERS: Final = {
+    "dO_x": {"dO_x": 1.0},
+    "dO_y": {"dO_y": 1.0},
+    "dO_z": {"dO_z": 1.0},
+    "alpha": {"alpha": 1.0},
+    "dD_x": {"dD_x": 1.0},
+    "dD_y": {"dD_y": 1.0},
+    "dS_x": {"dS_x": 1.0},
+    "dS_y": {"dS_y": 1.0},
+    # Seen from a source that comes nearer, object and panel go away.
+    "dS_z": {"dO_z": -1.0, "dD_z": -1.0},
+}
+"""What may move -> the parameters of a frame that stand for it, with their factors."""
+JITTERS: Final = ("dO_x", "dO_y", "dO_z", "alpha")
+"""What may differ from frame to frame by itself: of others this looks like the object's."""
+FOLLOWED: Final = ("dO_x", "dO_y", "dO_z", "alpha")
+"""Parameters that are advised to differ between frames where something moves."""
+LEAST_FRAMES: Final = 3
+MOST_WAVES: Final = 24
+"""Half waves in a scan, of a wander."""
+MOST_JUMPS: Final = 60
+"""Frames before which a jump is looked for."""
+KINDS: Final = 3
+"""Smooth kinds of motion, which share the odds."""
+
+
+class Moves(NamedTuple):
+    """What a group of motion is: what moves, how, in which scan, and at which frame."""
+
+    what: str
+    how: str
+    scan: int
+    at: int = -1
+
+
+def families(table: Linearised, known: Known) -> Iterator[Family]:
+    """Make each kind of motion of all that may move, in each scan, and shifts from scan to
+    scan.
+    """
+    many = len(table.scans) > 1
+    for number, frames in enumerate(table.scans):
+        count = len(frames)
+        if count < LEAST_FRAMES:
+            continue
+        place = (np.arange(count) + 0.5) / count
+        where = f" in scan {number + 1}" if many else ""
+        waves = np.arange(1, min(count - 1, MOST_WAVES) + 1)
+        wander = np.cos(math.pi * place[:, None] * waves) / waves
+        ramp = (place - 0.5)[:, None]
+        # Of all half waves alike: frames by themselves, but for their mean.
+        every = np.arange(1, count)
+        jitter = np.cos(math.pi * place[:, None] * every) * math.sqrt(2.0 / count)
+        chance = LOG_CHANCE - math.log(KINDS)
+        for how, course in (("wanders", wander), ("ramps", ramp), ("jitters", jitter)):
+            some = JITTERS if how == "jitters" else tuple(MOVERS)
+            if how == "ramps":
+                # Of even angles this is a factor on them.
+                some = tuple(what for what in MOVERS if what != "alpha")
+            for names in _alike(some):
+                yield _family(
+                    table, [Moves(name, how, number) for name in names], where,
+                    np.stack([_in(table.n, frames, course)]), chance,
+                )  # fmt: skip
+        jumps = np.unique(
+            np.linspace(1, count - 1, min(count - 1, MOST_JUMPS)).round().astype(int)
+        )
+        late = (np.arange(count)[:, None] >= jumps) - (1 - jumps / count)
+        courses = np.stack(
+            [_in(table.n, frames, late[:, i : i + 1]) for i in range(len(jumps))]
+        )
+        chance = LOG_CHANCE - math.log(KINDS * len(jumps))
+        for names in _alike(tuple(MOVERS)):
+            moves = [
+                Moves(m, "jumps", number, int(frames[at])) for m in names for at in jumps
+            ]
+            every = np.concatenate([courses] * len(names))
+            yield _family(table, moves, where, every, chance)
+    if many:
+        group = table.problem.group
+        apart = np.equal.outer(group, range(group.max() + 1)) - np.bincount(group) / len(
+            group
+        )
+        own = {n.split("@")[0] for n in table.problem.layout.names if "@" in n}
+        shared = tuple(w for w, part in MOVERS.items() if own.isdisjoint(part))
+        for names in _alike(shared):
+            yield _family(
+                table, [Moves(name, "differs", -1) for name in names], " between scans",
+                apart[None], LOG_CHANCE - math.log(KINDS),
+            )  # fmt: skip
+
+
+def _alike(names: tuple[str, ...]) -> list[list[str]]:
+    """Group movers by the number of their parameters."""
+    sizes = sorted({len(MOVERS[name]) for name in names})
+    return [[n for n in names if len(MOVERS[n]) == size] for size in sizes]
+
+
+def _in(n: int, frames: FloatArray, course: FloatArray) -> FloatArray:
+    out = np.zeros((n, course.shape[1]))
+    out[frames] = course
+    return out
+
+
+def _family(
+    table: Linearised, moves: list[Moves], where: str, courses: FloatArray, chance: float
+) -> Family:
+    """Make a family of motions of as many parameters each.
+
+    Args:
+        table: of the slopes.
+        moves: of each group.
+        where: words on the scan.
+        courses: (1 or g, n, c) of the frames.
+        chance: of each.
+    """
+    parts = [MOVERS[move.what] for move in moves]
+    factors = np.array([list(part.values()) for part in parts])
+    every = np.broadcast_to(courses, (len(moves), *courses.shape[1:]))
+    shared = len(courses) == 1 and bool((factors == factors[0]).all())
+    if shared:
+        every = courses
+        factors = factors[:1]
+    names = tuple(
+        f"{m.what} {m.how}{f' at {m.at}' if m.at >= 0 else ''}{where}" for m in moves
+    )
+    return Family(
+        NAME,
+        names,
+        Acts.FRAMES,
+        tuple((tuple(part), move) for part, move in zip(parts, moves, strict=True)),
+        chance,
+        slopes=np.array([[PER_FRAME.index(p) for p in part] for part in parts]),
+        courses=factors[:, :, None, None] * every[:, None],
+    )
+
+
+def told(found: Found) -> list[Finding]:
+    """Tell what moves, how, and by how much: the geometry is that of the mean. A turn that is
+    whole steps, or a jump of the angle, is an error.
+    """
+    seen = found.of(NAME)
+    out = []
+    turned = [s for s in seen if _moves(s).what == "alpha"]
+    moved = [s for s in seen if _moves(s).what != "alpha"]
+    angles = found.fit.problem.poses.angle
+    group = found.fit.problem.group
+    if turned:
+        out.append(_turned(turned, angles, group))
+    if moved:
+        out.append(_moved(moved, found))
+    return out
+
+
+def _moves(seen: Seen) -> Moves:
+    place = seen.place
+    assert isinstance(place, tuple)
+    assert isinstance(place[1], Moves)
+    return place[1]
+
+
+def _reach(seen: Sequence[Seen]) -> tuple[float, FloatArray]:
+    """Return the range of what some groups of one mover do together, and its course, internal
+    units.
+    """
+    course = sum(s.courses[0] for s in seen if s.courses is not None)
+    return float(np.ptp(course)), np.asarray(course)
+
+
+def _moved(seen: Sequence[Seen], found: Found) -> Finding:
+    """Tell a motion of object, source or panel, those that do most first."""
+    effects: dict[str, float] = {}
+    for one in seen:
+        what = _moves(one).what
+        effects[what] = math.hypot(effects.get(what, 0.0), one.effect_px)
+    ordered = sorted(effects, key=lambda what: -effects[what])
+    first = [s for s in seen if _moves(s).what == ordered[0]]
+    said = []
+    for what in ordered:
+        reach, _ = _reach([s for s in seen if _moves(s).what == what])
+        if effects[what] > 0.3 * effects[ordered[0]]:
+            parameter = "dO_z" if what == "dS_z" else what
+            said.append(f"{what} by {to_edge(parameter, reach):.3g} {UNITS[parameter]}")
+    main = max(first, key=lambda s: s.effect_px)
+    how = _how(first, main)
+    many = found.fit.problem.group.max() > 0
+    scan = _moves(main).scan
+    where = f" of scan {scan + 1}" if many and scan >= 0 else ""
+    shakes = _moves(main).how == "jitters"
+    words = " and ".join(MOTION_WORDS[what] for what in ordered[:2])
+    px = math.sqrt(sum(e**2 for e in effects.values()))
+    return warning(
+        CalibrationCode.VIBRATION if shakes else CalibrationCode.DRIFT,
+        f"{', '.join(said)} moves during the scan{where}, {how}: {words}"
+        f"{_looks_alike(ordered[0])}. It moves the images by {px:.2g} px rms; the geometry is "
+        f"that of the mean, and --per-frame {','.join(FOLLOWED)} follows it",
+        per_frame=FOLLOWED,
+    )
+
+
+def _how(first: Sequence[Seen], main: Seen) -> str:
+    """Write how something moves."""
+    move = _moves(main)
+    if move.how == "jumps":
+        return f"at frame {move.at}"
+    if move.how == "jitters":
+        return "from frame to frame"
+    if move.how == "differs":
+        return "from scan to scan"
+    _, course = _reach(first)
+    some = course[course != 0.0] if (course != 0.0).any() else course
+    steady = abs(float(np.corrcoef(some, np.arange(len(some)))[0, 1])) > 0.9
+    return "steadily from the first to the last frame" if steady else "to and fro"
+
+
+def _looks_alike(what: str) -> str:
+    """Return words on another motion that looks like one, in brackets after a blank."""
+    words = ALIKE_MOTION.get(what, ())
+    return (
+        f" (or {' or '.join(words)}, which look{'s' * (len(words) == 1)} alike)"
+        if words
+        else ""
+    )
+
+
+def _turned(seen: Sequence[Seen], angles: FloatArray, group: FloatArray) -> Finding:
+    """Tell how the object turns otherwise than stated."""
+    jumps = [s for s in seen if _moves(s).how == "jumps"]
+    main = max(seen, key=lambda s: s.effect_px)
+    if jumps and main in jumps:
+        move = _moves(main)
+        assert main.courses is not None
+        course = main.courses[0]
+        height = to_edge("alpha", float(course[move.at] - course[move.at - 1]))
+        code, text = named_turn(height, angles[group == group[move.at]])
+        return error(code, f"between frames {move.at - 1} and {move.at} {text}")
+    _, course = _reach(seen)
+    off = np.array([to_edge("alpha", v) for v in course])
+    return warning(
+        CalibrationCode.ANGLES_WRONG,
+        f"the frames' angles differ from the stated ones by {np.std(off):.3g} deg "
+        f"rms (up to {np.abs(off).max():.3g}): the geometry is that of their mean, and "
+        "--per-frame alpha follows them",
+        per_frame=("alpha",),
+    )

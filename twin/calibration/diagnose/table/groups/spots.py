@@ -1,0 +1,81 @@
+"""Errors of spots: each bead's positions err smoothly as the object turns, or slowly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose import CalibrationCode
+from flexdt.twin.calibration.diagnose.table.group import (
+    LOG_CHANCE,
+    Acts,
+    Family,
+    Found,
+    Known,
+)
+from flexdt.twin.calibration.diagnose.table.linearised import Linearised
+from flexdt.twin.findings import Finding, warning
+from flexdt.twin.geometry.conventions import FloatArray
+
+NAME: Final = "spots"
+WORDS: Final = "errors of single spots that change slowly"
+HARMONICS: Final = 3
+LEAST_FRAMES: Final = 16
+MOST_WAVES: Final = 16
+"""Half waves over the scan, of slow errors."""
+BEAD_ERROR_SPREADS: Final = 1.0
+"""Errors, in standard deviations of a position, up to which they widen the intervals alone and are
+no finding."""
+
+
+def families(table: Linearised, known: Known) -> Iterator[Family]:
+    """Make errors that repeat with the turn, and errors that are slow, of each coordinate of
+    each bead's positions.
+    """
+    if table.n < LEAST_FRAMES:
+        return
+    number = np.arange(HARMONICS + 1)
+    turn = table.problem.poses.angle[:, None] * number
+    size = 1.0 / np.maximum(number, 1)
+    harmonics = np.concatenate(
+        [size * np.cos(turn), size[1:] * np.sin(turn[:, 1:])], axis=1
+    )
+    place = (np.arange(table.n) + 0.5) / table.n
+    waves = np.arange(MOST_WAVES + 1)
+    slow = np.cos(math.pi * place[:, None] * waves) / np.sqrt(1.0 + (waves / 4.0) ** 2)
+    slopes = table.spot_slopes[None]
+    for how, each in (("with the turn", harmonics), ("slowly", slow)):
+        yield Family(
+            NAME,
+            (f"spots err {how}",),
+            Acts.IMAGE,
+            (how,),
+            LOG_CHANCE - math.log(2),
+            slopes=slopes,
+            courses=_each_by_itself(each, slopes.shape[1])[None],
+        )
+
+
+def _each_by_itself(course: FloatArray, count: int) -> FloatArray:
+    n, c = course.shape
+    out = np.zeros((count, n, count, c))
+    out[np.arange(count), :, np.arange(count)] = course
+    return out.reshape(count, n, count * c)
+
+
+def told(found: Found) -> list[Finding]:
+    """Tell errors of spots that exceed the noise of a position."""
+    seen = found.of(NAME)
+    size = math.sqrt(sum(s.effect_px**2 for s in seen))
+    if not seen or size < BEAD_ERROR_SPREADS * found.fit.certificate.rms_px:
+        return []
+    return [
+        warning(
+            CalibrationCode.BEAD_ERRORS,
+            f"single beads err by about {size:.2g} px, smoothly as the object turns (bead "
+            "positions, background, distortion): the intervals allow for it",
+        )
+    ]

@@ -1,0 +1,125 @@
+"""Tiles: a part of the panel is shifted against the rest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.calibration.diagnose.table.group import (
+    LOG_CHANCE,
+    Acts,
+    Family,
+    Found,
+    Known,
+)
+from flexdt.twin.calibration.diagnose.table.linearised import Linearised, image_shape
+from flexdt.twin.findings import Finding
+from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.panel import Border
+
+NAME: Final = "tiles"
+WORDS: Final = "a panel whose tiles are apart"
+LEAST_TILE: Final = 1 / 8
+"""Least part of the panel on each side of a border."""
+LEAST_SIDE: Final = 4
+"""Positions on each side of a border that tell it."""
+NEAR: Final = 6
+"""Gaps between spots, about a border of the last table, that are tried, too."""
+BORDERS: Final = 80
+"""Places of a border along an axis that are tried, one in each gap between spots at most."""
+
+
+def families(table: Linearised, known: Known) -> Iterator[Family]:
+    """Make tiles that begin at places along columns and rows, each shifted by two numbers;
+    places between which no spot lies are one.
+    """
+    shape = image_shape(table.problem)
+    if shape is None:
+        return
+    counted = table.weight > 0
+    known_borders = [one for one in table.state.found if isinstance(one, Border)]
+    borders = []
+    beyond = []
+    for axis in (0, 1):
+        place = table.measured[..., axis]
+        found = [b.at for b in known_borders if b.axis == axis]
+        for at in _borders(place[counted], shape[1 - axis], found):
+            borders.append(Border(axis, at))
+            beyond.append((place >= at) * 1.0)
+    if borders:
+        yield _family(table, borders, beyond, LOG_CHANCE - math.log(BORDERS))
+    # Four tiles are two borders, and a quarter that is neither.
+    quarters = [
+        (table.measured >= (one.at, other.at)).all(axis=2) * 1.0
+        for one in known_borders
+        for other in known_borders
+        if one.axis == 0 and other.axis == 1
+    ]
+    quarters = [q for q in quarters if q[counted].sum() >= LEAST_SIDE]
+    if quarters:
+        yield _family(
+            table, [f"quarter {i}" for i in range(len(quarters))], quarters, 0.0
+        )
+
+
+def _borders(places: FloatArray, size: int, found: Sequence[float]) -> list[float]:
+    """Choose places of a border along an axis [px], each in the middle between two spots:
+    `BORDERS` at most, and all near those that were found in the last table.
+
+    Args:
+        places: (m,) of the spots that count.
+        size: of the panel.
+        found: borders.
+    """
+    here = np.sort(places)
+    own = slice(LEAST_SIDE - 1, len(here) - LEAST_SIDE)
+    middles = ((here[1:] + here[:-1]) / 2)[own]
+    gaps = np.diff(here)[own]
+    inside = (middles >= LEAST_TILE * size) & (middles <= (1 - LEAST_TILE) * size)
+    middles, gaps = middles[inside & (gaps > 0)], gaps[inside & (gaps > 0)]
+    if not len(middles):
+        return []
+    # Evenly among the spots, and in the widest gaps: of beads that stay in their rows.
+    chosen = np.linspace(0, len(middles) - 1, min(len(middles), BORDERS // 2)).round()
+    some = {*chosen.astype(int).tolist(), *np.argsort(-gaps)[: BORDERS // 2].tolist()}
+    for at in found:
+        nearest = int(np.searchsorted(middles, at))
+        step = len(middles) // BORDERS + NEAR
+        some |= set(range(max(nearest - step, 0), min(nearest + step + 1, len(middles))))
+    return [float(middles[i]) for i in sorted(some)]
+
+
+def _family(
+    table: Linearised,
+    places: Sequence[Border | str],
+    beyond: Sequence[FloatArray],
+    chance: float,
+) -> Family:
+    """Make groups that shift the spots in a part of the panel, each by two numbers.
+
+    Args:
+        table: of the fit.
+        places: of the parts: borders, or names.
+        beyond: of each part (n, k), 1 where a spot is in it.
+        chance: of each.
+    """
+    rows = []
+    for part in beyond:
+        shift = np.zeros((*part.shape, 2, 2))
+        shift[..., 0, 0] = shift[..., 1, 1] = part
+        rows.append(table.rows_of(shift))
+    names = tuple(
+        f"tile from {('column', 'row')[p.axis]} {p.at:.2f}"
+        if isinstance(p, Border)
+        else p
+        for p in places
+    )
+    return Family(NAME, names, Acts.IMAGE, tuple(places), chance, np.array(rows))
+
+
+def told(found: Found) -> list[Finding]:
+    """Tell nothing: tiles are told with the panel."""
+    return []
