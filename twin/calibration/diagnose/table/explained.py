@@ -10,7 +10,13 @@ from typing import Final
 import numpy as np
 
 from flexdt.twin.calibration.diagnose.table.group import Acts, Family, Known
-from flexdt.twin.calibration.diagnose.table.groups import every_family, strain, tiles
+from flexdt.twin.calibration.diagnose.table.groups import (
+    beads,
+    every_family,
+    spots,
+    strain,
+    tiles,
+)
 from flexdt.twin.calibration.diagnose.table.linearised import (
     Linearised,
     State,
@@ -52,6 +58,7 @@ class Explained:
         strain: of the phantom, (10,) in the order of STRAINS, and its covariance.
         moves_px: group -> root mean square of the shift that it makes, less what the geometry
             would take up of it [px].
+        held: groups of the best model that are assumed.
     """
 
     fit: FitResult
@@ -60,6 +67,7 @@ class Explained:
     weights: dict[Group, FloatArray]
     strain: tuple[FloatArray, FloatArray] | None
     moves_px: dict[Group, float]
+    held: frozenset[Group] = frozenset()
 
     def of(self, cause: str) -> list[Group]:
         """List the groups of a cause that the best model has."""
@@ -121,8 +129,26 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
         if settled and (not names or before == (names, factor)):
             break
         before = (names, factor)
-    posterior = search.mixture(model, further)
-    return _made(fit, search, posterior, state, known)
+    held = [
+        at[name]
+        for name in _never_exact(table, known)
+        if name in at and at[name] not in model.widths
+    ]
+    for group in held:
+        model = search.with_open(model, further, group)
+        further = search.further(model)
+    if held:
+        state = _state(search, model.solved.mean, tuple(model.widths), table.state)
+    posterior = search.mixture(model, further, held)
+    return _made(fit, search, posterior, state, frozenset(held), known)
+
+
+def _never_exact(table: Linearised, known: Known) -> tuple[str, ...]:
+    """Name the groups that are there however little the residuals show of them: places of so
+    few beads that any displacement is a strain. No phantom has its beads exactly in place.
+    """
+    few = table.k <= beads.MOST_STRAINED and known.bead_tolerance_mm is None
+    return (beads.ALL,) if few else ()
 
 
 def _name(families: Sequence[Family], group: Group) -> str:
@@ -178,7 +204,12 @@ def _state(
 
 
 def _made(
-    fit: FitResult, search: Search, posterior: Posterior, state: State, known: Known
+    fit: FitResult,
+    search: Search,
+    posterior: Posterior,
+    state: State,
+    held: frozenset[Group],
+    known: Known,
 ) -> Explained:
     """Make the fit with the groups of the best model, with the posterior's covariance."""
     table = search.table
@@ -193,6 +224,12 @@ def _made(
     tolerance = fit.bead_prior_mm
     own = math.sqrt(best.noise2)
     if groups:
+        # Errors of the spots themselves stay residuals: other fits are compared by them.
+        for f, g in groups:
+            if search.products.families[f].cause == spots.NAME:
+                rows = search.products.rows(f, g)
+                own_shift = table.shift_of(rows @ weights[f, g])
+                state = replace(state, shift=state.shift - own_shift)
         problem, x = _with_groups(fit.problem, search, posterior, state)
         use = table.problem.seen & (table.lengths <= 5.0 * max(own, known.floor))
         solution = replace(solution, x=x, use=use)
@@ -230,7 +267,7 @@ def _made(
     )
     return Explained(
         made, posterior, table, weights, _strain(search, posterior),
-        {g: _effect(search, best, g, weights[g]) for g in groups},
+        {g: _effect(search, best, g, weights[g]) for g in groups}, held,
     )  # fmt: skip
 
 

@@ -10,14 +10,14 @@ mixture of the best model and of it with one group more, one less, or one exchan
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
 
-from flexdt.twin.calibration.diagnose.table.group import Family
+from flexdt.twin.calibration.diagnose.table.group import OPEN_LOG_ODDS, Family
 from flexdt.twin.calibration.diagnose.table.linearised import Linearised
 from flexdt.twin.calibration.diagnose.table.products import Products
 from flexdt.twin.calibration.fit.certificate import SPREAD_FREEDOM
@@ -463,12 +463,36 @@ class Search:
                 break
         return model, further
 
-    def mixture(self, model: Model, further: Mapping[int, Further]) -> Posterior:
+    def with_open(
+        self, model: Model, further: Mapping[int, Further], group: Group
+    ) -> Model:
+        """Return a model with a group as wide as the residuals leave it open: the largest
+        width that they speak against by odds of `OPEN_LOG_ODDS` at most.
+
+        Args:
+            model: without the group.
+            further: what groups would add to it.
+            group: of the table.
+        """
+        f, g = group
+        gain = further[f].gain[g]
+        open_ = GRID[gain >= max(float(gain.max()), 0.0) - OPEN_LOG_ODDS]
+        widths = {**model.widths, group: model.noise2 * float(open_.max()) ** 2}
+        solved = self.solve(widths, model.noise2, model.factor)
+        return Model(widths, model.noise2, model.factor, solved, model.evidence)
+
+    def mixture(
+        self,
+        model: Model,
+        further: Mapping[int, Further],
+        held: Collection[Group] = (),
+    ) -> Posterior:
         """Average over a model and those with one group more, one less, or one exchanged.
 
         Args:
             model: the most probable.
             further: what further groups would add to it.
+            held: groups that are in all of them.
         """
         count = self.table.parameters
         parts: list[tuple[float, frozenset[Group], FloatArray, FloatArray]] = []
@@ -505,6 +529,8 @@ class Search:
         take(model, 0.0)
         take_further(model, further, 0.0)
         for group in model.widths:
+            if group in held:
+                continue
             less = self.model(_without(model.widths, group), model.noise2, model.factor)
             take(less, less.evidence - model.evidence)
             beside = self._pinned(model, group)

@@ -7,7 +7,6 @@ warning. What no group explains, or only errors of the spots themselves, counts 
 from __future__ import annotations
 
 import enum
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
@@ -108,7 +107,7 @@ def judged(
     told += _open(found, told)
     fit = what.fit
     lost = _lost_beads(fit, told)
-    if _misfits(what, found, sigmas_known, misfit_px):
+    if _misfits(what, sigmas_known, misfit_px):
         told = [_misfit(fit)] if not any(_withheld(f) for f in told) else told
     return fit, [*lost, *map(_by_policy, told)]
 
@@ -132,6 +131,7 @@ def found_in(what: Explained) -> Found:
             px * what.moves_px[group],
         )
         for group, weights in what.weights.items()
+        if group not in what.held
     ]  # fmt: skip
     seen.sort(key=lambda s: -s.effect_px)
     there = {s.cause for s in seen}
@@ -172,15 +172,12 @@ def _by_policy(finding: Finding) -> Finding:
     return replace(finding, severity=ERROR if _withheld(finding) else WARNING)
 
 
-def _misfits(what: Explained, found: Found, sigmas_known: bool, misfit_px: float) -> bool:
+def _misfits(what: Explained, sigmas_known: bool, misfit_px: float) -> bool:
     """Check whether residuals are larger than chance makes them, those that only errors of
     the spots themselves explain among them.
     """
     fit = what.fit
-    spread = math.hypot(
-        fit.certificate.rms_px,
-        *(s.effect_px for s in found.seen if s.cause == spots.NAME),
-    )
+    spread = fit.certificate.rms_px
     limit = max(misfit_px, largest_residual(fit, MISFIT_CHANCE, sigmas_known))
     return bool(spread >= limit) or _share_left_out(fit) > MOST_LEFT_OUT
 

@@ -22,6 +22,8 @@ from flexdt.twin.findings import Finding, warning
 NAME: Final = "beads"
 WORDS: Final = "beads elsewhere"
 ALL: Final = "beads"
+MOST_STRAINED: Final = 4
+"""Number of beads of which every displacement is an affine map, of twelve numbers."""
 LARGEST_SHARE: Final = 3e-2
 """Largest standard deviation of beads' places, as a part of the phantom's size."""
 
@@ -44,6 +46,8 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             NAME, ("beads as stated",), Acts.COLUMNS, (columns,), 0.0, rows,
             always=known.bead_tolerance_mm,
         )  # fmt: skip
+    if k <= MOST_STRAINED:
+        widest = min(widest, table.problem.model.tolerance_mm or widest)
     yield Family(NAME, (ALL,), Acts.COLUMNS, (columns,), LOG_CHANCE, rows, widest=widest)
     each = columns.reshape(k, 3)
     yield Family(

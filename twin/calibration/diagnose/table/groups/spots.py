@@ -70,7 +70,8 @@ def told(found: Found) -> list[Finding]:
     """Tell errors of spots that exceed the noise of a position."""
     seen = found.of(NAME)
     size = math.sqrt(sum(s.effect_px**2 for s in seen))
-    if not seen or size < BEAD_ERROR_SPREADS * found.fit.certificate.rms_px:
+    spread = found.fit.certificate.rms_px  # which contains them
+    if not seen or 2.0 * size**2 < BEAD_ERROR_SPREADS**2 * spread**2:
         return []
     return [
         warning(
