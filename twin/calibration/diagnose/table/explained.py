@@ -24,11 +24,18 @@ from flexdt.twin.calibration.diagnose.table.linearised import (
     moved,
     with_every_column,
 )
-from flexdt.twin.calibration.diagnose.table.posterior import Group, Posterior, Search
+from flexdt.twin.calibration.diagnose.table.posterior import (
+    Group,
+    Model,
+    Posterior,
+    Search,
+)
 from flexdt.twin.calibration.fit.certificate import Certificate, Rival, certify, widened
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import (
     STRAINS,
+    STRETCHES,
+    ColumnLayout,
     FitProblem,
     edge_factors,
 )
@@ -355,12 +362,6 @@ def _with_groups(
             _gap(search, posterior, b) for b in borders
         )])  # fmt: skip
         terms = np.concatenate([x[layout.panel_column :], gaps])
-    from flexdt.twin.calibration.fit.problem import layout as assigned
-
-    columns = assigned(
-        _asked(old), len(every.base), _each(old), len(plain.model), free_beads,
-        _unasked(old), panel.names if panel else (), strained, arc, rows,
-    )  # fmt: skip
     keep = [
         *range(count),
         *(range(*_ends(layout.bead_columns)) if free_beads else ()),
@@ -368,6 +369,7 @@ def _with_groups(
         *([layout.arc_column] if arc else ()),
         *([layout.rows_column] if rows else ()),
     ]
+    columns = _layout_of(old, [layout.names[i] for i in keep], panel)
     assert every.turning is not None
     turning = None
     if arc or rows:
@@ -403,19 +405,31 @@ def _ends(columns: slice) -> tuple[int, int]:
     return columns.start, columns.stop
 
 
-def _asked(old: object) -> tuple[str, ...]:
-    names = old.names[: old.asked]  # type: ignore[attr-defined]
-    return tuple(dict.fromkeys(n.split("@")[0] for n in names))
+def _layout_of(
+    old: ColumnLayout, names: Sequence[str], panel: PanelModel | None
+) -> ColumnLayout:
+    """Return a layout with the parameters of another, and further columns.
 
+    Args:
+        old: of the parameters.
+        names: of all columns but the panel's.
+        panel: its terms follow.
+    """
 
-def _unasked(old: object) -> tuple[str, ...]:
-    names = old.names[old.asked : old.parameter_count]  # type: ignore[attr-defined]
-    return tuple(dict.fromkeys(n.split("@")[0] for n in names))
+    def first(begin: str) -> int:
+        """Return the first column whose name begins so; -1 without."""
+        return next((i for i, n in enumerate(names) if n.split(" ")[0] == begin), -1)
 
-
-def _each(old: object) -> tuple[str, ...]:
-    names = old.names[: old.asked]  # type: ignore[attr-defined]
-    return tuple(dict.fromkeys(n.split("@")[0] for n in names if "@" in n))
+    terms = () if panel is None else tuple(f"panel {term}" for term in panel.names)
+    return replace(
+        old,
+        names=(*names, *terms),
+        bead_column=first("bead"),
+        strain_column=first("strain"),
+        arc_column=first("arc"),
+        rows_column=first("rows"),
+        panel_column=len(names),
+    )
 
 
 def _widths(
@@ -442,7 +456,7 @@ def _widths(
         name = names[at]
         kind = name.split(" ")[0]
         if kind == "strain":
-            first = STRAINS.index(name.split(" ")[1]) < 4
+            first = STRAINS.index(name.split(" ")[1]) < STRETCHES
             width = math.hypot(own.get(name, 0.0), shapes[0 if first else 1])
         elif kind in groups:
             width = math.hypot(own.get(name, 0.0), groups[kind])
@@ -492,12 +506,15 @@ def _strain(search: Search, posterior: Posterior) -> tuple[FloatArray, FloatArra
     return sums @ solved.mean, sums @ solved.covariance @ sums.T
 
 
-def _effect(search: Search, best: object, group: Group, weights: FloatArray) -> float:
+def _effect(search: Search, best: Model, group: Group, weights: FloatArray) -> float:
     """Compute the root mean square shift of the positions by a group, less what the geometry
-    takes up [whitened].
+    takes up of it within its priors [whitened].
     """
+    table = search.table
     rows = search.products.rows(*group) @ weights
-    base = search.table.geometry
-    coefficients = np.linalg.lstsq(base, rows, rcond=1e-9)[0]
-    rest = rows - base @ coefficients
-    return math.sqrt(float(rest @ rest) / max(search.table.count, 1.0))
+    base = table.geometry
+    normal = base.T @ base + best.noise2 * np.diag(table.precision)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = np.linalg.pinv(normal * np.outer(scale, scale), hermitian=True)
+    rest = rows - base @ (scale * (inverse @ (scale * (base.T @ rows))))
+    return math.sqrt(float(rest @ rest) / max(table.count, 1.0))

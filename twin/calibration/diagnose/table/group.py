@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -53,6 +54,7 @@ class Known:
             are not those of the middle of an exposure, by the spots' smear; None: the arc was
             not measured.
         sampling_px: standard deviation of errors that follow a spot's place in the pixel grid.
+        limits: largest standard deviation of causes (`stated_causes`), 0: excluded.
     """
 
     strain: Strain
@@ -61,6 +63,7 @@ class Known:
     arc: float | None = None
     arc_left: float | None = None
     sampling_px: float = 0.0
+    limits: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from flexdt.twin.calibration.diagnose.table.group import Family, Found, Known
@@ -19,6 +20,7 @@ from flexdt.twin.calibration.diagnose.table.groups import (
     spots,
     strain,
     tiles,
+    told,
     wobble,
 )
 from flexdt.twin.calibration.diagnose.table.linearised import Linearised
@@ -45,12 +47,58 @@ CAUSES: Final = tuple(
     Cause(module.NAME, module.WORDS, module.families, module.told)
     for module in (
         strain, beads, slips, arc, rows, panel, tiles, motion, growth, wobble,
-        angle_scale, spots, positions,
+        angle_scale, spots, told, positions,
     )
 )  # fmt: skip
 """Every cause, in the order in which findings are told."""
 
 
+STATED: Final = (
+    (tiles.NAME, "", "gap"),
+    (panel.NAME, "", "distortion"),
+    (strain.NAME, "", "shape"),
+    (beads.NAME, "", "beads"),
+    (arc.NAME, "", "arc"),
+    (rows.NAME, "", "rows"),
+    (angle_scale.NAME, "", "angles"),
+    (motion.NAME, "alpha", "angles"),
+    (motion.NAME, "", "motion"),
+    (growth.NAME, "", "motion"),
+    (spots.NAME, "", "spots"),
+)
+"""Cause, begin of its groups' names, and the name by which its size is stated (`stated_causes`);
+the first counts."""
+SAME_UNIT: Final = ("gap", "distortion", "shape", "beads")
+"""Stated causes of which a group's weights have the stated unit."""
+
+
 def every_family(table: Linearised, known: Known) -> list[Family]:
-    """Make the groups of every cause at a table."""
-    return [family for cause in CAUSES for family in cause.families(table, known)]
+    """Make the groups of every cause at a table, none wider than it is stated to be."""
+    return [
+        limited
+        for cause in CAUSES
+        for family in cause.families(table, known)
+        if (limited := _limited(family, known)) is not None
+    ]
+
+
+def _limited(family: Family, known: Known) -> Family | None:
+    """Return a family that is no wider than stated; None for one that is excluded. Of a size
+    that is stated in another unit than its weights', only 0 is one.
+    """
+    name = next(
+        (
+            stated
+            for cause, begin, stated in STATED
+            if family.cause == cause and all(n.startswith(begin) for n in family.names)
+        ),
+        "",
+    )
+    limit = known.limits.get(name)
+    if limit is None or family.always:
+        return family
+    if limit == 0.0:
+        return None
+    if name not in SAME_UNIT:
+        return family
+    return replace(family, widest=min(family.widest, limit))

@@ -117,6 +117,8 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             group
         )
         own = {n.split("@")[0] for n in table.problem.layout.names if "@" in n}
+        # Scans that stand apart have told places, with a prior of their own.
+        own |= {n.replace("place", "dO") for n in own if n.startswith("place")}
         shared = tuple(w for w, part in MOVERS.items() if own.isdisjoint(part))
         for names in _alike(shared):
             yield _family(
@@ -126,9 +128,13 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
 
 
 def _alike(names: tuple[str, ...]) -> list[list[str]]:
-    """Group movers by the number of their parameters."""
-    sizes = sorted({len(MOVERS[name]) for name in names})
-    return [[n for n in names if len(MOVERS[n]) == size] for size in sizes]
+    """Group movers by the number of their parameters, the angle by itself."""
+    kinds = sorted({_kind(name) for name in names})
+    return [[n for n in names if _kind(n) == kind] for kind in kinds]
+
+
+def _kind(name: str) -> tuple[int, bool]:
+    return len(MOVERS[name]), name == "alpha"
 
 
 def _in(n: int, frames: FloatArray, course: FloatArray) -> FloatArray:
