@@ -665,20 +665,6 @@ def _finite(value: float) -> float | None:
 SHARP_PX: Final = 0.25
 """Largest sigma of the axis column with which a volume is as sharp as its voxels [px]; assumed:
 a column that is off by d makes an edge d pixels wider."""
-SPOILS: Final = {
-    **dict.fromkeys(
-        (
-            CalibrationCode.DRIFT,
-            CalibrationCode.VIBRATION,
-            CalibrationCode.WOBBLE,
-            CalibrationCode.ANGLES_WRONG,
-        ),
-        "it is that of the mean, and volumes of this scan are blurred by what moves",
-    ),
-    CalibrationCode.ROWS_IN_TURN: "volumes of this scan are twisted",
-    CalibrationCode.EXPOSURE_ARC: "volumes of this scan are blurred along the turn",
-}
-"""What spoils volumes of the scan, but not the geometry -> its consequence in words."""
 SECOND_SOD_RATIO: Final = 0.7
 """Source-object distance of a second placement over the first's: nearer, where offsets
 act differently."""
@@ -687,6 +673,10 @@ act differently."""
 SPOILT: Final[Mapping[CalibrationCode, str]] = {
     CalibrationCode.SATURATED: "the flat field is saturated",
     CalibrationCode.ROWS_IN_TURN: "volumes are twisted, because rows are read in turn",
+    CalibrationCode.DRIFT: "something drifts or jumps, and the geometry is that of the mean",
+    CalibrationCode.VIBRATION: "something shakes, and the geometry is that of the mean",
+    CalibrationCode.WOBBLE: "the axis wobbles, and the geometry is that of the mean",
+    CalibrationCode.ANGLES_WRONG: "angles err, and the geometry is that of their mean",
 }
 """Finding beside which the images are not to be reconstructed -> why, in words."""
 LEAST_SCALE_SHARE: Final = 0.3
@@ -718,10 +708,6 @@ def verdict_of(result: Calibration, seen: Sequence[Mapping[str, Estimate]]) -> s
         use = "Safe to reconstruct"
     else:
         use = "Too uncertain for a sharp volume"
-    for code, words in SPOILS.items():
-        if result.findings.of(code):
-            use = f"Geometry to be used; {words}"
-            break
     if result.findings.of(CalibrationCode.PANEL_DISTORTED):
         use += " with this correction, which undoes the panel's distortion"
     spoilt = [why for code, why in SPOILT.items() if result.findings.of(code)]

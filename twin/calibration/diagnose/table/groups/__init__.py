@@ -25,6 +25,7 @@ from flexdt.twin.calibration.diagnose.table.groups import (
 )
 from flexdt.twin.calibration.diagnose.table.linearised import Linearised
 from flexdt.twin.findings import Finding
+from flexdt.twin.machine.stated_causes import TOLD_RIVALS
 
 
 class Cause(NamedTuple):
@@ -65,6 +66,7 @@ STATED: Final = (
     (motion.NAME, "", "motion"),
     (growth.NAME, "", "motion"),
     (spots.NAME, "", "spots"),
+    (told.NAME, "", TOLD_RIVALS),
 )
 """Cause, begin of its groups' names, and the name by which its size is stated (`stated_causes`);
 the first counts."""
