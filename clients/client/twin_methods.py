@@ -47,6 +47,8 @@ ScanProgress = Callable[[s.JobStatus], object] | bool | None
 
 CHUNK: Final = 4 * 2**20
 """Size of one message of an upload [bytes]: below a frame, also as base64."""
+PAGE: Final = 200
+"""Jobs or samples that are asked for at once: some 60 KB, a turn of the server's loop."""
 SCENE_FORMATS: Final = get_args(scanner.SceneFormat)
 MESH_FORMATS: Final = get_args(scanner.MeshFormat)
 FINAL_STATES: Final[tuple[s.EndedPhase, ...]] = get_args(s.EndedPhase)
@@ -256,7 +258,13 @@ def samples() -> Flow[scanner.SampleListResult]:
         >>> "lego" in [sample.name for sample in twin.samples().samples]
         True
     """
-    return ask(scanner.SAMPLE_LIST)
+    found = yield from ask(scanner.SAMPLE_LIST, count=PAGE)
+    while len(found.samples) < (found.total or 0):
+        more = yield from ask(scanner.SAMPLE_LIST, start=len(found.samples), count=PAGE)
+        if not more.samples or more.total != found.total:  # it changed meanwhile
+            return (yield from ask(scanner.SAMPLE_LIST))
+        found = found.model_copy(update={"samples": [*found.samples, *more.samples]})
+    return found
 
 
 def set_sample(
@@ -720,7 +728,13 @@ def jobs() -> Flow[scans.JobListResult]:
         >>> all(job.frames_done <= job.frames_total for job in twin.jobs().jobs)
         True
     """
-    return ask(scans.JOB_LIST)
+    found = yield from ask(scans.JOB_LIST, count=PAGE)
+    while len(found.jobs) < (found.total or 0):
+        more = yield from ask(scans.JOB_LIST, start=len(found.jobs), count=PAGE)
+        if not more.jobs or more.total != found.total:  # it changed meanwhile
+            return (yield from ask(scans.JOB_LIST))
+        found = found.model_copy(update={"jobs": [*found.jobs, *more.jobs]})
+    return found
 
 
 def _name_of(job: Job | None) -> str | None:

@@ -17,7 +17,7 @@ import {
   within,
   words,
 } from "./dom.js";
-import { call, command, emit, on, store } from "./link.js";
+import { allJobs, call, command, emit, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import { differences, ofImage, only, sampleOf } from "./fingerprint.js";
 import { draw as drawTimeline } from "./timeline.js";
@@ -267,9 +267,12 @@ on("session", () => {
  */
 async function resume(name) {
   const none = `${name} does not go on`;
-  const all = await command("job.list", {}, none);
-  if (!all) return;
-  const job = all.jobs.findLast((each) => folder(each) === name);
+  const jobs = await allJobs().catch((/** @type {unknown} */ error) => {
+    emit("note", "error", none, words(error));
+    return null;
+  });
+  if (!jobs) return;
+  const job = jobs.findLast((each) => folder(each) === name);
   if (job) {
     await command("job.resume", { job: job.job }, none);
     return;

@@ -194,6 +194,37 @@ export async function command(method, params = {}, title = "Refused") {
   }
 }
 
+/** How many jobs or samples are asked for at once. */
+const PART = 200;
+
+/**
+ * All jobs, oldest first, in parts that the twin answers in a turn.
+ * @returns {Promise<JobStatus[]>}
+ */
+export async function allJobs() {
+  /** @type {JobStatus[]} */
+  const jobs = [];
+  for (;;) {
+    const part = await call("job.list", { start: jobs.length, count: PART });
+    jobs.push(...part.jobs);
+    if (!part.jobs.length || jobs.length >= (part.total ?? 0)) return jobs;
+  }
+}
+
+/**
+ * All samples that may be set, likewise, and the materials of meshes.
+ * @returns {Promise<Answers["sample.list"]>}
+ */
+export async function allSamples() {
+  const found = await call("sample.list", { count: PART });
+  while (found.samples.length < (found.total ?? 0)) {
+    const part = await call("sample.list", { start: found.samples.length, count: PART });
+    if (!part.samples.length) break;
+    found.samples.push(...part.samples);
+  }
+  return found;
+}
+
 // Who is there: kept in this browser, and told to the twin with each connection.
 const PERSON = "flexdt-person";
 /** @returns {string} */

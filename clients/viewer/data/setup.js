@@ -15,7 +15,7 @@ import {
   words,
 } from "./dom.js";
 import { differences, listed, only } from "./fingerprint.js";
-import { call, command, emit, on, store } from "./link.js";
+import { allSamples, call, command, emit, on, store } from "./link.js";
 import { curve } from "./plots.js";
 /**
  * @import { ExposurePrediction, Placement, PredictedSetting, Requests, State }
@@ -185,7 +185,7 @@ async function deleteSample() {
 }
 
 export async function list() {
-  const answer = await call("sample.list").catch(() => null);
+  const answer = await allSamples().catch(() => null);
   if (!answer) return;
   const select = $select("#sample");
   const chosen = typed("sample") ? select.value : (store.state?.sample.name ?? "empty");

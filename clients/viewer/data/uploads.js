@@ -1,7 +1,7 @@
 // A mesh from a file to the stage: its size beside the unit before anything is sent, one upload
 // at a time with its progress, and a question where the size is absurd.
-import { $, $button, $input, $select, base64, clicks, el, setText } from "./dom.js";
-import { command, emit, store } from "./link.js";
+import { $, $button, $input, $select, base64, clicks, el, setText, words } from "./dom.js";
+import { allSamples, command, emit, store } from "./link.js";
 import { absurd, length, meshExtent, MM_PER_UNIT } from "./mesh_extent.js";
 import { sampleName } from "./names.js";
 /**
@@ -111,7 +111,10 @@ async function send(chosen, mine) {
   if (!format) refuse(`: allowed are ${FORMATS.join(", ")}`);
   else if (!total) refuse(" is empty");
   if (!format || !total) return null;
-  const known = await command("sample.list", {}, "No upload");
+  const known = await allSamples().catch((/** @type {unknown} */ error) => {
+    emit("note", "error", "No upload", words(error));
+    return null;
+  });
   if (!known) return null;
   const taken = known.samples.map((s) => s.name);
   const common = {
