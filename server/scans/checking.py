@@ -11,10 +11,11 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import math
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, TypeVar, assert_never
 
 from flexdt.protocol import Codec
@@ -30,7 +31,7 @@ from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.collision.convex_solids import Polytope
 from flexdt.twin.collision.obstacle_path import free_moves
 from flexdt.twin.collision.plan_report import collision_check
-from flexdt.twin.findings import Finding, Findings
+from flexdt.twin.findings import Finding, Findings, error
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.predicted_beam import Physics
@@ -80,6 +81,7 @@ class CheckInput:
         size: of the sample the beam sees.
         pieces, parameters: bodies of the sample, and the applied correction.
         physics: model of images, for the counts of the open beam.
+        clock_left_s: until the end of the twin's clock; plans do not depend on it [s].
     """
 
     source: ScanSource
@@ -90,6 +92,7 @@ class CheckInput:
     pieces: Sequence[Polytope]
     parameters: Offsets
     physics: Physics = "ideal"
+    clock_left_s: float = field(default=math.inf, compare=False)
 
     @property
     def light(self) -> bool:
@@ -116,6 +119,18 @@ class CheckInput:
         Raises:
             RpcError: -32008, the report would be larger than that; nothing is swept then.
         """
+        report = self._report(bytes_at_most, swept)
+        if report.plan.duration_s <= self.clock_left_s:
+            return report
+        said = (
+            f"the scan takes {report.plan.duration_s:.6g} s, and the twin's clock ends in "
+            f"{self.clock_left_s:.6g} s; a twin that is started anew begins at 0 s"
+        )
+        late = Findings([*report.problems, error(ScriptCode.LIMIT, said)])
+        return replace(report, problems=late.by_place())
+
+    def _report(self, bytes_at_most: int | None, swept: bool) -> CheckReport:
+        """Make the report of a scan whose time is no matter; as `report`."""
         source = self.source
         machine = self.machine
         sweep: dry_run.CollisionCheck | None = None
@@ -250,7 +265,11 @@ class Checks:
         """
         last = self._last
         self._last = None
-        if last is not None and last.check_input == check_input:
+        if (
+            last is not None
+            and last.check_input == check_input
+            and last.plan.duration_s <= check_input.clock_left_s
+        ):
             return last
         if self._runs_here(check_input):
             plan, warnings = await self._threaded(lambda: planned(check_input))

@@ -28,7 +28,7 @@ from flexdt.server.scans.scan_job import ENDED_PHASES, Job, JobInputs, Prepare, 
 from flexdt.server.scans.twin_clock import SpeedUp, TwinClock
 from flexdt.server.storage.job_files import JobMemory, number_of
 from flexdt.twin.errors import TwinError, UnknownNameError
-from flexdt.twin.motion.drives import require_time
+from flexdt.twin.motion.drives import clock_left, require_time
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import Exposure, ScanPlan
@@ -225,6 +225,10 @@ class Jobs:
         """List the samples of jobs that have not ended, one for each job that has one."""
         unended = (j for j in self._all.values() if j.phase not in ENDED_PHASES)
         return [j.sample for j in unended if j.sample is not None]
+
+    def clock_left(self) -> float:
+        """Return how long a scan that began now might take [s]."""
+        return clock_left(self._clock.now())
 
     def status(self, job: Job) -> JobStatus:
         """Make the wire form of a job: its phase, progress, times [s], error and

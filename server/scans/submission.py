@@ -444,6 +444,7 @@ class Submissions:
             pieces,
             parameters,
             physics,
+            self.jobs.clock_left(),
         )
 
     def _shapes(

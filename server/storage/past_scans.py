@@ -46,6 +46,7 @@ from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.findings import Severity
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
+from flexdt.twin.input_limits import LIMITS
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.plausibility import Operation, examine
 
@@ -59,7 +60,7 @@ LIST_S: Final = 4.0
 """Time limit for a list [s]; the rest is read at the next request."""
 MEASURE_S: Final = 10.0
 """Time limit for computing mean counts [s]."""
-MAX_DOCUMENT_BYTES: Final = 256 << 20
+MAX_DOCUMENT_BYTES: Final = LIMITS[DOCUMENT].file_bytes
 """Largest flexdt.json [bytes]."""
 MAX_LISTED_DOCUMENT_BYTES: Final = 64 << 20
 """Largest flexdt.json that is read for a list [bytes]."""

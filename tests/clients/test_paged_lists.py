@@ -14,7 +14,9 @@ def test_lists_longer_than_a_part_are_whole(monkeypatch: pytest.MonkeyPatch) -> 
         client = scanner.client
         for i in range(7):
             client.wait_job(
-                client.submit_trajectory([{"rot_obj": float(i)}], 100.0, f"s{i}", "max").job
+                client.submit_trajectory(
+                    [{"rot_obj": float(i)}], 100.0, f"s{i}", "max"
+                ).job
             )
         assert [job.name for job in client.jobs().jobs] == [f"s{i}" for i in range(7)]
         found = client.samples()

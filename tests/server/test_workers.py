@@ -32,6 +32,7 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.script import ScanPlan, StartState
 from flexdt.twin.script.planning.plan_values import SampleSize
+from flexdt.twin.script.problems import ScriptCode
 
 M = builtin_machine()
 P = builtin_profile(M.default_profile)
@@ -101,7 +102,7 @@ OTHERS: dict[str, Callable[[CheckInput], Any]] = {
 
 
 def test_a_plan_is_made_once_and_anew_where_anything_it_depends_on_is_another() -> None:
-    assert set(OTHERS) == {field.name for field in fields(CheckInput)}
+    assert set(OTHERS) == {field.name for field in fields(CheckInput) if field.compare}
 
     async def body(checks: Checks) -> None:
         first = check_input(ScanSource(long_script(1)))
@@ -353,3 +354,13 @@ def test_a_plan_comes_in_pieces_that_are_read_at_once() -> None:
     assert [g.files for g in checking._rebuilt_plan(pieces, M, P).groups] == [
         g.files for g in plan.groups
     ]
+
+
+def test_a_check_looks_at_the_end_of_the_clock() -> None:
+    """A submission was refused for it, and the check of the same script said nothing."""
+    scan = check_input(ScanSource(b"rot_obj\tmove absolute\t90\t0\tACK\t\t\r\n"))
+    assert scan.report().ok
+    late = replace(scan, clock_left_s=1.0).report()
+    assert [problem.code for problem in late.errors] == [ScriptCode.LIMIT]
+    assert "the twin's clock ends in 1 s" in late.errors[0].message
+    assert replace(scan, clock_left_s=1.0) == scan  # one plan for both

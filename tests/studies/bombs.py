@@ -60,8 +60,9 @@ class Answer(NamedTuple):
     mb: float
     refused: bool
 
-    def faults(self, bomb: Bomb) -> list[str]:
-        """What is not as it must be."""
+    def faults(self, bomb: Bomb, door: str) -> list[str]:
+        """What is not as it must be; a twin lists a data set whose document it cannot read."""
+        listed = door == "wire" and bomb.upload == "dataset"
         lines = self.words.strip().splitlines()
         return [
             said
@@ -73,7 +74,7 @@ class Answer(NamedTuple):
                 (f"{len(self.words)} characters", len(self.words) > MOST_CHARACTERS),
                 (f"{self.seconds:.1f} s", self.seconds > MOST_S),
                 (f"{self.mb:.0f} MB", self.mb > MOST_MB),
-                ("not refused", not self.refused and not bomb.harmless),
+                ("not refused", not self.refused and not bomb.harmless and not listed),
             )
             if holds
         ]
@@ -198,7 +199,7 @@ def main() -> None:
                         if door == "wire" and not bomb.upload:
                             continue
                         answer = answered(door, bomb, Path(folder), rays)
-                        faults = answer.faults(bomb)
+                        faults = answer.faults(bomb, door)
                         bad, answers = bad + bool(faults), answers + 1
                         worst_s = max(worst_s, answer.seconds)
                         worst_mb = max(worst_mb, answer.mb)

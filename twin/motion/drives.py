@@ -120,6 +120,11 @@ class Drive:
 Drives = Mapping[str, Drive]
 
 
+def clock_left(now: float) -> float:
+    """Return how long motion may still take at time `now` of the clock [s]."""
+    return max(now, motion.LATE_S) + motion.LATEST_MOTION_S - now
+
+
 def require_time(what: str, end: float, now: float) -> None:
     """Check that a motion ends before the clock does: its steps would be too coarse for
     what was swept.
@@ -132,7 +137,7 @@ def require_time(what: str, end: float, now: float) -> None:
     Raises:
         LimitError: it ends more than `LATEST_MOTION_S` after `LATE_S` and now.
     """
-    last = max(now, motion.LATE_S) + motion.LATEST_MOTION_S
+    last = now + clock_left(now)
     if last < end < math.inf:
         raise LimitError(
             f"{what} would end at {end:.6g} s of the twin's clock, and motion ends by "
