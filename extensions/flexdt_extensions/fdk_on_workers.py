@@ -114,11 +114,12 @@ def create(path: Path, grid: Grid) -> Any:
     about: Any = {"name": "attenuation [1/mm]", "axes": axes, "datasets": datasets}
     group = zarr.open_group(path, mode="w", zarr_format=3)
     first, last = slabs(grid)[0]
-    places = list(zip(grid.center_mm[::-1], grid.shape, strict=True))
+    edges = np.broadcast_to(np.asarray(grid.voxel_mm, dtype=float), 3)[::-1].tolist()
+    places = list(zip(grid.center_mm[::-1], grid.shape, edges, strict=True))
     for level, shape in enumerate(levels(grid)):
-        size = grid.voxel_mm * 2**level
-        first_voxel = [centre + (size - n * grid.voxel_mm) / 2 for centre, n in places]
-        scale = {"type": "scale", "scale": [size] * 3}
+        half = 2**level
+        first_voxel = [at + (half * edge - n * edge) / 2 for at, n, edge in places]
+        scale = {"type": "scale", "scale": [half * edge for edge in edges]}
         place = {"type": "translation", "translation": first_voxel}
         datasets.append({"path": str(level), "coordinateTransformations": [scale, place]})
         layers = -(-(last - first) // 2**level)
@@ -243,17 +244,17 @@ class VolumeFormat:
         move(part, path)
 
     @staticmethod
-    def read(path: Path) -> tuple[Float32Array, float, Sequence[float], bool]:
+    def read(path: Path) -> tuple[Float32Array, Sequence[float], Sequence[float], bool]:
         """Read a volume from its store.
 
         Returns:
-            Values (z, y, x), voxel [mm], centre (x, y, z) of the first voxel [mm], and
+            Values (z, y, x), edges of a voxel and centre of the first one (x, y, z) [mm], and
             True, which marks that place.
         """
         group = opened(path)
         (scale,) = group.attrs["ome"]["multiscales"]
         size, place = scale["datasets"][0]["coordinateTransformations"]
-        return group["0"][:], float(size["scale"][0]), place["translation"][::-1], True
+        return group["0"][:], size["scale"][::-1], place["translation"][::-1], True
 
 
 STORE: Final = "volume.zarr"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -69,3 +70,24 @@ def test_a_folder_that_is_no_volume_is_neither_read_nor_replaced(tmp_path: Path)
     with pytest.raises(OSError, match="not empty"):
         VOLUME.save(kept.parent)
     assert [p.name for p in tmp_path.rglob("*")] == ["v.zarr", "letter.txt"]
+
+
+def test_voxels_of_three_edges(tmp_path: Path) -> None:
+    """OME-NGFF: a voxel's centre is its index times scale plus translation, at each level."""
+    values = np.random.default_rng(3).normal(size=(6, 5, 140)).astype(np.float32)
+    edges, centre = np.array([0.5, 0.25, 1.5]), np.array([6.2, -6.4, 11.0])
+    file = tmp_path / "oblong.zarr"
+    fx.Volume(values, tuple(edges), tuple(centre)).save(file)
+    back = fx.Volume.load(file)
+    np.testing.assert_array_equal(back.data, values)
+    np.testing.assert_allclose(back.voxel_mm, edges)
+    np.testing.assert_allclose(back.center_mm, centre)
+    (scales,) = json.loads((file / "zarr.json").read_text())["attributes"]["ome"][
+        "multiscales"
+    ]
+    low = (centre - (np.array([140, 5, 6]) - 1) / 2 * edges)[::-1]
+    for level, said in enumerate(scales["datasets"]):
+        scale, place = said["coordinateTransformations"]
+        np.testing.assert_allclose(scale["scale"], edges[::-1] * 2**level)
+        corner = np.array(place["translation"]) - np.array(scale["scale"]) / 2
+        np.testing.assert_allclose(corner, low - edges[::-1] / 2)

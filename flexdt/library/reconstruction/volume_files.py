@@ -48,8 +48,8 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
         grid: of the volume.
 
     Raises:
-        LimitError: another ending, a missing folder, voxels that the format does not
-            allow, or too little room on the disk for a format without compression.
+        LimitError: another ending, a missing folder, or too little room on the disk for a
+            format without compression.
         TwinError: the package that writes the format is not installed.
         OSError: the file cannot be written.
     """
@@ -58,16 +58,6 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
         places = VoxelPlaces.of(grid)
     else:
         places = grid
-    if not (form.oblong or places.cubes):
-        allowed = [
-            ending for one in VOLUME_FORMATS if one.oblong for ending in one.endings
-        ]
-        message = (
-            f"{path}: voxels of {' x '.join(f'{edge:g}' for edge in places.edges_mm)} mm"
-        )
-        raise LimitError.instead(
-            message, list(places.edges_mm), f"cubes, or {', '.join(allowed)}"
-        )
     if not form.packed:
         require_bytes(path, 4 * math.prod(places.shape))
     part = path.with_name(f".{path.name}.part{path.suffix}")

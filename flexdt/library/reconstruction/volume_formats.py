@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.extras import extension, package
-from flexdt.twin.errors import GeometryError
 from flexdt.twin.projection import Grid
 from flexdt.twin.projection.volume import edges_xyz
 
@@ -39,7 +38,7 @@ BIG_TIFF_BYTES: Final = 3 << 30
 NRRD_FIELDS: Final[Mapping[str, str]] = {
     "type": "float",
     "dimension": "3",
-    "space": "right-anterior-superior",
+    "space": "3D-right-handed",
     "sizes": "",
     "space directions": "",
     "kinds": "domain domain domain",
@@ -55,7 +54,7 @@ MHA_FIELDS: Final[Mapping[str, str]] = {
     "BinaryData": "True",
     "BinaryDataByteOrderMSB": "False",
     "CompressedData": "False",
-    "TransformMatrix": "-1 0 0 0 -1 0 0 0 1",
+    "TransformMatrix": "1 0 0 0 1 0 0 0 1",
     "Offset": "",
     "CenterOfRotation": "0 0 0",
     "ElementSpacing": "",
@@ -64,6 +63,12 @@ MHA_FIELDS: Final[Mapping[str, str]] = {
     "ElementDataFile": "LOCAL",
 }
 """The same of MetaImage's header."""
+OLDER_FIELDS: Final[Mapping[str, str]] = {
+    "space": "right-anterior-superior",
+    "TransformMatrix": "-1 0 0 0 -1 0 0 0 1",
+}
+"""Values of files up to version 0.4: the first names the same coordinates, and with the second
+x and y of the offset have the other sign."""
 FIELDS_OF_OTHER_VALUES: Final = (
     "ElementNumberOfChannels",
     "HeaderSize",
@@ -108,23 +113,9 @@ class VoxelPlaces:
         return len(set(self.edges_mm)) == 1
 
     @property
-    def grid(self) -> Grid:
-        """Grid of cubes with this shape, centre and edge.
-
-        Raises:
-            GeometryError: they are no cubes.
-        """
-        if not self.cubes:
-            message = f"voxels of {' x '.join(f'{edge:g}' for edge in self.edges_mm)} mm"
-            raise GeometryError.instead(
-                message, list(self.edges_mm), "cubes, three equal edges"
-            )
-        return Grid(self.shape, self.edges_mm[0], self.center_mm)
-
-    @property
-    def voxel_mm(self) -> float:
-        """Edge of cubes [mm]; raises as `grid`."""
-        return self.grid.voxel_mm
+    def voxel_mm(self) -> float | tuple[float, float, float]:
+        """Edge of cubes, else the three edges (x, y, z) [mm]."""
+        return self.edges_mm[0] if self.cubes else self.edges_mm
 
     @property
     def bytes(self) -> int:
@@ -151,7 +142,6 @@ class VolumeFormat:
             slabs; afterwards the unfinished file is complete and gets its final path.
         read: from a path; ValueError and its like where the file is of another kind.
         require: raises TwinError where a package that the format needs is not installed.
-        oblong: whether its voxels may have three edges.
         packed: whether it is compressed, so that its size is not known before.
     """
 
@@ -159,7 +149,6 @@ class VolumeFormat:
     write: Callable[[Path, Path, VoxelPlaces], Iterator[Sink]]
     read: Callable[[Path], Stored]
     require: Callable[[], object] = lambda: None
-    oblong: bool = False
     packed: bool = False
 
 
@@ -240,15 +229,14 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
     """
     import tifffile
 
-    grid = places.grid
     about = {
         "unit": "1/mm",
         "axes": "zyx",
-        "voxel_mm": grid.voxel_mm,
-        "center_mm": list(grid.center_mm),
+        "voxel_mm": places.voxel_mm,
+        "center_mm": list(places.center_mm),
     }
-    per_cm = 10.0 / grid.voxel_mm
-    with tifffile.TiffWriter(part, bigtiff=grid.bytes > BIG_TIFF_BYTES) as tiff:
+    per_cm = 10.0 / places.edges_mm[0], 10.0 / places.edges_mm[1]
+    with tifffile.TiffWriter(part, bigtiff=places.bytes > BIG_TIFF_BYTES) as tiff:
         first = True
 
         def write(slab: Float32Array) -> None:
@@ -261,7 +249,7 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
                     layer,
                     contiguous=True,
                     photometric="minisblack",
-                    resolution=(per_cm, per_cm),
+                    resolution=per_cm,
                     resolutionunit="CENTIMETER",
                     description=json.dumps(about) if first else None,
                     metadata=None,
@@ -273,7 +261,8 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
 
 def _nrrd_header(places: VoxelPlaces) -> bytes:
     """Make NRRD's header for raw little-endian floats: sizes (x, y, z), voxel edges and
-    first voxel [mm]; axes point right, front and up.
+    first voxel [mm] in a right-handed space, whose names of directions are left open: readers
+    would turn those of patients.
     """
     nz, ny, nx = places.shape
     x, y, z = (f"{edge:.9g}" for edge in places.edges_mm)
@@ -287,15 +276,10 @@ def _nrrd_header(places: VoxelPlaces) -> bytes:
 
 
 def _mha_header(places: VoxelPlaces) -> bytes:
-    """Make MetaImage's header, of a file with header and data.
-
-    ITK takes its axes to point left, back and up, so x and y are turned: the place is then that
-    of the NRRD and NIfTI files.
-    """
+    """Make MetaImage's header, of a file with header and data; its physical point is ours."""
     nz, ny, nx = places.shape
-    x, y, z = places.first_mm
     fields = dict(MHA_FIELDS) | {
-        "Offset": " ".join(repr(float(place)) for place in (-x, -y, z)),
+        "Offset": " ".join(repr(float(place)) for place in places.first_mm),
         "ElementSpacing": " ".join(repr(float(edge)) for edge in places.edges_mm),
         "DimSize": f"{nx} {ny} {nz}",
     }
@@ -337,11 +321,13 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
     Raises:
         TwinError: h5py is missing.
     """
-    grid = places.grid
     with _h5py().File(part, "w") as file:
-        values = file.create_dataset("volume", grid.shape, "f4")
+        values = file.create_dataset("volume", places.shape, "f4")
         values.attrs.update(
-            unit="1/mm", axes="zyx", voxel_mm=grid.voxel_mm, center_mm=grid.center_mm
+            unit="1/mm",
+            axes="zyx",
+            voxel_mm=places.voxel_mm,
+            center_mm=places.center_mm,
         )
         done = 0
 
@@ -387,7 +373,7 @@ def _require_own(fields: Mapping[str, str], own: Mapping[str, str]) -> None:
         ValueError: names the first field that does.
     """
     for key, value in own.items():
-        if value and fields.get(key, value) != value:
+        if value and fields.get(key, value) not in (value, OLDER_FIELDS.get(key)):
             raise ValueError(f"its {key} is {fields[key]}; allowed: {value}")
     for key in FIELDS_OF_OTHER_VALUES:
         if key in fields:
@@ -432,18 +418,18 @@ def _read_tiff(path: Path) -> Stored:
     with tifffile.TiffFile(path) as file:
         about = json.loads(file.pages.first.description)
     values = np.asarray(tifffile.imread(path), dtype=np.float32)
-    return values, float(about["voxel_mm"]), about["center_mm"], False
+    return values, about["voxel_mm"], about["center_mm"], False
 
 
 def _read_mha(path: Path) -> Stored:
     """Read voxels (memory-mapped), edges [mm], the first voxel's place [mm] and True (it
-    is the first voxel's, not the centre) from an .mha file; x and y of the file point the
-    other way."""
+    is the first voxel's, not the centre) from an .mha file."""
     fields, begin = _header(path, "=", b"ElementDataFile = LOCAL\n")
     _require_own(fields, MHA_FIELDS)
     values = _map_values(path, begin, fields["DimSize"])
     x, y, z = (float(v) for v in fields["Offset"].split())
-    low = [-x, -y, z]
+    older = fields.get("TransformMatrix") == OLDER_FIELDS["TransformMatrix"]
+    low = [-x, -y, z] if older else [x, y, z]
     return values, [float(edge) for edge in fields["ElementSpacing"].split()], low, True
 
 
@@ -486,7 +472,7 @@ def _read_hdf5(path: Path) -> Stored:
     with _h5py().File(path) as file:
         values = file["volume"]
         about = values.attrs
-        return values[:], float(about["voxel_mm"]), about["center_mm"], False
+        return values[:], about["voxel_mm"], about["center_mm"], False
 
 
 def _nibabel() -> Any:
@@ -503,7 +489,7 @@ def _zarr() -> Any:
 
 def _write_zarr(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
     """Write by the function of the extension."""
-    yield from _zarr().write(part, path, places.grid)
+    yield from _zarr().write(part, path, places)
 
 
 def _read_zarr(path: Path) -> Stored:
@@ -513,14 +499,13 @@ def _read_zarr(path: Path) -> Stored:
 
 VOLUME_FORMATS: Final = (
     VolumeFormat((".tif", ".tiff"), _write_and_rename(_write_tiff), _read_tiff),
-    VolumeFormat((".nrrd",), _write_headed(_nrrd_header), _read_nrrd, oblong=True),
-    VolumeFormat((".mha",), _write_headed(_mha_header), _read_mha, oblong=True),
+    VolumeFormat((".nrrd",), _write_headed(_nrrd_header), _read_nrrd),
+    VolumeFormat((".mha",), _write_headed(_mha_header), _read_mha),
     VolumeFormat(
         (".nii.gz",),
         _write_headed(_nifti_header, compress=True),
         _read_nifti,
         _nibabel,
-        oblong=True,
         packed=True,
     ),
     VolumeFormat((".h5",), _write_and_rename(_write_hdf5), _read_hdf5, _h5py),
