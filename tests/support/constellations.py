@@ -211,7 +211,7 @@ def _diameters(scan: Drawn, rng: Rng) -> Drawn:
 
 
 def _half(scan: Drawn, rng: Rng) -> Drawn:
-    return replace(scan, believed_radii=0.5 * scan.radii, names="diameter|radius")
+    return replace(scan, believed_radii=0.5 * scan.radii, names="half the radii")
 
 
 def _remounted(scan: Drawn, rng: Rng) -> Drawn:

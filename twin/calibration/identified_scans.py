@@ -29,10 +29,11 @@ from flexdt.twin.calibration.fit.problem import usual_step
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, nothing
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.recognised import Recognised, doubtful, recognise
 from flexdt.twin.calibration.request import CalibrationRequest
 from flexdt.twin.calibration.rivals import judge_rivals
 from flexdt.twin.calibration.second_measurement import seen_arc
-from flexdt.twin.findings import Finding, Findings
+from flexdt.twin.findings import Finding, Findings, error
 from flexdt.twin.geometry.offsets import Offsets
 
 MAX_BEAD_SHARE: Final = 0.6
@@ -78,7 +79,25 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
         search = Search(turn=_stated_turn(scan, request), near=first)
         seek = partial(attempt, model=state.model, poses=scan.poses, start=request.start)
         found = seek(detections, search=search)
-        numbers = _numbers(found, detections, state.model, scan, request.start)
+        told = Recognised(state.model)
+        if doubtful(found, scan.poses):
+            told = recognise(
+                found, detections, state.model, scan.poses, scan.name, request.start
+            )
+        if told.decided:
+            leans = told.model is not state.model
+            findings += listed(told.finding)
+            if told.found is None:
+                break
+            if leans and out:
+                findings.append(_stands_otherwise(scan.name))
+                break
+            state = replace(state, model=told.model)
+            out.append(told.found)
+            continue
+        numbers = None
+        if not told.right_angles or (found is not None and convincing(found)):
+            numbers = _numbers(found, detections, state.model, scan, request.start)
         if numbers is not None and (odd := numbers.judged(scan.name)) is not None:
             findings.append(odd)
             if odd.forbids:
@@ -87,8 +106,9 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             detections = _spots(scan, looks[i])
             found = seek(detections, search=search)
         finding = explain_identification(
-            found, detections, state.model, scan.poses, scan.name, request.start
-        )
+            found, detections, state.model, scan.poses, scan.name, request.start,
+            right_angles=told.right_angles, mistakes=told.mistakes,
+        )  # fmt: skip
         if (
             found is not None
             and finding is not None
@@ -109,6 +129,14 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
     found_so_far = replace(state, identifications=tuple(out), looks=tuple(looks))
     # In other scans of the same phantom the spots of a displaced bead are no others.
     return found_so_far.with_findings(*Findings(findings).reduced())
+
+
+def _stands_otherwise(name: str) -> Finding:
+    """Make the error that the phantom leans in one scan and not in those before."""
+    return error(
+        CalibrationCode.WRONG_PHANTOM,
+        f"{name}: the phantom leans otherwise than in the scans before; calibrate this one alone",
+    )
 
 
 def _by_exposure(

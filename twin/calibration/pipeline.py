@@ -20,7 +20,7 @@ from flexdt.twin.calibration.bead_sizes import judge_first_sizes, judge_sizes
 from flexdt.twin.calibration.detect.bead_contrast import detector_for
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import CalibrationCode, listed
-from flexdt.twin.calibration.diagnose.data import judge_emptiness, judge_frames
+from flexdt.twin.calibration.diagnose.data import judge_frames
 from flexdt.twin.calibration.diagnose.fitted import OF_MOTION, OF_RESIDUALS, judge_offsets
 from flexdt.twin.calibration.diagnose.frame_places import judge_places
 from flexdt.twin.calibration.diagnose.measured_spots import (
@@ -42,6 +42,7 @@ from flexdt.twin.calibration.motion_of_scans import (
     settle_motion,
 )
 from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.recognised import judge_emptiness
 from flexdt.twin.calibration.request import (
     CalibrationRequest,
     with_free,
@@ -137,6 +138,8 @@ def calibrate(
     state = identify_scans(state, asked)
     if state.errors:
         return state
+    if state.findings.of(CalibrationCode.PHANTOM_LEANS):
+        solids = None  # They stand as the file has them.
     asked = asked_of(state, asked)
     fitted = _first_fit(state, asked)
     if fitted.state.errors or fitted.fit.certificate.spectrum.singular:

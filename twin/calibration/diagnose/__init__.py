@@ -26,6 +26,8 @@ class CalibrationCode(FindingCode):
     WRONG_PHANTOM = "wrong_phantom", ERROR, "the spots do not fit the phantom"
     MIRRORED_PHANTOM = "mirrored_phantom", ERROR, "the mirror image of the phantom fits"
     PHANTOM_UPSIDE_DOWN = "phantom_upside_down", ERROR, "the phantom stands on its head"
+    PHANTOM_LEANS = "phantom_leans", WARNING, "the phantom leans on the stage"
+    REMOUNTED = "remounted", ERROR, "the phantom was moved between two frames"
     AMBIGUOUS = "ambiguous", ERROR, "the beads cannot be told apart"
     BEADS_MISSING = "beads_missing", WARNING, "beads that no frame shows"
     ANGLE_ENDPOINT = (

@@ -28,6 +28,7 @@ from flexdt.twin.calibration.fit.problem import SIX, UNSTRAINED
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan
 from flexdt.twin.calibration.identify import Identification, Search, attempt
 from flexdt.twin.findings import Finding, error, warning
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 
@@ -62,6 +63,8 @@ LEAST_TURN = 0.04
 """Least relative error of a turn for that; smaller ones are found in other ways."""
 TURN_WIDTH = {CalibrationCode.ANGLE_SCALE: 0.1}
 """Standard deviation of the factor about a trial value."""
+ONE_FRAME_TURN = math.radians(8.0)
+"""Error of the turn that a frame shows by itself (assumed) [rad]."""
 SAMPLED_FRAMES = 8
 """Number of frames that are examined one by one."""
 
@@ -69,10 +72,6 @@ SHOWN_AT_LEAST = 0.5
 """Least share of the frames with spots for another reading of the images to be reported."""
 MAX_SHOWN = 5
 """Largest number of unusable files that are named."""
-UNITS_MM = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
-"""Unit in which somebody may have written lengths -> its millimetres."""
-SAME_SIZE = 1.3
-"""Largest ratio of two radii that are the same, measured roughly."""
 _STATES = {
     FrameState.MISSING: (CalibrationCode.FRAMES_MISSING, "missing"),
     FrameState.DARK: (CalibrationCode.FRAMES_DARK, "dark"),
@@ -164,54 +163,6 @@ def _looked_for(sought: SpotFinder) -> str:
     )
 
 
-def judge_emptiness(
-    scans: Sequence[Scan], looks: Sequence[Sequence[FrameSpots]], model: BeadModel
-) -> list[Finding]:
-    """Look for spots of any size in scans where no bead of the expected size was found;
-    reads their images again.
-
-    Args:
-        scans: the scans.
-        looks: spots of each frame of each scan.
-        model: the beads.
-
-    Returns:
-        An error for each scan that shows another phantom: round spots in half of its
-        frames or more.
-    """
-    out = []
-    for scan, some in zip(scans, looks, strict=True):
-        if any(len(look.detections) for look in some):
-            continue
-        anything = scan.frames.look(SpotFinder())
-        radii = [look.detections.radii_px for look in anything if len(look.detections)]
-        if len(radii) < 0.5 * len(anything) or not radii:
-            continue
-        expected = float(
-            np.median(model.bead_radius_mm) * np.median(scan.poses.pixels_per_mm)
-        )
-        seen = float(np.median(np.concatenate(radii)))
-        out.append(
-            error(
-                CalibrationCode.WRONG_PHANTOM,
-                f"{scan.name}: the images show round shadows of radius {seen:.1f} px where the "
-                f"beads of {model.name!r} would cast {expected:.3g} px: another phantom"
-                f"{_of_unit(seen / expected)}",
-            )
-        )
-    return out
-
-
-def _of_unit(ratio: float) -> str:
-    """Name the unit of length by which sizes differ by a ratio, as the end of a sentence;
-    "" if none does.
-    """
-    for unit, millimetres in UNITS_MM.items():
-        if abs(abs(math.log(ratio)) - math.log(millimetres)) < math.log(SAME_SIZE):
-            return f", or some lengths are in {unit}, not in mm"
-    return ""
-
-
 def explain_identification(
     found: Identification | None,
     detections: Sequence[Detections],
@@ -219,6 +170,9 @@ def explain_identification(
     poses: Poses,
     name: str,
     start: Offsets = NOMINAL,
+    *,
+    right_angles: bool = False,
+    mistakes: frozenset[CalibrationCode] | None = None,
 ) -> Finding | None:
     """Judge an assignment; if it is poor, find the mistake that explains the spots.
 
@@ -234,6 +188,9 @@ def explain_identification(
         poses: nominal geometry.
         name: of the scan, the text's beginning.
         start: offsets that are known before.
+        right_angles: the spots turn together as the angles say, so that no mistake of angles
+            or of frames, and no motion, is looked for where the assignment is not plausible.
+        mistakes: codes of those that are tried then; None: all.
 
     Returns:
         None for a good assignment.
@@ -264,7 +221,11 @@ def explain_identification(
         judged_beads = _beads_or_spots(found, detections, model, name)
         if judged_beads is not None or convincing(found):
             return judged_beads
-    explanation = _alternative(found, detections, model, poses, start)
+    plausible = found is not None and _plausible(found)
+    explanation = _alternative(
+        found, detections, model, poses, start,
+        right_angles and not plausible, None if plausible else mistakes,
+    )  # fmt: skip
     if explanation is not None:
         return replace(explanation, message=f"{name}: {explanation.message}")
     if found is not None and _plausible(found):
@@ -550,6 +511,8 @@ def _alternative(
     model: BeadModel,
     poses: Poses,
     start: Offsets,
+    right_angles: bool,
+    mistakes: frozenset[CalibrationCode] | None,
 ) -> Finding | None:
     """Find the mistake that makes phantom and spots agree best.
 
@@ -565,11 +528,14 @@ def _alternative(
         model: the beads.
         poses: nominal geometry.
         start: offsets that are known before.
+        right_angles, mistakes: see `explain_identification`.
 
     Returns:
         Its finding, an error; None if no mistake explains the spots.
     """
     trials = _mistakes(detections, model, poses)
+    if mistakes is not None:
+        trials = [one for one in trials if one[0] in mistakes]
     given: dict[str, Any] = {
         "detections": detections, "model": model, "poses": poses, "start": start,
     }  # fmt: skip
@@ -582,14 +548,15 @@ def _alternative(
     if better:
         return min(better, key=lambda one: one.off).finding
     plausible = found is not None and _plausible(found)
+    if right_angles:
+        return None if found is None else _bead_elsewhere(fit_well, found)
     if found is not None and plausible and found.typical_px > 0.3 * found.rms_px:
         return None  # The right beads in about the right places: the residuals will tell.
     return (
         _in_motion(detections, model, poses, start)
         or (None if found is None or plausible else _bead_elsewhere(fit_well, found))
         or _in_parts(detections, model, poses, start)
-        or _other_turn(detections, model, poses, start)
-        or _one_by_one(detections, model, poses, start)
+        or _frame_by_frame(detections, model, poses, start)
     )
 
 
@@ -686,7 +653,11 @@ def _in_parts(
 
 
 def _other_turn(
-    detections: Sequence[Detections], model: BeadModel, poses: Poses, start: Offsets
+    detections: Sequence[Detections],
+    model: BeadModel,
+    poses: Poses,
+    start: Offsets,
+    factors: Sequence[float],
 ) -> Finding | None:
     """Check whether the stage turns by another angle than stated, from the frames within
     75 deg of the first.
@@ -696,6 +667,7 @@ def _other_turn(
         model: the beads.
         poses: nominal geometry.
         start: offsets that are known before.
+        factors: on the angles, that are tried.
 
     Returns:
         An error with the factor on the angles; None if no other one fits, it is within
@@ -706,7 +678,7 @@ def _other_turn(
     if n < 4:
         return None
     best = (GOOD_RMS_PX, 1.0)
-    for factor in TURN_FACTORS:
+    for factor in factors:
         some = replace(poses, angle=poses.angle[0] + factor * turned)[:n]
         own = attempt(detections[:n], model, some, loose=TURN_WIDTH, start=start)
         if own is not None and convincing(own) and own.rms_px < best[0]:
@@ -721,7 +693,7 @@ def _other_turn(
     )
 
 
-def _one_by_one(
+def _frame_by_frame(
     detections: Sequence[Detections], model: BeadModel, poses: Poses, start: Offsets
 ) -> Finding | None:
     """Check whether frames fit the phantom one by one, though not together:
@@ -734,22 +706,46 @@ def _one_by_one(
         start: offsets that are known before.
 
     Returns:
-        An error on the frames' order or angles; None if fewer than 70 % fit.
+        An error on another turn if their start angles follow one or they are too few to
+        tell; on the frames' order or angles if they follow none; None if neither fits.
     """
     chosen = np.linspace(0, len(poses) - 1, SAMPLED_FRAMES).astype(int).tolist()
-    good = 0
+    turned: list[float] = []
+    stated: list[float] = []
     for i in chosen:
+        if len(detections[i]) < 5:
+            continue
         alone = slice(i, i + 1)
-        own = attempt(
-            detections[alone], model, poses[alone], search=Search(starts=36), start=start
-        )
-        if own is not None and len(detections[i]) >= 5:
-            good += convincing(own) and own.explained > SOME_SPOTS
-    if good < 0.7 * len(chosen):
-        return None
-    return error(
+        search = Search(starts=36)
+        own = attempt(detections[alone], model, poses[alone], search=search, start=start)
+        if own is not None and convincing(own) and own.explained > SOME_SPOTS:
+            turned.append(own.parameters.alpha + float(poses.angle[i]))
+            stated.append(float(poses.angle[i]))
+    if len(turned) < 0.7 * len(chosen):
+        return _other_turn(detections, model, poses, start, TURN_FACTORS)
+    factor = _factor_of(np.array(turned), np.array(stated))
+    other = None
+    if factor is not None:
+        other = _other_turn(detections, model, poses, start, (factor,))
+    return other or error(
         CalibrationCode.FRAME_NUMBERS,
-        f"{good} of {len(chosen)} frames that were tried fit the phantom each "
+        f"{len(turned)} of {len(chosen)} frames that were tried fit the phantom each "
         "by itself, together they do not: the frames are in another order, "
         "or their angles are wrong",
     )
+
+
+def _factor_of(turned: FloatArray, stated: FloatArray) -> float | None:
+    """Find the factor on stated angles with which frames turn as they show; None if the angles
+    follow none to `ONE_FRAME_TURN`.
+
+    Args:
+        turned: what single frames show, up to whole turns [rad].
+        stated: of the same frames [rad].
+    """
+    best: tuple[float, float | None] = (ONE_FRAME_TURN, None)
+    for factor in np.geomspace(TURN_FACTORS[0], TURN_FACTORS[-1], 400).tolist():
+        off = np.exp(1j * (turned - factor * stated))
+        apart = np.abs(np.angle(off / np.mean(off)))
+        best = min(best, (float(np.median(apart)), factor), key=lambda one: one[0])
+    return best[1]

@@ -13,6 +13,7 @@ from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.detect.smear import Smear
 from flexdt.twin.calibration.diagnose import CalibrationCode
+from flexdt.twin.calibration.diagnose.usual_factors import OF_RADII, usual_reason
 from flexdt.twin.calibration.frame_source import FrameSpots
 from flexdt.twin.calibration.identify import Identification
 from flexdt.twin.findings import Finding, error, warning
@@ -96,12 +97,16 @@ def _other_size(ratio: float) -> Finding:
     Args:
         ratio: measured over predicted size.
     """
+    reason = usual_reason(ratio, OF_RADII)
+    if reason:
+        why = f"{reason}, or they are other beads"
+    else:
+        why = "beads of another size, or a phantom of another scale"
     return error(
         CalibrationCode.BEAD_SIZE,
         f"the shadows are {100 * abs(ratio - 1):.0f} % "
         f"{'larger' if ratio > 1 else 'smaller'} than those that the phantom's "
-        "beads cast at the fitted geometry: beads of another size, "
-        "or a phantom of another scale",
+        f"beads cast at the fitted geometry: {why}",
     )
 
 
