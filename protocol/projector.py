@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from annotated_types import Ge, Le, Len, MaxLen
+from annotated_types import Ge, Gt, Le, Len, MaxLen
 from pydantic import BeforeValidator, Field, InstanceOf, TypeAdapter, model_validator
 from pydantic.json_schema import WithJsonSchema
 
@@ -30,6 +30,8 @@ MAX_CORNERS: Final = 1 << 27
 """Vertices, or triangles, of a mesh."""
 MAX_MM: Final = 1e7
 """Farthest that anything is from the origin; also the longest u and v."""
+MAX_RAYS: Final = 16
+"""Largest number of rays along each side of a pixel."""
 MAX_LISTED_NAMES: Final = 50
 """Number of volumes that an error lists, those used last."""
 UNKNOWN_VOLUME: Final = "unknown volume"
@@ -209,14 +211,63 @@ class VolumeRef(f.Params):
     name: f.VolumeName
 
 
+class Within(f.Params):
+    """Pixels along several rays of which line integrals are wanted."""
+
+    pixels: Buffer
+    """int64, little-endian: places in images (n, rows, cols), growing"""
+    sides: Buffer
+    """uint8, of each pixel: rays along a side, 1 to 16"""
+
+    @property
+    def places(self) -> np.ndarray:
+        """The pixels, int64."""
+        return np.frombuffer(self.pixels, "<i8")
+
+    @property
+    def rays(self) -> np.ndarray:
+        """Rays along a side of each, uint8."""
+        return np.frombuffer(self.sides, np.uint8)
+
+    @model_validator(mode="after")
+    def _fitting(self) -> Within:
+        """Check that each pixel is named once, in order, with its rays."""
+        if self.pixels.nbytes != 8 * self.sides.nbytes:
+            raise ValueError("pixels are eight bytes each, sides one")
+        places, rays = self.places, self.rays
+        if places.size and (places[0] < 0 or (np.diff(places) <= 0).any()):
+            raise ValueError("pixels are not growing from 0 on")
+        if rays.size and not 1 <= rays.min() <= rays.max() <= MAX_RAYS:
+            raise ValueError(
+                f"a side has {rays.min()} to {rays.max()} rays; allowed: 1 to 16"
+            )
+        return self
+
+
 class Project(f.Params):
     """Line integrals of a volume."""
 
     volume: f.VolumeName
     cone_vec: ConeVecs
     detector: Detector
+    within: Within | None = None
+    """along several rays of these pixels, float32 (rays,), those of a pixel in a row"""
     key: Annotated[f.ShortText, MaxLen(300)] | None = None
     """interactive: a newer request with this key replaces one that waits"""
+
+
+class RaysNeeded(f.Params):
+    """Rays along each side that the pixels of a view need, because edges are in their way."""
+
+    volume: f.VolumeName
+    cone_vec: ConeVecs
+    detector: Detector
+    error: Annotated[float, Gt(0.0), Le(1e9)]
+    """permitted on an edge (standard deviation)"""
+    counts: bool = False
+    """of signals as a part of the open beam's, not of line integrals"""
+    weight: Annotated[float, Ge(0.0), Le(1e9)] = 1.0
+    """attenuation of a unit of the volume's projection"""
 
 
 class Backproject(f.Params):
@@ -280,7 +331,7 @@ class Removed(f.Result):
 class Array(f.Result):
     """An image value, or (with `parts`) the description of one sent in parts."""
 
-    dtype: Literal["float32"]
+    dtype: Literal["float32", "uint8"]
     shape: list[int]
     parts: int | None = None
     data: Buffer | None = None
@@ -327,6 +378,12 @@ PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
         read("volume.list", f.Empty, VolumeList, "the volumes there are"),
         read("volume.remove", VolumeRef, Removed, "forget a volume"),
         read("project", Project, Array, "line integrals, float32 (n, rows, cols)"),
+        read(
+            "rays",
+            RaysNeeded,
+            Array,
+            "rays along each side of a pixel that it needs, uint8",
+        ),
         Method(
             "backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"
         ),

@@ -105,11 +105,36 @@ def _reconstruction() -> None:
     fdk_kernels.warp(images, np.ones((8, 3, 3)), fdk_kernels.lanczos(), images.copy())
 
 
+def _edges() -> None:
+    """Compile the kernels of pixels that edges of solids and meshes reach."""
+    from flexdt.twin.projection import Box, Scene, Solid, TriangleMesh
+    from flexdt.twin.projection.pixel_areas import area_means
+
+    scan = ConeVec.circular(sod=10, sdd=20, angles=1, shape=(4, 6), pixel=1.0)
+    solids = Scene((Solid(Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), "water", 0.1),))
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    mesh = TriangleMesh(corners, faces)
+    area_means([(solids, 1.0), (mesh, 0.1)], scan, (4, 6), "auto")
+
+
+def _smooth() -> None:
+    """Compile the kernels of the model "linear" and of its adjoint."""
+    from flexdt.twin.projection import back, forward
+
+    scan = ConeVec.circular(sod=10, sdd=20, angles=1, shape=(4, 6), pixel=1.0)
+    grid = Grid((2, 3, 4), 0.5)
+    forward(grid.blank(), scan, model="linear")
+    back(np.ones((1, 4, 6), np.float32), scan, grid, model="linear")
+
+
 GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
     "back projection": (warm_up_back, "projection.kernels.fan_kernels:spread_fans"),
     "projection": (warm_up_forward, "projection.kernels.fan_kernels:project_fans"),
     "calibration": (_fit, "calibration.fit.fit_kernels:evaluate"),
     "bead detection": (_detection, "calibration.detect.spot_kernels:fit_ball"),
+    "edges in pixels": (_edges, "projection.kernels.within_kernels:triangles_within"),
+    "smooth volumes": (_smooth, "projection.kernels.linear_kernels:spread_linear"),
     "FDK": (_reconstruction, "reconstruction.kernels.fdk_kernels:warp"),
 }
 """Group -> function that compiles it, and the entry point that it compiles last;

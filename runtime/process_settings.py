@@ -18,6 +18,8 @@ import typer
 
 from flexdt.runtime.public_address import PublicAddress, public_address
 from flexdt.runtime.settings import Settings, option
+from flexdt.twin.errors import LimitError
+from flexdt.twin.rays_a_pixel import Rays, check_rays
 
 LOOPBACK: Final = "127.0.0.1"
 TWIN_PORT: Final = 55000
@@ -146,6 +148,19 @@ def public_url() -> Any:
     return option(None, public=False, hidden=True, metavar="URL", parser=public_address)
 
 
+def rays_a_side(text: str | int) -> Rays:
+    """Parse the rays along each side of a pixel: "auto", or a whole number from 1 to 16.
+
+    Raises:
+        typer.BadParameter: neither.
+    """
+    word = str(text).strip().lower()
+    try:
+        return check_rays(int(word) if word.isdigit() else word)
+    except LimitError as error:
+        raise typer.BadParameter(error.message) from None
+
+
 def tcp_port(
     default: int | None, *flags: str, most: int = MAX_PORT, public: bool = True
 ) -> Any:
@@ -219,6 +234,7 @@ class ScannerSettings(ServerSettings):
         speed_up: Let the twin's time run X times as fast as yours.
         physics: Make images this way (docs/physics.md).
         scatter: Simulate scattered radiation, with physics mono and poly.
+        rays: Sample pixels at the sample's edges by X by X rays, or as many as the noise asks.
         fresh: Start anew instead of where the last twin left off.
     """
 
@@ -231,6 +247,7 @@ class ScannerSettings(ServerSettings):
     speed_up: Any = option(1.0, metavar="X or max", parser=speed_up)
     physics: Physics = option("ideal")
     scatter: Scatter = option("off", metavar="off or mc", parser=scatter_method)
+    rays: Any = option("auto", metavar="X or auto", parser=rays_a_side)
     fresh: bool = option(False, public=False)
 
 

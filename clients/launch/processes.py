@@ -32,6 +32,7 @@ from flexdt.runtime.settings import words
 from flexdt.twin import long_work
 from flexdt.twin.errors import TwinError
 from flexdt.twin.long_work import Progress
+from flexdt.twin.rays_a_pixel import Rays
 from flexdt.twin.signatures import public
 
 STOP_TIMEOUT_S = 30.0
@@ -235,6 +236,8 @@ class LocalTwin:
         profile: calibration profile; None for the machine's default.
         physics: how images are made: ideal, mono or poly.
         scatter: scattered radiation, with physics mono and poly: off or mc.
+        rays: along each side of a pixel that an edge of the sample reaches, 1 to 16 or
+            "auto".
         speed_up: the twin's seconds for each of yours, or "max".
         truth: file with a hidden misalignment.
         viewer: whether to start the viewer as well; see `viewer_url` and `viewer`.
@@ -260,6 +263,7 @@ class LocalTwin:
         profile: str | None = None,
         physics: Physics = "ideal",
         scatter: Scatter = "off",
+        rays: Rays = "auto",
         speed_up: float | Literal["max"] = "max",
         truth: str | PathLike[str] | None = None,
         viewer: bool = False,
@@ -278,6 +282,7 @@ class LocalTwin:
             "profile": profile,
             "physics": physics,
             "scatter": scatter,
+            "rays": rays,
             "speed-up": speed_up,
             "truth": truth,
             "public-url": public_url,

@@ -40,6 +40,13 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.projection import Body, project_body
+from flexdt.twin.projection.pixel_areas import (
+    Marks,
+    Need,
+    Within,
+    paths_within,
+    rays_needed,
+)
 from flexdt.twin.scanner.state import Sample
 
 THREAD_DELAYS_S = (0.0, 0.0, 0.0004, 0.002, 0.03)
@@ -191,6 +198,22 @@ class DirectProjector:
     ) -> Float32Array:
         """Compute line integrals, float32 (n, rows, cols)."""
         return project_body(self.known[name], cone_vec, shape)
+
+    async def rays_needed(
+        self,
+        name: str,
+        cone_vec: ConeVec,
+        shape: tuple[int, int],
+        need: tuple[Need, float],
+    ) -> Marks:
+        """Find the rays along each side that pixels need, uint8 (n, rows, cols)."""
+        return rays_needed(self.known[name], cone_vec, shape, *need)
+
+    async def paths_within(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within
+    ) -> Float32Array:
+        """Compute line integrals along several rays of some pixels, float32 (rays,)."""
+        return paths_within(self.known[name], cone_vec, shape, within)
 
 
 class _Receiver(Protocol):

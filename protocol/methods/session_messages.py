@@ -93,6 +93,8 @@ class HelloResult(Result):
     """this connection's name, as in `controller`"""
     physics: str | None = None
     """how images are made: ideal, mono or poly"""
+    rays: int | Literal["auto"] | None = None
+    """along each side of a pixel that an edge of the sample reaches"""
     instance: str | None = None
     """made up when the server started: results of another instance may be out of date"""
 

@@ -21,7 +21,7 @@ import asyncio
 import hashlib
 import json
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,10 +46,12 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.input_limits import InputLimitError, parse_toml
 from flexdt.twin.machine.camera import CameraSettings, PixelGrid
 from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.physics.chain import PixelPaths
 from flexdt.twin.physics.sampled_views import spot_views
 from flexdt.twin.physics.scatter import Object
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.projection.pixel_areas import Marks, Need, Within
 from flexdt.twin.scanner.state import Sample, StagePlacement, require_before_source
 
 MAX_TRUTH_VALUE = 1e6
@@ -189,6 +191,20 @@ class Projector(Protocol):
     ) -> Float32Array:
         """Compute line integrals, float32 (n, rows, cols)."""
 
+    async def rays_needed(
+        self,
+        name: str,
+        cone_vec: ConeVec,
+        shape: tuple[int, int],
+        need: tuple[Need, float],
+    ) -> Marks:
+        """Find the rays along each side that pixels need, uint8 (n, rows, cols)."""
+
+    async def paths_within(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within
+    ) -> Float32Array:
+        """Compute line integrals along several rays of some pixels, float32 (rays,)."""
+
 
 @dataclass(eq=False)
 class _DividedSample:
@@ -251,8 +267,12 @@ class Imaging:
         camera: CameraSettings,
         *,
         truth: TrueGeometry | None = None,
+        need: Need | None = None,
     ) -> Float32Array:
         """Compute line integrals of `sample` at n nominal poses, in the true geometry.
+
+        With `need`, pixels that an edge reaches have the line integral of the mean signal
+        of several rays: intensities are averaged, as a panel does.
 
         The parts (solids, meshes, voxels) are projected one after the other and added
         up with their factors. The sample is sent to the projector where it is new
@@ -262,6 +282,7 @@ class Imaging:
         Args:
             sample, poses, camera: as `Radiography.take` has them.
             truth: instead of the hidden one; None for the hidden one.
+            need: what pixels need for a small error; None for one ray a pixel.
 
         Returns:
             float32 (n, rows, cols), dimensionless; zeros for an empty stage. The
@@ -279,14 +300,52 @@ class Imaging:
         check_cone_vec(cone, camera.pixels_mm(self.sensor))
         async with self._on_projector(sample, "part") as divided:
             factors = [factor for _, factor in divided.found]
-            if factors == [1.0]:
+            if factors == [1.0] and need is None:
                 return await self.projector.project(divided.names[0], cone, camera.shape)
             total = np.zeros((len(cone), *camera.shape), dtype=np.float32)
             for name, factor in zip(divided.names, factors, strict=True):
                 total += np.float32(factor) * await self.projector.project(
                     name, cone, camera.shape
                 )
+            if need is not None:
+                within, paths = await self._within(
+                    divided, cone, camera.shape, need, factors
+                )
+                rays = np.tensordot(np.array(factors, np.float32), paths, axes=1)
+                signals = await asyncio.to_thread(within.mean_signals, rays)
+                total.reshape(-1)[within.pixels] = signals
             return total
+
+    async def _within(
+        self,
+        divided: _DividedSample,
+        cone: ConeVec,
+        shape: tuple[int, int],
+        need: Need,
+        weights: Sequence[float],
+    ) -> tuple[Within, Float32Array]:
+        """Find the pixels that need several rays for any piece, and project all pieces along
+        these.
+
+        Args:
+            divided: the sample, on the projector.
+            cone: n views.
+            shape: detector (rows, cols).
+            need: what pixels need.
+            weights: of the pieces.
+
+        Returns:
+            The pixels, and float32 (pieces, rays).
+        """
+        marks: Any = np.ones((len(cone), *shape), np.uint8)
+        for name, weight in zip(divided.names, weights, strict=True):
+            more = await self.projector.rays_needed(name, cone, shape, (need, weight))
+            marks = np.maximum(marks, more)
+        within = await asyncio.to_thread(Within.of, marks)
+        paths = np.empty((len(divided.names), int(within.starts[-1])), np.float32)
+        for i, name in enumerate(divided.names):
+            paths[i] = await self.projector.paths_within(name, cone, shape, within)
+        return within, paths
 
     async def path_lengths(
         self,
@@ -296,7 +355,10 @@ class Imaging:
         *,
         truth: TrueGeometry | None = None,
         spot: tuple[float, int] = (0.0, 1),
-    ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray]:
+        need: Callable[[tuple[Channel, ...]], tuple[Need, Sequence[float]] | None] = (
+            lambda channels: None
+        ),
+    ) -> tuple[tuple[Channel, ...], Float32Array, FloatArray, PixelPaths | None]:
         """Compute paths through each material of `sample` at n nominal poses.
 
         The geometry is checked before the focal spot is divided, for an empty stage
@@ -307,10 +369,13 @@ class Imaging:
             spot: size of the focal spot [mm] and number of its points from which rays
                 start. With more than one point n is the number of poses times that of
                 points: the views of a pose follow one another.
+            need: gives, for the materials, what pixels need and the attenuation of each
+                material; None for one ray a pixel.
 
         Returns:
-            The materials (m), float32 (m, n, rows, cols) [mm], and the true geometry
-                (n, 12), which must not leave the server. An empty stage has m = 0.
+            The materials (m), float32 (m, n, rows, cols) [mm], the true geometry
+                (n, 12), which must not leave the server, and the paths in pixels with
+                several rays. An empty stage has m = 0.
 
         Raises:
             ProjectorUnavailable, GeometryError, RpcError: as `line_integrals`.
@@ -324,6 +389,7 @@ class Imaging:
                 (),
                 np.empty((0, len(cone), *camera.shape), dtype=np.float32),
                 cone.rows,
+                None,
             )
         async with self._on_projector(sample, "material") as divided:
             out = np.empty(
@@ -331,7 +397,11 @@ class Imaging:
             )
             for i, name in enumerate(divided.names):
                 out[i] = await self.projector.project(name, cone, camera.shape)
-            return divided.found, out, cone.rows
+            wanted = await asyncio.to_thread(need, divided.found)
+            if wanted is None:
+                return divided.found, out, cone.rows, None
+            areas = PixelPaths(*await self._within(divided, cone, camera.shape, *wanted))
+            return divided.found, out, cone.rows, areas
 
     async def ray(self, sample: Sample, cone: ConeVec) -> dict[str, float]:
         """Compute the path of one ray through each material.

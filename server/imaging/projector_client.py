@@ -10,7 +10,7 @@ import asyncio
 import ssl as tls
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
+from flexdt.twin.projection.pixel_areas import Marks, Need, Within
 
 _T = TypeVar("_T")
 
@@ -102,11 +103,7 @@ class ProjectorClient:
     async def project(
         self, name: str, body: Body | None, cone_vec: ConeVec, shape: tuple[int, int]
     ) -> npt.NDArray[np.float32]:
-        """Compute line integrals; send the body again if the server has dropped it.
-
-        A volume that the server does not know is sent and requested again: as often as
-        other clients' volumes displace it, which are projected meanwhile, and until it is lost
-        `MAX_LOSSES` times without that. Without `body` it is an error at once.
+        """Compute line integrals.
 
         Args:
             name, body: the body to project; body None if it is there already.
@@ -117,22 +114,103 @@ class ProjectorClient:
             float32 (n, rows, cols), read-only.
 
         Raises:
+            RpcError, ProjectorUnavailable: as of `_array`.
+        """
+        sizes = (len(cone_vec), *shape)
+        return await self._array("project", name, body, (cone_vec, shape), {}, sizes)
+
+    async def rays_needed(
+        self,
+        name: str,
+        body: Body | None,
+        cone_vec: ConeVec,
+        shape: tuple[int, int],
+        need: tuple[Need, float],
+    ) -> Marks:
+        """Find the rays along each side that every pixel needs, uint8 (n, rows, cols).
+
+        Args:
+            name, body, cone_vec, shape: as of `project`.
+            need: and the body's weight; see `pixel_areas.rays_needed`.
+        """
+        wanted, weight = need
+        params = {
+            "error": wanted.error,
+            "counts": wanted.counts,
+            "weight": abs(float(weight)),
+        }
+        sizes = (len(cone_vec), *shape)
+        marks = await self._array(
+            "rays", name, body, (cone_vec, shape), params, sizes, np.uint8
+        )
+        return wanted.given(marks)
+
+    async def paths_within(
+        self,
+        name: str,
+        body: Body | None,
+        cone_vec: ConeVec,
+        shape: tuple[int, int],
+        within: Within,
+    ) -> npt.NDArray[np.float32]:
+        """Compute line integrals along several rays of some pixels, float32 (rays,).
+
+        Args:
+            name, body, cone_vec, shape: as of `project`.
+            within: the pixels; see `pixel_areas.paths_within`.
+        """
+        if not len(within.pixels):
+            return np.zeros(0, np.float32)
+        pixels = within.pixels.astype("<i8").view(np.uint8).data.toreadonly()
+        sides = within.sides.data.toreadonly()
+        params = {"within": {"pixels": pixels, "sides": sides}}
+        sizes = (int(within.starts[-1]),)
+        return await self._array("project", name, body, (cone_vec, shape), params, sizes)
+
+    async def _array(
+        self,
+        method: str,
+        name: str,
+        body: Body | None,
+        views: tuple[ConeVec, tuple[int, int]],
+        more: Mapping[str, object],
+        sizes: tuple[int, ...],
+        dtype: npt.DTypeLike = np.float32,
+    ) -> npt.NDArray[Any]:
+        """Request an array about a body; send the body again if the server has dropped it.
+
+        A volume that the server does not know is sent and requested again: as often as
+        other clients' volumes displace it, which are projected meanwhile, and until it is lost
+        `MAX_LOSSES` times without that. Without `body` it is an error at once.
+
+        Args:
+            method: of the wire.
+            name, body: the body; None if it is there already.
+            views: object frame, and detector (rows, cols).
+            more: the method's further parameters.
+            sizes, dtype: of the array.
+
+        Returns:
+            The array, read-only.
+
+        Raises:
             RpcError: invalid parameters, or an unknown volume.
             ProjectorUnavailable: the server does not answer.
         """
+        cone_vec, shape = views
         params: dict[str, object] = {
             "volume": name,
             "cone_vec": image.encode(cone_vec.rows),
             "detector": list(shape),
+            **more,
         }
-        sizes = (len(cone_vec), *shape)
         losses = 0
         while True:
             if body is not None:
                 await self.give(name, body)
             try:
                 return await self._ask(
-                    "project", lambda c: c.ask_array("project", params, sizes)
+                    method, lambda c: c.ask_array(method, params, sizes, dtype)
                 )
             except RpcError as error:
                 there = volumes_there(error, name)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
@@ -24,6 +24,7 @@ from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Body
+from flexdt.twin.projection.pixel_areas import Marks, Need, Within
 
 MAX_OPEN_REQUESTS: Final = 2
 """Largest number of requests that a projector has: one is computed while the other travels."""
@@ -33,6 +34,10 @@ LATE_S: Final = 1.0
 """Time after which a request may count as late [s]."""
 LATE_FACTOR: Final = 6.0
 """Multiple of the usual time, after `LATE_S`, at which another projector is asked as well."""
+
+
+Work = Callable[[ProjectorClient, Body | None], Awaitable[Any]]
+"""What is asked of a projector's client about a body."""
 
 
 @dataclass(eq=False)
@@ -165,7 +170,7 @@ class ProjectorPool:
         Raises as `_request`.
         """
         self._values[name] = body
-        await self._request(name, None, (0, 0))
+        await self._request(name, 0, None)
 
     async def remove(self, name: str) -> None:
         """Forget a body and have all projectors remove it; their failures are ignored.
@@ -192,14 +197,41 @@ class ProjectorPool:
         Raises:
             ProjectorUnavailable, RpcError: as `_request`.
         """
-        images = await self._request(name, cone_vec, shape)
-        assert images is not None
+        images: Float32Array = await self._request(
+            name,
+            len(cone_vec),
+            lambda client, body: client.project(name, body, cone_vec, shape),
+        )
         return images
 
-    async def _request(
-        self, name: str, views: ConeVec | None, shape: tuple[int, int]
-    ) -> Float32Array | None:
-        """Request images of a free projector, and of another one if it is late; take the
+    async def rays_needed(
+        self,
+        name: str,
+        cone_vec: ConeVec,
+        shape: tuple[int, int],
+        need: tuple[Need, float],
+    ) -> Marks:
+        """Find the rays along each side that pixels need, as `ProjectorClient.rays_needed`."""
+        marks: Marks = await self._request(
+            name,
+            0,
+            lambda client, body: client.rays_needed(name, body, cone_vec, shape, need),
+        )
+        return marks
+
+    async def paths_within(
+        self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within
+    ) -> Float32Array:
+        """Compute line integrals along several rays of some pixels, as
+        `ProjectorClient.paths_within`."""
+        return await self._request(
+            name,
+            0,
+            lambda client, body: client.paths_within(name, body, cone_vec, shape, within),
+        )
+
+    async def _request(self, name: str, views: int, work: Work | None) -> Any:
+        """Request something of a free projector, and of another one if it is late; take the
         first answer.
 
         A request is late after `LATE_S` and `LATE_FACTOR` times the time that its views
@@ -210,11 +242,13 @@ class ProjectorPool:
 
         Args:
             name: of the body.
-            views: n views; None sends the body alone.
-            shape: detector (rows, cols).
+            views: number of views that are projected, of which the pace is kept; 0 for
+                work whose pace is not.
+            work: what is asked of a projector's client, with the body; None sends the
+                body alone.
 
         Returns:
-            Images (n, rows, cols), or None without views.
+            The value of `work`, or None without.
 
         Raises:
             ProjectorUnavailable: a projector has failed after `patience_s`, with none
@@ -224,7 +258,7 @@ class ProjectorPool:
         """
         loop = asyncio.get_running_loop()
         ask = partial(
-            self._ask, name=name, value=self._values.get(name), views=views, shape=shape
+            self._ask, name=name, value=self._values.get(name), views=views, work=work
         )
         asked = _Asked(loop.time() + self.patience_s)
         try:
@@ -233,7 +267,7 @@ class ProjectorPool:
                 # All that wait share one future; a done one has woken those of before.
                 if self._turn is None or self._turn.done():
                     self._turn = loop.create_future()
-                self._ask_another(asked, ask, len(views or ()), now)
+                self._ask_another(asked, ask, views, now)
                 done, _ = await asyncio.wait(
                     {*asked.running, self._turn},
                     timeout=self._until_wake(asked.late, now),
@@ -242,8 +276,7 @@ class ProjectorPool:
                 for task in asked.running.keys() & done:
                     if asked.answers(task, loop.time(), len(self)):
                         asked.running.clear()  # late requests keep their place until answered
-                        images: Float32Array | None = task.result()
-                        return images
+                        return task.result()
                 # All have failed: after their rest each is asked again, until the patience
                 # ends.
                 if not asked.running:
@@ -256,7 +289,7 @@ class ProjectorPool:
     def _ask_another(
         self,
         asked: _Asked,
-        ask: Callable[[_Member], Coroutine[Any, Any, Float32Array | None]],
+        ask: Callable[[_Member], Coroutine[Any, Any, Any]],
         views: int,
         now: float,
     ) -> None:
@@ -307,7 +340,7 @@ class ProjectorPool:
         return min(free, key=lambda m: (m.open, m.pace_s or 0.0), default=None)
 
     def _start_request(
-        self, member: _Member, asking: Coroutine[Any, Any, Float32Array | None]
+        self, member: _Member, asking: Coroutine[Any, Any, Any]
     ) -> asyncio.Task[Float32Array | None]:
         """Start a request in a task that counts as open until it ends, and then wakes a
         waiting request.
@@ -343,9 +376,9 @@ class ProjectorPool:
         member: _Member,
         name: str,
         value: Body | None,
-        views: ConeVec | None,
-        shape: tuple[int, int],
-    ) -> Float32Array | None:
+        views: int,
+        work: Work | None,
+    ) -> Any:
         """Send a request to one projector; measure its pace, or let it rest after a
         failure.
 
@@ -360,11 +393,11 @@ class ProjectorPool:
             name: of the body.
             value: the body, sent unless it is there; None for a request that sends
                 none.
-            views: to project; None for none.
-            shape: (rows, cols) of the images.
+            views: number of views that are projected; 0 for other work.
+            work: what is asked of it; None for nothing.
 
         Returns:
-            Line integrals (n, rows, cols); None without views.
+            The value of `work`; None without.
 
         Raises:
             ProjectorUnavailable, RpcError: the projector's failure.
@@ -377,10 +410,10 @@ class ProjectorPool:
                 self._compare()
             if value is not None:
                 await member.client.give(name, value)
-            if views is None:
+            if work is None:
                 return None
             begun = loop.time()
-            images = await member.client.project(name, value, views, shape)
+            answer = await work(member.client, value)
         except (ProjectorUnavailable, RpcError) as error:
             if isinstance(error, ProjectorUnavailable) or len(self) > 1:
                 member.rests_until = loop.time() + REST_S
@@ -390,13 +423,15 @@ class ProjectorPool:
                     "a projector gave no answer", logging.WARNING, reason=str(error)
                 )
             raise
-        taken = (loop.time() - begun) / len(views)
+        if not views:
+            return answer
+        taken = (loop.time() - begun) / views
         if member.pace_s is None:
             member.pace_s = taken
         else:
             member.pace_s = (3 * member.pace_s + taken) / 4
-        member.views += len(views)
-        return images
+        member.views += views
+        return answer
 
     def _compare(self) -> None:
         """Log a warning if known projectors differ in version or backend; at every call."""

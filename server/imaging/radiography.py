@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms import Phantom, exposure_forecast
-from flexdt.phantoms.channels import chain_through
+from flexdt.phantoms.channels import Channel, chain_through
 from flexdt.protocol import Codec
 from flexdt.protocol.connection import encoded
 from flexdt.protocol.methods.image_messages import PREDICTION_LIMITS, ExposurePrediction
@@ -36,10 +36,13 @@ from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics import exposure as ideal
 from flexdt.twin.physics import scatter as mc
+from flexdt.twin.physics.blur import spot_blur_px
 from flexdt.twin.physics.chain import (
     Chain,
     Radiograph,
     Scattered,
+    mean_attenuation,
+    open_noise,
     radiographs,
     without_spot,
 )
@@ -47,7 +50,10 @@ from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.predicted_beam import CountShares, Physics, only_keV
 from flexdt.twin.physics.readout import Expected, expected_counts, read_out
+from flexdt.twin.physics.sampled_views import permitted_error
 from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
+from flexdt.twin.projection.pixel_areas import FEWEST_NEEDED, Need
+from flexdt.twin.rays_a_pixel import Rays
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.planning.sample_findings import SampleProbe, shares_behind
 
@@ -118,6 +124,7 @@ class Radiography:
         physics: ideal, mono or poly.
         panel, tube: of the other two.
         scatter: the sample's scatter on the panel, of the other two: off or mc.
+        rays: along each side of a pixel that an edge reaches, or "auto".
     """
 
     imaging: Imaging
@@ -126,6 +133,7 @@ class Radiography:
     panel: Detector = field(default_factory=Detector)
     tube: TubeModel = field(default_factory=TubeModel)
     scatter: mc.Scatter = "off"
+    rays: Rays = "auto"
 
     @classmethod
     def of(
@@ -134,6 +142,7 @@ class Radiography:
         machine: Machine,
         physics: Physics = "ideal",
         scatter: mc.Scatter = "off",
+        rays: Rays = "auto",
     ) -> Radiography:
         """Make the radiography of a machine's tube and detector.
 
@@ -149,7 +158,8 @@ class Radiography:
             )
         panel = detector_of(machine.detector)
         tube = tube_of(machine.tube)
-        return cls(imaging, ideal.ideal_response(machine), physics, panel, tube, scatter)
+        response = ideal.ideal_response(machine)
+        return cls(imaging, response, physics, panel, tube, scatter, rays)
 
     @property
     def photons(self) -> bool:
@@ -170,15 +180,20 @@ class Radiography:
         """List the figures of the images' physics by name, for data sets.
 
         "ideal": the noise model's, without its reference; else markers of physics and
-        scatter, and the figures of detector and tube.
+        scatter, and the figures of detector and tube. `rays` along each side of a pixel, or
+        the mark `rays_auto`, unless there is one.
         """
+        if self.rays == "auto":
+            rays = {"rays_auto": 1.0}
+        else:
+            rays = {"rays": float(self.rays)}
         if not self.photons:
             return {
                 name: float(getattr(self.model, name))
                 for name in self.model.__dataclass_fields__
                 if name != "reference"
-            }
-        figures = {f"physics_{self.physics}": 1.0, **self.panel.figures()}
+            } | rays
+        figures = {f"physics_{self.physics}": 1.0, **self.panel.figures(), **rays}
         if self.scatter != "off":
             figures |= {f"scatter_{self.scatter}": 1.0, "scatter_error": SCATTER.error}
         return figures | self.tube.figures()
@@ -225,7 +240,10 @@ class Radiography:
         """
         count = len(exposures)
         if not self.photons:
-            lines = await self.imaging.line_integrals(sample, poses, camera, truth=truth)
+            wanted = self._need([self._ideal_noise(one) for one in exposures])
+            lines = await self.imaging.line_integrals(
+                sample, poses, camera, truth=truth, need=wanted
+            )
             if len(lines) == count:
                 return [Radiograph(one) for one in lines]
             return [
@@ -240,8 +258,20 @@ class Radiography:
                 for p, e in zip(parts, exposures, strict=True)
             ]
         spot = self.tube.focal_spot_mm(exposures[0].power_W), points
-        channels, paths, views = await self.imaging.path_lengths(
-            sample, poses, camera, truth=truth, spot=spot
+
+        def need(parts: tuple[Channel, ...]) -> tuple[Need, list[float]] | None:
+            """Compute what pixels need, and the attenuation of each material."""
+            chain = chain_through(parts, self.panel, self.tube, only_keV(self.physics))
+            view = poses[:1].cone_vec().rows[0]
+            noise = [open_noise(chain, view, exposure) for exposure in exposures]
+            blur = spot_blur_px(view, spot[0]) if points == 1 else 0.0
+            wanted = self._need(noise, blur, points)
+            if wanted is None:
+                return None
+            return wanted, mean_attenuation(chain, exposures[0].kV).tolist()
+
+        channels, paths, views, areas = await self.imaging.path_lengths(
+            sample, poses, camera, truth=truth, spot=spot, need=need
         )
         chain = chain_through(channels, self.panel, self.tube, only_keV(self.physics))
         if points > 1:
@@ -255,8 +285,33 @@ class Radiography:
                 self._scattered, thing, chain, middles, camera, exposures
             )
         return await asyncio.to_thread(
-            radiographs, chain, paths, views, exposures, moments, added
+            radiographs, chain, paths, views, exposures, moments, added, areas
         )
+
+    def _need(
+        self, noise: Sequence[float], blur_px: float = 0.0, points: int = 1
+    ) -> Need | None:
+        """Compute what the pixels of images need; None for one ray a pixel.
+
+        Args:
+            noise: of each image's open beam, relative to its signal.
+            blur_px: standard deviation of the spot's blur [pixels].
+            points: of the spot.
+        """
+        if self.rays == 1:
+            return None
+        if self.rays != "auto":
+            return Need(FEWEST_NEEDED, counts=True, rays=self.rays)
+        return Need(permitted_error(min(noise), blur_px, points), counts=True)
+
+    def _ideal_noise(self, exposure: ExposureSettings) -> float:
+        """Compute the noise of an open pixel by the ideal model, relative to its signal;
+        infinite without a signal."""
+        beam = ideal.open_beam(self.model, replace(exposure, xrays_on=True))
+        if beam <= 0.0:
+            return math.inf
+        photons = self.model.photons_per_count * exposure.averages
+        return 1.0 / math.sqrt(beam * photons)
 
     def _scattered(
         self,

@@ -34,6 +34,7 @@ from flexdt.runtime import compile_ahead
 from flexdt.twin.projection import Body, gpu, project_body
 from flexdt.twin.projection.analytic import warm_up_forward
 from flexdt.twin.projection.kernels.compiling import LOG
+from flexdt.twin.projection.pixel_areas import Need, Within, paths_within, rays_needed
 
 COMPILE_BACK_AFTER_S: Final = 60.0
 """Delay before back projection is compiled [s], so that a first scan has all cores."""
@@ -196,6 +197,59 @@ def projection_steps(
 
     for start in range(0, len(rows), block):
         yield step(rows[start : start + block])
+
+
+def marking_steps(
+    body: Body,
+    rows: npt.NDArray[np.float64],
+    shape: tuple[int, int],
+    block: int,
+    need: tuple[Need, float],
+) -> Iterator[Step]:
+    """Yield functions that each find the rays that the pixels of a block of views need.
+
+    Args:
+        body, rows, shape, block: as of `projection_steps`.
+        need: and the body's weight, as of `rays_needed`.
+
+    Yields:
+        Steps whose values are uint8 (views, rows, cols).
+    """
+
+    def step(part: npt.NDArray[np.float64]) -> Step:
+        """Make the step of some rows."""
+        return lambda: rays_needed(body, part, shape, *need)
+
+    for start in range(0, len(rows), block):
+        yield step(rows[start : start + block])
+
+
+def within_steps(
+    body: Body,
+    rows: npt.NDArray[np.float64],
+    shape: tuple[int, int],
+    block: int,
+    within: Within,
+) -> Iterator[Step]:
+    """Yield functions that each project a block of views along several rays of some pixels.
+
+    Args:
+        body, rows, shape, block: as of `projection_steps`.
+        within: pixels of all views.
+
+    Yields:
+        Steps whose values are float32 (rays,).
+    """
+    view = shape[0] * shape[1]
+
+    def step(start: int) -> Step:
+        """Make the step of the views from `start` on."""
+        part = rows[start : start + block]
+        some, _ = within.of_range(start * view, (start + len(part)) * view)
+        return lambda: paths_within(body, part, shape, some)
+
+    for start in range(0, len(rows), block):
+        yield step(start)
 
 
 def views_a_block(shape: tuple[int, int]) -> int:

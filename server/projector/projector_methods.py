@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import scene_from_dict
 from flexdt.protocol import MAX_FRAME, PROTOCOL, image
@@ -25,14 +26,19 @@ from flexdt.protocol.methods import openrpc_document
 from flexdt.protocol.methods.session_messages import Hello
 from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
 from flexdt.server.projector.compute import (
+    ComputeJob,
+    Step,
+    marking_steps,
     projection_steps,
     views_a_block,
+    within_steps,
 )
 from flexdt.server.projector.job_context import SPARE_BYTES, Context, JobClient
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.plausibility import Operation, examine, settled
-from flexdt.twin.projection import TriangleMesh, Volume, back
+from flexdt.twin.projection import Body, TriangleMesh, Volume, back
 from flexdt.twin.projection.operators import as_cone_vec
+from flexdt.twin.projection.pixel_areas import Need, Within
 
 MAX_VIEW_BYTES: Final = 512 * 2**20
 """Largest view [bytes]."""
@@ -185,32 +191,104 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
         RpcError: no such volume, or a view of more than `MAX_VIEW_BYTES`.
         GeometryError: a geometry that no scanner has.
     """
-    volume = context.store.get(p.volume)
-    view = math.prod(p.detector)
-    if 4 * view > MAX_VIEW_BYTES:
-        raise too_large("a view", 4 * view, MAX_VIEW_BYTES)
-    # All rows at once, before any is computed: blocks would count from their own first row.
-    views = as_cone_vec(p.cone_vec)
-    rows = views.rows
-    boxes = volume.boxes if isinstance(volume, Volume) else None
-    found = examine(Operation.PROJECT, views, p.detector, boxes=boxes)
-    warnings = _warnings(settled(found, GeometryError))
+    volume, rows, warnings = _looked_at(context, p)
     block = views_a_block(p.detector)
+    if p.within is None:
+        steps = projection_steps(volume, rows, p.detector, block)
+        shape: tuple[int, ...] = (len(rows), *p.detector)
+    else:
+        pixels = Within(p.within.places, p.within.rays)
+        if len(pixels.pixels) and pixels.pixels[-1] >= len(rows) * math.prod(p.detector):
+            raise invalid_params("a pixel is beyond the last view")
+        steps = within_steps(volume, rows, p.detector, block, pixels)
+        shape = (int(pixels.starts[-1]),)
     if p.key is not None:
         context.supersede(client, p.key)
     job = client.begin(id, p.key)
-    parts = 0
-    done = 0
-    for step in projection_steps(volume, rows, p.detector, block):
-        images = await job.run(context.compute, step)
-        assert isinstance(images, np.ndarray)
-        context.views += len(images)
-        if len(images) == len(rows) and images.nbytes + SPARE_BYTES <= MAX_FRAME:
-            return {**image.encode(images), **warnings}
-        parts += await context.send_parts(client, id, images, done * view)
-        done += len(images)
-    shape = [len(rows), *p.detector]
-    return {"dtype": "float32", "shape": shape, "parts": parts, **warnings}
+    return {**await _sent(context, client, id, job, steps, shape), **warnings}
+
+
+async def rays(context: Context, client: JobClient, id: Id, p: wire.RaysNeeded) -> object:
+    """Find the rays along each side that pixels need, and send them as uint8 (n, rows, cols).
+
+    Args:
+        context: of the server.
+        client: that calls.
+        id: of the request.
+        p: name of the volume, cone_vec (n, 12), detector, and the permitted error.
+
+    Returns:
+        As of `project`.
+
+    Raises:
+        RpcError, GeometryError: as of `project`.
+    """
+    volume, rows, warnings = _looked_at(context, p)
+    steps = marking_steps(
+        volume,
+        rows,
+        p.detector,
+        views_a_block(p.detector),
+        (Need(p.error, p.counts), p.weight),
+    )
+    job = client.begin(id, None)
+    shape = (len(rows), *p.detector)
+    return {**await _sent(context, client, id, job, steps, shape), **warnings}
+
+
+def _looked_at(
+    context: Context, p: wire.Project | wire.RaysNeeded
+) -> tuple[Body, npt.NDArray[np.float64], dict[str, list[str]]]:
+    """Examine a request's geometry before anything is computed: body, rows and warnings.
+
+    All rows at once: blocks would count from their own first row.
+
+    Raises:
+        RpcError: no such volume, or a view of more than `MAX_VIEW_BYTES`.
+        GeometryError: a geometry that no scanner has.
+    """
+    volume = context.store.get(p.volume)
+    view = 4 * math.prod(p.detector)
+    if view > MAX_VIEW_BYTES:
+        raise too_large("a view", view, MAX_VIEW_BYTES)
+    views = as_cone_vec(p.cone_vec)
+    boxes = volume.boxes if isinstance(volume, Volume) else None
+    found = examine(Operation.PROJECT, views, p.detector, boxes=boxes)
+    return volume, views.rows, _warnings(settled(found, GeometryError))
+
+
+async def _sent(
+    context: Context,
+    client: JobClient,
+    id: Id,
+    job: ComputeJob,
+    steps: Iterator[Step],
+    shape: tuple[int, ...],
+) -> dict[str, Any]:
+    """Compute steps one after the other and send their values: the image value if all are
+    one step's and fit into a frame; else dtype, shape and the number of parts, sent before.
+
+    Args:
+        context: of the server.
+        client: that called.
+        id: of its request.
+        job: of the request.
+        steps: of the array's first axis, in order.
+        shape: of the array.
+    """
+    parts = done = 0
+    dtype = np.dtype(np.float32)
+    for step in steps:
+        values = await job.run(context.compute, step)
+        assert isinstance(values, np.ndarray)
+        if values.dtype == np.float32 and values.ndim == 3:
+            context.views += len(values)
+        if len(values) == shape[0] and values.nbytes + SPARE_BYTES <= MAX_FRAME:
+            return dict(image.encode(values))
+        parts += await context.send_parts(client, id, values, done)
+        done += values.size
+        dtype = values.dtype
+    return {"dtype": str(dtype), "shape": list(shape), "parts": parts}
 
 
 async def backproject(
@@ -380,6 +458,7 @@ ANSWERS: Final[Mapping[str, Answer]] = {
     "volume.list": volume_list,
     "volume.remove": volume_remove,
     "project": project,
+    "rays": rays,
     "backproject": backproject,
     "health": health,
     "cancel": cancel,

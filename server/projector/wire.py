@@ -275,10 +275,11 @@ class _Pending:
 
     answer: asyncio.Future[Answered[_Pending]]
     shape: tuple[int, ...] | None
-    parts: npt.NDArray[np.float32] | None = None
+    dtype: npt.DTypeLike = np.float32
+    parts: npt.NDArray[Any] | None = None
 
     def part(self, params: Mapping[str, object]) -> None:
-        """Copy a part (float32, from index `start`) into the result's flat array, which
+        """Copy a part (from index `start`) into the result's flat array, which
         the first part makes.
 
         The part is ignored if no array was requested or `start` is no whole number.
@@ -288,8 +289,8 @@ class _Pending:
         if self.shape is None or not isinstance(start, int):
             return
         if self.parts is None:
-            self.parts = np.empty(math.prod(self.shape), np.float32)
-        values = np.frombuffer(image.payload(data), np.float32)
+            self.parts = np.empty(math.prod(self.shape), self.dtype)
+        values = np.frombuffer(image.payload(data), self.dtype)
         self.parts[start : start + len(values)] = values
 
 
@@ -344,27 +345,31 @@ class ProjectorLink:
         return (await self._request(method, params, None))[0]
 
     async def ask_array(
-        self, method: str, params: Mapping[str, object], shape: tuple[int, ...]
-    ) -> npt.NDArray[np.float32]:
-        """Request a float32 array, which comes in one piece or in parts.
+        self,
+        method: str,
+        params: Mapping[str, object],
+        shape: tuple[int, ...],
+        dtype: npt.DTypeLike = np.float32,
+    ) -> npt.NDArray[Any]:
+        """Request an array, which comes in one piece or in parts.
 
         Args:
             method: its name on the wire.
             params: its parameters.
             shape: of the array.
+            dtype: of its values.
 
         Returns:
             The array, read-only.
 
         Raises:
-            RpcError: the answer is an error; -32603, it is no float32 array of that
-                shape.
+            RpcError: the answer is an error; -32603, it is no such array.
             LinkLost: the connection has ended.
         """
-        answer, parts = await self._request(method, params, shape)
+        answer, parts = await self._request(method, params, shape, dtype)
         if isinstance(answer, Mapping) and answer.get("data") is not None:
             array = np.asarray(image.decode(answer))
-            if array.shape == shape and array.dtype == np.float32:
+            if array.shape == shape and array.dtype == dtype:
                 return array
         elif parts is not None and tuple(parse_result(Array, answer).shape) == shape:
             parts.setflags(write=False)
@@ -374,8 +379,12 @@ class ProjectorLink:
         )
 
     async def _request(
-        self, method: str, params: Mapping[str, object], shape: tuple[int, ...] | None
-    ) -> tuple[object, npt.NDArray[np.float32] | None]:
+        self,
+        method: str,
+        params: Mapping[str, object],
+        shape: tuple[int, ...] | None,
+        dtype: npt.DTypeLike = np.float32,
+    ) -> tuple[object, npt.NDArray[Any] | None]:
         """Send a request and wait for its answer and parts; cancel it if this is cancelled.
 
         Only a request that may have been sent can still be answered; such answers are
@@ -385,6 +394,7 @@ class ProjectorLink:
             method: its name on the wire.
             params: its parameters.
             shape: of the array that comes in parts; None for none.
+            dtype: of its values.
 
         Returns:
             The result, and the array of its parts, or None.
@@ -393,7 +403,7 @@ class ProjectorLink:
             LinkLost: the connection ended.
             RpcError: the answer is an error.
         """
-        pending = _Pending(asyncio.get_running_loop().create_future(), shape)
+        pending = _Pending(asyncio.get_running_loop().create_future(), shape, dtype)
         request = self._calls.request(method, params, pending, current()[:100])
         sent = False
         try:

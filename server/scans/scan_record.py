@@ -31,6 +31,7 @@ from flexdt.server.storage.job_files import RECORDS
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
 from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.physics.scatter import Scatter
+from flexdt.twin.rays_a_pixel import Rays
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script import StartState
 
@@ -117,6 +118,8 @@ class StartConditions:
     """Conditions at a scan's start, kept so that it can be resumed.
 
     Attributes:
+        rays: along each side of a pixel that an edge reaches; 1 in records of older
+            servers.
         revision: content of the sample's upload at that time; None for a shipped phantom,
             and in records of older servers.
     """
@@ -127,6 +130,7 @@ class StartConditions:
     moments: Annotated[int, Field(ge=1, le=MAX_MOMENTS, strict=True)]
     physics: Physics = "ideal"
     scatter: Scatter = "off"
+    rays: Rays = 1
     revision: str | None = None
 
 

@@ -259,6 +259,7 @@ class Submissions:
                 source.moments,
                 self.radiography.physics,
                 self.radiography.scatter,
+                self.radiography.rays,
             )
         if name is not None:
             chosen = name
@@ -482,7 +483,7 @@ class Submissions:
         """Write the scan's record, create its data set or go on with it, and make the
         producer of its frames; in a worker thread.
 
-        Physics, scatter and seed are those of the start conditions. The geometry is
+        Physics, scatter, rays and seed are those of the start conditions. The geometry is
         checked before anything is written.
 
         Args:
@@ -502,7 +503,10 @@ class Submissions:
         """
         begin = job_record.begin
         radiography = replace(
-            self.radiography, physics=begin.physics, scatter=begin.scatter
+            self.radiography,
+            physics=begin.physics,
+            scatter=begin.scatter,
+            rays=begin.rays,
         )
         noise = NoiseRecord(begin.seed, radiography.record())
         size = self.stage.size(begin.sample)

@@ -58,6 +58,7 @@ from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.physics.chain import Radiograph
 from flexdt.twin.physics.predicted_beam import Physics
 from flexdt.twin.physics.scatter import Scatter
+from flexdt.twin.rays_a_pixel import Rays
 from flexdt.twin.scanner.safety import Guard
 from flexdt.twin.scanner.scanner import ScannerTwin
 from flexdt.twin.scanner.state import NamedCorrection, Sample, ScannerState, TubeSettings
@@ -186,7 +187,7 @@ class TwinServer:
         seed: makes the noise's seed of each scan; a function that returns None switches
             noise off.
         limits: of jobs, uploads, disk, control.
-        physics, scatter: how images are made, see `radiography`.
+        physics, scatter, rays: how images are made, see `radiography`.
         projectors: servers behind `projector`.
         wall: real time [s], monotonic; a simulation has its own.
         memory_limit: of the samples in memory [bytes]; None for any.
@@ -208,6 +209,7 @@ class TwinServer:
         limits: TwinLimits | None = None,
         physics: Physics = "ideal",
         scatter: Scatter = "off",
+        rays: Rays = "auto",
         projectors: int = 1,
         wall: Callable[[], float] = time.monotonic,
         memory_limit: int | None = None,
@@ -295,7 +297,7 @@ class TwinServer:
             max_ended=self.limits.max_ended_jobs,
             max_age=timedelta(days=self.limits.ended_job_days),
         )
-        self.radiography = Radiography.of(self.imaging, machine, physics, scatter)
+        self.radiography = Radiography.of(self.imaging, machine, physics, scatter, rays)
         self.live = LiveView(
             self.scanner,
             self.clock,

@@ -96,6 +96,7 @@ async def run(options: TwinSettings) -> int:
         seed=(lambda: None) if options.no_noise else fresh_seed,
         physics=options.physics,
         scatter=options.scatter,
+        rays=options.rays,
         projectors=len(clients),
         memory_limit=options.memory_limit or memory_bytes() // 4,
         projector_room=projector.room,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from one_ray import OneRay
 
 from flexdt.runtime.files.directory import open_data
 from flexdt.server.imaging.projections import Imaging, TrueGeometry, load_truth
@@ -50,7 +51,7 @@ FLY = "\r\n".join(
 )
 
 
-class AngleProjector:
+class AngleProjector(OneRay):
     """Each view's line integral is the stage angle, read back from where the source stands."""
 
     def __init__(self) -> None:

@@ -134,7 +134,7 @@ def test_materials_of_a_sample_are_named_by_content_too(tmp_path: Path) -> None:
         imaging = Imaging(
             one, TrueGeometry(), SampleStore(open_data(tmp_path)), M.detector.pixels
         )
-        channels, paths, _ = await imaging.path_lengths(Sample("lego"), POSES, CAMERA)
+        channels, paths, *_ = await imaging.path_lengths(Sample("lego"), POSES, CAMERA)
         assert len(channels) == len(paths) > 1
         names = [v.name for v in (await one.volumes()).volumes]
         assert len(names) == len(channels)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from one_ray import OneRay
 
 from flexdt.protocol import (
     METHODS,
@@ -43,7 +44,7 @@ PATIENCE_S = 60.0
 """For what happens a moment later, on a machine that may be busy."""
 
 
-class PointProjector:
+class PointProjector(OneRay):
     """Shows one point of the object as one bright pixel, and counts."""
 
     POINT = np.array([[2.0, -1.0, 0.3]])  # near the height of the source at home

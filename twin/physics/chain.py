@@ -9,6 +9,7 @@ scan of the twin differ in nothing but their geometry.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -24,6 +25,7 @@ from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.readout import Expected
 from flexdt.twin.physics.tube import TubeModel, monochromatic, tube_spectrum
+from flexdt.twin.projection.pixel_areas import Within
 
 REFERENCE_MM = 1000.0
 """Distance at which the tables state the fluence."""
@@ -96,14 +98,33 @@ def mAs(exposure: ExposureSettings) -> float:
     return exposure.power_W / exposure.kV * exposure.exposure_ms / 1000.0
 
 
+@dataclass(frozen=True, eq=False)
+class PixelPaths:
+    """Paths along several rays of some pixels, of which the signals are averaged.
+
+    Attributes:
+        within: the pixels, of images (moments, rows, cols).
+        paths_mm: float32 (m, rays), one channel a substance [mm].
+    """
+
+    within: Within
+    paths_mm: Float32Array
+
+    def of_views(self, first: int, last: int, pixels: int) -> PixelPaths:
+        """Take the pixels of views `first` to `last` - 1, of `pixels` each."""
+        within, rays = self.within.of_range(first * pixels, last * pixels)
+        return PixelPaths(within, self.paths_mm[:, rays])
+
+
 def expected_signal(
     chain: Chain,
     paths_mm: Float32Array,
     view: npt.ArrayLike,
     exposure: ExposureSettings,
+    areas: PixelPaths | None = None,
 ) -> Expected:
-    """Compute the noise-free charge of one image: attenuation averaged over the moments,
-    focal-spot blur of the rotation axis, then flux.
+    """Compute the noise-free charge of one image: attenuation averaged over the pixels'
+    areas and over the moments, focal-spot blur of the rotation axis, then flux.
 
     Args:
         chain: tube, materials, panel.
@@ -112,6 +133,8 @@ def expected_signal(
         view: the cone_vec row (12,) of the image [mm]; distances give flux and focal-spot
             blur.
         exposure: tube and time; with X-rays off all is 0.
+        areas: pixels whose signal is the mean of several rays'; the other pixels have that
+            of their centre.
 
     Returns:
         Electrons of one read-out and their variance, float32 (rows, cols) each.
@@ -126,7 +149,13 @@ def expected_signal(
     else:
         count = 1
     moments = paths_mm.reshape(len(chain.substances), count, *shape)
-    mean, variance = beam_of(chain, exposure.kV).transmit(moments)
+    beam = beam_of(chain, exposure.kV)
+    mean, variance = beam.transmit(moments)
+    if areas is not None and len(areas.within.pixels):
+        for whole, rays in zip(
+            (mean, variance), beam.transmit(areas.paths_mm), strict=True
+        ):
+            whole.reshape(-1)[areas.within.pixels] = areas.within.means(rays)
     one = mean.mean(axis=0)
     spread = variance.mean(axis=0)
     spot = spot_blur_px(row, chain.tube.focal_spot_mm(exposure.power_W))
@@ -135,6 +164,31 @@ def expected_signal(
     return Expected(
         blurred(one, spot, across) * flux, blurred(spread, spot, across) * flux
     )
+
+
+def open_noise(chain: Chain, view: npt.ArrayLike, exposure: ExposureSettings) -> float:
+    """Compute the noise of a pixel of the open beam at the panel's centre, relative to its
+    signal (standard deviation); infinite without a signal.
+
+    Args:
+        chain: tube and panel; its materials are not used.
+        view: cone_vec row (12,) [mm].
+        exposure: tube, time and averages; taken as if X-rays were on.
+    """
+    signal, variance = weights_of(chain, exposure.kV)
+    charge = float(flux_of(view, (1, 1))[0, 0]) * mAs(replace(exposure, xrays_on=True))
+    mean = float(signal.sum()) * charge
+    if mean <= 0.0:
+        return math.inf
+    return math.sqrt(float(variance.sum()) * charge / exposure.averages) / mean
+
+
+def mean_attenuation(chain: Chain, kV: float) -> FloatArray:
+    """Compute the attenuation of each substance, weighted by the open beam's signal [1/mm]:
+    behind a thickness it is less.
+    """
+    beam = beam_of(chain, kV)
+    return np.asarray(beam.mu @ beam.signal / beam.signal.sum())
 
 
 def without_spot(chain: Chain) -> Chain:
@@ -265,6 +319,7 @@ def radiographs(
     exposures: Sequence[ExposureSettings],
     moments: int = 1,
     scatter: Sequence[Scattered] = (),
+    areas: PixelPaths | None = None,
 ) -> list[Radiograph]:
     """Compute the images of several exposures, as if X-rays were on. Distances, flux and
     blur of an exposure are those of its middle view.
@@ -276,6 +331,7 @@ def radiographs(
         exposures: tube and time of each of the n images.
         moments: views spread over each exposure.
         scatter: of each image; none if left out.
+        areas: pixels, of all views, whose signal is the mean of several rays'.
 
     Returns:
         Line integrals and expected electrons of each image, in order.
@@ -285,7 +341,11 @@ def radiographs(
         exposure = replace(given, xrays_on=True)
         part = slice(i * moments, (i + 1) * moments)
         view = views[i * moments + moments // 2]
-        expected = expected_signal(chain, paths_mm[:, part], view, exposure)
+        own = None
+        if areas is not None:
+            size = int(np.prod(paths_mm.shape[2:]))
+            own = areas.of_views(part.start, part.stop, size)
+        expected = expected_signal(chain, paths_mm[:, part], view, exposure, own)
         if scatter:
             expected = scatter[i].added_to(expected, chain, view, exposure)
         images.append(

@@ -8,6 +8,11 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.physics.blur import FWHM
 
+NOISE_SHARE = 0.5
+"""Error of a pixel on an edge as a part of the noise of the exposure: noise and error
+together are 12 % more than the noise alone."""
+LARGEST_ERROR = 0.1
+"""Largest permitted error of a pixel on an edge, however noisy the exposure."""
 MAX_RAYS = 16
 """Largest number of rays along each side of a pixel."""
 
@@ -33,6 +38,23 @@ def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
     out = np.repeat(rows[:, None], points, axis=1)
     out[:, :, :3] += np.einsum("ak,nax->nkx", places, edges)
     return out.reshape(-1, 12)
+
+
+def permitted_error(noise: float, blur_px: float, points: int = 1) -> float:
+    """Compute the error that a pixel on an edge may have, as a part of the open beam's signal
+    (standard deviation): `NOISE_SHARE` of the noise of the exposure.
+
+    An edge's errors are averaged where the focal spot blurs it, over 2 sqrt(pi) standard
+    deviations of the blur, and over the points of the spot that are computed; each divides the
+    error by the root of its number.
+
+    Args:
+        noise: of a pixel of the open beam, relative to its signal.
+        blur_px: standard deviation of the spot's blur [pixels]; 0 where its points are computed.
+        points: of the focal spot.
+    """
+    averaged = max(1.0, 2.0 * np.sqrt(np.pi) * blur_px) * points
+    return float(min(NOISE_SHARE * noise * np.sqrt(averaged), LARGEST_ERROR))
 
 
 def check_rays(rays: int) -> None:

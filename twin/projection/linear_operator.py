@@ -21,20 +21,23 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, LimitError, TwinError
+from flexdt.twin.errors import GeometryError, LimitError, NotBuiltError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import gpu
 from flexdt.twin.projection.device_arrays import DeviceArray
+from flexdt.twin.projection.linear import Model
 from flexdt.twin.projection.operators import (
     Shape2,
     as_cone_vec,
     back,
+    check_sampling,
     forward,
     geometry_change,
     geometry_gradient,
 )
 from flexdt.twin.projection.volume import DeviceVolume, Grid, Volume, as_volume, room_like
+from flexdt.twin.rays_a_pixel import Rays
 from flexdt.twin.signatures import public
 
 if TYPE_CHECKING:
@@ -93,9 +96,15 @@ class Operator:
         geometry: the scan; an array (n, 12) [mm] is taken for one.
         like: the grid, a `Volume` (its values are not used) or a `Grid`.
         detector_shape: (rows, cols): those of the geometry, or else `shape`.
+        model: "exact", voxels of one value each, or "linear", samples of something smooth
+            (docs/operator.md has which one when). Gradients by the geometry are those of
+            "exact" with one ray.
+        rays: along each side of a pixel, of which the line integrals are averaged; "auto", two
+            to the shadow of a voxel. "linear" averages over the pixel by itself.
 
     Raises:
         GeometryError: the geometry does not hold, or the shape of the detector is not known.
+        LimitError: an unknown model, or rays that it does not have.
 
     Examples:
         >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
@@ -110,6 +119,8 @@ class Operator:
     geometry: ConeVec
     like: Volume
     detector_shape: Shape2
+    model: Model
+    rays: Rays
     dtype: ClassVar = np.dtype(np.float32)
 
     def __init__(
@@ -117,11 +128,17 @@ class Operator:
         geometry: ConeVec | npt.ArrayLike,
         like: Volume | Grid,
         shape: Shape2 | None = None,
+        *,
+        model: Model = "exact",
+        rays: Rays = 1,
     ) -> None:
-        """Take the geometry, the volume's grid and the detector's shape (None: the
-        geometry's); see the class. Values of `like` are ignored.
+        """Take the geometry, the volume's grid, the detector's shape (None: the geometry's),
+        the model and the rays a pixel; see the class. Values of `like` are ignored.
         """
         scan = as_cone_vec(geometry)
+        check_sampling(model, rays)
+        object.__setattr__(self, "model", model)
+        object.__setattr__(self, "rays", rays)
         object.__setattr__(self, "geometry", scan)
         object.__setattr__(self, "like", as_volume(like))
         object.__setattr__(self, "detector_shape", scan.of_shape(shape))
@@ -172,14 +189,20 @@ class Operator:
                     list(x.shape),
                     f"the operator's grid, {wanted}",
                 )
-            return forward(x, self.geometry, self.detector_shape)
+            return forward(x, self.geometry, self.detector_shape, **self._sampling)
         if _is_tensor(x):
             return self.torch()(x)
         return on_host(self._forward)(x)
 
     def _forward(self, x: npt.NDArray[Any]) -> Float32Array:
         _check(x.shape, self.voxel_shape, "voxels")
-        return forward(self.like.like(x), self.geometry, self.detector_shape)
+        volume = self.like.like(x)
+        return forward(volume, self.geometry, self.detector_shape, **self._sampling)
+
+    @property
+    def _sampling(self) -> dict[str, Any]:
+        """Model and rays, as arguments of `forward` and `back`."""
+        return {"model": self.model, "rays": self.rays}
 
     def _back(self, y: npt.NDArray[Any]) -> Float32Array:
         """Apply the transpose to images of `image_shape`; returns voxels (nz, ny, nx).
@@ -189,7 +212,7 @@ class Operator:
         """
         _check(y.shape, self.image_shape, "projections")
         room = room_like(self.like)
-        back(y, self.geometry, self.like, room)
+        back(y, self.geometry, self.like, room, **self._sampling)
         return room
 
     @property
@@ -310,6 +333,12 @@ class Operator:
     def _torch(self) -> TorchOperator:
         from flexdt.twin.projection.for_torch import TorchOperator
 
+        if self._sampling != {"model": "exact", "rays": 1}:
+            raise NotBuiltError(
+                f"model {self.model!r} with rays {self.rays} for PyTorch; "
+                "allowed: 'exact' with 1",
+                {"asked": [self.model, str(self.rays)]},
+            )
         return TorchOperator(self.geometry, self.like, self.detector_shape)
 
     def odl(self) -> Any:
@@ -384,7 +413,7 @@ class Adjoint:
         """
         if not _is_tensor(y) and gpu.is_there(y):
             _check(tuple(y.shape), self.T.image_shape, "projections")
-            return back(y, self.T.geometry, self.T.like)
+            return back(y, self.T.geometry, self.T.like, **self.T._sampling)
         if _is_tensor(y):
             return self.T.torch().T(y)
         return on_host(self.T._back)(y)

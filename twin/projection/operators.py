@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec, check_spread
 from flexdt.twin.geometry.cone_vec import check_shape as check_shape
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
@@ -40,14 +40,22 @@ from flexdt.twin.geometry.virtual_panel import (
     stretched_steps,
     stretches,
 )
-from flexdt.twin.projection import cpu, fan_plan, gpu, single_view
+from flexdt.twin.projection import cpu, fan_plan, gpu, linear, single_view
 from flexdt.twin.projection.cpu import TILE_COLUMNS
 from flexdt.twin.projection.fan_plan import (
     MAX_FAN_COLUMNS,
     MAX_SPREAD_VOXELS,
     MIN_FACING_COSINE,
 )
+from flexdt.twin.projection.finer_pixels import (
+    averaged,
+    batches,
+    divided,
+    finer,
+    voxel_rays_a_side,
+)
 from flexdt.twin.projection.kernels.fan_types import Box
+from flexdt.twin.projection.linear import Model, check_model
 from flexdt.twin.projection.portions import equal_portions
 from flexdt.twin.projection.volume import (
     DeviceVolume,
@@ -59,6 +67,7 @@ from flexdt.twin.projection.volume import (
     bring_over,
     room_like,
 )
+from flexdt.twin.rays_a_pixel import Rays, check_rays
 from flexdt.twin.signatures import public
 
 Order = tuple[int, int, int]
@@ -194,9 +203,15 @@ def forward(
     cone_vec: ConeVec | npt.ArrayLike,
     shape: Shape2 | None = None,
     out: Float32Array | None = None,
+    *,
+    model: Model = "exact",
+    rays: Rays = 1,
 ) -> Float32Array:
-    """Compute line integrals of a volume: path length times value over voxels (Siddon
-    1985).
+    """Compute line integrals of a volume.
+
+    Exact: path length times value over voxels (Siddon 1985), along one ray a pixel or as the
+    mean of several. Linear: of values between voxel centres, averaged over the pixel
+    (docs/operator.md has which one when).
 
     Args:
         volume: attenuation [1/mm], as Volume(data, voxel_mm). Of a `DeviceVolume`, the
@@ -204,13 +219,19 @@ def forward(
         cone_vec: ConeVec or (n, 12) [mm], object frame; any orientation of the detector.
         shape: detector (rows, cols); default: the geometry's own.
         out: float32 (n, rows, cols), C order, filled and returned if given.
+        model: "exact", voxels of one value each; "linear", samples of something smooth. On
+            the processor.
+        rays: along each side of a pixel, 1 to 16, or "auto", two to the shadow of a voxel
+            (at least two a pixel); the model "linear" averages over the pixel by itself.
 
     Returns:
         float32 (n, rows, cols), dimensionless; numpy's, or on the device numba's array.
 
     Raises:
         GeometryError: volume, cone_vec, shape or out do not fit, a row gives its pixels
-            no rays of their own, or `out` is given for a `DeviceVolume`.
+            no rays of their own, or `out`, a model or rays are given for a
+            `DeviceVolume`.
+        LimitError: an unknown model, or another number of rays.
         DeviceError: the device failed at a `DeviceVolume`; for other volumes the
             processor computes instead.
 
@@ -222,6 +243,8 @@ def forward(
         >>> round(float(forward(volume, view, (1, 1))[0, 0, 0]), 4)
         0.04
     """
+    if model != "exact" or rays != 1:
+        return _of_areas(volume, cone_vec, shape, out, model, rays)
     image = _single_view(volume, cone_vec, shape, out)
     if image is not None:
         return image
@@ -253,6 +276,111 @@ def forward(
             views = voxel_rays(in_order(geometry[some], order), layout, shape)
             cpu.project(box_of(layout), views, result[some], fans=fans)
     return result
+
+
+def check_sampling(model: Model, rays: Rays) -> None:
+    """Check a model and its rays along each side of a pixel.
+
+    Raises:
+        LimitError: an unknown model, or rays that it does not have.
+    """
+    check_model(model)
+    check_rays(rays)
+    if model == "linear" and rays not in (1, "auto"):
+        message = f"rays is {rays} with model 'linear'"
+        raise LimitError.instead(
+            message, rays, "1 or 'auto': it averages over the whole pixel"
+        )
+
+
+def _sampling(
+    volume: Volume | DeviceVolume, geometry: ConeVec, model: Model, rays: Rays
+) -> int:
+    """Check model and rays, and return the rays along each side, 1 for the model "linear".
+
+    Raises:
+        LimitError: as of `check_sampling`.
+        GeometryError: a volume on a device.
+    """
+    check_sampling(model, rays)
+    if isinstance(volume, DeviceVolume):
+        message = f"model {model!r} with rays {rays} of a volume on a device"
+        raise GeometryError.instead(
+            message,
+            [model, str(rays)],
+            "'exact' with 1 there; volume.to('cpu') for others",
+        )
+    return voxel_rays_a_side(volume, geometry, rays) if model == "exact" else 1
+
+
+def _of_areas(
+    volume: Volume | DeviceVolume,
+    cone_vec: ConeVec | npt.ArrayLike,
+    shape: Shape2 | None,
+    out: Float32Array | None,
+    model: Model,
+    rays: Rays,
+) -> Float32Array:
+    """Compute means over pixels, as `forward` with a model or with several rays."""
+    geometry = as_cone_vec(cone_vec)
+    shape = geometry.of_shape(shape)
+    side = _sampling(volume, geometry, model, rays)
+    assert isinstance(volume, Volume | Grid)
+    result = check_out(out, (len(geometry), *shape))
+    volume = as_volume(volume)
+    if model == "exact":
+        if side == 1:
+            return forward(volume, geometry, shape, result)
+        room: Float32Array | None = None
+        for some in batches(len(geometry), shape, side):
+            fine = finer(geometry[some], shape, side)
+            if room is None or len(room) != len(fine):
+                room = np.empty((len(fine), shape[0] * side, shape[1] * side), np.float32)
+            result[some] = averaged(forward(volume, fine, out=room), side)
+        return result
+    geometry = run_through(geometry, corners_of(volume))
+    for some, order in _by_steepness(volume, geometry, shape):
+        layout = volume.in_order(order).layout
+        if layout.empty:
+            result[some] = 0.0
+        else:
+            views = voxel_rays(in_order(geometry[some], order), layout, shape)
+            linear.project(box_of(layout), views, result[some])
+    return result
+
+
+def _by_steepness(
+    volume: Volume, geometry: ConeVec, shape: Shape2
+) -> Iterator[tuple[slice, Order]]:
+    """Yield ranges of neighbouring views with the order of axes in which the model "linear"
+    projects them."""
+    rays = geometry.rays(shape) / np.tile(volume.voxel_xyz, 4)
+    axes = linear.level_axes(rays, shape)
+    edges = [0, *(np.flatnonzero(np.diff(axes)) + 1).tolist(), len(axes)]
+    for begin, end in pairwise(edges if len(axes) else []):
+        yield slice(begin, end), ORDERS[axes[begin]]
+
+
+def _back_of_areas(
+    values: Float32Array, geometry: ConeVec, like: Volume, model: Model, rays: Rays
+) -> Volume:
+    """Apply the transpose of `_of_areas` to images (n, rows, cols)."""
+    side = _sampling(like, geometry, model, rays)
+    shape = (values.shape[1], values.shape[2])
+    total = room_like(like)
+    if model == "exact":
+        for some in batches(len(geometry), shape, side):
+            fine = finer(geometry[some], shape, side)
+            total += back(divided(values[some], side), fine, like).data
+        return replace(like, data=total)
+    for some, order in _by_steepness(like, geometry, shape):
+        turned = like.in_order(order)
+        layout = blank_layout(turned)
+        views = voxel_rays(in_order(geometry[some], order), layout, shape)
+        linear.spread(box_of(layout), views, values[some])
+        data = layout_data(layout)
+        total += data.transpose([2 - order.index(axis) for axis in (2, 1, 0)])
+    return replace(like, data=total)
 
 
 def _single_view(
@@ -329,8 +457,11 @@ def back(
     out: Float32Array | None = None,
     *,
     deterministic: bool = False,
+    model: Model = "exact",
+    rays: Rays = 1,
 ) -> Volume:
-    """Apply the exact adjoint of `forward`: <forward(x), y> = <x, back(y)>.
+    """Apply the exact adjoint of `forward`: <forward(x), y> = <x, back(y)>, of the same model
+    and rays.
 
     The result's data is a (nz, ny, nx) view with z contiguous in memory, which `forward`
     reads without another copy; use np.ascontiguousarray where C order matters.
@@ -345,6 +476,7 @@ def back(
         deterministic: on a CUDA device, where rays add to voxels as they come, sums whose
             bytes are equal at every run, for three times the memory; the processor's
             always are.
+        model, rays: as of `forward`.
 
     Returns:
         Volume (of images on a device: `DeviceVolume`) on the grid of `like`; values in
@@ -370,6 +502,18 @@ def back(
     shape = geometry.of_shape((values.shape[1], values.shape[2]))
     like = as_volume(like)
     geometry = run_through(geometry, corners_of(like))
+    if model != "exact" or rays != 1:
+        if gpu.is_there(values):
+            raise GeometryError.instead(
+                f"model {model!r} with rays {rays} of images on a device",
+                [model, str(rays)],
+                "'exact' with 1 there",
+            )
+        made = _back_of_areas(values, geometry, like, model, rays)
+        if out is None:
+            return made
+        out[...] = made.data
+        return replace(like, data=out)
     if gpu.is_there(values):
         if out is not None:
             raise GeometryError(

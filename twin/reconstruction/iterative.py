@@ -20,6 +20,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.long_work import Advance, Progress
 from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.projection.linear import Model
 from flexdt.twin.projection.linear_operator import dot
 from flexdt.twin.reconstruction.linear_system import (
     ALL,
@@ -52,6 +53,7 @@ def sirt(
     variances: npt.ArrayLike | None = None,
     hardening: Polychromatic | None = None,
     surroundings: Volume | Grid | None = None,
+    model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
@@ -86,6 +88,7 @@ def sirt(
         hardening: spectrum and materials of the object, `Polychromatic.of`; line
             integrals are then those measured, uncorrected.
         surroundings: grid of the whole object, coarser than `like`, which lies in it.
+        model: of the projector: "linear" for something smooth (docs/operator.md).
         watch: called in every iteration.
         progress: a bar after two seconds; False for none, or what takes the fraction
             done.
@@ -110,7 +113,14 @@ def sirt(
         True
     """
     problem = LinearSystem.of(
-        projections, cone_vec, like, iterations, variances, hardening, surroundings
+        projections,
+        cone_vec,
+        like,
+        iterations,
+        variances,
+        hardening,
+        surroundings,
+        model=model,
     )
     with long_work.during("solving by SIRT", progress) as advance:
         return solved(
@@ -134,6 +144,7 @@ def sart(
     variances: npt.ArrayLike | None = None,
     hardening: Polychromatic | None = None,
     surroundings: Volume | Grid | None = None,
+    model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
@@ -164,7 +175,14 @@ def sart(
         True
     """
     problem = LinearSystem.of(
-        projections, cone_vec, like, iterations, variances, hardening, surroundings
+        projections,
+        cone_vec,
+        like,
+        iterations,
+        variances,
+        hardening,
+        surroundings,
+        model=model,
     )
     count = min(subsets, len(problem.geometry))
     if count < 1 or not 0.0 < relaxation < 2.0:
@@ -238,6 +256,7 @@ def cgls(
     iterations: int = 15,
     start: Volume | None = None,
     surroundings: Volume | Grid | None = None,
+    model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
@@ -268,7 +287,7 @@ def cgls(
         True
     """
     problem = LinearSystem.of(
-        projections, cone_vec, like, iterations, surroundings=surroundings
+        projections, cone_vec, like, iterations, surroundings=surroundings, model=model
     )
     with long_work.during("solving by CGLS", progress) as advance:
         return solved(problem, lambda p: _cgls(p, iterations, start, watch, advance))
@@ -319,6 +338,7 @@ def em(
     *,
     iterations: int = 30,
     start: Volume | None = None,
+    model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
 ) -> Volume:
@@ -343,7 +363,7 @@ def em(
         >>> bool(abs(found.data - 0.02).max() < 0.002)
         True
     """
-    problem = LinearSystem.of(projections, cone_vec, like, iterations)
+    problem = LinearSystem.of(projections, cone_vec, like, iterations, model=model)
     with long_work.during("solving by EM", progress) as advance:
         return solved(problem, lambda p: _em(p, iterations, start, watch, advance))
 

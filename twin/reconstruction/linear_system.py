@@ -24,6 +24,7 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.plausibility import Operation, examine, warn_of
 from flexdt.twin.projection import Grid, Volume, as_volume, back, forward, gpu, room_like
 from flexdt.twin.projection.device_arrays import DeviceArray
+from flexdt.twin.projection.linear import Model, check_model
 from flexdt.twin.projection.linear_operator import dot
 from flexdt.twin.projection.operators import (
     as_cone_vec,
@@ -80,6 +81,7 @@ class LinearSystem:
             alike.
         hardening: effect of the spectrum on line integrals through materials; None: no
             effect.
+        model: of the projector.
     """
 
     measured: Float32Array
@@ -87,6 +89,7 @@ class LinearSystem:
     like: Volume
     weights: Float32Array | None = None
     hardening: Polychromatic | None = None
+    model: Model = "exact"
 
     @classmethod
     def of(
@@ -98,6 +101,7 @@ class LinearSystem:
         variances: npt.ArrayLike | None = None,
         hardening: Polychromatic | None = None,
         surroundings: Volume | Grid | None = None,
+        model: Model = "exact",
     ) -> LinearSystem:
         """Check the arguments and make the system from them; warns of doubts about them.
 
@@ -110,6 +114,7 @@ class LinearSystem:
             hardening: expected line integrals of a polychromatic beam.
             surroundings: volume or grid around the region, whose voxels are unknowns,
                 too.
+            model: of the projector.
 
         Returns:
             A `RegionSystem` with surroundings.
@@ -117,9 +122,11 @@ class LinearSystem:
         Raises:
             GeometryError: no views, shapes that do not fit, values that are not finite, a
                 doubt that is a refusal, variances that are not above 0, surroundings
-                within the region, or these or hardening with images on a device.
-            LimitError: no iterations.
+                within the region, these, hardening or the model "linear" with images on a
+                device, or that model with surroundings.
+            LimitError: no iterations, or an unknown model.
         """
+        check_model(model)
         if iterations < 1:
             message = f"iterations is {iterations!r}"
             raise LimitError.instead(message, repr(iterations), "a whole number from 1")
@@ -144,7 +151,7 @@ class LinearSystem:
                 wanted = f"one above 0 for each line integral, {values.shape}"
                 raise GeometryError.instead(message, list(spread.shape), wanted)
             weights = 1.0 / spread
-        system = cls(values, geometry, as_volume(like), weights, hardening)
+        system = cls(values, geometry, as_volume(like), weights, hardening, model)
         box = system.like.boxes[0]
         if on_host:
             given = np.asarray(projections)
@@ -152,9 +159,13 @@ class LinearSystem:
             given = None
         found = examine(Operation.ITERATE, geometry, system.shape, images=given, grid=box)
         warn_of(found, GeometryError)
-        if gpu.is_there(values) and (hardening is not None or surroundings is not None):
-            message = "images on a device, with hardening or surroundings"
+        others = hardening is not None or surroundings is not None or model != "exact"
+        if gpu.is_there(values) and others:
+            message = "images on a device, with hardening, surroundings or a model"
             raise GeometryError.instead(message, "device", "images of the host")
+        if model != "exact" and surroundings is not None:
+            message = f"model {model!r} with surroundings"
+            raise GeometryError.instead(message, model, "'exact' with them")
         if surroundings is None:
             return system
         return RegionSystem.within(system, surroundings)
@@ -182,11 +193,13 @@ class LinearSystem:
 
     def project(self, x: Float32Array, views: Some = ALL) -> Float32Array:
         """Projections of voxels, of some views."""
-        return forward(replace(self.like, data=x), self.geometry[views], self.shape)
+        volume = replace(self.like, data=x)
+        return forward(volume, self.geometry[views], self.shape, model=self.model)
 
     def spread(self, y: Float32Array, views: Some = ALL) -> Float32Array:
         """Apply the adjoint, into memory that the next call overwrites."""
-        return back(y, self.geometry[views], self.like, self.room).data
+        geometry = self.geometry[views]
+        return back(y, geometry, self.like, self.room, model=self.model).data
 
     def misfit(self, x: Any, views: Some) -> tuple[Any, Any]:
         """Compute measured less expected line integrals of some views.
@@ -426,7 +439,7 @@ def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Fo
     processor.
 
     If the device fails with images of the host, the method is run again on the processor.
-    With hardening or surroundings the method always runs on the processor, and only
+    With hardening, surroundings or another model the method always runs on the processor, and only
     projections are made on a device.
 
     Args:
@@ -436,7 +449,8 @@ def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Fo
     Returns:
         The method's result.
     """
-    if problem.hardening is not None or isinstance(problem, RegionSystem):
+    here = problem.hardening is not None or problem.model != "exact"
+    if here or isinstance(problem, RegionSystem):
         return method(problem)
     if gpu.is_there(problem.measured):
         return method(DeviceProblem.of_host(problem))

@@ -119,7 +119,7 @@ export type GeometryState = {
 };
 export type HelloResult = {
   protocol: string; server: string; machine: string; profile: string | null; session: string | null;
-  physics: string | null; instance: string | null
+  physics: string | null; rays: number | "auto" | null; instance: string | null
 };
 export type ImageFlags = {
   time: number | null; saturated: number; starved: number;

@@ -52,6 +52,7 @@ def hello(twin: TwinServer, client: Client, params: p.Hello) -> p.HelloResult:
         profile=twin.profile.name,
         session=client.name,
         physics=twin.radiography.physics,
+        rays=twin.radiography.rays,
         instance=twin.instance,
     )
 

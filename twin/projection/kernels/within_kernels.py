@@ -1,0 +1,742 @@
+"""Several rays in the pixels that need them: which pixels an edge of a solid or of a mesh reaches,
+and paths along the rays in these. Double precision.
+
+A pixel needs one ray where a solid's chord changes smoothly over its area, and more where the
+chord has a kink there: at an outline, or where another face becomes the nearest. Whether it has
+one follows from the range, over the pixel, of the distances at which each surface is met; no
+sample can miss a part between rays. Of a mesh the kinks lie on its edges, which are drawn onto
+the pixels they touch.
+
+How many rays: with k of them a step of height C comes out in k steps, so its error is C / (sqrt(12)
+k) as a standard deviation. The rays of a pixel are `rays_aside`: no two in one row or column.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from flexdt.twin.projection.kernels import analytic_kernels
+from flexdt.twin.projection.kernels.analytic_kernels import edge_form, locate, mapped
+from flexdt.twin.projection.kernels.compiling import inline, kernel, parallel, sources
+
+SOURCES = sources(analytic_kernels)
+MAX_RAYS = 16
+"""Largest number of rays along each side of a pixel."""
+STEP_SPREAD = math.sqrt(12.0)
+"""Height of a step over the standard deviation of where it falls between two of its steps."""
+CURVED_SPREAD = 24.0
+"""Square of a slope across a pixel over the error of its middle, relative, of an exponential."""
+RIM_REACHES = 2.0
+"""Half pixels from the outline of a curved solid within which its chord counts as bent."""
+BLOCK, CELL = 16, 4
+"""Pixels along a side of the squares that are looked at first, and then."""
+PIXELS_A_JOB = 32
+"""Pixels whose rays are one job."""
+
+
+@inline
+def rays_for_step(change, error, counts, least=0.0):
+    """Compute the rays along each side of a pixel within which the line integral bends or
+    jumps by at most `change`.
+
+    Args:
+        change: largest difference of line integrals within the pixel.
+        error: permitted, as a standard deviation; part of the open beam for counts.
+        counts: whether signals are averaged, which differ by less than line integrals.
+        least: no line integral of the pixel is below it.
+    """
+    height = math.exp(-least) * (1.0 - math.exp(-change)) if counts else change
+    return min(math.ceil(math.sqrt(height / (STEP_SPREAD * error))), MAX_RAYS)
+
+
+@inline
+def rays_for_slope(change, error, counts, least=0.0):
+    """Compute the rays along each side of a pixel across which the line integral changes
+    evenly by `change`: its mean is that of the middle, that of signals is not. Arguments as of
+    `rays_for_step`.
+    """
+    if not counts:
+        return 1
+    return math.ceil(
+        min(change * math.sqrt(math.exp(-least) / (CURVED_SPREAD * error)), MAX_RAYS)
+    )
+
+
+@inline
+def rays_aside(k, side):
+    """Compute the place of ray k of side^2 in its pixel, (columns, rows) from the centre."""
+    j = k // side
+    i = k - j * side
+    return (
+        (i + (j + 0.5) / side) / side - 0.5,
+        (j + (side - i - 0.5) / side) / side - 0.5,
+    )
+
+
+@inline
+def slab_ranges(low, high, at, speed, reach):
+    """Compute the ranges, over a pixel, of the distances at which its rays enter and leave
+    a slab: (least entry, largest entry, least exit, largest exit), in lengths of the rays.
+
+    Args:
+        low, high: the slab's limits.
+        at: the source's height above its plane.
+        speed: height of the ray to the pixel's centre, above the source.
+        reach: largest change of `speed` within the pixel.
+    """
+    size = abs(speed)
+    if size > reach:
+        slow = 1.0 / (size - reach)
+        fast = 1.0 / (size + reach)
+        near, far = (low - at, high - at) if speed > 0.0 else (at - high, at - low)
+        a0, a1 = (near * fast, near * slow) if near >= 0.0 else (near * slow, near * fast)
+        b0, b1 = (far * fast, far * slow) if far >= 0.0 else (far * slow, far * fast)
+        return a0, a1, b0, b1
+    least = 1.0 / max(size + reach, 1e-300)
+    if at < low or at > high:  # some rays may meet it, others not
+        gap = low - at if at < low else at - high
+        return gap * least, math.inf, 0.0, math.inf
+    gap = min(at - low, high - at)
+    return -math.inf, -gap * least, gap * least, math.inf
+
+
+@inline
+def quadric_ranges(q, d, u, v):
+    """Compute the ranges, over a pixel, at which its rays enter and leave |q + t d| <= 1, as
+    `slab_ranges`, and whether the outline is near.
+
+    Args:
+        q: (3,) the source, mapped by the quadric's matrix, as are all others.
+        d: (3,) ray to the pixel's centre.
+        u, v: (3,) the pixel's sides.
+    """
+    a = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    size = math.sqrt(a)
+    uu = math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+    vv = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    half = 0.5 * (uu + vv)
+    if size <= 2.0 * half:  # (nearly) along the axis of a cylinder
+        return 0.0, 1.0, 0.0, 1.0, True
+    middle = -(q[0] * d[0] + q[1] * d[1] + q[2] * d[2]) / a
+    x = q[0] + middle * d[0]
+    y = q[1] + middle * d[1]
+    z = q[2] + middle * d[2]
+    away = math.sqrt(x * x + y * y + z * z)
+    reach = abs(middle) * half
+    if away - reach >= 1.0:
+        return 1.0, 1.0, 0.0, 0.0, False
+    du = d[0] * u[0] + d[1] * u[1] + d[2] * u[2]
+    dv = d[0] * v[0] + d[1] * v[1] + d[2] * v[2]
+    xu = x * u[0] + y * u[1] + z * u[2]
+    xv = x * v[0] + y * v[1] + z * v[2]
+    moved = 0.5 * (abs(middle * du + xu) + abs(middle * dv + xv)) / a
+    bent = 0.5 * (abs(du) + abs(dv)) / a
+    inner = max(away - reach, 0.0)
+    outer = away + reach
+    largest = math.sqrt(max(1.0 - inner * inner, 0.0)) / size * (1.0 + bent)
+    least = math.sqrt(max(1.0 - outer * outer, 0.0)) / size * (1.0 - bent)
+    rim = away + RIM_REACHES * reach >= 1.0
+    return (
+        middle - moved - largest,
+        middle + moved - least,
+        middle - moved + least,
+        middle + moved + largest,
+        rim,
+    )
+
+
+@kernel
+def side_needed(
+    quadric, slabs, first, last, g, d, u, v, weight, filled, error, counts, room
+):
+    """Compute the rays along each side that a pixel needs for one convex solid, 0 where none
+    of its rays meets the solid.
+
+    Args:
+        quadric: (13,) of the solid.
+        slabs: of all solids; first, last: the solid's.
+        g: (12,) the view's rays [mm].
+        d: (3,) the pixel's ray.
+        u, v: (3,) the pixel's sides.
+        weight, filled, error, counts: as of `mark_convex`.
+        room: (7, 3), of which five are overwritten.
+    """
+    # The solid is entered at the largest of its surfaces' entries and left at the least of the
+    # exits; chords end at the source and at the panel. Ranges over the pixel.
+    e0, e1, l0, l1 = 0.0, 0.0, 1.0, 1.0
+    qa, qb = -math.inf, math.inf
+    rim = False
+    if quadric[0] != 0.0:
+        m = quadric[1:10]
+        for i in range(3):
+            room[4, i] = g[i] - quadric[10 + i]
+        mapped(m, room[4], room[0])
+        mapped(m, d, room[1])
+        mapped(m, u, room[2])
+        mapped(m, v, room[3])
+        a0, qa, qb, b1, rim = quadric_ranges(room[0], room[1], room[2], room[3])
+        e0, e1 = max(e0, a0), max(e1, qa)
+        l0, l1 = min(l0, qb), min(l1, b1)
+        if l1 <= e0:
+            return 0
+    for j in range(first, last):
+        a0, a1, b0, b1 = ranges_of(slabs[j], g, d, u, v)
+        e0, e1 = max(e0, a0), max(e1, a1)
+        l0, l1 = min(l0, b0), min(l1, b1)
+        if l1 <= e0:
+            return 0
+    length = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    sure = max(l0 - e1, 0.0)
+    change = ((l1 - e0) - sure) * length * weight
+    least = sure * length * weight if filled else 0.0
+    need = rays_for_step(change, error, counts, least)
+    if need <= 1 or rim or l0 <= e1:
+        return need
+    # All rays meet it. Bent where more than one surface may be the first, or the last.
+    entries = exits = 0
+    entries += e0 <= 0.0
+    exits += l1 >= 1.0
+    entries += qa >= e0
+    exits += qb <= l1
+    for j in range(first, last):
+        _, a1, b0, _ = ranges_of(slabs[j], g, d, u, v)
+        entries += a1 >= e0
+        exits += b0 <= l1
+    if entries <= 1 and exits <= 1:
+        return min(need, rays_for_slope(change, error, counts, least))
+    return need
+
+
+@inline
+def ranges_of(b, g, d, u, v):
+    """Compute `slab_ranges` of slab b for the pixel of ray d and sides u, v."""
+    at = b[0] * g[0] + b[1] * g[1] + b[2] * g[2]
+    speed = b[0] * d[0] + b[1] * d[1] + b[2] * d[2]
+    across = b[0] * u[0] + b[1] * u[1] + b[2] * u[2]
+    down = b[0] * v[0] + b[1] * v[1] + b[2] * v[2]
+    return slab_ranges(b[3], b[4], at, speed, 0.5 * (abs(across) + abs(down)))
+
+
+@kernel
+def mark_block(
+    quadric,
+    slabs,
+    first,
+    last,
+    g,
+    top,
+    left,
+    r0,
+    r1,
+    c0,
+    c1,
+    weight,
+    filled,
+    error,
+    counts,
+    marks,
+    room,
+    d,
+):
+    """Raise the marks of a block of BLOCK x BLOCK pixels: of those of its cells in which the
+    chord bends, because a cell without a bend has none in any of its pixels.
+
+    Args:
+        quadric, slabs, first, last, g, weight, filled, error, counts: as of `side_needed`.
+        top, left: the block's first pixel.
+        r0, r1, c0, c1: pixels that count.
+        marks: (rows, cols) changed in place.
+        room: (7, 3) overwritten; d: (3,) overwritten.
+    """
+    u, v = room[5], room[6]
+    if not bends(
+        quadric,
+        slabs,
+        first,
+        last,
+        g,
+        top,
+        left,
+        BLOCK,
+        weight,
+        filled,
+        error,
+        counts,
+        room,
+        d,
+    ):
+        return
+    for i in range(top, min(top + BLOCK, r1), CELL):
+        for j in range(left, min(left + BLOCK, c1), CELL):
+            if not bends(
+                quadric,
+                slabs,
+                first,
+                last,
+                g,
+                i,
+                j,
+                CELL,
+                weight,
+                filled,
+                error,
+                counts,
+                room,
+                d,
+            ):
+                continue
+            for k in range(3):
+                u[k], v[k] = g[6 + k], g[9 + k]
+            for r in range(max(i, r0), min(i + CELL, r1)):
+                for c in range(max(j, c0), min(j + CELL, c1)):
+                    for k in range(3):
+                        d[k] = g[3 + k] + c * u[k] + r * v[k]
+                    need = side_needed(
+                        quadric,
+                        slabs,
+                        first,
+                        last,
+                        g,
+                        d,
+                        u,
+                        v,
+                        weight,
+                        filled,
+                        error,
+                        counts,
+                        room,
+                    )
+                    if need > marks[r, c]:
+                        marks[r, c] = need
+
+
+@inline
+def bends(
+    quadric,
+    slabs,
+    first,
+    last,
+    g,
+    top,
+    left,
+    size,
+    weight,
+    filled,
+    error,
+    counts,
+    room,
+    d,
+):
+    """Return whether a solid's chord bends within a square of size x size pixels, as
+    `side_needed` of one large pixel."""
+    u, v = room[5], room[6]
+    for k in range(3):
+        u[k], v[k] = size * g[6 + k], size * g[9 + k]
+        d[k] = (
+            g[3 + k]
+            + (left + 0.5 * (size - 1)) * g[6 + k]
+            + (top + 0.5 * (size - 1)) * g[9 + k]
+        )
+    return (
+        side_needed(
+            quadric, slabs, first, last, g, d, u, v, weight, filled, error, counts, room
+        )
+        > 1
+    )
+
+
+@inline
+def chord_of(quadric, slabs, first, last, g, dx, dy, dz):
+    """Compute the chord of one ray in a convex solid, in lengths of the ray.
+
+    Args:
+        quadric: (13,) of the solid; slabs, first, last: its slabs.
+        g: (12,) the view's rays [mm].
+        dx, dy, dz: the ray, from the source to its place on the panel.
+    """
+    t0, t1 = 0.0, 1.0
+    if quadric[0] != 0.0:
+        x, y, z = g[0] - quadric[10], g[1] - quadric[11], g[2] - quadric[12]
+        qx = quadric[1] * x + quadric[2] * y + quadric[3] * z
+        qy = quadric[4] * x + quadric[5] * y + quadric[6] * z
+        qz = quadric[7] * x + quadric[8] * y + quadric[9] * z
+        ex = quadric[1] * dx + quadric[2] * dy + quadric[3] * dz
+        ey = quadric[4] * dx + quadric[5] * dy + quadric[6] * dz
+        ez = quadric[7] * dx + quadric[8] * dy + quadric[9] * dz
+        a = ex * ex + ey * ey + ez * ez
+        if a > 1e-300:
+            middle = -(qx * ex + qy * ey + qz * ez) / a
+            x, y, z = qx + middle * ex, qy + middle * ey, qz + middle * ez
+            inside = 1.0 - (x * x + y * y + z * z)
+            if inside <= 0.0:
+                return 0.0
+            half = math.sqrt(inside / a)
+            t0, t1 = max(t0, middle - half), min(t1, middle + half)
+        elif qx * qx + qy * qy + qz * qz > 1.0:
+            return 0.0
+    for j in range(first, last):
+        b = slabs[j]
+        at = b[0] * g[0] + b[1] * g[1] + b[2] * g[2]
+        speed = b[0] * dx + b[1] * dy + b[2] * dz
+        inverse = 1.0 / (speed if speed != 0.0 else 1e-300)
+        near = (b[3] - at) * inverse
+        far = (b[4] - at) * inverse
+        t0 = max(t0, min(near, far))
+        t1 = min(t1, max(near, far))
+    return max(t1 - t0, 0.0)
+
+
+@parallel
+def chords_within(
+    quadric, slabs, slab_range, shadow, rays, weight, pixels, sides, starts, out
+):
+    """Fill `out` with line integrals of convex solids along several rays of some pixels.
+
+    Args:
+        quadric, slabs, slab_range, rays: as of `mark_convex`.
+        shadow: (n, k, 4), a pixel wider.
+        weight: (k,) factors on the chords.
+        pixels: (m, 3) view, row, column.
+        sides: (m,) rays along a side of each.
+        starts: (m,) place of its first ray.
+        out: float32, filled.
+    """
+    for job in prange((len(pixels) + PIXELS_A_JOB - 1) // PIXELS_A_JOB):
+        dx = np.empty(MAX_RAYS * MAX_RAYS)
+        dy = np.empty(MAX_RAYS * MAX_RAYS)
+        dz = np.empty(MAX_RAYS * MAX_RAYS)
+        total = np.empty(MAX_RAYS * MAX_RAYS)
+        for i in range(job * PIXELS_A_JOB, min(len(pixels), (job + 1) * PIXELS_A_JOB)):
+            view, r, c = pixels[i]
+            g = rays[view]
+            count = sides[i] * sides[i]
+            for k in range(count):
+                x, y = rays_aside(k, sides[i])
+                dx[k] = g[3] + (c + x) * g[6] + (r + y) * g[9]
+                dy[k] = g[4] + (c + x) * g[7] + (r + y) * g[10]
+                dz[k] = g[5] + (c + x) * g[8] + (r + y) * g[11]
+                total[k] = 0.0
+            for s in range(shadow.shape[1]):
+                near = shadow[view, s]
+                if not (near[0] <= r < near[1] and near[2] <= c < near[3]):
+                    continue
+                first, last = slab_range[s, 0], slab_range[s, 1]
+                for k in range(count):
+                    total[k] += weight[s] * chord_of(
+                        quadric[s], slabs, first, last, g, dx[k], dy[k], dz[k]
+                    )
+            for k in range(count):
+                length = math.sqrt(dx[k] * dx[k] + dy[k] * dy[k] + dz[k] * dz[k])
+                out[starts[i] + k] = np.float32(total[k] * length)
+
+
+@kernel
+def raise_marks(marks, x, y, need):
+    """Raise the marks of every pixel that a triangle touches to `need`; of two equal corners
+    it is a line.
+
+    Args:
+        marks: (rows, cols) changed in place.
+        x, y: (3,) columns and rows of its corners.
+        need: rays along a side.
+    """
+    rows, cols = marks.shape
+    low = min(y[0], min(y[1], y[2]))
+    high = max(y[0], max(y[1], y[2]))
+    if high < -1.0 or low > rows:
+        return
+    for r in range(max(0, math.floor(low + 0.5)), min(rows, math.floor(high + 0.5) + 1)):
+        left, right = math.inf, -math.inf
+        for i in range(3):
+            j = (i + 1) % 3
+            t0, t1 = 0.0, 1.0
+            rise = y[j] - y[i]
+            # The part of this side within the row.
+            if rise != 0.0:
+                a = (r - 0.5 - y[i]) / rise
+                b = (r + 0.5 - y[i]) / rise
+                t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
+            elif abs(y[i] - r) > 0.5:
+                continue
+            if t0 > t1:
+                continue
+            p, q = x[i] + t0 * (x[j] - x[i]), x[i] + t1 * (x[j] - x[i])
+            left = min(left, min(p, q))
+            right = max(right, max(p, q))
+        if right < -1.0 or left > cols:
+            continue
+        for c in range(
+            max(0, math.floor(left + 0.5)), min(cols, math.floor(right + 0.5) + 1)
+        ):
+            marks[r, c] = max(marks[r, c], need)
+
+
+@kernel
+def slopes_of(p, face, g, out):
+    """Compute the plane of a face as a form of the pixel, (3,): a ray meets it at a distance
+    in proportion to 1 / form.
+
+    Args:
+        p: (k, 3) vertices seen from the source.
+        face: (3,) numbers of vertices.
+        g: (12,) the view's rays.
+        out: (3,) filled.
+    """
+    i, j, k = face[0], face[1], face[2]
+    ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+    bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    for q in range(3):
+        at = 3 + 3 * q
+        out[q] = g[at] * nx + g[at + 1] * ny + g[at + 2] * nz
+
+
+@inline
+def slope_at(plane, c, r):
+    """Compute the change of a face's distance by a column and by a row, relative to the
+    distance; huge where the face is seen edge on.
+    """
+    form = plane[0] + c * plane[1] + r * plane[2]
+    if abs(form) < 1e-12 * (abs(plane[0]) + abs(plane[1]) + abs(plane[2])):
+        return 1e12, 1e12
+    return -plane[1] / form, -plane[2] / form
+
+
+def _entry_points(key: int):  # type: ignore[no-untyped-def]
+    """Make the entry points that inline kernels of other files; `key` is a hash of their text,
+    so that they are compiled anew with it.
+    """
+
+    @parallel
+    def mark_convex(
+        quadric, slabs, slab_range, shadow, rays, weight, filled, error, counts, marks
+    ):
+        """Raise `marks` to the rays along a side that each pixel needs for convex solids.
+
+        Args:
+            quadric, slabs, slab_range: as of `analytic_kernels.project_convex`.
+            shadow: (n, k, 4) rows and columns that a solid can reach, a pixel wider.
+            rays: (n, 12) [mm]: source, first pixel minus source, u, v.
+            weight: (k,) attenuation along the chords [1/mm], not negative.
+            filled: whether no solid takes away from another.
+            error, counts: as of `rays_for_step`.
+            marks: uint8 (n, rows, cols), changed in place.
+        """
+        _ = key
+        rows = marks.shape[1]
+        bands = (rows + BLOCK - 1) // BLOCK
+        for job in prange(len(rays) * bands):
+            view = job // bands
+            row0 = (job - view * bands) * BLOCK
+            row1 = min(rows, row0 + BLOCK)
+            g = rays[view]
+            d = np.empty(3)
+            room = np.empty((7, 3))
+            for s in range(shadow.shape[1]):
+                c0, c1 = shadow[view, s, 2], shadow[view, s, 3]
+                r0, r1 = max(row0, shadow[view, s, 0]), min(row1, shadow[view, s, 1])
+                if c1 <= c0 or r1 <= r0 or weight[s] == 0.0:
+                    continue
+                first, last = slab_range[s, 0], slab_range[s, 1]
+                for left in range(c0 // BLOCK * BLOCK, c1, BLOCK):
+                    mark_block(
+                        quadric[s],
+                        slabs,
+                        first,
+                        last,
+                        g,
+                        row0,
+                        left,
+                        r0,
+                        r1,
+                        c0,
+                        c1,
+                        weight[s],
+                        filled,
+                        error,
+                        counts,
+                        marks[view],
+                        room,
+                        d,
+                    )
+
+    @parallel
+    def mark_mesh(
+        vertices, faces, edges, rays, inverses, weight, largest, error, counts, marks
+    ):
+        """Raise `marks` to the rays along a side that each pixel needs for a closed mesh: along
+        edges where the path bends, and on faces that are seen steeply.
+
+        Args:
+            vertices: (k, 3) [mm].
+            faces: (m, 3) numbers of vertices.
+            edges: (e, 4) two vertices, and the two faces that share them.
+            rays, inverses: as of `analytic_kernels.project_triangles`.
+            weight: attenuation [1/mm].
+            largest: no path is longer [mm].
+            error, counts: as of `rays_for_step`.
+            marks: uint8 (n, rows, cols), changed in place.
+        """
+        _ = key
+        for view in prange(len(rays)):
+            g = rays[view]
+            p = np.empty((len(vertices), 3))
+            pixels = np.empty((len(vertices), 3))
+            planes = np.empty((len(faces), 3))
+            x = np.empty(3)
+            y = np.empty(3)
+            locate(vertices, g, inverses[view], p, pixels)
+            if pixels[:, 2].min() == 0.0:
+                # The mesh reaches behind the source: every pixel may have an edge.
+                need = max(rays_for_step(largest * weight, error, counts), 1)
+                for r in range(marks.shape[1]):
+                    for c in range(marks.shape[2]):
+                        marks[view, r, c] = max(marks[view, r, c], need)
+                continue
+            for f in range(len(faces)):
+                slopes_of(p, faces[f], g, planes[f])
+            for e in range(len(edges)):
+                i, j = edges[e, 0], edges[e, 1]
+                c = 0.5 * (pixels[i, 0] + pixels[j, 0])
+                r = 0.5 * (pixels[i, 1] + pixels[j, 1])
+                ax, ay = slope_at(planes[edges[e, 2]], c, r)
+                bx, by = slope_at(planes[edges[e, 3]], c, r)
+                away = 0.5 * (
+                    math.sqrt(p[i, 0] ** 2 + p[i, 1] ** 2 + p[i, 2] ** 2)
+                    + math.sqrt(p[j, 0] ** 2 + p[j, 1] ** 2 + p[j, 2] ** 2)
+                )
+                bend = 0.5 * away * math.sqrt((ax - bx) ** 2 + (ay - by) ** 2)
+                need = rays_for_step(min(bend, largest) * weight, error, counts)
+                if need > 1:
+                    x[0], x[1], x[2] = pixels[i, 0], pixels[j, 0], pixels[j, 0]
+                    y[0], y[1], y[2] = pixels[i, 1], pixels[j, 1], pixels[j, 1]
+                    raise_marks(marks[view], x, y, need)
+            if not counts:
+                continue
+            for f in range(len(faces)):
+                c = r = away = 0.0
+                for k in range(3):
+                    i = faces[f, k]
+                    x[k], y[k] = pixels[i, 0], pixels[i, 1]
+                    c += pixels[i, 0] / 3.0
+                    r += pixels[i, 1] / 3.0
+                    away += math.sqrt(p[i, 0] ** 2 + p[i, 1] ** 2 + p[i, 2] ** 2) / 3.0
+                ax, ay = slope_at(planes[f], c, r)
+                steep = min(away * math.sqrt(ax * ax + ay * ay), largest) * weight
+                need = min(
+                    rays_for_slope(steep, error, counts),
+                    rays_for_step(steep, error, counts),
+                )
+                if need > 1:
+                    raise_marks(marks[view], x, y, need)
+
+    @parallel
+    def triangles_within(vertices, faces, rays, inverses, sides, starts, out, band):
+        """Add up path lengths through a closed mesh along several rays of some pixels.
+
+        Args:
+            vertices, faces, rays, inverses: as of `analytic_kernels.project_triangles`.
+            sides: uint8 (n, rows, cols) rays along a side, 0 in pixels that are left out.
+            starts: int64 (n, rows, cols) place of a pixel's first ray.
+            out: float64, changed in place: lengths of the rays, then mm.
+            band: rows of a job.
+        """
+        _ = key
+        _, rows, cols = sides.shape
+        bands = (rows + band - 1) // band
+        for job in prange(len(rays) * bands):
+            view = job // bands
+            row0 = (job - view * bands) * band
+            row1 = min(rows, row0 + band)
+            if sides[view, row0:row1].max() == 0:
+                continue
+            g = rays[view]
+            p = np.empty((len(vertices), 3))
+            pixels = np.empty((len(vertices), 3))
+            forms = np.empty((3, 3))
+            plane = np.empty(3)
+            locate(vertices, g, inverses[view], p, pixels)
+            for f in range(len(faces)):
+                i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+                front = pixels[i, 2] + pixels[j, 2] + pixels[k, 2]
+                if front == 0.0:
+                    continue
+                first, last, c0, c1 = row0, row1, 0, cols
+                if front == 3.0:
+                    low = min(pixels[i, 1], min(pixels[j, 1], pixels[k, 1]))
+                    high = max(pixels[i, 1], max(pixels[j, 1], pixels[k, 1]))
+                    left = min(pixels[i, 0], min(pixels[j, 0], pixels[k, 0]))
+                    right = max(pixels[i, 0], max(pixels[j, 0], pixels[k, 0]))
+                    if high < row0 - 1 or low > row1 or right < -1 or left > cols:
+                        continue
+                    first = max(row0, math.floor(low + 0.5 - 1e-6))
+                    last = min(row1, math.floor(high + 0.5 + 1e-6) + 1)
+                    c0 = max(0, math.floor(left + 0.5 - 1e-6))
+                    c1 = min(cols, math.floor(right + 0.5 + 1e-6) + 1)
+                if last <= first or c1 <= c0:
+                    continue
+                edge_form(p, i, j, g, forms[0])
+                edge_form(p, j, k, g, forms[1])
+                edge_form(p, k, i, g, forms[2])
+                slopes_of(p, faces[f], g, plane)
+                ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+                bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
+                reach = (
+                    p[i, 0] * (ay * bz - az * by)
+                    + p[i, 1] * (az * bx - ax * bz)
+                    + p[i, 2] * (ax * by - ay * bx)
+                )
+                for r in range(first, last):
+                    for c in range(c0, c1):
+                        side = np.int64(sides[view, r, c])
+                        if side == 0:
+                            continue
+                        known = 0
+                        for q in range(3):
+                            value = forms[q, 0] + forms[q, 1] * c + forms[q, 2] * r
+                            room = 0.5 * (abs(forms[q, 1]) + abs(forms[q, 2]))
+                            flip = (i > j) if q == 0 else ((j > k) if q == 1 else (k > i))
+                            if abs(value) > room:
+                                known |= 1 if (value > 0.0) != flip else 2
+                        if known == 3:  # left of one edge and right of another: outside
+                            continue
+                        at = starts[view, r, c]
+                        for s in range(side * side):
+                            x, y = rays_aside(s, side)
+                            x += c
+                            y += r
+                            # As `analytic_kernels.draw_row`: the sides of an edge are computed from
+                            # the edge alone, the same way for both its faces.
+                            a = (
+                                forms[0, 0] + forms[0, 1] * x + forms[0, 2] * y >= 0.0
+                            ) != (i > j)
+                            b = (
+                                forms[1, 0] + forms[1, 1] * x + forms[1, 2] * y >= 0.0
+                            ) != (j > k)
+                            e = (
+                                forms[2, 0] + forms[2, 1] * x + forms[2, 2] * y >= 0.0
+                            ) != (k > i)
+                            if a == b and b == e:
+                                speed = plane[0] + plane[1] * x + plane[2] * y
+                                t = reach / speed if speed != 0.0 else 0.0
+                                t = min(max(t, 0.0), 1.0)
+                                out[at + s] += t if a else -t
+            for r in range(row0, row1):
+                for c in range(cols):
+                    side = np.int64(sides[view, r, c])
+                    for s in range(side * side):
+                        x, y = rays_aside(s, side)
+                        dx = g[3] + (c + x) * g[6] + (r + y) * g[9]
+                        dy = g[4] + (c + x) * g[7] + (r + y) * g[10]
+                        dz = g[5] + (c + x) * g[8] + (r + y) * g[11]
+                        out[starts[view, r, c] + s] *= math.sqrt(
+                            dx * dx + dy * dy + dz * dz
+                        )
+
+    return mark_convex, mark_mesh, triangles_within
+
+
+mark_convex, mark_mesh, triangles_within = _entry_points(SOURCES)
