@@ -159,7 +159,7 @@ def drawn_objects(seed: int) -> list[Drawn]:
         a, b, c = size * rng.uniform(0.6, 1.0, 3)
         return Drawn(kind, (a, a if kind != "box" else b, c), turned(), center, mu)
 
-    soft = body(kinds[seed % 4], rng.uniform(8, 12), rng.uniform(-1, 1, 3), 0.02)
+    soft = body(kinds[seed % 4], rng.uniform(5, 7.5), rng.uniform(-1, 1, 3), 0.02)
     bodies = [soft]
     for _ in range(rng.integers(1, 4)):
         kind = kinds[rng.integers(4)]
