@@ -42,7 +42,7 @@ if _typing.TYPE_CHECKING:
     from flexdt.twin.reconstruction.checked_fdk import fdk as fdk
     from flexdt.twin.reconstruction.iterative import cgls as cgls
     from flexdt.twin.reconstruction.iterative import sirt as sirt
-    from flexdt.twin.reconstruction.tv import tv as tv
+    from flexdt.twin.reconstruction.total_variation import tv as tv
 
     open = load_dataset
     __version__: str
@@ -114,7 +114,7 @@ _HOMES: _typing.Final = {
     "reconstruct": "flexdt.library.analysis",
     "simulate": "flexdt.library.simulate",
     "sirt": "flexdt.twin.reconstruction.iterative",
-    "tv": "flexdt.twin.reconstruction.tv",
+    "tv": "flexdt.twin.reconstruction.total_variation",
 }
 """Name -> module, or MODULE:ATTRIBUTE where the names differ; a module itself ends with a
 colon."""

@@ -78,7 +78,7 @@ ALGORITHMS: Final[dict[str, Algorithm]] = {
         Algorithm("em", _ITERATIVE, "em"),
         Algorithm(
             "tv",
-            "flexdt.twin.reconstruction.tv",
+            "flexdt.twin.reconstruction.total_variation",
             "tv",
             options=frozenset({"iterations", "weight"}),
             stacks=6,

@@ -7,7 +7,7 @@ import pytest
 
 from flexdt.twin.attenuation.scattering import cross_sections
 from flexdt.twin.attenuation.substances import Substance, tables
-from flexdt.twin.physics.scintillator import K_SHELL, deposited
+from flexdt.twin.physics.scintillator import K_SHELL, deposited, through
 from flexdt.twin.physics.tube import Filter
 
 CSI = Substance.of("CsI", "CsI", 4.51)
@@ -86,3 +86,10 @@ def test_a_thick_screen_keeps_all_but_what_escapes_through_its_front() -> None:
     assert part.max() < 1.0 + 1e-12
     assert part[tables().energy_keV < 50].min() > 0.96
     assert deposited(Filter(GOS, 0.0)).mean.max() == 0.0
+
+
+def test_what_gets_through_a_slab_is_the_exponential_integral() -> None:
+    special = pytest.importorskip("scipy.special")
+    random = np.random.default_rng(2)
+    paths = np.concatenate([[0.0, 1e-9], 10 ** random.uniform(-8, 3, 500)])
+    np.testing.assert_allclose(through(paths), special.expn(2, paths), atol=2e-6)

@@ -377,7 +377,9 @@ PlainName = Annotated[str, AfterValidator(_plain)]
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+    model_config = ConfigDict(
+        frozen=True, extra="ignore", allow_inf_nan=False, defer_build=True
+    )
 
 
 class FrameEntry(_Model):

@@ -37,14 +37,14 @@ def kernel(sigma_px: float) -> Float32Array:
     """Compute the weights of a Gaussian blur by `sigma_px` > 0, float32 (2 r + 1,),
     adding up to 1: samples of the Gaussian, below `MIN_SAMPLED_SIGMA_PX` the discrete
     Gaussian (Bessel functions). r is 4 sigma + 1, rounded up."""
-    from scipy.special import ive
-
     t = sigma_px * sigma_px
     reach = max(1, int(np.ceil(4.0 * sigma_px + 1.0)))
     n = np.arange(-reach, reach + 1)
     if sigma_px >= MIN_SAMPLED_SIGMA_PX:
         weights = np.exp(n * n / (-2.0 * t))
     else:
+        from scipy.special import ive  # half of what this module would cost
+
         weights = ive(np.abs(n), t)
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 

@@ -22,6 +22,7 @@ from flexdt.twin.long_work import Advance, Progress
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.linear import Model
 from flexdt.twin.projection.linear_operator import dot
+from flexdt.twin.reconstruction.beam_hardening import Polychromatic
 from flexdt.twin.reconstruction.linear_system import (
     ALL,
     LinearSystem,
@@ -32,7 +33,6 @@ from flexdt.twin.reconstruction.linear_system import (
     ratio,
     solved,
 )
-from flexdt.twin.reconstruction.scatter_correction import Polychromatic
 from flexdt.twin.signatures import public
 
 

@@ -33,7 +33,7 @@ from flexdt.twin.projection.operators import (
     require_line_integrals,
 )
 from flexdt.twin.projection.volume import DeviceVolume
-from flexdt.twin.reconstruction.scatter_correction import Polychromatic
+from flexdt.twin.reconstruction.beam_hardening import Polychromatic
 
 MIN_WEIGHT_SHARE = 1e-6
 """Least sum of weights that is divided by, as a share of the largest."""

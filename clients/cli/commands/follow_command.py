@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -60,6 +59,8 @@ def follow(
         they come, without --json; counts of alarms and unread messages at the end go to
         standard error. Exactly one of address and --replay, else a usage error.
     """
+    import asyncio
+
     from flexdt.clients.following.frames_beside import FramesBeside
     from flexdt.clients.following.recording import STAMP
     from flexdt.clients.following.session import FollowSession
@@ -171,6 +172,8 @@ async def _run(
     After the time all tasks are cancelled, without an error. Errors of the status line
     and of images are dropped.
     """
+    import asyncio
+
     work = asyncio.create_task(session.run(address))
     more = [asyncio.create_task(_status(session))]
     if beside is not None:
@@ -189,6 +192,8 @@ async def _status(session: FollowSession) -> None:
 
     It goes to standard error.
     """
+    import asyncio
+
     while True:
         await asyncio.sleep(STATUS_S)
         mirror = session.mirror

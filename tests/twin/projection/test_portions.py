@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Volume, back, forward, portions
 from flexdt.twin.projection.operators import geometry_change, geometry_gradient
-from flexdt.twin.reconstruction.tv import tv
+from flexdt.twin.reconstruction.total_variation import tv
 
 SHAPE = (7, 40)
 END_ON = ConeVec.from_vectors((0, 0, -40), (0, 0, 30), (0.9, 0, 0), (0, 0.9, 0))
