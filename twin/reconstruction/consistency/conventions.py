@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Final
 
@@ -160,8 +161,8 @@ def _plain(cone_vec: ConeVec, mirror: FloatArray) -> FloatArray:
 def fits(image: Image, cone_vec: ConeVec, shape: tuple[int, int]) -> list[Fit]:
     """Compare the images of a scan with every combination, the best first.
 
-    A finer copy is compared where the first leaves more than one open. What fitted best on
-    the first stays open on the finer one: two looks that differ decide nothing.
+    Two copies are compared, a coarse and a finer one, whose errors differ: a combination
+    has the larger of its odds on the two, so that what differs excludes nothing.
 
     Args:
         image: gives the line integrals of a view, (rows, cols), by its number.
@@ -175,23 +176,17 @@ def fits(image: Image, cone_vec: ConeVec, shape: tuple[int, int]) -> list[Fit]:
     Raises:
         GeometryError: neither a circle nor a helix.
     """
+    odds: dict[frozenset[str], float] = {}
     found: list[Fit] = []
-    first: Fit | None = None
     for nodes in (NODES, FINE_NODES):
-        scan = CoarseScan.of(image, cone_vec, shape, None, nodes).thinned(all_views=True)
+        scan = CoarseScan.of(image, cone_vec, shape, None, nodes).thinned()
         if too_few(scan) or not np.abs(scan.images).max() > 0.0:
             return []
         found = _compared(scan)
-        if first is not None:
-            own = first.combinations[0]
-            found = [
-                replace(fit, odds=1.0) if own in fit.combinations else fit
-                for fit in found
-            ]
-        if sum(fit.odds >= level_of(found) for fit in found) <= 1:
-            break
-        first = found[0]
-    return found
+        for fit in found:
+            for changes in fit.combinations:
+                odds[changes] = max(odds.get(changes, 0.0), fit.odds)
+    return [replace(fit, odds=max(odds[c] for c in fit.combinations)) for fit in found]
 
 
 def _compared(scan: CoarseScan) -> list[Fit]:
@@ -207,35 +202,64 @@ def _compared(scan: CoarseScan) -> list[Fit]:
         if seen is None:
             unusable.append(Fit(tuple(members), None, odds=0.0))
         else:
-            shown.append(_Shown(tuple(members), views, seen))
+            shown.append(_Shown(scan, tuple(members), views, seen))
     shown.sort(key=lambda one: float(np.log(one.shown.arcs).mean()))
     if not shown:
         return unusable
     best = shown[0]
-    whole = _whole(scan, best.cone_vec)
-    again = None if whole is None else _shown(scan, whole, best.cone_vec)
+    again = None if best.whole is None else _shown(scan, best.whole, best.cone_vec)
     expected = np.full(2, np.inf) if again is None else again.misfit()
     telling = expected < MAX_RELIABLE_RESIDUAL
     if not telling.any():
         return [*(Fit(one.combinations, None) for one in shown), *unusable]
+    rest_of_best = scan.images - best.shown.again
+    own = best.right(rest_of_best)
+    seen_right = None if own is None else _shown(scan, own, best.cone_vec)
     made = []
     for one in shown:
         misfit = one.shown.misfit(MIN_SIGNAL_SHARE) / expected
         size = float(misfit[1 if telling[1] else 0])
         odds = 1.0
         if one is not best:
-            odds = _odds(scan, best, one, telling, fits=size <= MAX_MISFIT)
+            said = _ratio(best.shown, one.shown, telling)
+            usual: FloatArray | None = np.zeros_like(said)
+            if size <= MAX_MISFIT:
+                usual = _expected(best, one, seen_right, rest_of_best, telling)
+            odds = 1.0 if usual is None else _chance(said - usual)
         made.append(Fit(one.combinations, one.shown.arcs[telling], size, odds))
     return [*made, *unusable]
 
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A class of combinations with its geometry, and the images as of it."""
+    """A class of combinations with its geometry, and the images as of it.
 
+    Attributes:
+        scan: the coarse copy.
+        combinations: of `CHANGES`.
+        cone_vec: of the copy, so changed.
+        shown: the images, and what the others predict of them.
+    """
+
+    scan: CoarseScan
     combinations: tuple[frozenset[str], ...]
     cone_vec: ConeVec
     shown: Reprojection
+
+    @cached_property
+    def whole(self) -> Float32Array | None:
+        """Projections of the volume of all images; None where FDK cannot use them."""
+        made = Reprojection.of(self.scan, self.scan.images, self.cone_vec, None)
+        return None if made is None else made.again
+
+    def right(self, rest: Float32Array) -> Float32Array | None:
+        """Return images of which this class is right, with the residual (n, rows, cols) of
+        other views as their noise; None where FDK cannot use them.
+        """
+        if self.whole is None:
+            return None
+        elsewhere = np.roll(rest, len(rest) // 2, axis=0)
+        return np.asarray(self.whole + elsewhere, np.float32)
 
 
 def _shown(
@@ -265,71 +289,48 @@ def _shown(
     return Reprojection(images, values, again, noise)
 
 
-def _odds(
-    scan: CoarseScan,
-    best: _Shown,
-    rival: _Shown,
-    telling: npt.NDArray[np.bool_],
-    *,
-    fits: bool,
-) -> float:
-    """Compute the probability that a rival which is right seems to fit so much worse.
-
-    What the comparison says where either is right is found by it: the projections of each
-    volume, with the residual of other views as their noise, are compared in the same way.
-    The images speak for the best as far as they are nearer to what it says of the best.
-    Student's distribution of the arcs' mean gives the probability.
-
-    Args:
-        scan: coarse.
-        best, rival: with their reprojections.
-        telling: measures that count, (2,).
-        fits: the rival's misfit is that of a right scan; if not, what the comparison says
-            by itself is not asked for.
-    """
+def _chance(each: FloatArray) -> float:
+    """Return the probability of so large a mean, where it is 0: Student's distribution."""
     from scipy.stats import t
 
-    said = _ratio(best.shown, rival.shown, telling)
-    usual = _expected(scan, best, rival, telling) if fits else np.zeros_like(said)
-    if usual is None:
-        return 1.0
-    each = said - usual
     spread = max(float(each.std(ddof=1)), float(np.finfo(np.float32).tiny))
     sigmas = float(each.mean()) * np.sqrt(len(each)) / spread
     return float(t.sf(sigmas, len(each) - 1))
 
 
 def _expected(
-    scan: CoarseScan, best: _Shown, rival: _Shown, telling: npt.NDArray[np.bool_]
+    best: _Shown,
+    rival: _Shown,
+    seen: Reprojection | None,
+    rest: Float32Array,
+    telling: npt.NDArray[np.bool_],
 ) -> FloatArray | None:
     """Compute, in each arc, the middle of what the comparison says where the best is right
-    and where the rival is; None where it says no more for the one than for the other.
+    and where the rival is: the images speak for the best as far as they are beyond it.
 
-    Arguments as for `_odds`.
+    Args:
+        best, rival: with their reprojections.
+        seen: images of which the best is right, as of its geometry; None without any.
+        rest: residual of the best, (n, rows, cols).
+        telling: measures that count, (2,).
+
+    Returns:
+        None where the comparison says no more for the best where that is right, or FDK
+        cannot use what it needs.
     """
-    wholes = [_whole(scan, one.cone_vec) for one in (best, rival)]
-    rest = scan.images - best.shown.again
-    elsewhere = np.roll(rest, len(rest) // 2, axis=0)
-    expected = []
-    for right in wholes:
-        if right is None:
-            return None
-        images = np.asarray(right + elsewhere, np.float32)
-        both = [_shown(scan, images, one.cone_vec) for one in (best, rival)]
-        if both[0] is None or both[1] is None:
-            return None
-        expected.append(_ratio(both[0], both[1], telling))
-    if expected[0].mean() <= expected[1].mean():
+    theirs = rival.right(rest)
+    if seen is None or theirs is None:
         return None
-    return np.asarray(0.5 * (expected[0] + expected[1]))
-
-
-def _whole(scan: CoarseScan, cone_vec: ConeVec) -> Float32Array | None:
-    """Return the projections of the volume of all images as of a geometry; None where FDK
-    cannot use it.
-    """
-    shown = Reprojection.of(scan, scan.images, cone_vec, None)
-    return None if shown is None else shown.again
+    scan = best.scan
+    other = _shown(scan, seen.images, rival.cone_vec)
+    both = [_shown(scan, theirs, one.cone_vec) for one in (best, rival)]
+    if other is None or both[0] is None or both[1] is None:
+        return None
+    of_best = _ratio(seen, other, telling)
+    of_rival = _ratio(both[0], both[1], telling)
+    if of_best.mean() <= of_rival.mean():
+        return None
+    return np.asarray(0.5 * (of_best + of_rival))
 
 
 def _ratio(
