@@ -102,6 +102,17 @@ class DatasetListResult(Result):
     """older folders, and folders whose names no data set may have"""
 
 
+class StatedValue(Result):
+    """A value of a file that a data set was read from."""
+
+    field: str
+    """where it stands"""
+    value: str
+    use: Literal["used", "contradicted", "ignored"]
+    consequence: str
+    """what it is used for, or what its being left aside means"""
+
+
 class DatasetResult(Result):
     """A data set over time: lists have one entry for each image of `indices`."""
 
@@ -128,6 +139,8 @@ class DatasetResult(Result):
     script: str | None = None
     warnings: list[str] = Field(default_factory=list)
     """contradictions of its files and its geometry"""
+    provenance: list[StatedValue] = Field(default_factory=list)
+    """values of another program's file; none of flexdt's own scans"""
 
 
 class DatasetFrameResult(ImageValue):

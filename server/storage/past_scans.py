@@ -42,6 +42,7 @@ from flexdt.twin.dataset.flexdt_json import (
     parse_document,
 )
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
+from flexdt.twin.dataset.provenance import shortened
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.findings import Severity
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -287,7 +288,8 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
         most: largest size of the document [bytes].
 
     Raises:
-        DatasetError: there is no usable document and no projection.
+        DatasetError: there is no usable document, no projection of flexdt's names and no
+            geometry that `DataSet.save` wrote.
     """
     try:
         if folder.document is None:
@@ -297,7 +299,7 @@ def _scan(folder: files.Folder, most: int) -> _Scan:
         document = parse_document(files.read_text(folder.path / DOCUMENT, most), DOCUMENT)
         return _Scan(folder, tuple(document.frames), document)
     except ds.DatasetError as error:
-        if not folder.projections:
+        if not folder.projections and folder.geometry is None:
             raise
         texts = _texts(folder)
         problem = error.message
@@ -680,8 +682,23 @@ def _get(
         same_machine=_same_machine(scan, context),
         script=_script(folder) if asked.script else None,
         warnings=_doubts(scan, info.shape),
+        provenance=_stated(scan),
         **(_measure(scan, tuple(at)) if asked.measure else {}),
     )
+
+
+def _stated(scan: _Scan) -> list[p.StatedValue]:
+    """List the values of another program's file with their uses; [] without one."""
+    values = scan.texts.provenance if scan.texts is not None else ()
+    return [
+        p.StatedValue(
+            field=one.field,
+            value=shortened(one.value),
+            use=one.use.value,
+            consequence=one.consequence,
+        )
+        for one in values
+    ]
 
 
 def _doubts(scan: _Scan, shape: tuple[int, int] | None) -> list[str]:

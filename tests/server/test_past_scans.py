@@ -18,6 +18,7 @@ import pytest
 import tifffile
 from lab import Process, fly_script, twin
 
+import flexdt as fx
 from flexdt.clients.client.client import TwinClient
 from flexdt.protocol import Codec, RpcError
 from flexdt.protocol.fields import Params
@@ -536,3 +537,26 @@ def test_work_that_takes_too_long_is_ended_and_the_next_is_done(
             scans.close()
 
     assert asyncio.run(asks()) == "first scan"
+
+
+def test_another_makers_scan_tells_what_became_of_its_values(tmp_path: Path) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    for i in range(4):
+        tifffile.imwrite(folder / f"p_{i + 1}.tif", np.full((6, 9), 500, np.uint16))
+    said = {
+        "Projections": 4, "WhiteLevel": 1000, "DetectorPixelsX": 9, "DetectorPixelsY": 6,
+        "DetectorPixelSizeX": 0.2, "DetectorPixelSizeY": 0.2, "SrcToObject": 100,
+        "SrcToDetector": 400, "AngularStep": 90, "unknown_thing": 7,
+    }  # fmt: skip
+    text = "".join(f"{key}={value}\n" for key, value in said.items())
+    (folder / "p.xtekct").write_text(text)
+    fx.open(folder).save(tmp_path / "data" / "bought")
+    told = asked(tmp_path / "data", DatasetGet(name="bought"))
+    assert [one["field"] for one in told["provenance"]] == list(said)
+    assert told["provenance"][-1] == {
+        "field": "unknown_thing",
+        "value": "7",
+        "use": "ignored",
+        "consequence": "not known to flexdt",
+    }

@@ -147,6 +147,7 @@ const panel = el(
     canvas,
   ),
   el("div", { id: "record-note", class: "muted small-text cut" }),
+  el("details", { id: "record-values", hidden: true }),
 );
 $("#stage").append(panel);
 
@@ -346,6 +347,7 @@ export async function open(name, at = null, step = false) {
   $button("#record-replay").disabled = bare || !told.same_machine;
   slider.max = String(Math.max(0, told.images - 1));
   setText($("#record-note"), note());
+  showValues(told.provenance);
   lanes();
   await show(Math.min(Math.max(0, at ?? told.kinds.indexOf("projection")), told.images - 1));
   const measured = await call("dataset.get", { name, points: 400, measure: true }).catch(
@@ -357,6 +359,27 @@ export async function open(name, at = null, step = false) {
   lanes();
 }
 let opening = 0;
+
+/**
+ * Values of another program's file with what became of each; none of flexdt's own scans.
+ * @param {DatasetResult["provenance"]} values
+ */
+function showValues(values) {
+  const box = $("#record-values");
+  box.hidden = !values.length;
+  const unused = values.filter((one) => one.use !== "used").length;
+  /** @param {"th" | "td"} tag @param {string[]} texts */
+  const row = (tag, texts) => el("tr", {}, ...texts.map((text) => el(tag, {}, text)));
+  box.replaceChildren(
+    el("summary", {}, `${values.length} values of its file, ${unused} not used`),
+    el(
+      "table",
+      { class: "small-text" },
+      row("th", ["field", "value", "use", "consequence"]),
+      ...values.map((one) => row("td", [one.field, one.value, one.use, one.consequence])),
+    ),
+  );
+}
 
 /**
  * What the virtual image that is shown was made of; null where there is none.

@@ -93,7 +93,7 @@ export type DatasetResult = {
   times_s: Array<number> | null; positions: Record<string, Array<number | null>>;
   same_machine: boolean; counts: Array<number | null> | null;
   clearance_mm: Array<number | null> | null; clearance_of: string; script: string | null;
-  warnings: Array<string>
+  warnings: Array<string>; provenance: Array<StatedValue>
 };
 export type Datasets = { search?: string; start?: number };
 export type Empty = Record<string, never>;
@@ -251,6 +251,9 @@ export type State = {
   correction: Correction | null; clock: ClockState; controller: string | null;
   image: ImageFlags | null; unsaved: string | null; projector: string | null;
   missing: Record<string, string>
+};
+export type StatedValue = {
+  field: string; value: string; use: "used" | "contradicted" | "ignored"; consequence: string
 };
 export type Stopped = {
   time: number; axes: Record<string, AxisState>; tube: TubeState; camera: CameraState;
