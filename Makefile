@@ -49,7 +49,7 @@ $(STAMP): pyproject.toml extensions/pyproject.toml constraints.txt
 
 # The kernels, on all cores. The demonstration compiles its own while it starts and scans.
 $(COMPILED): $(STAMP)
-	$(BIN)/python -P -m flexdt.runtime.compile_ahead
+	$(BIN)/python -P -m flexdt.runtime.kernels.compile_ahead
 	@touch $@
 
 # What longer tests need beside it: peers that flexdt is checked against, node, a browser's driver. Added to

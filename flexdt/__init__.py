@@ -74,7 +74,7 @@ def _show_work(
 
 def _open_kernel_store() -> _kernel_store.KernelStore:
     """Open the folders in which compiled kernels are kept."""
-    from flexdt.runtime import kernel_files
+    from flexdt.runtime.kernels import kernel_files
 
     return kernel_files.opened()
 

@@ -194,6 +194,31 @@ def is_rebound(host: str) -> bool:
     return not is_loopback(urlsplit(f"//{host}").hostname or "")
 
 
+@dataclass(frozen=True)
+class PublicAddress:
+    """The address of the page in a browser; as text an URL.
+
+    Args:
+        host: name, with a port where it is not the scheme's own.
+        path: begins and ends with a slash.
+        is_secure: whether the browser speaks HTTPS.
+    """
+
+    host: str
+    path: str = "/"
+    is_secure: bool = False
+
+    def __str__(self) -> str:
+        """Format as an URL."""
+        return f"http{'s' if self.is_secure else ''}://{self.host}{self.path}"
+
+    def below(self, path: str) -> str:
+        """Return a request's path without the public path, if the proxy has left it there."""
+        if self.path != "/" and path.startswith(self.path):
+            return path[len(self.path) - 1 :]
+        return path
+
+
 def check_bind(host: str, token: str | None) -> None:
     """Check that a token has at least 16 characters, and that an address that others can
     reach has one.

@@ -12,14 +12,16 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from urllib.parse import urlsplit
 
 import typer
 
-from flexdt.runtime.public_address import PublicAddress, public_address
+from flexdt.runtime.access import PublicAddress
 from flexdt.runtime.settings import Settings, option
-from flexdt.twin.errors import LimitError
-from flexdt.twin.rays_a_pixel import Rays, check_rays
+
+if TYPE_CHECKING:
+    from flexdt.twin.rays_a_pixel import Rays
 
 LOOPBACK: Final = "127.0.0.1"
 TWIN_PORT: Final = 55000
@@ -46,6 +48,27 @@ class Address:
         if ":" in self.host:
             return f"[{self.host}]:{self.port}"
         return f"{self.host}:{self.port}"
+
+
+def public_address(text: str) -> PublicAddress:
+    """Parse an URL, such as https://hub.example/user/me/proxy/8080/.
+
+    Raises:
+        typer.BadParameter: it has no scheme of the web or no host, or a query.
+    """
+    try:
+        url = urlsplit(text.strip())
+        readable = url.scheme in ("http", "https") and bool(url.hostname)
+    except ValueError:
+        readable = False
+    if not readable or url.query or url.fragment or url.username is not None:
+        raise typer.BadParameter(
+            f"{text!r} is no address of a page, such as https://hub.example/user/me/proxy/8080/"
+        )
+    path = url.path.strip("/")
+    return PublicAddress(
+        url.netloc.lower(), f"/{path}/" if path else "/", url.scheme == "https"
+    )
 
 
 def address(text: str) -> Address:
@@ -154,6 +177,9 @@ def rays_a_side(text: str | int) -> Rays:
     Raises:
         typer.BadParameter: neither.
     """
+    from flexdt.twin.errors import LimitError
+    from flexdt.twin.rays_a_pixel import check_rays
+
     word = str(text).strip().lower()
     try:
         return check_rays(int(word) if word.isdigit() else word)
@@ -247,7 +273,7 @@ class ScannerSettings(ServerSettings):
     speed_up: Any = option(1.0, metavar="X or max", parser=speed_up)
     physics: Physics = option("ideal")
     scatter: Scatter = option("off", metavar="off or mc", parser=scatter_method)
-    rays: Any = option("auto", metavar="X or auto", parser=rays_a_side)
+    rays: Any = option("auto", hidden=True, metavar="X or auto", parser=rays_a_side)
     fresh: bool = option(False, public=False)
 
 

@@ -29,7 +29,6 @@ from flexdt.clients.cli.commands import doctor_command as installation
 from flexdt.clients.cli.commands import expose_command as exposure
 from flexdt.clients.cli.commands import follow_command as following
 from flexdt.clients.cli.commands import job_commands as jobs
-from flexdt.clients.cli.commands import kernels_command as compiled_kernels
 from flexdt.clients.cli.commands import machine_commands as machines
 from flexdt.clients.cli.commands import new_machine_command as new_machine
 from flexdt.clients.cli.commands import phantom_commands as phantoms
@@ -81,9 +80,9 @@ GROUPS: Final[Mapping[str, tuple[str, Mapping[str, Callable[..., object]]]]] = {
     "kernels": (
         "Compiled kernels, and where they are kept.",
         {
-            "compile": compiled_kernels.compile,
-            "share": compiled_kernels.share,
-            "delete": compiled_kernels.delete,
+            "compile": installation.compile,
+            "share": installation.share,
+            "delete": installation.delete,
         },
     ),
     "machine": (

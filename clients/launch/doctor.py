@@ -161,7 +161,7 @@ def kernels() -> CheckOutcome:
 def kernel_cache() -> CheckOutcome:
     """Report where compiled kernels are kept and what first use will compile; a warning if
     they cannot be kept."""
-    from flexdt.runtime import compile_ahead, kernel_files
+    from flexdt.runtime.kernels import compile_ahead, kernel_files
 
     files = kernel_files.opened()
     place = files.writable()

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import TextIO
 
 from flexdt.library.extras import lacking
-from flexdt.runtime.access import ViewerLimits, limit_names
+from flexdt.runtime.access import PublicAddress, ViewerLimits, limit_names
 from flexdt.runtime.process import INVALID, REFUSED
 from flexdt.runtime.process_settings import (
     LOOPBACK,
@@ -26,7 +26,6 @@ from flexdt.runtime.process_settings import (
     UpSettings,
     ViewerSettings,
 )
-from flexdt.runtime.public_address import PublicAddress
 from flexdt.runtime.settings import parse, shared, words
 from flexdt.runtime.supervisor import (
     Addresses,

@@ -35,10 +35,15 @@ from flexdt.clients.viewer.browser_connections import Admission, BrowserConnecti
 from flexdt.clients.viewer.page_html import PAGE, TRANSLUCENT, page_file, token_form
 from flexdt.clients.viewer.page_messages import MessageFilter
 from flexdt.clients.viewer.viser_gate import MARK, parted
-from flexdt.runtime.access import check_bind, is_loopback, is_rebound, token_matches
+from flexdt.runtime.access import (
+    PublicAddress,
+    check_bind,
+    is_loopback,
+    is_rebound,
+    token_matches,
+)
 from flexdt.runtime.log import log
 from flexdt.runtime.process import TLS_HANDSHAKE_S, one_at_a_time
-from flexdt.runtime.public_address import PublicAddress
 
 COOKIE: Final = "flexdt_viewer"
 MAX_FROM_PAGE: Final = 16 << 20

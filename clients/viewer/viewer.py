@@ -44,9 +44,8 @@ from flexdt.clients.viewer.volumes.reconstruction_process import LiveReconstruct
 from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import RpcError
 from flexdt.protocol.state_model import SafetyState, SampleState, State
-from flexdt.runtime.access import ViewerLimits
+from flexdt.runtime.access import PublicAddress, ViewerLimits
 from flexdt.runtime.log import log
-from flexdt.runtime.public_address import PublicAddress
 from flexdt.runtime.workers import Workers
 from flexdt.twin.errors import TwinError
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of

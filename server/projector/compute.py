@@ -30,7 +30,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.runtime import compile_ahead
+from flexdt.runtime.kernels import compile_ahead
 from flexdt.twin.projection import Body, gpu, project_body
 from flexdt.twin.projection.analytic import warm_up_forward
 from flexdt.twin.projection.kernels.compiling import LOG

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.runtime import kernel_files
-from flexdt.runtime.kernel_files import KernelFiles, Owner, Place
+from flexdt.runtime.kernels import kernel_files
+from flexdt.runtime.kernels.kernel_files import KernelFiles, Owner, Place
 from flexdt.twin.projection.kernels import compiling
 
 posix = pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs POSIX's owners")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.runtime import kernel_files
+from flexdt.runtime.kernels import kernel_files
 
 ROOT = Path(__file__).resolve().parents[2]
 UID = 54321

@@ -25,7 +25,7 @@ from flexdt.clients.viewer.front import Download, Front
 from flexdt.clients.viewer.page import ON_THE_WAY
 from flexdt.runtime import waiting_room
 from flexdt.runtime.access import AccessError, client_tls, server_tls
-from flexdt.runtime.public_address import public_address
+from flexdt.runtime.process_settings import public_address
 
 TOKEN = "a-token-of-sixteen-or-more"
 TLS = Path(__file__).parents[1] / "data" / "tls"

@@ -119,7 +119,7 @@ def run_demo(
         CommandError: a stage failed; the line names it and the reason.
     """
     from flexdt.clients.client.client import TwinClient
-    from flexdt.runtime import compile_ahead
+    from flexdt.runtime.kernels import compile_ahead
 
     data = out / "data"
     data.mkdir(parents=True, exist_ok=True)

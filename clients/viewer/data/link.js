@@ -232,7 +232,8 @@ export const person = () => localStorage.getItem(PERSON) ?? "";
 /** @param {string} name */
 export function rename(name) {
   keep(PERSON, name.trim());
-  void call("viewer.person", { name: name.trim() }).catch(() => null); // the next connection brings it
+  // Without a connection the next one brings it.
+  void call("viewer.person", { name: name.trim() }).catch(() => null);
 }
 export function connect() {
   // Below the page's own address: a proxy may have put it anywhere.

@@ -164,9 +164,10 @@ const BACK = "the page comes back by itself";
 const LATE =
   "viewer or twin do not answer, or the network is slow; " +
   "what is done here may come late or not at all";
+const HERE = `${location.origin}${location.pathname}`;
 const UNREACHED =
   "no connection of this page has reached it: a proxy between them must pass WebSockets on, and " +
-  `the viewer must know this address (flexdt viewer --public-url ${location.origin}${location.pathname})`;
+  `the viewer must know this address (flexdt viewer --public-url ${HERE})`;
 /** @returns {Missing | null} */
 function missing() {
   if (store.refused) {

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flexdt.runtime import compile_ahead
+from flexdt.runtime.kernels import compile_ahead
 from flexdt.twin import long_work
 from flexdt.twin.projection.kernels import compiling
 from flexdt.twin.projection.kernels.siddon_kernels import clip
@@ -46,7 +46,7 @@ assert not seen, seen
 def test_nothing_compiles_after_it_was_compiled_ahead(tmp_path: Path) -> None:
     homes = dict.fromkeys(("FLEXDT_CACHE", "XDG_CACHE_HOME", "TMPDIR"), str(tmp_path))
     environment = os.environ | homes
-    ahead = [sys.executable, "-P", "-m", "flexdt.runtime.compile_ahead"]
+    ahead = [sys.executable, "-P", "-m", "flexdt.runtime.kernels.compile_ahead"]
     groups = len(compile_ahead.GROUPS)
     for last in (f"flexdt: compiled {groups} of {groups} ", ""):
         done = subprocess.run(

@@ -1,5 +1,5 @@
 """Kernels compiled before they are needed, on all cores:
-`python -m flexdt.runtime.compile_ahead`.
+`python -m flexdt.runtime.kernels.compile_ahead`.
 
 numba compiles under one lock, so each group of kernels has a process of its own, which
 runs it on a tiny problem and leaves it where kernels are kept. Groups that are there
@@ -25,7 +25,7 @@ from flexdt.twin.long_work import Rhythm, time_span
 from flexdt.twin.projection import Grid
 from flexdt.twin.projection.analytic import warm_up_back, warm_up_forward
 
-MODULE: Final = "flexdt.runtime.compile_ahead"
+MODULE: Final = "flexdt.runtime.kernels.compile_ahead"
 
 
 def _detection() -> None:

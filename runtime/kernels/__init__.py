@@ -1,0 +1,1 @@
+"""Compiled kernels: made ahead of their use, and kept in files."""
