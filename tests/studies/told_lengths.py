@@ -159,9 +159,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     offered = [r for r in results if r.offered]
     print(f"{len(results)} draws, {len(offered)} offered, {len(bad)} beyond 4 sigma")
     for name in PULLS:
-        some = [r.pulls[name] for r in offered if name in r.pulls]
-        if some:
-            print(f"  pulls of {name}: rms {math.sqrt(np.mean(np.square(some))):.2f}")
+        pulls = [r.pulls[name] for r in offered if name in r.pulls]
+        if pulls:
+            print(f"  pulls of {name}: rms {math.sqrt(np.mean(np.square(pulls))):.2f}")
     return 1 if bad else 0
 
 

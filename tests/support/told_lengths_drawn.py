@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 SHAPE: Final = (760, 956)
 PIXEL: Final = 0.1496
 NOISE_PX: Final = 0.02
-KINDS: Final = ("helix", "places", "steps", "others", "pixel")
+KINDS: Final = ("helix", "places", "odd_place", "panel_ways", "steps", "others", "pixel")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +115,9 @@ def drawn_told(
 
     Args:
         kind: of `KINDS`. A helix's rise; the way from the first place to each other one along
-            the beam; the SOD's steps within one scan; the SOD and SDD of another scanner's
-            geometry; the pixel pitch.
+            the beam, or to one of three; the way of the panel between two scans; the SOD's
+            steps within one scan; the SOD and SDD of another scanner's geometry; the pixel
+            pitch.
         seed: of the draws.
         wrong: true over told, less 1.
         scans: number of places.
@@ -161,25 +162,41 @@ def drawn_told(
         "det_roll": offset * rng.normal() * 0.2,
     }
     places = [0.0]
-    if kind == "places":
+    if kind == "odd_place":
+        scans = 3
+    if kind in ("places", "odd_place"):
         places += [
             float(p)
             for p in rng.permutation([-1.0, -0.5, 0.6])[: scans - 1]
             * rng.uniform(120.0, 200.0)
         ]
+    if kind == "panel_ways":
+        places = [0.0, 0.0]
+    further = float(rng.uniform(150.0, 350.0)) if kind == "panel_ways" else 0.0
     told = []
     columns = []
     seen_sods = []
-    for place in places:
+    for i, place in enumerate(places):
         way = steps + place
         height = rise * np.arange(frames) / frames
-        more = wrong if kind in ("places", "steps") else 0.0
+        more = (
+            wrong
+            if kind in ("places", "steps") or (kind == "odd_place" and i == 1)
+            else 0.0
+        )
         true_way = way * (1.0 + more)
         true_height = height * (1.0 + (wrong if kind == "helix" else 0.0))
         axis = np.stack([0 * way, true_sod + true_way, true_height], axis=1)
         stated = np.stack([0 * way, sod + way, height], axis=1)
         spots, column, here = _exposed(
-            real, radii, angles, axis, true_sdd, true_pixel, truth, rng
+            real,
+            radii,
+            angles,
+            axis,
+            true_sdd - i * further * (1.0 + wrong),
+            true_pixel,
+            truth,
+            rng,
         )
         columns.append(column)
         seen_sods.append(here - stated[:, 1])
@@ -188,7 +205,7 @@ def drawn_told(
                 spots,
                 np.zeros((frames, 3)),
                 stated,
-                np.tile([0.0, sdd, 0.0], (frames, 1)),
+                np.tile([0.0, sdd - i * further, 0.0], (frames, 1)),
                 angles,
                 PIXEL,
             )
@@ -200,7 +217,7 @@ def drawn_told(
         extra = wrong * (rise * np.arange(frames) / frames)
         ends["dO_y"] = (truth["dO_y"] + extra.min(), truth["dO_y"] + extra.max())
     far = true_sdd + truth["dD_z"]
-    ends["dD_z"] = (far - sdd, far - sdd)
+    ends["dD_z"] = tuple(sorted((far - sdd, far - sdd - further * wrong)))
     first = true_sod + truth["dO_z"]
     # tau moves the axis, too: dO is of the axis.
     first += truth["tau_z"]

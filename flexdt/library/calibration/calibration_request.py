@@ -56,10 +56,11 @@ def request_of(phantom: object, options: CalibrationOptions) -> CalibrationReque
         for name, (attribute, make) in _IN_REQUEST.items()
         if name in given
     }
-    stated = exact(tuple(free)) if priors == "none" else dict(priors)
+    stated: dict[str, float] = exact(tuple(free)) if priors == "none" else {**priors}
+    excluded: Any = given.get("exclude", ())
     return CalibrationRequest(
         free=tuple(free),
-        priors=stated | dict.fromkeys(require_causes(given.get("exclude", ())), 0.0),
+        priors=stated | dict.fromkeys(require_causes(excluded), 0.0),
         **made,
     )
 
