@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.priors import known_scale, known_strain
 from flexdt.twin.calibration.request import CalibrationRequest, with_stated
 from flexdt.twin.calibration.told_ways import told_motions
+from flexdt.twin.calibration.without_phantom.gaps.gap_evidence import GapFound
+from flexdt.twin.calibration.without_phantom.symmetry_plane import _gap
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.geometry.told_lengths import TOLD, TOLD_MEANINGS, TOLD_SOURCES, told_by
@@ -161,6 +164,12 @@ def test_what_a_phantoms_file_states_counts() -> None:
             Tolerance(**wrong)  # type: ignore[arg-type]
     with pytest.raises(TwinError):
         BeadModel(BEADS, radii, stated=Tolerance("x", (0.1, 0.1)))
+
+
+def test_align_looks_for_no_gap_in_a_panel_in_one_piece() -> None:
+    scan = SimpleNamespace(priors={"gap": 0.0})
+    first = SimpleNamespace(turn=object())
+    assert _gap(scan, first, None) == GapFound(None, None)  # type: ignore[arg-type]
 
 
 def test_causes_are_excluded_by_users_and_scanners() -> None:

@@ -324,12 +324,13 @@ def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFoun
         panel: known distortion; None: none.
 
     Returns:
-        Nothing found without a full turn.
+        Nothing found without a full turn, or where the machine's file says that the panel
+        is in one piece (`gap = 0` in its priors).
 
     Raises:
         NotIdentifiableError: there are two gaps.
     """
-    if first.turn is None:
+    if first.turn is None or scan.priors.get("gap") == 0.0:
         return GapFound(None, None)
     borders = panel.model.borders if panel else ()
     closed = [b.at for b in borders if b.axis == 0]
