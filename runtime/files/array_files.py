@@ -76,7 +76,10 @@ def _array(stream: Any, size: int, label: str) -> np.ndarray[Any, np.dtype[Any]]
     }
     if version not in heads:
         raise ValueError(f"version {version} of the format is not read")
-    shape, by_columns, kind = heads[version](stream)
+    try:
+        shape, by_columns, kind = heads[version](stream)
+    except Exception:  # numpy tokenizes a damaged head: anything may come
+        raise ValueError("its head is damaged") from None
     if kind.kind not in KINDS or kind.itemsize == 0:
         raise ValueError(f"it holds {kind}; allowed: numbers and texts")
     claimed = math.prod(shape) * kind.itemsize

@@ -249,8 +249,9 @@ def read_document(folder: Directory) -> DatasetDocument:
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is no UTF-8 text"
         raise ds.DatasetFormatError(
-            f"cannot read {path}: {error}", {"path": str(path)}
+            f"cannot read {path}: {reason}", {"path": str(path)}
         ) from None
     return parse_document(text, str(path))
 

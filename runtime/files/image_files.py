@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ __all__ = [
     "read_pixels",
 ]
 
+_T = TypeVar("_T")
 Pixels = tuple[npt.NDArray[Any], ImageHead]
 
 
@@ -185,7 +186,7 @@ def read_rows(
     return values[rows]
 
 
-def _answered(path: Path, ask: Callable[[ImageFormat, BinaryIO], Any]) -> Any:
+def _answered(path: Path, ask: Callable[[ImageFormat, BinaryIO], _T]) -> _T:
     """Return the answer of the format of a file.
 
     Raises:

@@ -287,7 +287,7 @@ def _contiguous_images(tiff: Any, pages: Sequence[Any]) -> int:
         said = (tiff.imagej_metadata or {}).get("images", 1)
         many = int(said) if isinstance(said, int | float) else 1
     elif tiff.is_shaped:
-        described = tiff.shaped_metadata or ({},)
+        described: Any = tiff.shaped_metadata or ({},)
         shape = described[0].get("shape", ())
         one = math.prod(page.shape) or 1
         many = max(math.prod(int(n) for n in shape) // one, 1) if shape else 1

@@ -221,10 +221,11 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
     rows = np.asarray(numbers, dtype=np.float64).reshape(-1, 12)
     if not len(rows):
         raise ExchangeError(f"{file} holds no view")
-    area = np.linalg.norm(np.cross(rows[:, 6:9], rows[:, 9:12]), axis=1)
+    with np.errstate(all="ignore"):  # numbers of a damaged file may have any size
+        area = np.linalg.norm(np.cross(rows[:, 6:9], rows[:, 9:12]), axis=1)
     for wrong, problem in (
         (~np.isfinite(rows).all(axis=1), "a number is not finite"),
-        (area <= 0.0, "u and v span no panel"),
+        (~(area > 0.0), "u and v span no panel"),
     ):
         if wrong.any():
             view = int(np.argmax(wrong))

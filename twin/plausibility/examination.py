@@ -88,17 +88,16 @@ def _found(
 ) -> Iterator[Finding]:
     """Yield the findings of all checks of a geometry; arguments as for `examine`.
 
-    Spans are checked unless projecting, arcs only for an iterative method whose spans are
-    fine. Placement needs `boxes` and `shape`, the grid check needs `grid` and `shape`;
+    Arcs are checked only for an iterative method whose spans are fine. Placement
+    needs `boxes` and `shape`, the grid check needs `grid` and `shape`;
     the panel counts as real only when simulating, layers above and below it count unless
     FDK. Inclination is checked for FDK with a `grid`, about the grid's centre.
     """
     yield from geometry_findings(geometry, shape)
-    if operation is not Operation.PROJECT:
-        spans = tuple(span_findings(geometry))
-        yield from spans
-        if operation is Operation.ITERATE and not spans:
-            yield from arc_findings(geometry)
+    spans = tuple(span_findings(geometry))
+    yield from spans
+    if operation is Operation.ITERATE and not spans:
+        yield from arc_findings(geometry)
     if boxes is not None and shape is not None:
         exposed = operation is Operation.SIMULATE
         yield from placement_findings(geometry, shape, boxes, exposed=exposed)

@@ -183,8 +183,11 @@ def _of_array(path: Path, views: int) -> Markers:
         raise
     except KeyError:
         raise TwinError(f"cannot read {path}: it holds several arrays") from None
-    except (OSError, TypeError, ValueError) as error:
-        raise TwinError(f"cannot read {path}: {error}") from None
+    except OSError as error:
+        raise TwinError(f"cannot read {path}: {error.strerror}") from None
+    except (TypeError, ValueError):
+        said = f"cannot read {path}: it is no NumPy file of numbers, or a damaged one"
+        raise TwinError(said) from None
     if tracks.ndim != 3 or tracks.shape[0] != views or tracks.shape[2] != 2:
         raise TwinError.of_shape(
             f"{path}: array", tracks.shape, (f"{views} frames", "markers", 2)

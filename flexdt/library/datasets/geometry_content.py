@@ -76,7 +76,7 @@ def arrays_of(path: Path) -> dict[str, np.ndarray[Any, np.dtype[Any]]]:
         return read_arrays(path)
     except InputLimitError as error:
         raise ExchangeError(error.message, error.data) from None
-    except ValueError as error:
+    except ValueError:
         raise ExchangeError(
-            f"{path} is no NumPy file: {error}", {"path": str(path)}
+            f"{path} is no NumPy file of numbers, or a damaged one", {"path": str(path)}
         ) from None

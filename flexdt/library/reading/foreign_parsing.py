@@ -10,7 +10,7 @@ from typing import Final
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.files.limited_files import limited_bytes
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.errors import TwinError, words_of
+from flexdt.twin.errors import TwinError
 from flexdt.twin.input_limits import InputLimitError
 
 UTF_16_MARKS: Final = (b"\xff\xfe", b"\xfe\xff")
@@ -22,7 +22,7 @@ def parsing(path: Path, form: str) -> Iterator[None]:
     """Run the body of a `with`, and turn any error of a parser into the file's error.
 
     A TwinError passes as it is; lack of memory has its own message. The parser's words
-    are repeated as `words_of` shortens them.
+    are not repeated: they are those of a program, not of a scan.
 
     Args:
         path: the file.
@@ -40,8 +40,8 @@ def parsing(path: Path, form: str) -> Iterator[None]:
         raise DatasetFormatError(said, {"path": str(path)}) from None
     except (
         Exception
-    ) as error:  # A third party's parser on a damaged file: anything may come.
-        said = f"{path} is no {form} file, or a damaged one ({words_of(error)})"
+    ) as error:  # a third party's parser on a damaged file: anything may come
+        said = f"{path} is no {form} file, or a damaged one"
         raise DatasetFormatError(said, {"path": str(path)}) from error
 
 

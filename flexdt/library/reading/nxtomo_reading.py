@@ -22,7 +22,7 @@ from flexdt.library.reading.nxtomo_geometry import (
 from flexdt.library.reading.nxtomo_scan import NxScan, scan_of
 from flexdt.library.reading.nxtomo_table import DETECTOR
 from flexdt.library.reading.one_exposure import on_one_exposure
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.plausibility import settled
 
@@ -54,9 +54,11 @@ def read_nxtomo(
     try:
         with h5py.File(path) as file:
             return _read(file, path, geometry, distances)
-    except OSError as error:
+    except FileNotFoundError:
+        raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
+    except OSError:
         raise DatasetFormatError(
-            f"{path} is no HDF5 file: {error}", {"path": str(path)}
+            f"{path} is no HDF5 file, or a damaged one", {"path": str(path)}
         ) from None
 
 

@@ -72,10 +72,8 @@ def read_zeiss(path: Path, geometry: ConeVec | None) -> DataSet:
                 return _read(streams, geometry, path.stem)
     except TwinError as error:
         said = error.message
-    except (
-        Exception
-    ) as error:  # A third party's parser on a damaged file: anything may come.
-        said = f"it is no OLE2 file, or a damaged one ({error})"
+    except Exception:  # a third party's parser on a damaged file: anything may come
+        said = "it is no OLE2 file, or a damaged one"
     raise DatasetFormatError(f"{path}: {said}", {"path": str(path)})
 
 

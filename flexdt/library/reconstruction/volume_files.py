@@ -20,12 +20,13 @@ import numpy.typing as npt
 from flexdt.library.datasets.pictures import png
 from flexdt.library.reconstruction.volume_formats import (
     VOLUME_FORMATS,
+    OtherFormError,
     Sink,
     VolumeFormat,
     VoxelPlaces,
 )
 from flexdt.runtime.files.whole_files import require_bytes, room_named
-from flexdt.twin.errors import LimitError, words_of
+from flexdt.twin.errors import GeometryError, LimitError, TwinError, words_of
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.signatures import File
 
@@ -153,12 +154,29 @@ def read_volume(file: File) -> Volume:
         x, y, z = (float(p) for p in place)
         cubes = along_x == along_y == along_z
         return Volume(values, along_x if cubes else edges, (x, y, z))
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        raise LimitError(
-            f"{path}: not a volume of flexdt reconstruct ({words_of(error)}); "
-            "values of other programs: fx.Volume(array, voxel_mm)",
-            {"file": str(path)},
-        ) from None
+    except OSError as error:
+        if error.errno is not None and error.strerror:
+            raise
+        raise _no_volume(path, "it is cut off or damaged") from None  # h5py's
+    except OtherFormError as error:
+        raise _no_volume(path, words_of(error)) from None
+    except GeometryError as error:
+        raise _no_volume(path, error.message) from None
+    except MemoryError:
+        raise _no_volume(path, "it takes more memory than there is") from None
+    except TwinError:
+        raise
+    except Exception:  # a third party's parser on a damaged file: anything may come
+        raise _no_volume(path, "it is cut off or damaged") from None
+
+
+def _no_volume(path: Path, why: str) -> LimitError:
+    """Make the error for a file that is no volume of flexdt."""
+    return LimitError(
+        f"{path}: not a volume of flexdt reconstruct ({why}); values of other programs: "
+        "fx.Volume(array, voxel_mm)",
+        {"file": str(path)},
+    )
 
 
 class MiddleSlices:

@@ -88,6 +88,10 @@ Stored = tuple[npt.NDArray[Any], float | Sequence[float], Sequence[float], bool]
 the first voxel's or the middle."""
 
 
+class OtherFormError(ValueError):
+    """A file that is no volume of flexdt; its message says what is different."""
+
+
 @dataclass(frozen=True)
 class VoxelPlaces:
     """Positions of the voxels of a file.
@@ -356,7 +360,7 @@ def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
     with path.open("rb") as file:
         head, mark, _ = file.read(HEADER_BYTES).partition(end)
     if not mark:
-        raise ValueError("no values in the file")
+        raise OtherFormError("no values in the file")
     fields = (line.partition(between) for line in head.decode("ascii").splitlines())
     return {key.strip(): value.strip() for key, _, value in fields}, len(head) + len(end)
 
@@ -374,10 +378,10 @@ def _require_own(fields: Mapping[str, str], own: Mapping[str, str]) -> None:
     """
     for key, value in own.items():
         if value and fields.get(key, value) not in (value, OLDER_FIELDS.get(key)):
-            raise ValueError(f"its {key} is {fields[key]}; allowed: {value}")
+            raise OtherFormError(f"its {key} is {fields[key]}; allowed: {value}")
     for key in FIELDS_OF_OTHER_VALUES:
         if key in fields:
-            raise ValueError(f"its {key} is {fields[key]}; allowed: none")
+            raise OtherFormError(f"its {key} is {fields[key]}; allowed: none")
 
 
 def _map_values(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
@@ -389,7 +393,7 @@ def _map_values(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
     nx, ny, nz = map(int, sizes.split())
     held = path.stat().st_size - offset
     if held != 4 * nx * ny * nz:
-        raise ValueError(
+        raise OtherFormError(
             f"{nx} x {ny} x {nz} values take {4 * nx * ny * nz} bytes; it holds {held}"
         )
     return np.memmap(path, "<f4", "r", offset=offset, shape=(nz, ny, nx))
@@ -443,11 +447,11 @@ def _read_nifti(path: Path) -> Stored:
     image = _nibabel().load(path)
     length = image.header.get_xyzt_units()[0]
     if length != "mm":
-        raise ValueError(f"its lengths are in {length}; allowed: mm")
+        raise OtherFormError(f"its lengths are in {length}; allowed: mm")
     values = np.asarray(image.dataobj)
     if values.ndim != 3 or values.dtype.kind not in "fiu":
         kind = f"{values.dtype} of shape {values.shape[::-1]}"
-        raise ValueError(f"its values are {kind}; allowed: real numbers (nz, ny, nx)")
+        raise OtherFormError(f"its values are {kind}; allowed: real numbers (nz, ny, nx)")
     edges = _upright(image.affine[:3, :3])
     return values.astype(np.float32).T, edges, image.affine[:3, 3], True
 
@@ -461,7 +465,9 @@ def _upright(axes: FloatArray) -> list[float]:
     edges = np.diag(axes)
     aside = np.abs(axes - np.diag(edges)).max()
     if not (edges > 0.0).all() or not aside <= MAX_ASIDE * edges.max():
-        raise ValueError(f"its axes are {axes.tolist()}; allowed: right, front and up")
+        raise OtherFormError(
+            f"its axes are {axes.tolist()}; allowed: right, front and up"
+        )
     return [float(edge) for edge in edges]
 
 
