@@ -55,13 +55,13 @@ from flexdt.twin.calibration.fit.certificate import Estimate
 from flexdt.twin.calibration.fit.fit import FitResult, image_quantities
 from flexdt.twin.calibration.fit.priors import STRAIN, prior_widths
 from flexdt.twin.calibration.fit.problem import SIX, from_printed_reading
+from flexdt.twin.calibration.fit.told_ways import told_motions
 from flexdt.twin.calibration.pipeline import (
     Calibration,
     CalibrationRequest,
     Scan,
     calibrate,
 )
-from flexdt.twin.calibration.told_ways import told_motions
 from flexdt.twin.calibration.unknown_markers import UNKNOWN
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.findings import Finding, Findings, error, warning

@@ -11,13 +11,12 @@ from told_lengths import WRONG_SIGMAS, calibrated, judged
 from told_lengths_drawn import drawn_told
 
 from flexdt.twin.calibration.bead_model import BeadModel, Tolerance
-from flexdt.twin.calibration.diagnose.causes import Known
-from flexdt.twin.calibration.diagnose.causes.cause import Cause
-from flexdt.twin.calibration.diagnose.causes.every_cause import _limited
+from flexdt.twin.calibration.diagnose.table.group import Acts, Family, Known
+from flexdt.twin.calibration.diagnose.table.groups import _limited, tiles
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.priors import known_scale, known_strain
+from flexdt.twin.calibration.fit.told_ways import told_motions
 from flexdt.twin.calibration.request import CalibrationRequest, with_stated
-from flexdt.twin.calibration.told_ways import told_motions
 from flexdt.twin.calibration.without_phantom.gaps.gap_evidence import GapFound
 from flexdt.twin.calibration.without_phantom.symmetry_plane import _gap
 from flexdt.twin.errors import TwinError, UnknownNameError
@@ -179,9 +178,13 @@ def test_causes_are_excluded_by_users_and_scanners() -> None:
     assert limits_of([{"dD_x": 1.0}], {"gap": 0.0, "dD_x": 2.0}) == {"gap": 0.0}
     with pytest.raises(UnknownNameError, match="gap"):
         require_causes(["gaps"])
-    tile = Cause("tile from column 4", (1,), (0.1, 1.0))
-    assert _limited(tile, {"gap": 0.0}).widths == ()
-    assert _limited(tile, {"gap": 0.5}).widths == (0.1,)
-    assert _limited(tile, {"gap": 0.01}).widths == (0.01,)
-    assert _limited(tile, {"rows": 0.0}) == tile
-    assert Known((0.0, 0.0), None, 1.0).limits == {}
+    tile = Family(tiles.NAME, ("a border",), Acts.IMAGE, (1,), 0.0)
+
+    def limited(**limits: float) -> Family | None:
+        return _limited(tile, Known((0.0, 0.0), None, 1.0, limits=limits))
+
+    assert limited(gap=0.0) is None
+    narrow = limited(gap=0.5)
+    assert narrow is not None
+    assert narrow.widest == 0.5
+    assert limited(rows=0.0) == limited() == tile
