@@ -220,3 +220,40 @@ def test_a_simulated_scan_that_is_saved_knows_its_voltage(tmp_path: Path) -> Non
         fx.TwinError, match=r"tube=fx\.Tube\(kV=\.\.\.\), or its voltage with --kv"
     ):
         unknown.reconstruct("fdk", material="pmma", errors=False)
+
+
+def test_a_scan_file_says_the_same_to_commands(tmp_path: Path) -> None:
+    """`flexdt calibrate`, `align`, `reconstruct` and `export` open it as any data set."""
+    from flexdt.clients.cli.commands.data_commands import scan_of
+
+    written(tmp_path)
+    whole = "images = 'scan'\ngeometry = 'scan.json'\n"
+    texts = {
+        "numbers": "dark = 100\nopen_beam = 40_000\n",
+        "files": "dark = 'dark.edf'\nflat = ['white.png', 'mean.npy']\n",
+        "HDF5": "dark = 100\nflat = 'other.h5:/exchange/white'\nangles = 'angles.txt'\n",
+    }
+    file = tmp_path / "my scan.toml"
+    for text in texts.values():
+        file.write_text(whole + text)
+        for data in (fx.open(file), scan_of(file, False, None)):
+            assert data.name == "my scan"
+            np.testing.assert_allclose(
+                data.line_integrals(), np.log(39_900 / (FRAMES - 100.0)), atol=2e-5
+            )
+    file.write_text(whole + texts["numbers"] + "crop = '2:10,3:15'\nviews = '::2'\n")
+    assert fx.open(file).geometry.shape == (4, 8, 12)
+    for text, why in (
+        ("images = 'scan'\n", 'geometry is missing; allowed: geometry = "PATH"'),
+        (
+            whole + "falt = 3\n",
+            "falt is not known, did you mean flat?; allowed: images, geometry",
+        ),
+        (whole + "flat = \n", "is not valid TOML"),
+        (whole + "shape = 3\n", "shape is 3; allowed: [ROWS, COLUMNS]"),
+        (whole + "flat = 'none*'\n", "flat is 'none*': there is no such file"),
+    ):
+        file.write_text(text)
+        with pytest.raises(fx.TwinError) as caught:
+            fx.open(file)
+        assert why in str(caught.value)

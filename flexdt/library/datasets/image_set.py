@@ -518,8 +518,8 @@ class ImageSet:
         if flat is None:
             raise DatasetMissingError(
                 f"{self.where}: no flat field (io000000.tif, images of key 1 in an NXtomo "
-                "file); without flat images or the count of an open beam there are no line "
-                "integrals",
+                "file), and without one there are no line integrals; allowed: flat images or "
+                "the count of an open beam, said to fx.open or in a scan file",
                 {"path": self.where, "missing": ["io000000.tif"]},
             )
         return flat

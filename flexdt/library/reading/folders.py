@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
+from flexdt.library.datasets import scan_files
 from flexdt.library.datasets.cutting import cut
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_doubts import SATURATED
@@ -128,7 +129,8 @@ def load_dataset(
     settings texts; with a `geometry` anybody's images, as `read_tiffs` does.
 
     Args:
-        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts;
+        folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; a scan
+            file (.toml) that says images, geometry and options;
             Nikon's .xtekct, SkyScan's .log, phoenix's .pca or YXLON's
             ScanParameter.xml with its TIFFs; Zeiss's .txrm; a Data Exchange or NXtomo
             file; or a folder with one of these; with a `geometry` a file of images, too.
@@ -155,6 +157,8 @@ def load_dataset(
         >>> len(data), data.shape  # doctest: +SKIP
     """
     source = Path(folder)
+    if source.suffix.lower() == scan_files.ENDING and source.is_file():
+        return _of_scan_file(source, geometry, options)
     if geometry is not None and _holds_images(source):
         return read_tiffs(folder, geometry, **options)
     if source.is_file():
@@ -185,6 +189,19 @@ def load_dataset(
         return looked_at(with_options(data, options))
     given = geometry_said(geometry, options, data.shape, content.path)
     return looked_at(with_options(_with_given(data, given), _without_angles(options)))
+
+
+def _of_scan_file(path: Path, geometry: Geometry | None, options: ScanOptions) -> DataSet:
+    """Open what a scan file says; a geometry and options given besides come before its own."""
+    said = scan_files.scan_file(path)
+    both = cast(ScanOptions, {**said.options, **options})
+    made = read_tiffs(
+        said.images,
+        said.geometry if geometry is None else geometry,
+        frames=said.frames,
+        **both,
+    )
+    return replace(made, name=path.stem)
 
 
 def _holds_images(source: Path) -> bool:
