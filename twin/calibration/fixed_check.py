@@ -109,17 +109,23 @@ def without_groups(state: Calibration, fit: FitResult) -> Calibration:
     """
     problem = fit.problem
     tracks = problem.pixels
-    scans = []
-    found = []
-    seen = state.measured or state.identifications
-    first = 0
-    for scan, one in zip(state.scans, seen, strict=True):
-        own = slice(first, first + len(scan.poses))
-        first = own.stop
-        scans.append(replace(scan, poses=problem.poses[own]))
-        found.append(replace(one, tracks=tracks[own]))
-    moved = {"measured" if state.measured else "identifications": tuple(found)}
-    return replace(state, scans=tuple(scans), **moved)
+    ends = np.cumsum([0, *(len(scan.poses) for scan in state.scans)]).tolist()
+    parts = [slice(*ends[i : i + 2]) for i in range(len(state.scans))]
+    scans = [
+        replace(scan, poses=problem.poses[own])
+        for scan, own in zip(state.scans, parts, strict=True)
+    ]
+    if state.measured:
+        measured = [
+            replace(one, tracks=tracks[own])
+            for one, own in zip(state.measured, parts, strict=True)
+        ]
+        return replace(state, scans=tuple(scans), measured=tuple(measured))
+    found = [
+        replace(one, tracks=tracks[own])
+        for one, own in zip(state.identifications, parts, strict=True)
+    ]
+    return replace(state, scans=tuple(scans), identifications=tuple(found))
 
 
 def _limits(state: Calibration, request: CalibrationRequest) -> dict[str, float]:

@@ -11,9 +11,15 @@ import pytest
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.table import groups
 from flexdt.twin.calibration.diagnose.table.explained import explained
-from flexdt.twin.calibration.diagnose.table.group import NAMED_LOG_ODDS, Family, Known
+from flexdt.twin.calibration.diagnose.table.group import (
+    NAMED_LOG_ODDS,
+    Acts,
+    Family,
+    Known,
+)
 from flexdt.twin.calibration.diagnose.table.groups import CAUSES, every_family
 from flexdt.twin.calibration.diagnose.table.linearised import (
+    PER_FRAME,
     Linearised,
     State,
     with_every_column,
@@ -84,6 +90,12 @@ def test_names_of_groups_are_unique_and_rows_have_one_length(fit: FitResult) -> 
     names = [name for f in families for name in f.names]
     assert len(set(names)) == len(names)
     products = Products(table, families)
+    for f in families:
+        if f.acts is Acts.FRAMES and f.slopes is not None:
+            for g, place in enumerate(f.places):
+                moved = [PER_FRAME[i] for i in f.slopes[g % len(f.slopes)]]
+                assert isinstance(place, tuple)
+                assert moved == list(place[0]), f.names[g]
     for i, f in enumerate(families):
         assert products.own(i).shape[0] == len(f.names) == len(f.places)
         for g in (0, len(f.names) - 1):

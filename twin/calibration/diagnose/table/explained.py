@@ -85,7 +85,8 @@ class Explained:
         """Return the course of each slope of a group over the frames, (s, n)."""
         family = self.posterior.families[group[0]]
         assert family.courses is not None
-        own = family.courses[group[1] if len(family.courses) > 1 else 0]
+        assert family.slopes is not None
+        own = family.courses[group[1] // len(family.slopes)]
         return np.asarray(own @ self.weights[group])
 
 
@@ -201,7 +202,8 @@ def _state(
         elif family.acts is Acts.FRAMES:
             assert family.courses is not None
             assert isinstance(place, tuple)
-            courses = family.courses[g if len(family.courses) > 1 else 0] @ weights
+            assert family.slopes is not None
+            courses = family.courses[g // len(family.slopes)] @ weights
             for name, course in zip(place[0], courses, strict=True):
                 frames[name] = frames.get(name, 0.0) + course
         elif not family.always:

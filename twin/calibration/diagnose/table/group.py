@@ -81,8 +81,9 @@ class Family:
             `Acts.IMAGE`.
         chance: logarithm of the odds of each group before the scan is seen.
         rows: (g, 2 n k, c) of the table; None with slopes.
-        slopes: (g, s) numbers of slopes of the table; None with rows.
-        courses: (1 or g, s, n, c) of each slope over the frames.
+        slopes: (p, s) numbers of slopes of the table; None with rows.
+        courses: (m, s, n, c) of each slope over the frames: the g = m p groups are each course
+            with each of the slopes, in this order.
         widest: largest width of a weight [its own unit].
         always: width that always holds, so that the group is no question; 0: it is one.
     """

@@ -180,7 +180,7 @@ class Linearised:
     @property
     def k(self) -> int:
         """Number of beads."""
-        return self.problem.seen.shape[1]
+        return int(self.problem.seen.shape[1])
 
     @property
     def scans(self) -> list[npt.NDArray[np.intp]]:

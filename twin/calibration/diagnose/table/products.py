@@ -34,11 +34,11 @@ class Products:
 
     def own(self, family: int) -> FloatArray:
         """Return the products of the columns of each group, (g, c, c), in units."""
-        return self._own[family] / self.units[family][:, None, None] ** 2
+        return np.asarray(self._own[family] / self.units[family][:, None, None] ** 2)
 
     def widest(self, family: int) -> FloatArray:
         """Return the largest width of each group, (g,), in units."""
-        return self.families[family].widest * self.units[family]
+        return np.asarray(self.families[family].widest * self.units[family])
 
     def block(self, columns: FloatArray) -> int:
         """Take columns (2 n k, p) up, and return their number for `cross`."""
@@ -66,20 +66,21 @@ class Products:
         """Make the columns of a group, (2 n k, c), weighted, for weights in its own unit."""
         one = self.families[family]
         if one.rows is not None:
-            return one.rows[group]
+            return np.asarray(one.rows[group])
         assert one.slopes is not None
         assert one.courses is not None
-        courses = one.courses[group if len(one.courses) > 1 else 0]
-        slopes = self.table.slopes[one.slopes[group]]
-        out = np.einsum("snq,snc->nqc", slopes, courses)
-        return out.reshape(-1, out.shape[2])
+        course, piece = divmod(group, len(one.slopes))
+        slopes = self.table.slopes[one.slopes[piece]]
+        out = np.einsum("snq,snc->nqc", slopes, one.courses[course])
+        return np.asarray(out.reshape(-1, out.shape[2]))
 
     def _products(self, family: int, block: int) -> FloatArray:
         one = self.families[family]
         columns = self._blocks[block]
         unit = self.units[family][:, None, None]
         if one.rows is not None:
-            return np.einsum("gmc,mp->gcp", one.rows, columns, optimize=True) / unit
+            crossed = np.einsum("gmc,mp->gcp", one.rows, columns, optimize=True)
+            return np.asarray(crossed / unit)
         assert one.slopes is not None
         assert one.courses is not None
         if block not in self._framed:
@@ -89,30 +90,27 @@ class Products:
                 np.ascontiguousarray(self.table.slopes.transpose(1, 0, 2)), parts
             )
         framed = self._framed[block]
+        count, s, n, c = one.courses.shape
         out: FloatArray | float = 0.0
-        for s in range(one.slopes.shape[1]):
-            part = framed[:, one.slopes[:, s]]
-            if len(one.courses) == 1:
-                n, g, p = part.shape
-                each = one.courses[0, s].T @ part.reshape(n, g * p)
-                out = out + each.reshape(-1, g, p).transpose(1, 0, 2)
-            else:
-                own = one.courses[:, s].transpose(0, 2, 1)
-                out = out + np.matmul(own, part.transpose(1, 0, 2))
+        for i in range(s):
+            # Each course with each slope: the first change slowest.
+            course = one.courses[:, i].transpose(0, 2, 1).reshape(count * c, n)
+            part = framed[:, one.slopes[:, i]]
+            each = course @ part.reshape(n, -1)
+            each = each.reshape(count, c, len(one.slopes), -1)
+            out = out + each.transpose(0, 2, 1, 3).reshape(-1, c, each.shape[3])
         return np.asarray(out) / unit
 
     def _squares(self, one: Family) -> FloatArray:
         if one.rows is not None:
-            return np.matmul(one.rows.transpose(0, 2, 1), one.rows)
+            return np.asarray(np.matmul(one.rows.transpose(0, 2, 1), one.rows))
         assert one.slopes is not None
         assert one.courses is not None
-        some, which = np.unique(one.slopes, axis=0, return_inverse=True)
-        slopes = self.table.slopes[some]
+        slopes = self.table.slopes[one.slopes]
         both = np.einsum("gsnq,gtnq->gstn", slopes, slopes, optimize=True)
-        both = both[which.reshape(-1)]
-        courses = np.broadcast_to(one.courses, (len(both), *one.courses.shape[1:]))
-        g, s, n, c = courses.shape
-        weighed = np.einsum("gstn,gtnd->gsnd", both, courses, optimize=True)
-        return np.matmul(
-            courses.reshape(g, s * n, c).transpose(0, 2, 1), weighed.reshape(g, s * n, c)
-        )
+        s, n, c = one.courses.shape[1:]
+        out = []
+        for course in one.courses:
+            weighed = np.einsum("gstn,tnd->gsnd", both, course, optimize=True)
+            out.append(course.reshape(s * n, c).T @ weighed.reshape(-1, s * n, c))
+        return np.asarray(np.concatenate(out))

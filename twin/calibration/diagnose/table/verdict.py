@@ -164,7 +164,9 @@ def _open(found: Found, told: list[Finding]) -> list[Finding]:
 
 
 def _withheld(finding: Finding) -> bool:
-    return POLICY.get(CalibrationCode(finding.code), Use.OFFER) is Use.WITHHOLD
+    code = finding.code
+    assert isinstance(code, CalibrationCode)
+    return POLICY.get(code, Use.OFFER) is Use.WITHHOLD
 
 
 def _by_policy(finding: Finding) -> Finding:

@@ -1,8 +1,10 @@
 """Motion: object, source, panel or angle are elsewhere from frame to frame.
 
-A motion is a ramp, a jump, a wander (half waves that fade with their number) or a jitter (each
-frame by itself), of the object, the source or the panel along an axis, or of the angle. All have
-a mean of zero over the scan: the geometry is that of the mean.
+A motion is a ramp, a jump, a wander (half waves that fade with their number), a swing (harmonics
+of the turn) or a jitter (each frame by itself), of object, source or panel along an axis, or of
+the angle. All have a mean of zero over the scan: the geometry is that of the mean. A swing once
+a turn looks like a phantom aside on its mount, and is taken for that as far as nothing else of it
+is seen.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.named_motion import (
@@ -56,7 +59,11 @@ MOST_WAVES: Final = 24
 """Half waves in a scan, of a wander."""
 MOST_JUMPS: Final = 60
 """Frames before which a jump is looked for."""
-KINDS: Final = 3
+HARMONICS: Final = 3
+"""Of the turn, that a swing follows."""
+LEAST_SWINGING: Final = 12
+"""Frames of which a swing is told."""
+KINDS: Final = 4
 """Smooth kinds of motion, which share the odds."""
 
 
@@ -86,8 +93,18 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         # Of all half waves alike: frames by themselves, but for their mean.
         every = np.arange(1, count)
         jitter = np.cos(math.pi * place[:, None] * every) * math.sqrt(2.0 / count)
+        turn = table.problem.poses.angle[frames, None] * np.arange(1, HARMONICS + 1)
+        swing = np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
+        swing -= swing.mean(axis=0)
         chance = LOG_CHANCE - math.log(KINDS)
-        for how, course in (("wanders", wander), ("ramps", ramp), ("jitters", jitter)):
+        for how, course in (
+            ("wanders", wander),
+            ("ramps", ramp),
+            ("jitters", jitter),
+            ("swings", swing),
+        ):
+            if how == "swings" and count < LEAST_SWINGING:
+                continue
             some = JITTERS if how == "jitters" else tuple(MOVERS)
             if how == "ramps":
                 # Of even angles this is a factor on them.
@@ -107,15 +124,13 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         chance = LOG_CHANCE - math.log(KINDS * len(jumps))
         for names in _alike(tuple(MOVERS)):
             moves = [
-                Moves(m, "jumps", number, int(frames[at])) for m in names for at in jumps
+                Moves(m, "jumps", number, int(frames[at])) for at in jumps for m in names
             ]
-            every = np.concatenate([courses] * len(names))
-            yield _family(table, moves, where, every, chance)
+            yield _family(table, moves, where, courses, chance)
     if many:
         group = table.problem.group
-        apart = np.equal.outer(group, range(group.max() + 1)) - np.bincount(group) / len(
-            group
-        )
+        apart = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
+        apart -= np.bincount(group) / len(group)
         own = {n.split("@")[0] for n in table.problem.layout.names if "@" in n}
         # Scans that stand apart have told places, with a prior of their own.
         own |= {n.replace("place", "dO") for n in own if n.startswith("place")}
@@ -137,7 +152,7 @@ def _kind(name: str) -> tuple[int, bool]:
     return len(MOVERS[name]), name == "alpha"
 
 
-def _in(n: int, frames: FloatArray, course: FloatArray) -> FloatArray:
+def _in(n: int, frames: npt.NDArray[np.intp], course: FloatArray) -> FloatArray:
     out = np.zeros((n, course.shape[1]))
     out[frames] = course
     return out
@@ -152,16 +167,12 @@ def _family(
         table: of the slopes.
         moves: of each group.
         where: words on the scan.
-        courses: (1 or g, n, c) of the frames.
+        courses: (m, n, c) of the frames, each with all movers.
         chance: of each.
     """
     parts = [MOVERS[move.what] for move in moves]
-    factors = np.array([list(part.values()) for part in parts])
-    every = np.broadcast_to(courses, (len(moves), *courses.shape[1:]))
-    shared = len(courses) == 1 and bool((factors == factors[0]).all())
-    if shared:
-        every = courses
-        factors = factors[:1]
+    first = parts[: len(parts) // len(courses)]
+    (factors,) = {tuple(part.values()) for part in first}
     names = tuple(
         f"{m.what} {m.how}{f' at {m.at}' if m.at >= 0 else ''}{where}" for m in moves
     )
@@ -171,8 +182,8 @@ def _family(
         Acts.FRAMES,
         tuple((tuple(part), move) for part, move in zip(parts, moves, strict=True)),
         chance,
-        slopes=np.array([[PER_FRAME.index(p) for p in part] for part in parts]),
-        courses=factors[:, :, None, None] * every[:, None],
+        slopes=np.array([[PER_FRAME.index(p) for p in part] for part in first]),
+        courses=np.array(factors)[:, None, None] * courses[:, None],
     )
 
 
@@ -264,7 +275,9 @@ def _looks_alike(what: str) -> str:
     )
 
 
-def _turned(seen: Sequence[Seen], angles: FloatArray, group: FloatArray) -> Finding:
+def _turned(
+    seen: Sequence[Seen], angles: FloatArray, group: npt.NDArray[np.int64]
+) -> Finding:
     """Tell how the object turns otherwise than stated."""
     jumps = [s for s in seen if _moves(s).how == "jumps"]
     main = max(seen, key=lambda s: s.effect_px)

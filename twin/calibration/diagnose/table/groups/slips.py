@@ -91,12 +91,8 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 Acts.IMAGE,
                 tuple(Slips(piece, number, at) for piece, at in each),
                 chance - math.log(2 * len(jumps)),
-                slopes=np.concatenate([slopes] * len(jumps)),
-                courses=np.repeat(
-                    _along_axes(table.n, frames, steps[:, :, None] == after),
-                    len(pieces),
-                    axis=0,
-                ),
+                slopes=slopes,
+                courses=_along_axes(table.n, frames, steps[:, :, None] == after),
             )
 
 
@@ -142,8 +138,8 @@ def told(found: Found) -> list[Finding]:
     alike: dict[int, list[int]] = {}
     for bead in sorted(far):
         if far[bead] > LEAST_PART * most:
-            at = frames[bead]
-            alike.setdefault(min(at) if len(at) == 1 else -1, []).append(bead)
+            first = min(frames[bead]) if len(frames[bead]) == 1 else -1
+            alike.setdefault(first, []).append(bead)
     parts = []
     for at, beads in sorted(alike.items()):
         which = f"bead{'s' * (len(beads) > 1)} {', '.join(map(str, beads))}"

@@ -26,6 +26,8 @@ HARMONICS: Final = 3
 LEAST_FRAMES: Final = 16
 MOST_WAVES: Final = 16
 """Half waves over the scan, of slow errors."""
+MOST_COLUMNS: Final = 360
+"""Columns of slow errors, from which the waves of many beads are fewer."""
 BEAD_ERROR_SPREADS: Final = 1.0
 """Errors, in standard deviations of a position, up to which they widen the intervals alone and are
 no finding."""
@@ -44,7 +46,9 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         [size * np.cos(turn), size[1:] * np.sin(turn[:, 1:])], axis=1
     )
     place = (np.arange(table.n) + 0.5) / table.n
-    waves = np.arange(MOST_WAVES + 1)
+    waves = np.arange(
+        min(MOST_WAVES, max(MOST_COLUMNS // (2 * table.k) - 1, HARMONICS)) + 1
+    )
     slow = np.cos(math.pi * place[:, None] * waves) / np.sqrt(1.0 + (waves / 4.0) ** 2)
     slopes = table.spot_slopes[None]
     for how, each in (("with the turn", harmonics), ("slowly", slow)):

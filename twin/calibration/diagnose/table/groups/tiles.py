@@ -41,19 +41,19 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         return
     counted = table.weight > 0
     known_borders = [one for one in table.state.found if isinstance(one, Border)]
-    borders = []
-    beyond = []
+    borders: list[Border] = []
+    beyond: list[FloatArray] = []
     for axis in (0, 1):
         place = table.measured[..., axis]
         found = [b.at for b in known_borders if b.axis == axis]
         for at in _borders(place[counted], shape[1 - axis], found):
             borders.append(Border(axis, at))
-            beyond.append((place >= at) * 1.0)
+            beyond.append(np.where(place >= at, 1.0, 0.0))
     if borders:
         yield _family(table, borders, beyond, LOG_CHANCE - math.log(BORDERS))
     # Four tiles are two borders, and a quarter that is neither.
-    quarters = [
-        (table.measured >= (one.at, other.at)).all(axis=2) * 1.0
+    quarters: list[FloatArray] = [
+        np.where((table.measured >= (one.at, other.at)).all(axis=2), 1.0, 0.0)
         for one in known_borders
         for other in known_borders
         if one.axis == 0 and other.axis == 1
