@@ -10,15 +10,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.data_set import DataSet
-from flexdt.library.datasets.image_doubts import image_doubts
-from flexdt.library.extras import extension
-from flexdt.library.machines import machine as machine_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import (
     Channel,
@@ -76,6 +72,9 @@ from flexdt.twin.projection.pixel_areas import (
 )
 from flexdt.twin.rays_a_pixel import Rays, check_rays
 from flexdt.twin.signatures import public
+
+if TYPE_CHECKING:
+    from flexdt.library.data_set import DataSet
 
 BATCH_BYTES: Final = 64 << 20
 """Path lengths in memory at a time."""
@@ -397,6 +396,10 @@ def simulate(
         given = (tube, detector, machine, shape, material, voxel_mm, exposure_ms)
         other = scatter != "off" or spot_points != 1 or given != (None,) * 7
         return _of_scenario(sample, noise, 3 if rays is None else rays, alone=not other)
+    from flexdt.library.data_set import DataSet
+    from flexdt.library.datasets.image_doubts import image_doubts
+    from flexdt.library.machines import machine as machine_of
+
     rays = check_rays("auto" if rays is None else rays)
     _check_sampling(noise, spot_points)
     cone = as_cone_vec(geometry)
@@ -477,6 +480,8 @@ def _of_scenario(
             "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
             {"asked": None},
         )
+    from flexdt.library.extras import extension
+
     scenario = extension("scenario", "a CTSimU scenario")
     made: DataSet = scenario(sample, noise, rays)
     return made

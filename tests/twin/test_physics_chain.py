@@ -19,6 +19,7 @@ from flexdt.twin.machine.camera import CameraSettings, PixelGrid, Roi
 from flexdt.twin.physics.blur import blurred, kernel, noise_kernel, spot_blur_px
 from flexdt.twin.physics.chain import (
     Chain,
+    brightest_flux,
     expected_signal,
     flux_of,
     radiographs,
@@ -448,3 +449,16 @@ def test_every_default_says_where_it_comes_from(kind):
             "Literature",
             "Assumed",
         )
+
+
+def test_the_brightest_flux_is_the_largest_of_the_map() -> None:
+    random = np.random.default_rng(4)
+    for _ in range(40):
+        row = random.normal(size=12) * 200.0
+        u = random.normal(size=3)
+        v = np.cross(u, random.normal(size=3))
+        row[6:9] = u / np.linalg.norm(u) * random.uniform(0.05, 2.0)
+        row[9:12] = v / np.linalg.norm(v) * random.uniform(0.05, 2.0)
+        shape = (int(random.integers(1, 40)), int(random.integers(1, 40)))
+        expected = float(flux_of(row, shape).max())
+        assert brightest_flux(row, shape) == pytest.approx(expected, rel=1e-6)

@@ -211,6 +211,23 @@ def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
     Returns:
         (rows, cols).
     """
+    return flux_map(*_panel_from_source(view), shape)
+
+
+def brightest_flux(view: npt.ArrayLike, shape: tuple[int, int]) -> float:
+    """Compute the largest value of `flux_of` alone, at the pixel nearest to the source's
+    foot point; a map of a whole panel takes 20 MB."""
+    distance, foot_u, foot_v, pixel_u, pixel_v = _panel_from_source(view)
+    rows, cols = shape
+    y = np.abs((np.arange(rows) - (rows - 1) / 2) * pixel_v - foot_v).min()
+    x = np.abs((np.arange(cols) - (cols - 1) / 2) * pixel_u - foot_u).min()
+    # The panel of one pixel whose centre is as far from the foot point.
+    return float(flux_map(distance, x, y, pixel_u, pixel_v, (1, 1))[0, 0])
+
+
+def _panel_from_source(view: npt.ArrayLike) -> tuple[float, float, float, float, float]:
+    """Describe the panel of a cone_vec row as the source sees it: distance of its plane,
+    the source's foot point from its centre along u and v, and both pitches [mm]."""
     row = np.asarray(view, dtype=np.float64)
     away = row[0:3] - row[3:6]
     u = row[6:9]
@@ -220,8 +237,8 @@ def flux_of(view: npt.ArrayLike, shape: tuple[int, int]) -> Float32Array:
     normal = np.cross(u, v) / (pixel_u * pixel_v)
     feet = float(away @ u) / pixel_u, float(away @ v) / pixel_v
     # Rounded, so that equal views share a map.
-    key = (round(x, 6) for x in (abs(float(away @ normal)), *feet))
-    return flux_map(*key, round(pixel_u, 12), round(pixel_v, 12), shape)
+    distance, foot_u, foot_v = (round(x, 6) for x in (abs(float(away @ normal)), *feet))
+    return distance, foot_u, foot_v, round(pixel_u, 12), round(pixel_v, 12)
 
 
 @lru_cache(maxsize=16)

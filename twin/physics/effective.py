@@ -25,6 +25,8 @@ SIGNAL_TOLERANCE = 1e-3
 MIN_TRANSMISSION = 1e-4
 """Transmission below which the error is relative to this value instead (about a
 count of 14 bit)."""
+LEAST_SIGNAL = 1e-19
+"""Signal of an energy that counts as none: float32 does not hold its square."""
 MAX_ENERGIES = 48
 """Largest number of effective energies; six metals at once take about 25."""
 AIMED_SHARE = 0.5
@@ -113,7 +115,7 @@ def effective_beam(
         The beam: at most `MAX_ENERGIES` energies whose signal is within the tolerance on
         thicknesses that were not fitted, with the largest error there.
     """
-    if not signal.max() > 0.0:
+    if not signal.max() > LEAST_SIGNAL:
         message = "no photon leaves anything in the detector"
         raise LimitError.instead(message, 0.0, "one that absorbs some of the spectrum")
     used = np.flatnonzero(signal > signal.max() * 1e-9)

@@ -14,7 +14,7 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.camera import CameraSettings
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.physics import exposure as ideal
-from flexdt.twin.physics.chain import Chain, expected_signal, flux_of
+from flexdt.twin.physics.chain import Chain, brightest_flux, expected_signal
 from flexdt.twin.physics.detector import detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.image_quality import pixel_reading
@@ -181,7 +181,7 @@ def _open_beam_of_a_spectrum(
 ) -> OpenBeam | None:
     """Predict the open beam with the tube's spectrum; None without one for the voltage."""
     panel = detector_of(machine.detector)
-    brightest = float(flux_of(view, camera.shape).max())
+    brightest = brightest_flux(view, camera.shape)
     try:
         reading = pixel_reading(
             Chain(panel, tube_of(machine.tube)), camera, exposure, brightest
