@@ -69,8 +69,11 @@ const COMPACT = new Intl.NumberFormat("en", {
   maximumSignificantDigits: 3,
 });
 
-/** @param {number} value */
-const written = (value) => COMPACT.format(value).replace("-", "−");
+/**
+ * A tick's number; none for one that uPlot leaves out where they stand close.
+ * @param {number | null} value
+ */
+const written = (value) => (value === null ? "" : COMPACT.format(value).replace("-", "−"));
 
 /**
  * @param {Element} host
@@ -195,7 +198,7 @@ export function histogram(host, places = "even") {
   /** @type {uPlot.Axis} */
   const ticks = {
     splits: (_chart, _axis, low, high) => powers(low, high),
-    values: (_, splits) => splits.map((power) => written(10 ** power)),
+    values: (_, splits) => splits.map((power) => written(power === null ? null : 10 ** power)),
   };
 
   /**
