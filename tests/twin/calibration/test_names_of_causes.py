@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import pkgutil
 from dataclasses import replace
 
@@ -71,8 +72,10 @@ def table_of(fit: FitResult) -> Linearised:
 
 
 def test_every_module_of_a_cause_is_registered(fit: FitResult) -> None:
-    files = {m.name for m in pkgutil.iter_modules(groups.__path__)}
-    assert {name.replace(" ", "_") for name in (c.name for c in CAUSES)} == files
+    files = [m.name for m in pkgutil.iter_modules(groups.__path__)]
+    modules = [importlib.import_module(f"{groups.__name__}.{name}") for name in files]
+    assert {module.NAME for module in modules} == {c.name for c in CAUSES}
+    assert len(files) == len(CAUSES)
     made = {f.cause for f in every_family(table_of(fit), KNOWN)}
     assert made == {c.name for c in CAUSES}
     assert all(c.words for c in CAUSES)

@@ -11,7 +11,7 @@ from faults_drawn import World, shadows
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose.table.group import Known
-from flexdt.twin.calibration.diagnose.table.groups import motion
+from flexdt.twin.calibration.diagnose.table.groups import moving
 from flexdt.twin.calibration.diagnose.table.linearised import (
     Linearised,
     State,
@@ -50,9 +50,9 @@ def test_a_motion_belongs_to_one_scan() -> None:
     problem = fit.problem
     _, x = with_every_column(problem, fit.solution.x)
     table = Linearised(problem, State(x, {}, np.zeros((2 * n, 5, 2))), 1e-3)
-    families = list(motion.families(table, Known((1e-3, 1e-3), None, 1e-3)))
+    families = list(moving.families(table, Known((1e-3, 1e-3), None, 1e-3)))
     names = {name for f in families for name in f.names}
-    for name in motion.MOVERS:
+    for name in moving.MOVERS:
         for scan in (1, 2):
             assert f"{name} wanders in scan {scan}" in names
         # What has a value in each scan cannot differ from scan to scan besides.

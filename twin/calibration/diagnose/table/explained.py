@@ -11,7 +11,7 @@ import numpy as np
 
 from flexdt.twin.calibration.diagnose.table.group import Acts, Family, Known
 from flexdt.twin.calibration.diagnose.table.groups import (
-    beads,
+    bead_places,
     every_family,
     spots,
     strain,
@@ -155,8 +155,8 @@ def _never_exact(table: Linearised, known: Known) -> tuple[str, ...]:
     """Name the groups that are there however little the residuals show of them: places of so
     few beads that any displacement is a strain. No phantom has its beads exactly in place.
     """
-    few = table.k <= beads.MOST_STRAINED and known.bead_tolerance_mm is None
-    return (beads.ALL,) if few else ()
+    few = table.k <= bead_places.MOST_STRAINED and known.bead_tolerance_mm is None
+    return (bead_places.ALL,) if few else ()
 
 
 def _name(families: Sequence[Family], group: Group) -> str:

@@ -27,7 +27,7 @@ from flexdt.twin.calibration.diagnose.table.group import (
 from flexdt.twin.calibration.diagnose.table.groups import (
     CAUSES,
     growth,
-    motion,
+    moving,
     positions,
     spots,
 )
@@ -40,7 +40,7 @@ its residuals are explained."""
 LEAST_BEADS: Final = 3
 MOST_LOST: Final = 0.35
 """Part of the positions that may be left out."""
-OF_MOTION: Final = (motion.NAME, growth.NAME)
+OF_MOTION: Final = (moving.NAME, growth.NAME)
 
 
 class Use(enum.Enum):

@@ -10,10 +10,10 @@ from flexdt.twin.calibration.diagnose.table.group import Family, Found, Known
 from flexdt.twin.calibration.diagnose.table.groups import (
     angle_scale,
     arc,
-    beads,
+    bead_places,
     growth,
-    motion,
-    panel,
+    moving,
+    panel_shape,
     positions,
     rows,
     slips,
@@ -47,7 +47,7 @@ class Cause(NamedTuple):
 CAUSES: Final = tuple(
     Cause(module.NAME, module.WORDS, module.families, module.told)
     for module in (
-        strain, beads, slips, arc, rows, panel, tiles, motion, growth, wobble,
+        strain, bead_places, slips, arc, rows, panel_shape, tiles, moving, growth, wobble,
         angle_scale, spots, told, positions,
     )
 )  # fmt: skip
@@ -56,14 +56,14 @@ CAUSES: Final = tuple(
 
 STATED: Final = (
     (tiles.NAME, "", "gap"),
-    (panel.NAME, "", "distortion"),
+    (panel_shape.NAME, "", "distortion"),
     (strain.NAME, "", "shape"),
-    (beads.NAME, "", "beads"),
+    (bead_places.NAME, "", "beads"),
     (arc.NAME, "", "arc"),
     (rows.NAME, "", "rows"),
     (angle_scale.NAME, "", "angles"),
-    (motion.NAME, "alpha", "angles"),
-    (motion.NAME, "", "motion"),
+    (moving.NAME, "alpha", "angles"),
+    (moving.NAME, "", "motion"),
     (growth.NAME, "", "motion"),
     (spots.NAME, "", "spots"),
     (told.NAME, "", TOLD_RIVALS),
