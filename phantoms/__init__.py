@@ -28,6 +28,7 @@ from flexdt.phantoms.samples import (
     phantom_names,
     shepp_logan,
 )
+from flexdt.phantoms.standard import ball_bar, ball_helix, ball_plate, two_rings
 from flexdt.twin.attenuation.materials import Material, material, materials, stated_keV
 
 __all__ = [
@@ -37,6 +38,9 @@ __all__ = [
     "Surface",
     "Voxels",
     "as_phantom",
+    "ball_bar",
+    "ball_helix",
+    "ball_plate",
     "bead_phantom",
     "beads",
     "chiral_phantom",
@@ -57,6 +61,7 @@ __all__ = [
     "shepp_logan",
     "spiral_positions",
     "stated_keV",
+    "two_rings",
     "voxel_phantom",
 ]
 

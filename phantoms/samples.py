@@ -34,6 +34,7 @@ from flexdt.phantoms.gears import gear_phantom
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
 from flexdt.phantoms.placement import Place, placed
+from flexdt.phantoms.standard import ball_bar, ball_helix, ball_plate, two_rings
 from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.errors import UnknownNameError
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
@@ -112,6 +113,10 @@ _MAKERS: Final[Mapping[str, Callable[[], Phantom]]] = {
     "shepp-logan": shepp_logan,
     "chiral": chiral_phantom,
     "gear": gear_phantom,
+    "two-rings": two_rings,
+    "helix": ball_helix,
+    "ball-plate": ball_plate,
+    "ball-bar": ball_bar,
 }
 
 
