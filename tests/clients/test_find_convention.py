@@ -32,15 +32,19 @@ class Pair:
 
 
 def scan_of(
-    angles: FloatArray, shape: tuple[int, int], column: float, row: float
+    angles: FloatArray,
+    shape: tuple[int, int],
+    column: float,
+    row: float,
+    pitch: float = PITCH,
 ) -> fx.ConeVec:
     """A circle whose central ray hits a column and row of the panel."""
     offset = (
-        ((shape[1] - 1) / 2 - column) * PITCH,
-        ((shape[0] - 1) / 2 - row) * PITCH,
+        ((shape[1] - 1) / 2 - column) * pitch,
+        ((shape[0] - 1) / 2 - row) * pitch,
     )
     return fx.ConeVec.circular(
-        sod=SOD, sdd=SDD, angles=angles, shape=shape, pixel=PITCH, offset=offset
+        sod=SOD, sdd=SDD, angles=angles, shape=shape, pixel=pitch, offset=offset
     )
 
 
@@ -62,11 +66,16 @@ def drawn(seed: int) -> Pair:
     column = middle[1] + float(rng.choice([0.0, rng.uniform(-6.0, 6.0)]))
     row = middle[0] + float(rng.choice([0.0, rng.uniform(-9.0, 9.0)]))
     count = int(rng.integers(3, 7))
-    balls = np.c_[rng.uniform(-4, 4, (count, 3)), rng.uniform(0.8, 2.2, count)]
-    lines = integrals(angles, column=column, row=row, shape=shape, balls=balls)
+    pitch = float(rng.uniform(0.75, 2.2))  # fans of 8 to 28 degrees
+    wide, tall = (0.5 * n * pitch * SOD / SDD for n in shape[::-1])
+    at = rng.uniform(-0.5, 0.5, (count, 3)) * [wide, wide, tall]
+    balls = np.c_[at, rng.uniform(0.1, 0.28, count) * wide]
+    lines = integrals(
+        angles, column=column, row=row, shape=shape, balls=balls, pitch=pitch
+    )
     lines += rng.normal(0.0, float(rng.uniform(0.0, 0.02)), lines.shape)
     columns, rows, sense, side, height, turned = rng.integers(0, 2, 6).astype(bool)
-    right = flipped(scan_of(angles, shape, column, row), columns, rows)
+    right = flipped(scan_of(angles, shape, column, row, pitch), columns, rows)
     if columns:
         lines = lines[:, :, ::-1]
     if rows:
@@ -76,6 +85,7 @@ def drawn(seed: int) -> Pair:
         shape,
         2 * middle[1] - column if side else column,
         2 * middle[0] - row if height else row,
+        pitch,
     )
     order = (1, 0, 2) if turned else (0, 1, 2)
     return Pair(np.transpose(lines, order), stated, right, order)

@@ -430,7 +430,7 @@ def test_a_reader_of_scan_files_is_added_by_its_recipe(copy: Path) -> None:
     module.with_name("probe_table.py").write_text(PROBE_TABLE)
     inserted(copy, {
         "flexdt/library/reading/foreign_files.py": (
-            ("from flexdt.library.reading.skyscan_reading",
+            ("from flexdt.library.reading.text_formats.skyscan_reading",
              "from flexdt.library.reading.probe_reading import read_probe\n"
              "from flexdt.library.reading.probe_table import PROBE\n"),
             ('    ScanFormat("YXLON"',

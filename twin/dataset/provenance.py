@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -116,14 +115,23 @@ class Provenance(tuple[Stated, ...]):
         return cls(Stated.from_dict(one) for one in members)
 
     @property
+    def rows(self) -> list[tuple[str, str, str, str]]:
+        """The table's heads, and the cells of each value; a long value is cut."""
+        heads = ("field", "value", "use", "consequence")
+        return [
+            heads,
+            *((s.field, shortened(s.value), s.use.value, s.consequence) for s in self),
+        ]
+
+    @property
     def lines(self) -> list[str]:
         """The table, a line a value, with a head; [] without values."""
         if not self:
             return []
-        cells = [("field", "value", "use", "consequence"), *map(_cells, self)]
-        widths = [max(len(row[k]) for row in cells) for k in range(3)]
+        rows = self.rows
+        widths = [max(len(row[k]) for row in rows) for k in range(3)]
         texts = []
-        for row in cells:
+        for row in rows:
             padded = [cell.ljust(w) for cell, w in zip(row[:3], widths, strict=True)]
             texts.append("  ".join((*padded, row[3])).rstrip())
         return texts
@@ -131,21 +139,6 @@ class Provenance(tuple[Stated, ...]):
     def __repr__(self) -> str:
         """Return the table; of an empty one a sentence."""
         return "\n".join(self.lines) or "<Provenance: no file>"
-
-    def _repr_html_(self) -> str:
-        """Return the table for a notebook."""
-        rows = [("field", "value", "use", "consequence"), *map(_cells, self)]
-        tags = ["th", *["td"] * len(self)]
-        lines = [
-            "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
-            for tag, row in zip(tags, rows, strict=True)
-        ]
-        return f"<table>{''.join(lines)}</table>"
-
-
-def _cells(one: Stated) -> tuple[str, str, str, str]:
-    """Return the texts of a row; a long value is cut."""
-    return one.field, shortened(one.value), one.use.value, one.consequence
 
 
 def shortened(value: str, width: int = VALUE_WIDTH) -> str:

@@ -18,7 +18,11 @@ from typing import Any, Final, Protocol, Self, TypeVar, overload
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.datasets.notebook_html import facts_table, thumbnail
+from flexdt.library.datasets.notebook_html import (
+    facts_table,
+    thumbnail,
+    values_table,
+)
 from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image, read_values
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
@@ -299,7 +303,8 @@ class ImageSet:
         if self.present:
             first = self.present[0]
             picture = thumbnail(self.counts(first), f"projection {first}")
-        values = self.provenance._repr_html_() if self.provenance else ""
+        heads, *rows = self.provenance.rows
+        values = values_table(heads, rows) if rows else ""
         return facts_table(f"DataSet {self.name}", facts) + values + picture
 
     def _reference_counts(self) -> tuple[int, int]:

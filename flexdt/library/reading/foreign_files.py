@@ -12,22 +12,22 @@ from typing import Final, NoReturn
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.exchange_formats import FORMATS
-from flexdt.library.reading.dxchange_reading import (
+from flexdt.library.reading.foreign_parsing import parsing
+from flexdt.library.reading.hdf5_formats.dxchange_reading import (
     is_data_exchange,
     read_data_exchange,
 )
-from flexdt.library.reading.dxchange_table import DATA_EXCHANGE
-from flexdt.library.reading.foreign_parsing import parsing
-from flexdt.library.reading.nikon_reading import read_nikon
-from flexdt.library.reading.nikon_table import NIKON
-from flexdt.library.reading.nxtomo_reading import read_nxtomo
-from flexdt.library.reading.nxtomo_table import NXTOMO
-from flexdt.library.reading.phoenix_reading import read_phoenix
-from flexdt.library.reading.phoenix_table import PHOENIX
-from flexdt.library.reading.skyscan_reading import is_skyscan, read_skyscan
-from flexdt.library.reading.skyscan_table import SKYSCAN
-from flexdt.library.reading.yxlon_reading import is_yxlon, read_yxlon
-from flexdt.library.reading.yxlon_table import YXLON
+from flexdt.library.reading.hdf5_formats.dxchange_table import DATA_EXCHANGE
+from flexdt.library.reading.hdf5_formats.nxtomo_reading import read_nxtomo
+from flexdt.library.reading.hdf5_formats.nxtomo_table import NXTOMO
+from flexdt.library.reading.text_formats.nikon_reading import read_nikon
+from flexdt.library.reading.text_formats.nikon_table import NIKON
+from flexdt.library.reading.text_formats.phoenix_reading import read_phoenix
+from flexdt.library.reading.text_formats.phoenix_table import PHOENIX
+from flexdt.library.reading.text_formats.skyscan_reading import is_skyscan, read_skyscan
+from flexdt.library.reading.text_formats.skyscan_table import SKYSCAN
+from flexdt.library.reading.text_formats.yxlon_reading import is_yxlon, read_yxlon
+from flexdt.library.reading.text_formats.yxlon_table import YXLON
 from flexdt.library.reading.zeiss_reading import read_zeiss
 from flexdt.library.reading.zeiss_table import ZEISS
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError

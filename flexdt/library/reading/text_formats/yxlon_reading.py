@@ -15,8 +15,12 @@ import numpy as np
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_parsing import head_text
-from flexdt.library.reading.text_scans import compared, projections_in, under_a_level
-from flexdt.library.reading.yxlon_table import YXLON
+from flexdt.library.reading.text_formats.text_scans import (
+    compared,
+    projections_in,
+    under_a_level,
+)
+from flexdt.library.reading.text_formats.yxlon_table import YXLON
 from flexdt.runtime.files.dataset_folder import list_folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger

@@ -17,9 +17,9 @@ import numpy as np
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_parsing import head_text
-from flexdt.library.reading.nikon_angles import chosen_angles
-from flexdt.library.reading.nikon_table import NIKON
-from flexdt.library.reading.text_scans import (
+from flexdt.library.reading.text_formats.nikon_angles import chosen_angles
+from flexdt.library.reading.text_formats.nikon_table import NIKON
+from flexdt.library.reading.text_formats.text_scans import (
     compared,
     folder_name,
     ini_values,

@@ -11,8 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.datasets.nxtomo_writing import PROJECTION
-from flexdt.library.reading.hdf5_values import lengths_mm, members_of, text_of
-from flexdt.library.reading.nxtomo_table import DETECTOR, NXTOMO
+from flexdt.library.reading.hdf5_formats.hdf5_values import (
+    lengths_mm,
+    members_of,
+    text_of,
+)
+from flexdt.library.reading.hdf5_formats.nxtomo_table import DETECTOR, NXTOMO
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
 

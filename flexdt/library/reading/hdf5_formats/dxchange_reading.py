@@ -17,16 +17,16 @@ import numpy.typing as npt
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, PROJECTION
 from flexdt.library.extras import package
-from flexdt.library.reading.dxchange_table import DATA_EXCHANGE, INSTRUMENT
 from flexdt.library.reading.foreign_parsing import require_memory
-from flexdt.library.reading.hdf5_values import (
+from flexdt.library.reading.hdf5_formats.dxchange_table import DATA_EXCHANGE, INSTRUMENT
+from flexdt.library.reading.hdf5_formats.hdf5_values import (
     angles_rad,
     lengths_mm,
     members_of,
     text_of,
 )
-from flexdt.library.reading.one_exposure import on_one_exposure
-from flexdt.library.reading.text_scans import compared
+from flexdt.library.reading.hdf5_formats.one_exposure import on_one_exposure
+from flexdt.library.reading.text_formats.text_scans import compared
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.geometry.cone_vec import ConeVec

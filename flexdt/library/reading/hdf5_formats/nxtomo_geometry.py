@@ -14,9 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.datasets.nxtomo_writing import HALF_SEEN
-from flexdt.library.reading.hdf5_values import angles_rad, lengths_mm, text_of
-from flexdt.library.reading.nxtomo_scan import NxScan
-from flexdt.library.reading.nxtomo_table import DETECTOR
+from flexdt.library.reading.hdf5_formats.hdf5_values import (
+    angles_rad,
+    lengths_mm,
+    text_of,
+)
+from flexdt.library.reading.hdf5_formats.nxtomo_scan import NxScan
+from flexdt.library.reading.hdf5_formats.nxtomo_table import DETECTOR
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.findings import Finding, warning

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_parsing import head_text
-from flexdt.library.reading.skyscan_table import SKYSCAN
-from flexdt.library.reading.text_scans import (
+from flexdt.library.reading.text_formats.skyscan_table import SKYSCAN
+from flexdt.library.reading.text_formats.text_scans import (
     TIFFS,
     compared,
     ini_values,

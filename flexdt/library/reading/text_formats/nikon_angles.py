@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from flexdt.library.reading.foreign_parsing import head_text
-from flexdt.library.reading.nikon_table import NIKON
+from flexdt.library.reading.text_formats.nikon_table import NIKON
 from flexdt.runtime.files.dataset_folder import list_folder
 from flexdt.twin.dataset.format_table import Ledger, as_number
 from flexdt.twin.dataset.provenance import Provenance

@@ -13,8 +13,8 @@ import numpy as np
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_parsing import head_text
-from flexdt.library.reading.phoenix_table import PHOENIX
-from flexdt.library.reading.text_scans import (
+from flexdt.library.reading.text_formats.phoenix_table import PHOENIX
+from flexdt.library.reading.text_formats.text_scans import (
     compared,
     ini_values,
     projections_in,

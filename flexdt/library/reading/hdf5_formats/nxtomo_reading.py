@@ -14,14 +14,14 @@ from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, INVALID, PROJECTION
 from flexdt.library.extras import package
 from flexdt.library.reading.foreign_parsing import require_memory
-from flexdt.library.reading.nxtomo_geometry import (
+from flexdt.library.reading.hdf5_formats.nxtomo_geometry import (
     file_geometry,
     replaced_by,
     stated_figures,
 )
-from flexdt.library.reading.nxtomo_scan import NxScan, scan_of
-from flexdt.library.reading.nxtomo_table import DETECTOR
-from flexdt.library.reading.one_exposure import on_one_exposure
+from flexdt.library.reading.hdf5_formats.nxtomo_scan import NxScan, scan_of
+from flexdt.library.reading.hdf5_formats.nxtomo_table import DETECTOR
+from flexdt.library.reading.hdf5_formats.one_exposure import on_one_exposure
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.plausibility import settled

@@ -1,0 +1,1 @@
+"""Formats whose geometry is a text beside image files: Nikon, SkyScan, phoenix, YXLON."""
