@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import index
 from typing import Final, Literal
 
 from flexdt.twin.errors import LimitError
@@ -24,12 +25,11 @@ def check_rays(rays: object) -> Rays:
     """
     if isinstance(rays, str) and rays == "auto":
         return "auto"
-    whole: int
     try:
-        whole = int(rays)  # type: ignore[call-overload, unused-ignore]
-    except (TypeError, ValueError):
+        whole = 0 if isinstance(rays, bool) else index(rays)  # type: ignore[arg-type]
+    except TypeError:
         whole = 0
-    if isinstance(rays, bool) or whole != rays or not 1 <= whole <= MAX_RAYS:
+    if not 1 <= whole <= MAX_RAYS:
         allowed = f'1 to {MAX_RAYS} along each side of a pixel, or "auto"'
         raise LimitError.instead(f"rays is {rays}", str(rays), allowed)
     return whole

@@ -363,7 +363,7 @@ def simulate(
             axis.
         rays: along each side of a pixel that an edge of the sample reaches, 1 to 16, or
             "auto", the default but for scenarios (3); their signals are averaged, as a
-            pixel does. "auto" keeps the error on an edge below half of the exposure's
+            pixel does. "auto" keeps the error on an edge below the exposure's
             noise (docs/physics.md). With 1 edges along rows or columns come out in
             steps, of which `align` has wider sigmas.
         spot_points: of the focal spot from which rays start, 3 to 1024; their signals are

@@ -224,11 +224,12 @@ class ProjectorPool:
     ) -> Float32Array:
         """Compute line integrals along several rays of some pixels, as
         `ProjectorClient.paths_within`."""
-        return await self._request(
+        paths: Float32Array = await self._request(
             name,
             0,
             lambda client, body: client.paths_within(name, body, cone_vec, shape, within),
         )
+        return paths
 
     async def _request(self, name: str, views: int, work: Work | None) -> Any:
         """Request something of a free projector, and of another one if it is late; take the

@@ -252,13 +252,17 @@ def main() -> None:
     """Print the table, and what is promised of it; exit 1 where a promise does not hold."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--count", type=int, default=60)
+    options.add_argument(
+        "--first", type=int, default=0, help="number of the first object"
+    )
+    options.add_argument("--table", action="store_true", help="the objects alone")
     options.add_argument("--astra", help="folder with ASTRA, where it is not installed")
     options.add_argument("--json", action="store_true")
     asked = options.parse_args()
     rows: dict[str, list[tuple[float, float]]] = {}
     kept: dict[str, list[Volume]] = {}
     images = []
-    for seed in range(asked.count):
+    for seed in range(asked.first, asked.first + asked.count):
         found, volumes, wanted = studied(seed, asked.astra)
         images.append(wanted)
         for name, values in found.items():
@@ -283,8 +287,8 @@ def main() -> None:
             "ms": round(float(np.median(times)), 1),
             "objects": len(errors),
         }
-    voxels = single_voxels(200)
-    ratios = costs()
+    voxels = {} if asked.table else single_voxels(200)
+    ratios = {} if asked.table else costs()
     if asked.json:
         print(json.dumps({"table": table, "voxels": voxels, "costs": ratios}, indent=1))
     else:

@@ -8,9 +8,9 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.physics.blur import FWHM
 
-NOISE_SHARE = 0.5
-"""Error of a pixel on an edge as a part of the noise of the exposure: noise and error
-together are 12 % more than the noise alone."""
+NOISE_SHARE = 1.0
+"""Error of a pixel on an edge, at most, as a part of the noise of the exposure in an open
+pixel."""
 LARGEST_ERROR = 0.1
 """Largest permitted error of a pixel on an edge, however noisy the exposure."""
 MAX_RAYS = 16
@@ -54,7 +54,9 @@ def permitted_error(noise: float, blur_px: float, points: int = 1) -> float:
         points: of the focal spot.
     """
     averaged = max(1.0, 2.0 * np.sqrt(np.pi) * blur_px) * points
-    return float(min(NOISE_SHARE * noise * np.sqrt(averaged), LARGEST_ERROR))
+    error = min(NOISE_SHARE * noise * np.sqrt(averaged), LARGEST_ERROR)
+    # Two digits: geometries that differ in the last ones have the same rays, and bytes.
+    return float(f"{error:.2g}")
 
 
 def check_rays(rays: int) -> None:

@@ -257,10 +257,10 @@ def forward(
             )
         geometry = run_through(geometry, corners_of(volume))
         there = volume.layout
-        rays = voxel_rays(geometry, volume.layout, shape)
+        lines = voxel_rays(geometry, volume.layout, shape)
         # Arrays on a device have no type of their own.
         images: Float32Array = gpu.demand(
-            lambda: gpu.project_there(box_of(there), there.flat, rays, shape)
+            lambda: gpu.project_there(box_of(there), there.flat, lines, shape)
         )
         return images
     result = check_out(out, (len(geometry), *shape))
@@ -521,10 +521,10 @@ def back(
             )
         target = DeviceVolume.blank(like)
         there = target.layout
-        rays = voxel_rays(geometry, target.layout, shape)
+        lines = voxel_rays(geometry, target.layout, shape)
         gpu.demand(
             lambda: gpu.spread_there(
-                box_of(there), there.flat, rays, values, deterministic=deterministic
+                box_of(there), there.flat, lines, values, deterministic=deterministic
             )
         )
         return target  # type: ignore[return-value]  # arrays on a device have no type of their own

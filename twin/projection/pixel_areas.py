@@ -45,12 +45,14 @@ from flexdt.twin.rays_a_pixel import Rays
 
 BATCH_PIXELS: Final = 1 << 21
 """Pixels of the views that are looked at together."""
+TILE_PIXELS: Final = 24
+"""Pixels along a side of a tile, whose rays are projected together."""
 BAND_ROWS: Final = 32
 """Rows of a job."""
 SHARE_OF_MAXIMUM: Final = 3e-3
 """Error of a pixel on an edge by "auto", as a part of the largest line integral (standard
 deviation)."""
-FEWEST_NEEDED: Final = 1e-3
+FEWEST_NEEDED: Final = 1e-4
 """The same from which a pixel gets the number of rays that is asked for."""
 IntArray = npt.NDArray[np.int64]
 Marks = npt.NDArray[np.uint8]
@@ -315,6 +317,11 @@ def _within_scene(
     geometry = run_through(geometry, np.concatenate([hull_points(s) for s in shapes]))
     rays = geometry.rays(shape)
     pixels = np.stack(np.unravel_index(within.pixels, (len(rays), *shape)), axis=1)
+    tile = pixels // [1, TILE_PIXELS, TILE_PIXELS]
+    across = -(-shape[1] // TILE_PIXELS)
+    key = (tile[:, 0] * -(-shape[0] // TILE_PIXELS) + tile[:, 1]) * across + tile[:, 2]
+    order = np.argsort(key, kind="stable")
+    edges = np.flatnonzero(np.diff(key[order])) + 1
     within_kernels.chords_within(
         quadric,
         slabs,
@@ -322,9 +329,10 @@ def _within_scene(
         _wide_shadows(shapes, rays, shape),
         rays,
         np.array([solid.mu_per_mm for solid in scene.solids], np.float64),
-        np.ascontiguousarray(pixels, dtype=np.int64),
-        within.sides.astype(np.int64),
-        within.starts,
+        np.ascontiguousarray(pixels[order], dtype=np.int64),
+        within.sides[order].astype(np.int64),
+        within.starts[:-1][order],
+        np.concatenate([[0], edges, [len(order)]]),
         out,
     )
 

@@ -49,7 +49,8 @@ def test_what_is_counted_is_the_mean_signal(seed: int) -> None:
     image.reshape(-1)[within.pixels] = within.mean_signals(np.asarray(total))
     wanted = np.array([area_means(bodies, row, SHAPE, counts=True) for row in SCAN.rows])
     apart = np.exp(-image) - wanted
-    assert np.abs(apart).max() < 0.012
+    # An upright edge falls between two of the witness's 40 points; ours may be off by sqrt(3) e.
+    assert np.abs(apart).max() < 1 / 80 + 2e-3
     assert np.sqrt((apart**2).mean()) < 5e-4
 
 

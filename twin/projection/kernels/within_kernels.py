@@ -33,8 +33,6 @@ RIM_REACHES = 2.0
 """Half pixels from the outline of a curved solid within which its chord counts as bent."""
 BLOCK, CELL = 16, 4
 """Pixels along a side of the squares that are looked at first, and then."""
-PIXELS_A_JOB = 32
-"""Pixels whose rays are one job."""
 
 
 @inline
@@ -348,89 +346,108 @@ def bends(
     )
 
 
-@inline
-def chord_of(quadric, slabs, first, last, g, dx, dy, dz):
-    """Compute the chord of one ray in a convex solid, in lengths of the ray.
+@kernel
+def cut_rays(quadric, slabs, first, last, g, dx, dy, dz, t0, t1):
+    """Fill t0 and t1 with the pieces of rays within a convex solid, in lengths of the rays;
+    t1 <= t0 where there is none. Loops without branches, so that they vectorise.
 
     Args:
         quadric: (13,) of the solid; slabs, first, last: its slabs.
         g: (12,) the view's rays [mm].
-        dx, dy, dz: the ray, from the source to its place on the panel.
+        dx, dy, dz: (k,) the rays, from the source to their places on the panel.
+        t0, t1: (k,) filled.
     """
-    t0, t1 = 0.0, 1.0
+    t0[:] = 0.0
+    t1[:] = 1.0
     if quadric[0] != 0.0:
         x, y, z = g[0] - quadric[10], g[1] - quadric[11], g[2] - quadric[12]
         qx = quadric[1] * x + quadric[2] * y + quadric[3] * z
         qy = quadric[4] * x + quadric[5] * y + quadric[6] * z
         qz = quadric[7] * x + quadric[8] * y + quadric[9] * z
-        ex = quadric[1] * dx + quadric[2] * dy + quadric[3] * dz
-        ey = quadric[4] * dx + quadric[5] * dy + quadric[6] * dz
-        ez = quadric[7] * dx + quadric[8] * dy + quadric[9] * dz
-        a = ex * ex + ey * ey + ez * ez
-        if a > 1e-300:
-            middle = -(qx * ex + qy * ey + qz * ez) / a
-            x, y, z = qx + middle * ex, qy + middle * ey, qz + middle * ez
-            inside = 1.0 - (x * x + y * y + z * z)
-            if inside <= 0.0:
-                return 0.0
-            half = math.sqrt(inside / a)
-            t0, t1 = max(t0, middle - half), min(t1, middle + half)
-        elif qx * qx + qy * qy + qz * qz > 1.0:
-            return 0.0
+        qq = qx * qx + qy * qy + qz * qz
+        for k in range(dx.size):
+            ex = quadric[1] * dx[k] + quadric[2] * dy[k] + quadric[3] * dz[k]
+            ey = quadric[4] * dx[k] + quadric[5] * dy[k] + quadric[6] * dz[k]
+            ez = quadric[7] * dx[k] + quadric[8] * dy[k] + quadric[9] * dz[k]
+            a = ex * ex + ey * ey + ez * ez
+            # Along the axis of a cylinder it is inside for all t or for none.
+            inverse = 1.0 / max(a, 1e-30)
+            middle = -(qx * ex + qy * ey + qz * ez) * inverse
+            rx, ry, rz = qx + middle * ex, qy + middle * ey, qz + middle * ez
+            inside = 1.0 - (rx * rx + ry * ry + rz * rz)
+            half = math.sqrt(max(inside, 0.0) * inverse)
+            t0[k] = max(0.0, middle - half)
+            t1[k] = min(1.0, middle + half)
+        if qq > 1.0:
+            for k in range(dx.size):
+                t1[k] = t1[k] if t1[k] > t0[k] else -1.0
     for j in range(first, last):
-        b = slabs[j]
-        at = b[0] * g[0] + b[1] * g[1] + b[2] * g[2]
-        speed = b[0] * dx + b[1] * dy + b[2] * dz
-        inverse = 1.0 / (speed if speed != 0.0 else 1e-300)
-        near = (b[3] - at) * inverse
-        far = (b[4] - at) * inverse
-        t0 = max(t0, min(near, far))
-        t1 = min(t1, max(near, far))
-    return max(t1 - t0, 0.0)
+        nx, ny, nz = slabs[j, 0], slabs[j, 1], slabs[j, 2]
+        at = nx * g[0] + ny * g[1] + nz * g[2]
+        low, high = slabs[j, 3] - at, slabs[j, 4] - at
+        for k in range(dx.size):
+            speed = nx * dx[k] + ny * dy[k] + nz * dz[k]
+            inverse = 1.0 / (speed if speed != 0.0 else 1e-300)
+            near, far = low * inverse, high * inverse
+            t0[k] = max(t0[k], min(near, far))
+            t1[k] = min(t1[k], max(near, far))
 
 
 @parallel
 def chords_within(
-    quadric, slabs, slab_range, shadow, rays, weight, pixels, sides, starts, out
+    quadric, slabs, slab_range, shadow, rays, weight, pixels, sides, starts, tiles, out
 ):
     """Fill `out` with line integrals of convex solids along several rays of some pixels.
+
+    The rays of a tile's pixels are cut by one surface after the other.
 
     Args:
         quadric, slabs, slab_range, rays: as of `mark_convex`.
         shadow: (n, k, 4), a pixel wider.
         weight: (k,) factors on the chords.
-        pixels: (m, 3) view, row, column.
+        pixels: (m, 3) view, row, column, those of a tile in a row.
         sides: (m,) rays along a side of each.
         starts: (m,) place of its first ray.
+        tiles: (t + 1,) first pixel of each tile, and m.
         out: float32, filled.
     """
-    for job in prange((len(pixels) + PIXELS_A_JOB - 1) // PIXELS_A_JOB):
-        dx = np.empty(MAX_RAYS * MAX_RAYS)
-        dy = np.empty(MAX_RAYS * MAX_RAYS)
-        dz = np.empty(MAX_RAYS * MAX_RAYS)
-        total = np.empty(MAX_RAYS * MAX_RAYS)
-        for i in range(job * PIXELS_A_JOB, min(len(pixels), (job + 1) * PIXELS_A_JOB)):
-            view, r, c = pixels[i]
-            g = rays[view]
-            count = sides[i] * sides[i]
-            for k in range(count):
+    for tile in prange(len(tiles) - 1):
+        first, last = tiles[tile], tiles[tile + 1]
+        view = pixels[first, 0]
+        g = rays[view]
+        count = 0
+        top, bottom, left, right = pixels[first, 1], 0, pixels[first, 2], 0
+        for i in range(first, last):
+            count += sides[i] * sides[i]
+            top, bottom = min(top, pixels[i, 1]), max(bottom, pixels[i, 1])
+            left, right = min(left, pixels[i, 2]), max(right, pixels[i, 2])
+        dx, dy, dz = np.empty(count), np.empty(count), np.empty(count)
+        t0, t1, total = np.empty(count), np.empty(count), np.zeros(count)
+        n = 0
+        for i in range(first, last):
+            for k in range(sides[i] * sides[i]):
                 x, y = rays_aside(k, sides[i])
-                dx[k] = g[3] + (c + x) * g[6] + (r + y) * g[9]
-                dy[k] = g[4] + (c + x) * g[7] + (r + y) * g[10]
-                dz[k] = g[5] + (c + x) * g[8] + (r + y) * g[11]
-                total[k] = 0.0
-            for s in range(shadow.shape[1]):
-                near = shadow[view, s]
-                if not (near[0] <= r < near[1] and near[2] <= c < near[3]):
-                    continue
-                first, last = slab_range[s, 0], slab_range[s, 1]
-                for k in range(count):
-                    total[k] += weight[s] * chord_of(
-                        quadric[s], slabs, first, last, g, dx[k], dy[k], dz[k]
-                    )
+                x += pixels[i, 2]
+                y += pixels[i, 1]
+                dx[n] = g[3] + x * g[6] + y * g[9]
+                dy[n] = g[4] + x * g[7] + y * g[10]
+                dz[n] = g[5] + x * g[8] + y * g[11]
+                n += 1
+        for s in range(shadow.shape[1]):
+            near = shadow[view, s]
+            if near[0] > bottom or near[1] <= top or near[2] > right or near[3] <= left:
+                continue
+            a, b = slab_range[s, 0], slab_range[s, 1]
+            cut_rays(quadric[s], slabs, a, b, g, dx, dy, dz, t0, t1)
+            factor = weight[s]
             for k in range(count):
-                length = math.sqrt(dx[k] * dx[k] + dy[k] * dy[k] + dz[k] * dz[k])
-                out[starts[i] + k] = np.float32(total[k] * length)
+                total[k] += factor * max(t1[k] - t0[k], 0.0)
+        n = 0
+        for i in range(first, last):
+            for k in range(sides[i] * sides[i]):
+                length = math.sqrt(dx[n] * dx[n] + dy[n] * dy[n] + dz[n] * dz[n])
+                out[starts[i] + k] = np.float32(total[n] * length)
+                n += 1
 
 
 @kernel
