@@ -15,14 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.runtime.files import plain_images, tiff_images
-from flexdt.runtime.files.image_meaning import ImageFact, ImageHead, UnreadImageError
+from flexdt.runtime.files.image_meaning import ImageHead, UnreadImageError
 from flexdt.runtime.files.reading_within import opened
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 
 __all__ = [
     "IMAGE_ENDINGS",
     "IMAGE_FORMATS",
-    "ImageFact",
     "ImageHead",
     "image_head",
     "read_pixels",

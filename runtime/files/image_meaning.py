@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.dataset.provenance import Stated
 from flexdt.twin.input_limits import LIMITS
 
 MAX_IMAGE_BYTES: Final = LIMITS["tiff"].decoded_bytes
@@ -45,23 +46,6 @@ def quoted(text: str) -> str:
 
 
 @dataclass(frozen=True)
-class ImageFact:
-    """One statement of an image file, and what became of it.
-
-    Attributes:
-        field: its name in the format.
-        value: as the file says it.
-        use: "used" or "ignored".
-        consequence: what follows, in a few words.
-    """
-
-    field: str
-    value: str
-    use: str
-    consequence: str
-
-
-@dataclass(frozen=True)
 class ImageHead:
     """What a file says of its images before any pixel is read.
 
@@ -77,7 +61,7 @@ class ImageHead:
     dtype: np.dtype[Any]
     bits: int
     images: int = 1
-    facts: tuple[ImageFact, ...] = ()
+    facts: tuple[Stated, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the size of one image before memory is taken for it."""

@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.runtime.files.image_meaning import (
-    ImageFact,
     ImageHead,
     UnreadImageError,
     grey,
@@ -29,6 +28,7 @@ from flexdt.runtime.files.image_meaning import (
     quoted,
 )
 from flexdt.runtime.files.reading_within import opened
+from flexdt.twin.dataset.provenance import Stated, Use
 
 MAX_HEADER_BYTES: Final = 1 << 20
 """Of a header of text."""
@@ -210,12 +210,12 @@ def _require_headers(path: Path, step: int, images: int) -> None:
                 )
 
 
-def _facts(fields: Mapping[str, str], known: Any) -> list[ImageFact]:
+def _facts(fields: Mapping[str, str], known: Any) -> list[Stated]:
     """List what a header of text says, and whether it was used."""
     return [
-        ImageFact(key, value[:60], "used", "where pixels are")
+        Stated(key, quoted(value), Use.USED, "where pixels are")
         if key in known
-        else ImageFact(key, value[:60], "ignored", "not known to change pixels")
+        else Stated(key, quoted(value), Use.IGNORED, "not known to change pixels")
         for key, value in fields.items()
     ]
 
@@ -470,7 +470,7 @@ def png_head(file: BinaryIO) -> tuple[ImageHead, int]:
         elif name == "tRNS" and kind == 3:
             raise UnreadImageError("has transparent colours; allowed: grey values")
         facts.append(
-            ImageFact(name, f"{long} bytes", "ignored", "not known to change pixels")
+            Stated(name, f"{long} bytes", Use.IGNORED, "not known to change pixels")
         )
     head = ImageHead((rows, cols), np.dtype(f"u{bits // 8}"), bits, facts=tuple(facts))
     return head, 3 if kind in (2, 3, 6) else 1

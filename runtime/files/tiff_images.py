@@ -24,7 +24,6 @@ from flexdt.runtime.files.image_meaning import (
     NATIVE,
     ORIENTATIONS,
     TOP_LEFT,
-    ImageFact,
     ImageHead,
     UnreadImageError,
     grey,
@@ -35,6 +34,7 @@ from flexdt.runtime.files.image_meaning import (
     upright,
     whole_bytes_order,
 )
+from flexdt.twin.dataset.provenance import Stated, Use
 from flexdt.twin.input_limits import InputLimitError, require_strips
 
 # Our error has the reason of a damaged file; tifffile's log is for callers that set up logging.
@@ -654,7 +654,7 @@ def _samples_of_codec(page: Any) -> npt.NDArray[Any]:
     )
 
 
-def _facts(page: Any) -> Iterator[ImageFact]:
+def _facts(page: Any) -> Iterator[Stated]:
     """Yield what the tags of a page say and what becomes of it, in the file's order."""
     white = "inverted: 0 is white" if _photometric(page) == WHITE_IS_ZERO else ""
     words = {
@@ -665,16 +665,18 @@ def _facts(page: Any) -> Iterator[ImageFact]:
         339: "kind of numbers",
     }
     for tag in page.tags:
-        value = str(tag.value)
+        value, name = str(tag.value), str(tag.name)
         short = value if len(value) <= 60 else value[:57] + "..."
-        name = str(tag.name)
         if tag.code in LAYOUT_TAGS:
-            yield ImageFact(name, short, "used", words.get(tag.code, "where pixels are"))
+            became = words.get(tag.code, "where pixels are")
+            yield Stated(name, short, Use.USED, became)
         elif tag.code in (282, 283, 296):
-            yield ImageFact(
-                name, short, "ignored", "pixels have the size that the geometry states"
-            )
+            became = "pixels have the size that the geometry states"
+            yield Stated(name, short, Use.IGNORED, became)
         elif tag.code in DESCRIPTION_TAGS:
-            yield ImageFact(name, short, "ignored", "words about the file")
+            yield Stated(name, short, Use.IGNORED, "words about the file")
         else:
-            yield ImageFact(name, short, "ignored", "not known to change pixels")
+            # tifffile names the tags that are registered, by their numbers the others.
+            known = not name.isdecimal()
+            became = "of another program's" if known else "not known to flexdt"
+            yield Stated(name, short, Use.IGNORED, became, known=known)

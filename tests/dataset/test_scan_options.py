@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 from image_bytes_of import edf_file, meta_header, npy_file, png_file
+from tiff_bytes_of import tiff_file
 
 import flexdt as fx
 
@@ -257,3 +258,21 @@ def test_a_scan_file_says_the_same_to_commands(tmp_path: Path) -> None:
         with pytest.raises(fx.TwinError) as caught:
             fx.open(file)
         assert why in str(caught.value)
+
+
+def test_statements_of_the_images_are_a_part_of_the_data_set(tmp_path: Path) -> None:
+    """What a TIFF says beside its pixels is used or ignored by name, once for the scan."""
+    for i, image in enumerate(FRAMES):
+        content = tiff_file(
+            [image[::-1]],
+            orientation=4,
+            more=((65123, 3, [7]), (306, 2, b"2026:01:01 00:00:00\0")),
+        )
+        (tmp_path / f"p{i}.tif").write_bytes(content)
+    data = fx.read_tiffs(tmp_path, SCAN, dark=0, open_beam=65535)
+    np.testing.assert_array_equal(data.counts(), FRAMES)
+    (turned,) = data.provenance.field("Orientation")
+    assert (turned.use.value, turned.consequence) == ("used", "upside down")
+    assert data.provenance.field("DateTime")[0].use.value == "ignored"
+    assert [one.field for one in data.provenance.unknown] == ["65123"]
+    assert data.warnings == ("p0.tif: 1 field not known to flexdt, ignored: 65123",)

@@ -60,7 +60,7 @@ class Part:
         cut = self.of(counts)
         if cut.dtype == np.uint16:
             return np.ascontiguousarray(cut)
-        return np.rint(cut).astype(np.uint16)
+        return np.asarray(np.rint(cut), dtype=np.uint16)
 
     def of_geometry(self, geometry: ConeVec, shape: tuple[int, int]) -> ConeVec:
         """Return the geometry of the cut images of a panel of (rows, cols)."""

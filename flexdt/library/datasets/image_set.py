@@ -774,4 +774,5 @@ def references(data: ImageSet) -> list[tuple[str, Counts]]:
 
 def _rounded(image: npt.NDArray[Any]) -> Counts:
     """Round an image to counts."""
-    return np.rint(np.clip(image, 0, np.iinfo(np.uint16).max)).astype(np.uint16)
+    top = np.iinfo(np.uint16).max
+    return np.asarray(np.rint(np.clip(image, 0, top)), dtype=np.uint16)

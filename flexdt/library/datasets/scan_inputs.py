@@ -97,7 +97,11 @@ def references_said(
     Raises:
         DatasetError: they cannot be found or read, or flat images and an open beam are said.
     """
-    dark, flat, opened = (options.get(what) for what in ("dark", "flat", "open_beam"))
+    dark, flat, opened = (
+        options.get("dark"),
+        options.get("flat"),
+        options.get("open_beam"),
+    )
     if flat is not None and opened is not None:
         raise DatasetFormatError(
             "flat images and an open beam are two statements of one thing; allowed: one of them"

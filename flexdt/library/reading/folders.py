@@ -78,6 +78,7 @@ from flexdt.twin.dataset.file_names import (
     XRE_SETTINGS,
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
+from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
@@ -313,12 +314,14 @@ def _of_folder(
         raise _no_projections(content.path, names, frames, others)
     head = image_head(content.path / chosen[0])
     cone = geometry_said(geometry, options, head.shape, content.path)
+    said, unknown = _said_by(head, chosen[0])
     if head.images > 1:
         several, doubts = in_order(content, chosen, -1)
         paths = [content.path / name for name in several]
         made = _of_stacks(paths, content.path.name, cone, {}, dark, flat)
         return replace(made, warnings=(*made.warnings, *doubts))
     chosen, doubts = in_order(content, chosen, len(cone))
+    doubts += unknown
     if not flat:
         doubts = [*doubts, without_flat(content.path.name, names)]
     if not (head.counts and _countable(content.path / chosen[0], head)):
@@ -329,8 +332,30 @@ def _of_folder(
             if images.dtype.kind in "ui"
             else [d for d in doubts if NO_FLAT not in d]
         )
-        return replace(made, warnings=(*made.warnings, *told))
-    return listed(content, cone, chosen, (), (), warnings=doubts, references=(dark, flat))
+        return replace(made, warnings=(*made.warnings, *told), provenance=said)
+    return listed(
+        content,
+        cone,
+        chosen,
+        (),
+        (),
+        warnings=doubts,
+        references=(dark, flat),
+        provenance=said,
+    )
+
+
+def _said_by(head: ImageHead, file: str) -> tuple[Provenance, list[str]]:
+    """Return what the first image's file says and what became of it, and a doubt that names
+    what no table has.
+    """
+    said = Provenance(replace(one, file=file) for one in head.facts)
+    names = [one.field for one in said.unknown]
+    if not names:
+        return said, []
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    many = f"{len(names)} field{'s' if len(names) > 1 else ''} not known to flexdt"
+    return said, [f"{file}: {many}, ignored: {', '.join(names[:5])}{more}"]
 
 
 def _by_pattern(content: Folder, names: Sequence[str], pattern: str) -> Reference:
@@ -389,6 +414,7 @@ def _of_stacks(
         sizes = ", ".join(f"{h.shape[1]} x {h.shape[0]}" for h in heads[:3])
         raise DatasetFormatError(f"{paths[0].parent}: files of images of {sizes} pixels")
     cone = geometry_said(geometry, options, heads[0].shape, paths[0].parent)
+    said, unknown = _said_by(heads[0], paths[0].name)
     many = sum(head.images for head in heads)
     if many != len(cone):
         raise DatasetFormatError.instead(
@@ -401,13 +427,15 @@ def _of_stacks(
                 for path, head in zip(paths, heads, strict=True)
             ]
         )
-        return in_memory(images, cone, dark, flat, name)
+        made = in_memory(images, cone, dark, flat, name)
+        return replace(made, warnings=(*made.warnings, *unknown), provenance=said)
     places = [
         (p, i) for p, head in zip(paths, heads, strict=True) for i in range(head.images)
     ]
-    doubts = [] if flat else [without_flat(name, [])]
+    doubts = unknown if flat else [*unknown, without_flat(name, [])]
     made = of_places(places, heads[0].shape, cone, name, doubts, dark_told=not dark)
-    return placed(made, dark or Reference(), flat or Reference())
+    made = placed(made, dark or Reference(), flat or Reference())
+    return replace(made, provenance=said)
 
 
 def _countable(path: Path, head: ImageHead) -> bool:

@@ -44,8 +44,8 @@ def without_flat(name: str, names: Sequence[str]) -> str:
     some = [n for n in names if FLAT_NAME.search(n) and is_image_name(n)]
     guess = f"; {some[0]} looks like one" if some else ""
     return (
-        f"{name}: {NO_FLAT}{guess}; counts become line integrals by one, or by the count of the "
-        "open beam"
+        f"{name}: {NO_FLAT} (io* unless said){guess}; counts become line integrals by one, "
+        "or by the count of the open beam"
     )
 
 
