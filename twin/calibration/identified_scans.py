@@ -29,9 +29,9 @@ from flexdt.twin.calibration.fit.problem import usual_step
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, Scan, nothing
 from flexdt.twin.calibration.identify import Identification, Search, attempt, identified
 from flexdt.twin.calibration.outcome import Calibration
-from flexdt.twin.calibration.recognised import Recognised, doubtful, recognise
+from flexdt.twin.calibration.recognise.recognised import Recognised, doubtful, recognise
+from flexdt.twin.calibration.recognise.rivals import judge_rivals
 from flexdt.twin.calibration.request import CalibrationRequest
-from flexdt.twin.calibration.rivals import judge_rivals
 from flexdt.twin.calibration.second_measurement import seen_arc
 from flexdt.twin.findings import Finding, Findings, error
 from flexdt.twin.geometry.offsets import Offsets

@@ -29,12 +29,12 @@ from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.calibration.fit.forecast import visible_beads
 from flexdt.twin.calibration.fit.priors import OFFSETS
 from flexdt.twin.calibration.fit.problem import SIX, FitProblem, as_poses, build_problem
-from flexdt.twin.calibration.symmetries import Symmetry, spacing, symmetry
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
 from flexdt.twin.geometry.offsets import NAMES, NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.geometry.symmetries import Symmetry, spacing, symmetry
 
 LOOSE_PX = 0.6
 """Root mean square distance of spots from their beads above which panel and axis are

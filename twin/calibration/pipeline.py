@@ -42,13 +42,13 @@ from flexdt.twin.calibration.motion_of_scans import (
     settle_motion,
 )
 from flexdt.twin.calibration.outcome import Calibration
-from flexdt.twin.calibration.recognised import judge_emptiness
+from flexdt.twin.calibration.recognise.recognised import judge_emptiness
+from flexdt.twin.calibration.recognise.rivals import asked_of, with_rivals
 from flexdt.twin.calibration.request import (
     CalibrationRequest,
     with_free,
     with_stated,
 )
-from flexdt.twin.calibration.rivals import asked_of, with_rivals
 from flexdt.twin.calibration.scans_to_calibrate import require_different, require_scans
 from flexdt.twin.calibration.second_measurement import measure_again
 from flexdt.twin.findings import Finding, Findings

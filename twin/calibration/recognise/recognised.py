@@ -16,15 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.constellation import (
-    FEWEST,
-    Constellation,
-    Likeness,
-    constellation,
-    lean_of,
-    likeness,
-    similarity,
-)
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.data import SOME_SPOTS, convincing
@@ -39,6 +30,15 @@ from flexdt.twin.calibration.fit.priors import ASSUMED
 from flexdt.twin.calibration.fit.problem import SIX
 from flexdt.twin.calibration.frame_source import FrameSpots, Scan
 from flexdt.twin.calibration.identify import Identification, attempt
+from flexdt.twin.calibration.recognise.constellation import (
+    FEWEST,
+    Constellation,
+    Likeness,
+    constellation,
+    lean_of,
+    likeness,
+    similarity,
+)
 from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -193,7 +193,7 @@ def _of_scale(scale: float) -> str:
     reason = usual_reason(scale, OF_LENGTHS)
     if reason:
         return f"{reason}; or it is another phantom of the same form"
-    return "another phantom of the same form, or other pixels or distances"
+    return "a phantom of another scale, or other pixels or distances"
 
 
 def judge_emptiness(

@@ -77,7 +77,7 @@ def symmetry(beads: FloatArray, tolerance_mm: float) -> Symmetry:
     across = beads[:, :2] - centre
     far = np.linalg.norm(across, axis=1)
     if len(beads) < 2 or far.max() < tolerance_mm:
-        return Symmetry(centre, np.zeros(0), free=True)
+        return Symmetry(centre, np.zeros(0), free=len(beads) > 1)
     # The bead with fewest others at its distance and height leaves fewest turns to try.
     mates = (np.abs(far[:, None] - far) < tolerance_mm) & (
         np.abs(beads[:, None, 2] - beads[:, 2]) < tolerance_mm
