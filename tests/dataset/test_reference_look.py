@@ -109,3 +109,14 @@ def test_rows_that_stand_for_views_are_told() -> None:
     assert any("images.transpose(1, 0, 2)" in w for w in wrong.warnings)
     even = fx.DataSet.from_arrays(np.full_like(counts, 40_000), scan, dark=0, flat=50_000)
     assert not any("[row, view, column]" in w for w in even.warnings)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_log_taken_twice_is_told_as_that(seed: int) -> None:
+    """Noise leaves air of small integrals, whose log is large; thick parts become negative."""
+    rng = np.random.default_rng(seed)
+    thick = 3.0 * np.sqrt(np.clip(1 - ((COLUMNS - 31) / 20.0) ** 2, 0, None))
+    once = np.broadcast_to(thick, (VIEWS, *SHAPE)) + rng.normal(0, 0.005, (VIEWS, *SHAPE))
+    told = fx.DataSet.from_arrays(-np.log(np.maximum(np.abs(once), 1e-6)), SCAN).warnings
+    assert any("was the log taken twice?" in one for one in told)
+    assert not any("log" in one for one in fx.DataSet.from_arrays(once, SCAN).warnings)

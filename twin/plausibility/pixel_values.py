@@ -93,6 +93,14 @@ def integral_findings(images: npt.NDArray[Any]) -> Iterator[Finding]:
             f"line integrals of {beam:.4g} at the images' edges, less behind the object"
         )
         yield error(PlausibilityCode.COUNTS, cause, _FROM_COUNTS, figure=beam)
+    elif beam >= OPEN[1] and float(np.quantile(values, TAIL)) < MIN_NEGATIVE_INTEGRAL:
+        lowest = float(np.quantile(values, TAIL))
+        cause = (
+            f"line integrals of {beam:.3g} at the images' edges and down to {lowest:.3g} between "
+            "them, where the beam would be brighter than the open one"
+        )
+        remedy = "was the log taken twice? they are -np.log of the transmission, once"
+        yield warning(PlausibilityCode.NEGATIVE, cause, remedy, figure=lowest)
     elif beam < OPEN[1] and darker > TAIL and brighter < MAX_BRIGHT_SHARE:
         open_share = float(((values > OPEN[0] * beam) & (values < OPEN[1] * beam)).mean())
         lowest = float(np.quantile(values, TAIL))
