@@ -7,7 +7,8 @@ from __future__ import annotations
 import pytest
 from safety_histories import all_are_called, episode
 
-from flexdt.twin.scanner import state
+from flexdt.twin.collision import guard, relative, retreat
+from flexdt.twin.scanner import joining, safety, state
 
 
 def found(seeds: range, steps: int, *, dear: bool = False) -> list[str]:
@@ -40,4 +41,26 @@ def test_the_campaign_finds_a_pose_behind_the_source(
 ) -> None:
     """With the rule of corrections taken away, a history reaches a pose without a geometry."""
     monkeypatch.setattr(state, "require_before_source", lambda *_: None)
-    assert any("not in front of the source" in what for what in found(range(30), 8))
+    assert any("not in front of the source" in what for what in found(range(10, 13), 8))
+
+
+@pytest.mark.slow
+def test_the_campaign_finds_motors_that_escape(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With no sweep at all, the oracle sees parts in each other."""
+    monkeypatch.setattr(guard.SceneGuard, "__call__", lambda *_: None)
+    assert any("oracle" in what and "mm lost" in what for what in found(range(1, 4), 8))
+
+
+@pytest.mark.slow
+def test_the_campaign_finds_a_micrometre_a_request(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With the allowance of record 15 back, a margin is lost by steps that each keep it."""
+
+    def planted(gap: float, margin: float) -> float:
+        return gap - 1e-3 if gap < margin + 0.006 else real(gap, margin)
+
+    real = safety.floor
+    for module in (relative, retreat, joining):
+        monkeypatch.setattr(module, "floor", planted)
+    assert any("oracle" in what and "mm lost" in what for what in found(range(2, 3), 8))

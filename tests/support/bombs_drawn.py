@@ -208,12 +208,12 @@ def obj_groups(rng: Rng, folder: Path) -> Bomb:
         for line in (f"{word} {i}", faces[i % 4])
     ]
     path = _file(folder, "part.obj", "\n".join(lines))
-    return Bomb(path, MESH, ("phantom", "make", "--mesh", "{P}", "--out", "{OUT}/p.json"), "obj",
+    return Bomb(path, MESH, ("phantom", "make", "{OUT}/p.json", "--mesh", "{P}"), "obj",
                 harmless=True)  # fmt: skip
 
 
 def _mesh(folder: Path, kind: str, data: bytes) -> Bomb:
-    command = ("phantom", "make", "--mesh", "{P}", "--out", "{OUT}/p.json")
+    command = ("phantom", "make", "{OUT}/p.json", "--mesh", "{P}")
     return Bomb(_file(folder, f"part.{kind}", data), MESH, command, kind)
 
 

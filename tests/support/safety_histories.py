@@ -11,6 +11,7 @@ import asyncio
 import json
 import random
 import tempfile
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,8 @@ from typing import Any
 import msgpack
 import numpy as np
 from in_process import Client, PointProjector, script
-from motion_histories import drawn_machine
+from motion_histories import Judge, drawn_machine
+from motion_oracle import MachineModel, Placed, Prism, Stage, machine_file
 from motor_units import RATES, UNITS, in_units
 
 from flexdt.protocol import METHODS, Codec, Connection, RpcError, parse_params
@@ -78,6 +80,8 @@ DEAR = {"rpc.discover", "exposure.predict", "script.check", "trajectory.check"}
 own."""
 
 
+ROUNDING = 1e-6
+"""Of a position at an end of its travel [mm, deg]."""
 MOST_RATE = 1e6
 """Largest speed and acceleration of a machine file."""
 
@@ -133,19 +137,40 @@ async def ask(rng: random.Random, client: Client, call: Call) -> object:
     return result
 
 
-def drawn(rng: np.random.Generator) -> Machine:
-    """The shipped scanner or a machine drawn anew, in mm or other units."""
+def drawn(
+    rng: np.random.Generator,
+) -> tuple[Machine, MachineModel, dict[str, float]]:
+    """The shipped scanner or a machine drawn anew, in mm or other units.
+
+    Returns:
+        The machine; as the oracle reads it, in mm and deg; motor -> mm or deg of its unit.
+    """
     if rng.random() < 0.6:
-        machine = builtin_machine()
+        machine, model = builtin_machine(), MachineModel(machine_file("flexray"))
     else:
-        machine = parse_machine(drawn_machine(rng), "drawn.toml")
+        text = drawn_machine(rng)
+        machine = parse_machine(text, "drawn.toml")
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "drawn.toml"
+            file.write_text(text, encoding="utf-8")
+            model = MachineModel(file)
+    mm, deg = 1.0, 1.0
     if rng.random() < 0.3:
-        machine = in_units(machine, *UNITS[str(rng.choice(list(UNITS)))])
+        mm, deg = UNITS[str(rng.choice(list(UNITS)))]
+        machine = in_units(machine, mm, deg)
+    sizes = {n: deg if a.unit == "deg" else mm for n, a in machine.axes.items()}
     rates = {  # as a machine file may state them
         n: a.model_copy(update={f: min(getattr(a, f), MOST_RATE) for f in RATES})
         for n, a in machine.axes.items()
     }
-    return machine.model_copy(update={"axes": rates})
+    return machine.model_copy(update={"axes": rates}), model, sizes
+
+
+BOXES = {"normal-3": Prism.box((20.0, 40.0, 60.0))}
+"""Samples whose shape the oracle knows; beside others it judges the parts alone."""
+CREEPS_MM = (1.0, 0.02, 0.01, *[0.004] * 4, *[0.002] * 3, *[0.00095] * 24)
+"""Requests beyond a place before a contact: to the margin, and then as small as passes for
+rounding, so many that they add up to more than the oracle allows."""
 
 
 class Episode:
@@ -160,7 +185,10 @@ class Episode:
     def __init__(self, seed: int, steps: int, *, dear: bool) -> None:
         self.rng, self.words = np.random.default_rng(seed), random.Random(seed)
         self.seed, self.steps, self.dear = seed, steps, dear
-        self.machine = drawn(self.rng)
+        self.machine, self.model, self.sizes = drawn(self.rng)
+        self.judge = Judge(self.model.margin)
+        self.creeping: list[Call] = []
+        """Requests of a micrometre each, towards a contact that was refused."""
         self.asked = self.accepted = 0
         self.found: list[str] = []
         self.following: Call | None = None
@@ -169,6 +197,8 @@ class Episode:
     def request(self) -> Call:
         """Draw a request that changes machine, correction, pose, clock, job or control."""
         rng, axes = self.rng, self.machine.axes
+        if self.creeping:
+            return self.creeping.pop(0)
         if self.following is not None:
             call, self.following = self.following, None
             return call
@@ -212,7 +242,9 @@ class Episode:
             case 12:
                 return "session.control", {"action": "force"}
             case _:
-                name = str(rng.choice(["chiral", "empty", "lego"]))
+                name = str(
+                    rng.choice(["chiral", "empty", "lego", "normal-3", "normal-3"])
+                )
                 return "sample.set", {"name": name}
 
     def to_worst_corner(self, parameters: dict[str, float]) -> Call | None:
@@ -228,9 +260,9 @@ class Episode:
         _, pose, _ = list(corners)[int(self.rng.choice([0, 0, 2]))]
         return ("axes.move", {"targets": pose, "wait": True}) if pose else None
 
-    async def step(self, client: Client) -> None:
+    async def step(self, client: Client) -> str:
         """Make one drawn request, mostly after what would have it refused is put away;
-        refusals are fine, failures are not.
+        refusals are fine, failures are not. Returns the method.
         """
         for name, params in (("session.control", {"action": "force"}), ("job.abort", {}),
                              ("safety.reset", {})):  # fmt: skip
@@ -246,8 +278,44 @@ class Episode:
         except RpcError as error:
             if error.code == -32603:
                 self.found.append(f"{name} {params}: {error}")
+            if error.code == -32002 and name == "axes.move" and not self.creeping:
+                self.creep(error.data, params["targets"])
         except TimeoutError:
             pass
+        return name
+
+    def creep(self, refusal: Mapping[str, Any], targets: Mapping[str, float]) -> None:
+        """Go to the last free place before a contact, and on by a micrometre a request."""
+        halts = refusal.get("halts_at") or {}
+        if not halts or self.rng.random() < 0.3:
+            return
+        stopped = [n for n in halts if n in targets]
+        if not stopped:
+            return
+        name = max(stopped, key=lambda n: abs(targets[n] - halts[n]) * self.sizes[n])
+        place = halts[name]
+        way = float(np.sign(targets[name] - place) or 1.0) / self.sizes[name]
+        self.creeping = [("axes.move", {"targets": {name: place}, "wait": True})] + [
+            ("axes.move", {"targets": {name: way * mm}, "relative": True, "wait": True})
+            for mm in CREEPS_MM
+        ]
+
+    async def judged(self, client: Client, done: str) -> None:
+        """Let the oracle judge where the parts are: its own kinematics and distances."""
+        state = await client.call("state.get")
+        if not any(axis["moving"] for axis in state["axes"].values()):
+            reading = {n: state["axes"][n]["position"] * s for n, s in self.sizes.items()}
+            applied = (state["correction"] or {}).get("parameters", {})
+            sample = Placed(BOXES.get(state["sample"]["name"] or ""))
+            stage = Stage(self.model, sample, applied)
+            said = "ready" if state["safety"]["state"] == "ok" else "stopped"
+            pose = self.model.vector(reading)
+            self.judge.look(stage, pose, said, done, forget=done != "axes.move")
+            low, high = self.model.lower - ROUNDING, self.model.upper + ROUNDING
+            if not ((low <= pose) & (pose <= high)).all():
+                self.judge.found.append(f"{done}: {reading} beyond the travel")
+            self.found += [f"oracle: {what}" for what in self.judge.found]
+            self.judge.found.clear()
 
     async def look(self, client: Client) -> None:
         """Ask for all answers; what does not come is found."""
@@ -283,8 +351,13 @@ class Episode:
             mover, other = Client(twin, "mover"), Client(twin, "other")
             for client in (mover, other):
                 await client.call("session.hello", protocol="1.0", client="test")
-            for _ in range(self.steps):
-                await self.step(mover if self.rng.random() < 0.8 else other)
+            steps = self.steps
+            while steps > 0 or self.creeping:
+                steps -= not self.creeping
+                done = await self.step(mover if self.rng.random() < 0.8 else other)
+                await self.judged(mover, done)
+                if self.creeping:
+                    continue
                 await self.look(mover if self.rng.random() < 0.5 else other)
                 states = [
                     c.of("state")[-1]["data"] for c in (mover, other) if c.of("state")
