@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 from turned_balls import PITCH, SDD, SHAPE, SOD, VIEWS, integrals, worst
 
 import flexdt as fx
@@ -43,6 +44,21 @@ def written(
 
 
 ANGLES = STEP * np.arange(VIEWS)
+
+
+def test_bitmaps_of_8_bits_are_read(tmp_path: Path) -> None:
+    said = {"Image Format": "BMP", "Depth (bits)": 8, "Reference Intensity": None}
+    path = written(tmp_path, said, integrals(ANGLES))
+    for i, image in enumerate(integrals(ANGLES)):
+        counts = np.rint(255.0 * np.exp(-image)).astype(np.uint8)
+        Image.fromarray(counts).save(tmp_path / f"bone_{i:08d}.bmp")
+    data = fx.open(path)
+    assert data.frames[0].file.endswith(".bmp")
+    assert worst(data) < 0.02  # half a count of 255
+    assert any("the open beam is 255" in one for one in data.warnings)
+    path.write_text(path.read_text().replace("BMP", "PCX"))
+    with pytest.raises(DatasetError, match="Image Format is pcx; allowed: TIFF or BMP"):
+        fx.open(path)
 
 
 @pytest.mark.parametrize(

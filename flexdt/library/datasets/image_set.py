@@ -303,8 +303,8 @@ class ImageSet:
         if self.present:
             first = self.present[0]
             picture = thumbnail(self.counts(first), f"projection {first}")
-        heads, *rows = self.provenance.rows
-        values = values_table(heads, rows) if rows else ""
+        heads, *stated = self.provenance.rows
+        values = values_table(heads, stated) if stated else ""
         return facts_table(f"DataSet {self.name}", facts) + values + picture
 
     def _reference_counts(self) -> tuple[int, int]:

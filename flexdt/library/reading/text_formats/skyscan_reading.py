@@ -78,7 +78,7 @@ def read_skyscan(path: Path, geometry: ConeVec | None) -> DataSet:
     cone = _geometry(said, path, folder, views, size, geometry)
     level = _open_beam(said)
     prefix = said.text("Filename Prefix", path.stem)
-    names, told = projections_in(folder, len(cone), _endings(said, folder), prefix)
+    names, told = projections_in(folder, len(cone), _endings(said), prefix)
     return under_a_level(
         said,
         folder,
@@ -92,19 +92,17 @@ def read_skyscan(path: Path, geometry: ConeVec | None) -> DataSet:
     )
 
 
-def _endings(said: Ledger, folder: Folder) -> tuple[str, ...]:
-    """Take the endings of the images by their format.
+def _endings(said: Ledger) -> tuple[str, ...]:
+    """Take the endings of the images by their format, TIFF by default.
 
     Raises:
-        DatasetFormatError: BMPs alone.
+        DatasetFormatError: another format than TIFF and BMP.
     """
-    form = said.text("Image Format", "TIFF").lower()
-    there = [name for name in folder.names if name.lower().endswith(TIFFS)]
-    if form.startswith("bmp") and not there:
-        raise DatasetFormatError.instead(
-            f"{said.path}: the images are BMP", "BMP", "TIFF: save them as 16 bit TIFF"
-        )
-    return TIFFS
+    form = said.text("Image Format", "TIFF").strip().lower()
+    if form not in ("tiff", "tif", "bmp"):
+        problem = f"{said.path}: Image Format is {form[:20]}"
+        raise DatasetFormatError.instead(problem, form, "TIFF or BMP")
+    return (".bmp",) if form == "bmp" else TIFFS
 
 
 def _open_beam(said: Ledger) -> float:
