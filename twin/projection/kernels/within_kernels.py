@@ -102,20 +102,21 @@ def slab_ranges(low, high, at, speed, reach):
 
 
 @inline
-def quadric_ranges(q, d, u, v):
+def quadric_ranges(q, d, u, v, size_px):
     """Compute the ranges, over a pixel, at which its rays enter and leave |q + t d| <= 1, as
     `slab_ranges`, and whether the outline is near.
 
     Args:
         q: (3,) the source, mapped by the quadric's matrix, as are all others.
         d: (3,) ray to the pixel's centre.
-        u, v: (3,) the pixel's sides.
+        u, v: (3,) sides of a detector pixel.
+        size_px: detector pixels along a side.
     """
     a = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     size = math.sqrt(a)
     uu = math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
     vv = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    half = 0.5 * (uu + vv)
+    half = 0.5 * size_px * (uu + vv)
     if size <= 2.0 * half:  # (nearly) along the axis of a cylinder
         return 0.0, 1.0, 0.0, 1.0, True
     middle = -(q[0] * d[0] + q[1] * d[1] + q[2] * d[2]) / a
@@ -130,8 +131,8 @@ def quadric_ranges(q, d, u, v):
     dv = d[0] * v[0] + d[1] * v[1] + d[2] * v[2]
     xu = x * u[0] + y * u[1] + z * u[2]
     xv = x * v[0] + y * v[1] + z * v[2]
-    moved = 0.5 * (abs(middle * du + xu) + abs(middle * dv + xv)) / a
-    bent = 0.5 * (abs(du) + abs(dv)) / a
+    moved = 0.5 * size_px * (abs(middle * du + xu) + abs(middle * dv + xv)) / a
+    bent = 0.5 * size_px * (abs(du) + abs(dv)) / a
     inner = max(away - reach, 0.0)
     outer = away + reach
     largest = math.sqrt(max(1.0 - inner * inner, 0.0)) / size * (1.0 + bent)
@@ -147,49 +148,44 @@ def quadric_ranges(q, d, u, v):
 
 
 @kernel
-def side_needed(
-    quadric, slabs, first, last, g, d, u, v, weight, filled, error, counts, room
-):
-    """Compute the rays along each side that a pixel needs for one convex solid, 0 where none
-    of its rays meets the solid.
+def side_needed(c, r, size, curved, forms, room, g, weight, filled, error, counts):
+    """Compute the rays along each side that a square of pixels needs for one convex solid, 0
+    where none of its rays meets the solid.
 
     Args:
-        quadric: (13,) of the solid.
-        slabs: of all solids; first, last: the solid's.
+        c, r: column and row of the square's middle.
+        size: its side [pixels].
+        curved: whether the solid has a quadric.
+        forms, room: of `solid_forms`; room[4] is overwritten.
         g: (12,) the view's rays [mm].
-        d: (3,) the pixel's ray.
-        u, v: (3,) the pixel's sides.
         weight, filled, error, counts: as of `mark_convex`.
-        room: (7, 3), of which five are overwritten.
     """
     # The solid is entered at the largest of its surfaces' entries and left at the least of the
-    # exits; chords end at the source and at the panel. Ranges over the pixel.
+    # exits; chords end at the source and at the panel. Ranges over the square.
     e0, e1, l0, l1 = 0.0, 0.0, 1.0, 1.0
     qa, qb = -math.inf, math.inf
     rim = False
-    if quadric[0] != 0.0:
-        m = quadric[1:10]
+    if curved:
         for i in range(3):
-            room[4, i] = g[i] - quadric[10 + i]
-        mapped(m, room[4], room[0])
-        mapped(m, d, room[1])
-        mapped(m, u, room[2])
-        mapped(m, v, room[3])
-        a0, qa, qb, b1, rim = quadric_ranges(room[0], room[1], room[2], room[3])
+            room[4, i] = room[1, i] + c * room[2, i] + r * room[3, i]
+        a0, qa, qb, b1, rim = quadric_ranges(room[0], room[4], room[2], room[3], size)
         e0, e1 = max(e0, a0), max(e1, qa)
         l0, l1 = min(l0, qb), min(l1, b1)
         if l1 <= e0:
             return 0
-    for j in range(first, last):
-        a0, a1, b0, b1 = ranges_of(slabs[j], g, d, u, v)
+    for j in range(len(forms)):
+        a0, a1, b0, b1 = ranges_of(forms[j], c, r, size)
         e0, e1 = max(e0, a0), max(e1, a1)
         l0, l1 = min(l0, b0), min(l1, b1)
         if l1 <= e0:
             return 0
-    length = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    x = g[3] + c * g[6] + r * g[9]
+    y = g[4] + c * g[7] + r * g[10]
+    z = g[5] + c * g[8] + r * g[11]
+    scale = math.sqrt(x * x + y * y + z * z) * weight
     sure = max(l0 - e1, 0.0)
-    change = ((l1 - e0) - sure) * length * weight
-    least = sure * length * weight if filled else 0.0
+    change = ((l1 - e0) - sure) * scale
+    least = sure * scale if filled else 0.0
     need = rays_for_step(change, error, counts, least)
     if need <= 1 or rim or l0 <= e1:
         return need
@@ -199,8 +195,8 @@ def side_needed(
     exits += l1 >= 1.0
     entries += qa >= e0
     exits += qb <= l1
-    for j in range(first, last):
-        _, a1, b0, _ = ranges_of(slabs[j], g, d, u, v)
+    for j in range(len(forms)):
+        _, a1, b0, _ = ranges_of(forms[j], c, r, size)
         entries += a1 >= e0
         exits += b0 <= l1
     if entries <= 1 and exits <= 1:
@@ -209,21 +205,45 @@ def side_needed(
 
 
 @inline
-def ranges_of(b, g, d, u, v):
-    """Compute `slab_ranges` of slab b for the pixel of ray d and sides u, v."""
-    at = b[0] * g[0] + b[1] * g[1] + b[2] * g[2]
-    speed = b[0] * d[0] + b[1] * d[1] + b[2] * d[2]
-    across = b[0] * u[0] + b[1] * u[1] + b[2] * u[2]
-    down = b[0] * v[0] + b[1] * v[1] + b[2] * v[2]
-    return slab_ranges(b[3], b[4], at, speed, 0.5 * (abs(across) + abs(down)))
+def ranges_of(form, c, r, size):
+    """Compute `slab_ranges` of a slab's form for a square of pixels, as of `side_needed`."""
+    speed = form[3] + c * form[4] + r * form[5]
+    reach = 0.5 * size * (abs(form[4]) + abs(form[5]))
+    return slab_ranges(form[0], form[1], form[2], speed, reach)
+
+
+@kernel
+def solid_forms(quadric, slabs, first, last, g, forms, room):
+    """Compute what of a solid is the same for all pixels of a view.
+
+    Args:
+        quadric: (13,) of the solid; slabs, first, last: its slabs.
+        g: (12,) the view's rays [mm].
+        forms: (k, 6) filled for each slab: limits, the source's height, and the height of the
+            ray to a pixel as a form of column and row.
+        room: (5, 3) filled: source, first pixel's ray and the pixel's sides, mapped by the
+            quadric's matrix; the last row is spare.
+    """
+    if quadric[0] != 0.0:
+        for i in range(3):
+            room[4, i] = g[i] - quadric[10 + i]
+        mapped(quadric[1:10], room[4], room[0])
+        mapped(quadric[1:10], g[3:6], room[1])
+        mapped(quadric[1:10], g[6:9], room[2])
+        mapped(quadric[1:10], g[9:12], room[3])
+    for j in range(first, last):
+        b = slabs[j]
+        form = forms[j - first]
+        form[0], form[1] = b[3], b[4]
+        for i in range(4):
+            form[2 + i] = b[0] * g[3 * i] + b[1] * g[3 * i + 1] + b[2] * g[3 * i + 2]
 
 
 @kernel
 def mark_block(
-    quadric,
-    slabs,
-    first,
-    last,
+    curved,
+    forms,
+    room,
     g,
     top,
     left,
@@ -236,114 +256,61 @@ def mark_block(
     error,
     counts,
     marks,
-    room,
-    d,
 ):
     """Raise the marks of a block of BLOCK x BLOCK pixels: of those of its cells in which the
     chord bends, because a cell without a bend has none in any of its pixels.
 
     Args:
-        quadric, slabs, first, last, g, weight, filled, error, counts: as of `side_needed`.
+        curved, forms, room, g, weight, filled, error, counts: as of `side_needed`.
         top, left: the block's first pixel.
         r0, r1, c0, c1: pixels that count.
         marks: (rows, cols) changed in place.
-        room: (7, 3) overwritten; d: (3,) overwritten.
     """
-    u, v = room[5], room[6]
-    if not bends(
-        quadric,
-        slabs,
-        first,
-        last,
-        g,
-        top,
-        left,
-        BLOCK,
-        weight,
-        filled,
-        error,
-        counts,
-        room,
-        d,
+    half = 0.5 * (BLOCK - 1)
+    if (
+        side_needed(
+            left + half,
+            top + half,
+            BLOCK,
+            curved,
+            forms,
+            room,
+            g,
+            weight,
+            filled,
+            error,
+            counts,
+        )
+        <= 1
     ):
         return
+    half = 0.5 * (CELL - 1)
     for i in range(top, min(top + BLOCK, r1), CELL):
         for j in range(left, min(left + BLOCK, c1), CELL):
-            if not bends(
-                quadric,
-                slabs,
-                first,
-                last,
-                g,
-                i,
-                j,
-                CELL,
-                weight,
-                filled,
-                error,
-                counts,
-                room,
-                d,
+            if (
+                side_needed(
+                    j + half,
+                    i + half,
+                    CELL,
+                    curved,
+                    forms,
+                    room,
+                    g,
+                    weight,
+                    filled,
+                    error,
+                    counts,
+                )
+                <= 1
             ):
                 continue
-            for k in range(3):
-                u[k], v[k] = g[6 + k], g[9 + k]
             for r in range(max(i, r0), min(i + CELL, r1)):
                 for c in range(max(j, c0), min(j + CELL, c1)):
-                    for k in range(3):
-                        d[k] = g[3 + k] + c * u[k] + r * v[k]
                     need = side_needed(
-                        quadric,
-                        slabs,
-                        first,
-                        last,
-                        g,
-                        d,
-                        u,
-                        v,
-                        weight,
-                        filled,
-                        error,
-                        counts,
-                        room,
+                        c, r, 1.0, curved, forms, room, g, weight, filled, error, counts
                     )
                     if need > marks[r, c]:
                         marks[r, c] = need
-
-
-@inline
-def bends(
-    quadric,
-    slabs,
-    first,
-    last,
-    g,
-    top,
-    left,
-    size,
-    weight,
-    filled,
-    error,
-    counts,
-    room,
-    d,
-):
-    """Return whether a solid's chord bends within a square of size x size pixels, as
-    `side_needed` of one large pixel."""
-    u, v = room[5], room[6]
-    for k in range(3):
-        u[k], v[k] = size * g[6 + k], size * g[9 + k]
-        d[k] = (
-            g[3 + k]
-            + (left + 0.5 * (size - 1)) * g[6 + k]
-            + (top + 0.5 * (size - 1)) * g[9 + k]
-        )
-    return (
-        side_needed(
-            quadric, slabs, first, last, g, d, u, v, weight, filled, error, counts, room
-        )
-        > 1
-    )
 
 
 @kernel
@@ -544,26 +511,29 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
         """
         _ = key
         rows = marks.shape[1]
+        most = 1
+        for s in range(len(slab_range)):
+            most = max(most, slab_range[s, 1] - slab_range[s, 0])
         bands = (rows + BLOCK - 1) // BLOCK
         for job in prange(len(rays) * bands):
             view = job // bands
             row0 = (job - view * bands) * BLOCK
             row1 = min(rows, row0 + BLOCK)
             g = rays[view]
-            d = np.empty(3)
-            room = np.empty((7, 3))
+            room = np.empty((5, 3))
+            forms = np.empty((most, 6))
             for s in range(shadow.shape[1]):
                 c0, c1 = shadow[view, s, 2], shadow[view, s, 3]
                 r0, r1 = max(row0, shadow[view, s, 0]), min(row1, shadow[view, s, 1])
                 if c1 <= c0 or r1 <= r0 or weight[s] == 0.0:
                     continue
                 first, last = slab_range[s, 0], slab_range[s, 1]
+                solid_forms(quadric[s], slabs, first, last, g, forms, room)
                 for left in range(c0 // BLOCK * BLOCK, c1, BLOCK):
                     mark_block(
-                        quadric[s],
-                        slabs,
-                        first,
-                        last,
+                        quadric[s, 0] != 0.0,
+                        forms[: last - first],
+                        room,
                         g,
                         row0,
                         left,
@@ -576,8 +546,6 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         error,
                         counts,
                         marks[view],
-                        room,
-                        d,
                     )
 
     @parallel

@@ -1,6 +1,6 @@
 """Images of drawn objects beside closed forms: rays a pixel, models, and other programs.
 
-    python tests/studies/pixel_areas.py --count 60 [--astra DIR]
+    python tests/studies/pixel_area_table.py --count 60 [--astra DIR]
 
 Each object is a soft sphere, cylinder, box or cone with one to three dense ones in it; every other
 one stands upright. The wanted image is the mean over each pixel of closed-form chords
