@@ -19,6 +19,7 @@ from constellations import (
 )
 from constellations_seen import calibrated, pulls
 
+from flexdt.library.calibration.proposed_commands import Typed, angle_commands
 from flexdt.twin.calibration.diagnose import CalibrationCode
 
 UPRIGHT = np.outer(9.0 * np.arange(-2, 3), [0, 0, 1.0])
@@ -33,9 +34,9 @@ TOLD: dict[str, Array] = {"helix": helix(), "bar": bar()}
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(n, marks=pytest.mark.campaign(1)) for n in range(1, 12))]
-)
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.daily(1)
+@pytest.mark.campaign(4)
 def test_axis_and_magnification_of_a_symmetric_phantom_are_offered_without_its_angle(
     shape: str, seed: int
 ) -> None:
@@ -51,9 +52,9 @@ def test_axis_and_magnification_of_a_symmetric_phantom_are_offered_without_its_a
 
 @pytest.mark.parametrize("odd", [odd_ball, odd_material])
 @pytest.mark.parametrize("shape", ["two rings", "rings of four", "plate"])
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(n, marks=pytest.mark.campaign(1)) for n in range(1, 10))]
-)
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.daily(1)
+@pytest.mark.campaign(4)
 def test_one_odd_ball_tells_everything(
     shape: str, seed: int, odd: Callable[[Drawn, np.random.Generator], Drawn]
 ) -> None:
@@ -73,9 +74,9 @@ def test_one_odd_ball_tells_everything(
 
 
 @pytest.mark.parametrize("shape", TOLD)
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(n, marks=pytest.mark.campaign(1)) for n in range(1, 10))]
-)
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.daily(1)
+@pytest.mark.campaign(4)
 def test_a_helix_and_a_leaning_bar_have_every_number(shape: str, seed: int) -> None:
     rng = np.random.default_rng([seed, 7])
     drawn = scan_of(TOLD[shape], rng)
@@ -112,3 +113,17 @@ def test_every_angle_of_a_symmetric_phantom_is_listed() -> None:
     true = drawn.truth["alpha"] % 30.0
     apart = np.abs((np.array(angles) - true + 15.0) % 30.0 - 15.0)
     assert apart.max() < 1.0
+
+
+def test_the_next_command_states_an_angle_beside_what_was_typed() -> None:
+    rng = np.random.default_rng(1)
+    drawn = scan_of(rings(), rng)
+    (told,) = calibrated(drawn, rng).findings.of(CalibrationCode.AMBIGUOUS)
+    typed = Typed(("SCAN",), "two-rings", options={"start": "dO_x=1,alpha=7"})
+    (command,) = angle_commands(told, typed)
+    words = command.split()
+    assert words[:5] == ["flexdt", "calibrate", "SCAN", "--phantom", "two-rings"]
+    assert words[words.index("--prior") + 1] == "alpha=5"
+    start, angle = words[words.index("--start") + 1].split(",alpha=")
+    assert start == "dO_x=1"
+    assert abs((float(angle) - drawn.truth["alpha"] + 15.0) % 30.0 - 15.0) < 1.0
