@@ -77,7 +77,7 @@ class DataSet(ImageSet):
 
     @classmethod
     @with_options_of(ScanOptions)
-    def from_arrays(  # type: ignore[override]
+    def from_arrays(
         cls,
         counts: npt.ArrayLike,
         geometry: ConeVec | npt.ArrayLike | File,
