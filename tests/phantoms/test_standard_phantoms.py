@@ -43,7 +43,7 @@ def test_a_bar_leans_from_z_towards_x() -> None:
     "made",
     [
         lambda: two_rings(2),
-        lambda: two_rings(60),
+        lambda: two_rings(80),
         lambda: ball_helix(3),
         lambda: ball_plate(1),
         lambda: ball_bar(2),
