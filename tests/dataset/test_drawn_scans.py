@@ -19,6 +19,8 @@ FITS = 4e-3
 
 @pytest.mark.parametrize("seed", range(EACH))
 @pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.daily(12)
+@pytest.mark.campaign(48)
 def test_no_figure_of_a_drawn_file_is_dropped_in_silence(
     form: str, seed: int, tmp_path: Path
 ) -> None:

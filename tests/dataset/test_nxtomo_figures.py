@@ -109,6 +109,7 @@ CASES: dict[str, tuple[Any, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.daily(6)
 def test_images_fit_the_geometry_that_is_read(name: str, tmp_path: Path) -> None:
     lines, members = CASES[name]
     data = fx.open(written(tmp_path / "scan.nx", lines, members))
@@ -120,6 +121,7 @@ def test_images_fit_the_geometry_that_is_read(name: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", [n for n in CASES if n not in ("plain", "one height")])
+@pytest.mark.daily(4)
 def test_the_images_would_show_a_figure_that_is_dropped(
     name: str, tmp_path: Path
 ) -> None:
