@@ -130,6 +130,7 @@ def outcome(pair: Pair, found: Convention) -> str:
     return "right" if found.decided else "undecided"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(200))
 @pytest.mark.campaign(2)
 def test_a_drawn_pair_is_named_right_or_left_undecided(seed: int) -> None:
