@@ -19,11 +19,13 @@ if _typing.TYPE_CHECKING:
     from flexdt.library.analysis import align as align
     from flexdt.library.analysis import calibrate as calibrate
     from flexdt.library.analysis import reconstruct as reconstruct
-    from flexdt.library.convention import find_convention as find_convention
     from flexdt.library.data_set import DataSet as DataSet
     from flexdt.library.expose import expose as expose
     from flexdt.library.reading.folders import load_dataset
     from flexdt.library.reading.folders import read_tiffs as read_tiffs
+    from flexdt.library.reconstruction.convention import (
+        find_convention as find_convention,
+    )
     from flexdt.library.scripts import machine as machine
     from flexdt.library.scripts import plan as plan
     from flexdt.library.simulate import project as project
@@ -103,7 +105,7 @@ _HOMES: _typing.Final = {
     "cgls": "flexdt.twin.reconstruction.iterative",
     "expose": "flexdt.library.expose",
     "fdk": "flexdt.twin.reconstruction.checked_fdk",
-    "find_convention": "flexdt.library.convention",
+    "find_convention": "flexdt.library.reconstruction.convention",
     "forward": "flexdt.twin.projection.operators",
     "machine": "flexdt.library.scripts",
     "open": "flexdt.library.reading.folders:load_dataset",

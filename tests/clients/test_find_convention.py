@@ -15,7 +15,7 @@ import pytest
 from turned_balls import integrals
 
 import flexdt as fx
-from flexdt.library.convention import Convention, find_convention
+from flexdt.library.reconstruction.convention import Convention, find_convention
 from flexdt.twin.geometry.conventions import FloatArray
 
 SOD, SDD, PITCH = 120.0, 260.0, 0.75

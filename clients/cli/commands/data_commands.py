@@ -598,7 +598,7 @@ def guess(
         The document of --json (decided, names, odds, sentence), then a line for each
         convention with its odds.
     """
-    from flexdt.library.convention import find_convention
+    from flexdt.library.reconstruction.convention import find_convention
     from flexdt.twin.errors import NotIdentifiableError
 
     data = scan_of(dataset, False, None, geometry)
