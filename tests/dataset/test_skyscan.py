@@ -80,7 +80,9 @@ def test_images_fit_the_geometry(
 ) -> None:
     data = fx.open(written(tmp_path, said, lines))
     assert worst(data) < 2e-3
-    assert data.warnings == ()  # the preview is no projection by SkyScan's names
+    (told,) = data.warnings
+    assert "sense of rotation is assumed" in told
+    # The preview is no projection by SkyScan's names
 
 
 def test_a_csv_has_the_shift_of_each_view(tmp_path: Path) -> None:

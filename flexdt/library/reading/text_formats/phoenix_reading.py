@@ -15,6 +15,7 @@ from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_parsing import head_text
 from flexdt.library.reading.text_formats.phoenix_table import PHOENIX
 from flexdt.library.reading.text_formats.text_scans import (
+    assume_sense,
     compared,
     ini_values,
     projections_in,
@@ -104,6 +105,8 @@ def _geometry(
         settled(impossible, DatasetFormatError, str(path))
     span = said.number("CT/RotationSector", 360.0)
     angles = span / views * np.arange(views, dtype=np.float64)
+    if given is None:
+        assume_sense(said, "clockwise seen from above; the file does not say")
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
     column, row = (
         said.number("Geometry/cx", middle[1]),

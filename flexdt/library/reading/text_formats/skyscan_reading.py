@@ -19,6 +19,7 @@ from flexdt.library.reading.foreign_parsing import head_text
 from flexdt.library.reading.text_formats.skyscan_table import SKYSCAN
 from flexdt.library.reading.text_formats.text_scans import (
     TIFFS,
+    assume_sense,
     compared,
     ini_values,
     projections_in,
@@ -198,6 +199,9 @@ def _angles(said: Ledger, views: int) -> FloatArray:
                 f"Use 360 Rotation says {turn}, {views} views of {step:g} deg are "
                 f"{span:g} deg, which is taken",
             )
+    assume_sense(
+        said, "of Rotation Direction as TIGRE reads it; no file of the maker's seen"
+    )
     sense = -1.0 if words == "CW" else 1.0
     return sense * (start + step * np.arange(views, dtype=np.float64))
 

@@ -137,6 +137,19 @@ def compared(
         said.warnings += settled(found, DatasetFormatError, said.file)
 
 
+def assume_sense(said: Ledger, why: str) -> None:
+    """Tell that the sense of rotation is assumed.
+
+    Args:
+        said: what the file states.
+        why: what it is taken from.
+    """
+    said.warnings.append(
+        f"{said.file}: the sense of rotation is assumed ({why}); the wrong one mirrors the"
+        " volume, which images cannot tell: compare a part whose handedness you know"
+    )
+
+
 def under_a_level(
     said: Ledger,
     folder: Folder,
