@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from motor_units import UNITS, history
+from motor_units import UNITS, history, in_units
 
-from flexdt.twin.machine.description import builtin_machine
+from flexdt.twin.errors import LimitError
+from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.travel import check_target
+from flexdt.twin.scanner.scanner import ScannerTwin
 
 NEAR_MM = 0.01
 """Positions of parts agree to the tolerance of a sweep."""
@@ -37,6 +39,20 @@ def test_requests_in_other_units_come_to_the_same(seed: int) -> None:
     a motor halted along a path raised ValueError (these two seeds); in metres a halt left the
     path by up to 10 um, and no motion shorter than 50 mm began before a contact."""
     assert differing(seed) == 0
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_least_rate_is_that_of_the_parts(unit: str) -> None:
+    """In mm/s and deg/s, whatever a motor counts in; it was one number for all units."""
+    mm, deg = UNITS[unit]
+    machine = in_units(builtin_machine(), mm, deg)
+    for axis, size in (("mag_obj", mm), ("rot_obj", deg)):
+        scanner = ScannerTwin(machine, builtin_profile(machine.default_profile))
+        with pytest.raises(LimitError) as refused:
+            scanner.set_axis(axis, speed=0.0)
+        least, _ = refused.value.data["allowed"]
+        assert least * size == pytest.approx(1e-6)
+        scanner.set_axis(axis, speed=1.01 * least)
 
 
 @pytest.mark.slow

@@ -139,7 +139,9 @@ class BeadModel:
         stated = None if self.stated is None else self.stated.bead_mm
         if not isinstance(stated, tuple) or not any(stated):
             return np.ones(len(self))
-        return np.maximum(stated, LEAST_SPREAD_MM) / np.sqrt(np.mean(np.square(stated)))
+        spreads = np.asarray(stated, dtype=np.float64)
+        rms = float(np.sqrt(np.mean(spreads**2)))
+        return np.asarray(np.maximum(spreads, LEAST_SPREAD_MM) / rms, dtype=np.float64)
 
     @property
     def contrasts(self) -> FloatArray:

@@ -313,6 +313,7 @@ def with_settings(
     """
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
+    low = max(MIN_RATE * machine.counts(name) / share for name, share in shares.items())
     settings: tuple[tuple[Rate, float | None], ...] = (
         ("speed", speed),
         ("acceleration", acceleration),
@@ -321,9 +322,8 @@ def with_settings(
         if value is None:
             continue
         above = rate(machine, axis, quantity, value).messages
-        if not above and all(value * share >= MIN_RATE for share in shares.values()):
+        if not above and value >= low:
             continue
-        low = MIN_RATE / min(shares.values())
         axes = machine.axes
         high = min(
             getattr(axes[name], f"max_{quantity}") / share

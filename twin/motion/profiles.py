@@ -24,7 +24,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.values import ArrayValue
 
 MIN_RATE = 1e-6
-"""Least speed and acceleration that can be set: a move may be slow, but it ends."""
+"""Least speed and acceleration that can be set [mm or deg per s, per s^2], whatever unit a motor
+counts in: a move may be slow, but it ends."""
 
 
 LATE_S = 1e9

@@ -282,8 +282,9 @@ class Lookahead:
             return None
         ((name, planned),) = new.items()
         current = self.drives[name].at(self.now)
-        speed = max(planned.top_speed, motion.MIN_RATE)
-        acceleration = max(planned.acceleration(self.now), motion.MIN_RATE)
+        least = motion.MIN_RATE * self.drives[name].counts
+        speed = max(planned.top_speed, least)
+        acceleration = max(planned.acceleration(self.now), least)
         way = current.redirected(contact.last_free[name], speed, acceleration, self.now)
         # Swept although it ends where the path is free: a motor that cannot stop before it
         # passes the place, and comes back.

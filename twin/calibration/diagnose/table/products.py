@@ -99,7 +99,7 @@ class Products:
             each = course @ part.reshape(n, -1)
             each = each.reshape(count, c, len(one.slopes), -1)
             out = out + each.transpose(0, 2, 1, 3).reshape(-1, c, each.shape[3])
-        return np.asarray(out) / unit
+        return np.asarray(np.asarray(out) / unit, dtype=np.float64)
 
     def _squares(self, one: Family) -> FloatArray:
         if one.rows is not None:
