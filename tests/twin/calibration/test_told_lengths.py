@@ -74,7 +74,6 @@ def test_witnesses_that_contradict_withhold_and_one_with_room_is_corrected() -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scans", [2, 4])
-@pytest.mark.campaign(1)
 def test_right_places_are_as_sure_of_the_axis_as_the_best_of_them(scans: int) -> None:
     """Two said 1.3 px where one said 0.001 px."""
     told = drawn_told("places", 1, 0.0, scans=scans)

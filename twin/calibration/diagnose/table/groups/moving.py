@@ -132,9 +132,14 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         apart = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
         apart -= np.bincount(group) / len(group)
         own = {n.split("@")[0] for n in table.problem.layout.names if "@" in n}
-        # Scans that stand apart have told places, with a prior of their own.
-        own |= {n.replace("place", "dO") for n in own if n.startswith("place")}
-        shared = tuple(w for w, part in MOVERS.items() if own.isdisjoint(part))
+        # Of scans that stand apart, what is elsewhere along an axis is the place, as wide as
+        # it is stated: source or panel look alike, and each scan's geometry has its place.
+        placed = {n[-1] for n in own if n.startswith("place")}
+        shared = tuple(
+            what
+            for what, part in MOVERS.items()
+            if own.isdisjoint(part) and (what == "alpha" or what[-1] not in placed)
+        )
         for names in _alike(shared):
             yield _family(
                 table, [Moves(name, "differs", -1) for name in names], " between scans",
