@@ -87,7 +87,9 @@ def test_lengths_in_another_unit_are_told(tmp_path: Path) -> None:
         files.append(str(file))
     seen = fx.simulate(files[0], few, noise=1)
     said = seen.calibrate(files[1]).document["problems"][0]["text"]
-    assert said.endswith("another phantom, or some lengths are in m, not in mm")
+    assert said.endswith(
+        "another phantom, or lengths of the phantom's file are in m, not in mm"
+    )
 
 
 def test_frames_that_are_all_dark_leave_no_others() -> None:

@@ -198,7 +198,7 @@ def _state(
         family = families[f]
         place = family.places[g]
         if family.acts is Acts.COLUMNS:
-            x[np.asarray(place, dtype=np.intp)] += weights
+            x[np.asarray(place, dtype=np.intp)] += family.at_places(weights)
         elif family.acts is Acts.FRAMES:
             assert family.courses is not None
             assert isinstance(place, tuple)
@@ -487,23 +487,18 @@ def _strain(search: Search, posterior: Posterior) -> tuple[FloatArray, FloatArra
     first = search.table.problem.layout.strain_columns.start
     sums = np.zeros((len(STRAINS), len(solved.mean)))
     at = search.base_count
-    places: list[tuple[object, slice, float]] = [
-        (posterior.families[f].places[0], own, 1.0)
-        for f, own in search.always
-        if posterior.families[f].cause == strain.NAME
-    ]
+    parts = [((f, 0), own, 1.0) for f, own in search.always]
     for f, g in posterior.best.widths:
         count = search.products.own(f).shape[1]
-        if posterior.families[f].cause == strain.NAME:
-            unit = float(search.products.units[f][g])
-            places.append(
-                (posterior.families[f].places[g], slice(at, at + count), 1 / unit)
-            )
+        unit = float(search.products.units[f][g])
+        parts.append(((f, g), slice(at, at + count), 1.0 / unit))
         at += count
-    for place, own, scale in places:
-        rows = np.asarray(place, dtype=np.intp) - first
-        sums[rows, range(own.start, own.stop)] = scale
-    if not places:
+    shapes = [p for p in parts if posterior.families[p[0][0]].cause == strain.NAME]
+    for (f, g), own, scale in shapes:
+        family = posterior.families[f]
+        rows = np.asarray(family.places[g], dtype=np.intp) - first
+        sums[rows, own] = family.at_places(scale * np.eye(own.stop - own.start))
+    if not shapes:
         return None
     return sums @ solved.mean, sums @ solved.covariance @ sums.T
 

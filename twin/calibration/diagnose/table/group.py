@@ -86,6 +86,8 @@ class Family:
             with each of the slopes, in this order.
         widest: largest width of a weight [its own unit].
         always: width that always holds, so that the group is no question; 0: it is one.
+        root: (q, c) what each weight does to the q places of `Acts.COLUMNS`, where these do not
+            change by themselves; None: each is one.
     """
 
     cause: str
@@ -98,6 +100,11 @@ class Family:
     courses: FloatArray | None = None
     widest: float = math.inf
     always: float = 0.0
+    root: FloatArray | None = None
+
+    def at_places(self, weights: FloatArray) -> FloatArray:
+        """Return what weights, (c, ...), do to the places of `Acts.COLUMNS`, (q, ...)."""
+        return weights if self.root is None else np.asarray(self.root @ weights)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from flexdt.twin.calibration.diagnose.table.linearised import Linearised
 from flexdt.twin.calibration.fit.problem import STRAINS, STRETCHES
 from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.geometry.told_lengths import PHANTOM
 
 NAME: Final = "strain"
 WORDS: Final = "a phantom of another shape"
@@ -78,6 +79,9 @@ def _parts(mean: FloatArray) -> Iterator[tuple[str, FloatArray]]:
 def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make stretches and shears: as wide as stated, which always holds, and wider; none for
     exact beads.
+
+    The images tell how stretches differ, not the scale that they share: that of a phantom of
+    another shape is wider in the same proportion as its stretches.
     """
     if known.bead_tolerance_mm == 0:
         return
@@ -99,9 +103,27 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 rows,
                 always=stated,
             )
+        root = None
+        if name == SHAPES[0]:
+            share = _scale_share(table, stated)
+            shape = np.linalg.cholesky(np.eye(STRETCHES) + share**2)
+            root = np.asarray(shape, dtype=np.float64)
+            rows = rows @ root
         yield Family(
-            NAME, (name,), Acts.COLUMNS, (part,), LOG_CHANCE, rows, widest=WIDEST
-        )
+            NAME, (name,), Acts.COLUMNS, (part,), LOG_CHANCE, rows, widest=WIDEST,
+            root=root,
+        )  # fmt: skip
+
+
+def _scale_share(table: Linearised, stretch: float) -> float:
+    """Compute the standard deviation of the phantom's scale over that of a stretch, both as
+    stated; 0 where the scale is exact, at most 1.
+    """
+    names = table.problem.layout.names[: table.parameters]
+    if PHANTOM not in names or stretch <= 0.0:
+        return 0.0
+    scale = float(table.plain.prior_sigma[names.index(PHANTOM)])
+    return min(scale / stretch, 1.0)
 
 
 def lean_of(
