@@ -1,4 +1,4 @@
-"""Drawn files of six makers: read right, refused for the true cause, or every figure named."""
+"""Drawn files of seven makers: read right, refused for the true cause, or every figure named."""
 
 from __future__ import annotations
 

@@ -101,6 +101,16 @@ def yxlon(folder: Path) -> None:
     )
 
 
+def varian(folder: Path) -> None:
+    made = load(ROOT / "tests" / "dataset" / "test_varian.py")
+    angles = np.rad2deg(START) + 360.0 / VIEWS * np.arange(VIEWS)
+    said = {"SAD": SOD, "SID": SDD, "ImagerSizeX": COLS, "ImagerSizeY": ROWS,
+            "ImagerResX": PIXEL, "ImagerResY": PIXEL}  # fmt: skip
+    lines = -np.log(images(0.0, START))
+    own = {"PixelWidth": PIXEL / 10}
+    made.written(folder / "part", lines, said, own, angles, compressed=False)
+
+
 def data_exchange(folder: Path) -> None:
     with pytest.importorskip("h5py").File(folder / "scan.h5", "w") as file:
         file["exchange/data"] = np.rint(5e4 * images(0.0, START)).astype(np.uint16)
@@ -155,6 +165,7 @@ MAKERS = {
     "SkyScan": skyscan,
     "phoenix": phoenix,
     "YXLON": yxlon,
+    "Varian": varian,
     "Zeiss": zeiss,
     "Data Exchange": data_exchange,
     "NXtomo": nxtomo,

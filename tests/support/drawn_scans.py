@@ -9,6 +9,7 @@ Writers know the formats from their descriptions and share nothing with the read
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -407,6 +408,83 @@ def yxlon(folder: Path, draw: Draw) -> Path:
     return path
 
 
+# Varian.
+
+
+def xim(path: Path, image: Any, said: Sequence[tuple[str, Any]]) -> None:
+    """An image that is not compressed, with doubles and texts behind it."""
+    rows, cols = image.shape
+    out = b"VMS.XI\0\0" + struct.pack("<7i", 1, cols, rows, 32, 4, 0, 4 * image.size)
+    out += image.astype("<i4").tobytes() + struct.pack("<2i", 0, len(said))
+    for name, value in said:
+        out += struct.pack("<i", len(name)) + name.encode()
+        if isinstance(value, str):
+            out += struct.pack("<2i", 2, len(value)) + value.encode()
+        else:
+            out += struct.pack("<id", 1, float(value))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(out)
+
+
+def varian_draw(rng: np.random.Generator) -> Draw:
+    draw = Draw([
+        ("SAD", SOD), ("SID", SDD), ("ImagerSizeX", SHAPE[1]), ("ImagerSizeY", SHAPE[0]),
+        ("ImagerResX", PITCH), ("ImagerResY", PITCH), ("ImagerLat", 0.0), ("Fan", "Full"),
+        ("xim/KVDetectorLat", 0.0), ("xim/KVDetectorLng", 0.0), ("xim/PixelWidth", PITCH / 10),
+        ("xim/KVKiloVolts", 100.0),
+    ], columns=True)  # fmt: skip
+    planted(draw, rng, ["", "xim/", "Strange/"][int(rng.integers(3))])
+    return draw
+
+
+def panel_aside(draw: Draw, rng: np.random.Generator) -> None:
+    aside = float(rng.uniform(-6.0, 6.0))
+    draw.set("xim/KVDetectorLat", aside / 10.0)
+    draw.world["column"] = MIDDLE[1] + aside / PITCH
+    if rng.integers(2):
+        draw.named.append(("ImagerLat",))
+    else:
+        draw.set("ImagerLat", aside)
+
+
+VARIAN: list[Change] = [
+    comma("SAD", "ImagerResX"), absent("SAD", "SID", "ImagerResX", "ImagerSizeY"),
+    no_number("SID", "ImagerLat"), twice("SAD", "SID"), panel_aside,
+    told("xim/KVDetectorRtn", 0.4), told("xim/KVSourceVrt", 13.0), told("xim/PixelHeight", 0.3),
+    told("xim/DataOffset", 20.0), told("SourceAngleOffset", 80.0),
+    stated("xim/KVDetectorLng", lambda r: float(r.uniform(-0.5, 0.5)),
+           world(row=lambda v: MIDDLE[0] - 10.0 * v / PITCH)),
+    stated("xim/KVSourceRtn", lambda r: -ANGLES, world(angles_deg=lambda v: v)),
+    stated("xim/GantryRtn", lambda r: 30.0 + ANGLES,
+           world(angles_deg=lambda v: 90.0 + v)),
+]  # fmt: skip
+
+
+def varian(folder: Path, draw: Draw) -> Path:
+    own = [(name[4:], value) for name, value in draw.said if name.startswith("xim/")]
+    if not any(
+        name.endswith("Rtn") and name[0] in "GK" and np.ndim(v) for name, v in own
+    ):
+        own.append(("KVSourceRtn", ANGLES))
+    beam = folder / "Calibrations" / "Air-1" / "Filter.xim"
+    xim(beam, np.full(SHAPE, 60_000), [("KVNormChamber", 500.0)])
+    for k, image in enumerate(draw.images()):
+        chamber = 400.0 + 10.0 * k
+        each = [(name, value[k] if np.ndim(value) else value) for name, value in own]
+        path = folder / "Acquisitions" / "5" / f"Proj_{k:05d}.xim"
+        counts = np.rint(60_000 * chamber / 500.0 * np.exp(-image))
+        xim(path, counts, [*each, ("KVNormChamber", chamber)])
+    rows = []
+    for name, value in draw.said:
+        if not name.startswith("xim/"):
+            outer, _, inner = name.rpartition("/")
+            text = f"<{inner}>{value}</{inner}>"
+            rows.append(f"<{outer}>{text}</{outer}>" if outer else text)
+    path = folder / "Scan.xml"
+    path.write_text(f"<Scan><Acquisitions>{''.join(rows)}</Acquisitions></Scan>")
+    return path
+
+
 # HDF5: Data Exchange and NXtomo.
 
 LENGTHS = {
@@ -603,6 +681,7 @@ FORMATS: dict[str, tuple[Callable[..., Draw], list[Change], Callable[..., Path]]
     "SkyScan": (skyscan_draw, SKYSCAN, skyscan),
     "phoenix": (phoenix_draw, PHOENIX, phoenix),
     "YXLON": (yxlon_draw, YXLON, yxlon),
+    "Varian": (varian_draw, VARIAN, varian),
     "Data Exchange": (exchange_draw, EXCHANGE, exchange),
     "NXtomo": (nxtomo_draw, NXTOMO, nxtomo),
 }

@@ -133,8 +133,9 @@ def load_dataset(
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; a scan
             file (.toml) that says images, geometry and options;
             Nikon's .xtekct, SkyScan's .log, phoenix's .pca or YXLON's
-            ScanParameter.xml with its TIFFs; Zeiss's .txrm; a Data Exchange or NXtomo
-            file; or a folder with one of these; with a `geometry` a file of images, too.
+            ScanParameter.xml with its TIFFs; Varian's Scan.xml; Zeiss's .txrm; a Data
+            Exchange or NXtomo file; or a folder with one of these; with a `geometry` a file
+            of images, too.
         machine: the scanner, for texts that do not name one that ships with the package.
             Ignored, like `profile`, unless flexdt.json or texts are read.
         profile: zero offsets to use; default: those of the file, or the profile that

@@ -28,6 +28,8 @@ from flexdt.library.reading.text_formats.skyscan_reading import is_skyscan, read
 from flexdt.library.reading.text_formats.skyscan_table import SKYSCAN
 from flexdt.library.reading.text_formats.yxlon_reading import is_yxlon, read_yxlon
 from flexdt.library.reading.text_formats.yxlon_table import YXLON
+from flexdt.library.reading.varian_formats.varian_reading import is_varian, read_varian
+from flexdt.library.reading.varian_formats.varian_table import VARIAN
 from flexdt.library.reading.zeiss_reading import read_zeiss
 from flexdt.library.reading.zeiss_table import ZEISS
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
@@ -62,6 +64,7 @@ SCAN_FORMATS: Final = (
     ScanFormat("SkyScan", (".log",), read_skyscan, table=SKYSCAN, holds=is_skyscan),
     ScanFormat("phoenix", (".pca",), read_phoenix, table=PHOENIX),
     ScanFormat("YXLON", (".xml",), read_yxlon, table=YXLON, holds=is_yxlon),
+    ScanFormat("Varian", (".xml",), read_varian, table=VARIAN, holds=is_varian),
     ScanFormat("Zeiss", (".txrm",), read_zeiss, table=ZEISS),
     ScanFormat(
         "Data Exchange",

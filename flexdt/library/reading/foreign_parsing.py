@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
+from xml.etree import ElementTree
 
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.files.limited_files import limited_bytes
@@ -76,3 +77,42 @@ def require_memory(path: Path, what: str, size: int) -> None:
         raise DatasetFormatError.instead(
             said, size, f"{most / 2**30:.4g} GiB", path=str(path)
         )
+
+
+def xml_values(path: Path, group: str) -> Iterator[tuple[str, str]]:
+    """Yield path and text of every element without members of an XML text below its first
+    element, and attributes as PATH@NAME; names have no namespace.
+
+    Args:
+        path: of the file.
+        group: name of the element in the first whose members stand without its name.
+
+    Raises:
+        DatasetFormatError: it is not valid XML, or larger than settings may be.
+    """
+    try:
+        root = ElementTree.fromstring(head_text(path))
+    except ElementTree.ParseError as error:
+        said_of = f"{path} is not valid XML: {error}"
+        raise DatasetFormatError(said_of, {"path": str(path)}) from None
+    for name, value in root.attrib.items():
+        yield f"@{_plain(name)}", value
+    for element in root:
+        for part in element if _plain(element.tag) == group else [element]:
+            yield from _values(part, "")
+
+
+def _plain(tag: str) -> str:
+    """Return a name without its namespace."""
+    return tag.rpartition("}")[2]
+
+
+def _values(element: ElementTree.Element, above: str) -> Iterator[tuple[str, str]]:
+    """Yield the values of an element below a path."""
+    path = f"{above}{_plain(element.tag)}"
+    for name, value in element.attrib.items():
+        yield f"{path}@{_plain(name)}", value
+    if not len(element):
+        yield path, (element.text or "").strip()
+    for inner in element:
+        yield from _values(inner, f"{path}/")

@@ -6,15 +6,13 @@ stage that turns anticlockwise; columns run to the right as seen from the source
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
-from xml.etree import ElementTree
 
 import numpy as np
 
 from flexdt.library.data_set import DataSet
-from flexdt.library.reading.foreign_parsing import head_text
+from flexdt.library.reading.foreign_parsing import xml_values
 from flexdt.library.reading.text_formats.text_scans import (
     compared,
     projections_in,
@@ -57,16 +55,8 @@ def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
         DatasetError: no such XML, a number is missing, impossible distances or another
             trajectory, or images are missing or of another shape.
     """
-    try:
-        root = ElementTree.fromstring(head_text(path))
-    except ElementTree.ParseError as error:
-        said_of = f"{path} is not valid XML: {error}"
-        raise DatasetFormatError(said_of, {"path": str(path)}) from None
     said = Ledger(YXLON, str(path))
-    for element in root:
-        inside = element if _plain(element.tag) == PARAMETERS else [element]
-        for part in inside:
-            said.state_all(_values(part, ""))
+    said.state_all(xml_values(path, PARAMETERS))
     views = said.whole("ScanTrajectory/NumberOfProjections")
     if not 0 < views <= MOST_VIEWS:
         problem = f"{path}: NumberOfProjections is {views}"
@@ -88,22 +78,6 @@ def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
         told=told,
         corrected=True,
     )
-
-
-def _plain(tag: str) -> str:
-    """Return a name without its namespace."""
-    return tag.rpartition("}")[2]
-
-
-def _values(element: ElementTree.Element, above: str) -> Iterator[tuple[str, str]]:
-    """Yield path and text of every element without members, and attributes as PATH@NAME."""
-    path = f"{above}{_plain(element.tag)}"
-    for name, value in element.attrib.items():
-        yield f"{path}@{_plain(name)}", value
-    if not len(element):
-        yield path, (element.text or "").strip()
-    for inner in element:
-        yield from _values(inner, f"{path}/")
 
 
 def _geometry(said: Ledger, path: Path, views: int, given: ConeVec | None) -> ConeVec:

@@ -64,7 +64,11 @@ YXLON: Final = FormatTable(
             "mirrored images",
             "they are taken as they are stored",
         ),
-        *noted_all("Name Comment Date Version Manufacturer", "words"),
+        *noted_all(
+            "Name Comment Date Version Manufacturer @Version @schemaLocation "
+            "@noNamespaceSchemaLocation",
+            "words",
+        ),
         *noted_all(
             "Voltage Current FilterMaterial FilterThickness IntegrationTime",
             "of the exposure",

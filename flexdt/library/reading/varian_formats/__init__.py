@@ -1,0 +1,1 @@
+"""Readers of Varian's scans: Scan.xml with XIM images."""
