@@ -29,6 +29,7 @@ VALUES: dict[str, Any] = {
     "reading": "mount",
     "bead_tolerance": 0.05,
     "priors": "none",
+    "exclude": ["gap"],
     "start": {"dO_x": 1.0},
     "bound": 2.0,
     "markers": "marks.csv",
@@ -50,6 +51,8 @@ def test_python_and_the_command_have_the_same_options() -> None:
         "geometry",
         "progress",
     }
+    # Exclusions are values of --prior on the command line.
+    declared = declared - {"exclude"}
     command = {RENAMED.get(n, n) for n in named(calibrate_commands.calibrate)}
     settings = {f.name for f in fields(CalibrateSettings)} - {"command"}
     assert (command | settings) - OF_FILES - OF_THE_TWIN == declared | {"phantom"}

@@ -55,6 +55,7 @@ class Fake:
             "physics": "poly",
             "scatter": "off",
             "speed-up": "max",
+            "rays": "auto",
             "data": log.parent / "data",
         }
 

@@ -39,7 +39,8 @@ def make_record(name: str = "scan", frames: int = 5, **changes: object) -> ScanR
         n = len(files)
         positions = {a: np.broadcast_to(np.asarray(v, dtype=float), (n,)).copy()
                      for a, v in at.items()}  # fmt: skip
-        return FrameBlock(kind, tuple(files), np.arange(n) * 0.16, camera, positions)  # type: ignore[arg-type]
+        times_s = np.arange(n) * 0.16
+        return FrameBlock(kind, tuple(files), times_s, camera, positions, kind != "dark")  # type: ignore[arg-type]
 
     turns = np.arange(frames) * 360.0 / max(frames - 1, 1)
     values: dict[str, object] = {

@@ -204,7 +204,7 @@ def test_a_panel_of_one_row_reconstructs() -> None:
 
 
 def test_a_data_set_reconstructs_in_memory(data: fx.DataSet) -> None:
-    with pytest.warns(UserWarning, match="do not decide between geometries"):
+    with pytest.warns(UserWarning, match="missing or few views"):
         volume = data.reconstruct("fdk", voxel=0.8, shape=(11, 22, 22))  # of 12 views
     x, y, z = volume.centers()
     weight = np.where(volume.data > 0.5 * volume.data.max(), 1.0, 0.0)

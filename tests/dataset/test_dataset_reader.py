@@ -47,10 +47,13 @@ def test_an_own_data_set_comes_back(
     assert (d.name, len(d), d.shape) == ("scan", 5, (24, 30))
     assert d.complete
     assert (
-        repr(d) == "<DataSet 'scan': 5 projections of 24 x 30 (rows x columns), complete>"
+        repr(d)
+        == "<DataSet 'scan': 5 projections of 24 x 30 (rows x columns), complete, 1 warning>"
     )
+    (told,) = d.warnings  # one flat image is three times as bright as the other
+    assert "flat images differ by 100 %" in told
     assert d.require_complete() is d
-    assert (d.reason, d.missing, d.warnings) == ("", (), ())
+    assert (d.reason, d.missing) == ("", ())
     assert [f.file for f in d.frames] == [f"scan_{i:06d}.tif" for i in range(5)]
     assert d.cone_vec == r.cone_vec(r.projections)
     assert d.machine == r.machine

@@ -183,7 +183,9 @@ def test_the_twins_images_of_a_mesh_are_exact() -> None:
     imaging = Imaging(DirectProjector(), TrueGeometry(), store, machine.detector.pixels)
     pose = poses(machine, profile, camera, {"rot_obj": [35.0]})
     lines = asyncio.run(imaging.line_integrals(Sample("rough"), pose, camera))[0].ravel()
-    found, paths, rows = asyncio.run(imaging.path_lengths(Sample("rough"), pose, camera))
+    found, paths, rows, _ = asyncio.run(
+        imaging.path_lengths(Sample("rough"), pose, camera)
+    )
     assert len(found) == 1
     row = np.array(rows[0])
     shadow = np.flatnonzero(lines)
