@@ -34,6 +34,7 @@ from flexdt.library.calibration.markers import (
     read_markers,
     seen_alone,
 )
+from flexdt.library.calibration.one_blas_thread import one_blas_thread
 from flexdt.library.calibration.proposed_commands import (
     IN_MEMORY,
     VALUE,
@@ -216,6 +217,7 @@ def typed_words(
     )
 
 
+@one_blas_thread()
 def calibrate_datasets(
     datasets: Sequence[Images],
     phantom: str | Phantom,

@@ -143,3 +143,25 @@ def test_a_planted_cause_is_found(cause: str, fit: FitResult) -> None:
     groups_of = [g for p in found.posterior.parts for g in p.groups]
     odds = found.posterior.odds(g for g in groups_of if every[g[0]].cause in alike)
     assert odds > NAMED_LOG_ODDS, names
+
+
+def test_a_tile_is_found_beside_beads_that_are_out_of_place(fit: FitResult) -> None:
+    table = table_of(fit)
+    families = every_family(table, KNOWN)
+    products = Products(table, families)
+    shift = np.zeros((*fit.problem.seen.shape, 2))
+    for cause, size in (("beads", 0.3), ("tiles", 0.5)):
+        number = next(
+            i
+            for i, f in enumerate(families)
+            if f.cause == cause and f.places[0] is not None and len(f.names) > 1
+        )
+        rows = products.rows(number, middle(families[number]))
+        own = table.shift_of(rows @ np.ones(rows.shape[1]))
+        shift += size * own / np.abs(own).max()
+    moved = replace(fit.problem, measured=fit.problem.measured + shift)
+    found = explained(replace(fit, problem=moved), KNOWN)
+    causes = {found.posterior.families[f].cause for f, _ in found.weights}
+    assert causes >= {"beads", "tiles"}, causes
+    assert found.fit.problem.panel is not None
+    assert found.fit.problem.panel.borders

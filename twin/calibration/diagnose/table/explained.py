@@ -474,7 +474,8 @@ def _gap(search: Search, posterior: Posterior, border: Border) -> FloatArray:
         search, posterior.best.solved.mean, tuple(posterior.best.widths)
     )
     for (f, g), weight in weights.items():
-        if posterior.families[f].places[g] == border:
+        place = posterior.families[f].places[g]
+        if isinstance(place, Border) and place == border:
             return weight
     raise AssertionError(border)
 
