@@ -131,6 +131,15 @@ OTHER_FORMATS: Final = {
     b"%PDF": "a PDF document",
 }
 """First bytes of formats that are named and not read -> the words for them."""
+RAW_ENDINGS: Final = (".raw", ".bin", ".dat", ".img", ".vol")
+"""Usual endings of files of numbers without a header."""
+RAW_ADVICE: Final = (
+    "is not known by its first bytes: for raw numbers write a text beside it, scan.mhd: "
+    "'NDims = 3', 'DimSize = COLUMNS ROWS IMAGES', 'ElementType = MET_USHORT', "
+    "'ElementDataFile = {name}', and open that; or fx.DataSet.from_arrays("
+    "np.fromfile('{name}', np.uint16).reshape(IMAGES, ROWS, COLUMNS), GEOMETRY)"
+)
+"""How to read a file of numbers without a header."""
 MOST_BEGIN: Final = 16
 """First bytes that are looked at."""
 
@@ -198,7 +207,7 @@ def _answered(path: Path, ask: Callable[[ImageFormat, BinaryIO], _T]) -> _T:
             begin = file.read(MOST_BEGIN)
             form = next((f for f in IMAGE_FORMATS if begin.startswith(f.begins)), None)
             if form is None:
-                raise UnreadImageError(_no_image(begin, known))
+                raise UnreadImageError(raw_advice(path) or _no_image(begin, known))
             file.seek(0)
             return ask(form, file)
     except UnreadImageError as error:
@@ -220,6 +229,13 @@ def _answered(path: Path, ask: Callable[[ImageFormat, BinaryIO], _T]) -> _T:
     except Exception:  # a third party's parser raises anything on a damaged file
         said = f"{path} is no readable image: its bytes are cut off or damaged"
         raise DatasetFormatError(said, {"path": str(path)}) from None
+
+
+def raw_advice(path: Path) -> str:
+    """Say how raw numbers are read; "" for a file whose ending does not mean them."""
+    if path.suffix.lower() not in RAW_ENDINGS:
+        return ""
+    return RAW_ADVICE.format(name=path.name)
 
 
 def _no_image(begin: bytes, known: str | None) -> str:

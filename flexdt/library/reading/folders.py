@@ -64,6 +64,7 @@ from flexdt.runtime.files.image_files import (
     ImageHead,
     image_head,
     is_image_name,
+    raw_advice,
 )
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
@@ -390,6 +391,8 @@ def _no_projections(
         )
     else:
         why = f"there are {', '.join(names[:3])} ..."
+        raw = [(n, said) for n in names if (said := raw_advice(folder / n))]
+        why += f"; {raw[0][0]} {raw[0][1]}" if raw else ""
     wanted = (
         f"match {frames!r}"
         if frames is not None

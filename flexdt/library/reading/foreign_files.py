@@ -32,6 +32,7 @@ from flexdt.library.reading.varian_formats.varian_reading import is_varian, read
 from flexdt.library.reading.varian_formats.varian_table import VARIAN
 from flexdt.library.reading.zeiss_reading import read_zeiss
 from flexdt.library.reading.zeiss_table import ZEISS
+from flexdt.runtime.files.image_files import raw_advice
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import FormatTable
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -103,6 +104,9 @@ def open_file(
         more = () if distances is None else (distances,)
         with parsing(path, form.name):
             return form.read(path, geometry, *more)
+    advice = raw_advice(path)
+    if advice:
+        raise DatasetFormatError(f"{path} {advice}", {"asked": str(path)})
     listed = ", ".join(
         f"{form.name} ({', '.join(form.endings)})" for form in SCAN_FORMATS
     )
