@@ -199,7 +199,7 @@ def test_every_line_has_its_use_and_it_is_saved(tmp_path):
     lines = path.read_text().splitlines()[1:]
     assert [f"{one.field}={one.value}" for one in data.provenance] == lines
     assert {one.field for one in data.provenance.of("ignored")} == {
-        "InputFolderName", "CoefX1", "Scattering", "XraykV"
+        "InputFolderName", "CoefX1", "Scattering"
     }  # fmt: skip
     data.save(tmp_path / "saved")
     assert fx.open(tmp_path / "saved").provenance == data.provenance

@@ -263,3 +263,18 @@ def test_damaged_files_get_a_sentence(kind: int, tmp_path: Path) -> None:
         assert time.process_time() - began < 1.0, seed
     assert all(said.startswith((str(path), "spoilt: no flat")) for said in refused)
     assert len(refused) > 80
+
+
+@pytest.mark.parametrize(
+    ("stated", "kV"),
+    [(numbers(60.0), 60.0), (numbers(0.0), None), (b"\0", None), (numbers(np.nan), None),
+     (numbers([80.0, 70.0]), 80.0)],
+)  # fmt: skip
+def test_the_voltage_of_a_file_is_used(
+    stated: bytes, kV: float | None, tmp_path: Path
+) -> None:
+    path = small(tmp_path / "a.txrm", said={"ImageInfo/Voltage": stated})
+    data = fx.open(path)
+    assert (data.settings.kV if data.settings else None) == kV
+    (said,) = [one for one in data.provenance if one.field == "ImageInfo/Voltage"]
+    assert said.use == ("ignored" if kV is None else "used")

@@ -180,6 +180,7 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
     exposure, camera = (
         getattr(data.truth, name, None) for name in ("exposure", "camera")
     )
+    beam = exposure or data.settings
     before = [name[:2] for name, _ in references(data)]
     start, last = np.degrees(even[[0, -1]]).tolist()
     return ScanSettings(
@@ -187,7 +188,7 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
         **figures.stated,
         sample_name=data.name,
         software="flexdt",
-        kV=None if exposure is None else exposure.kV,
+        kV=None if beam is None else beam.kV,
         power_W=None if exposure is None else exposure.power_W,
         exposure_ms=None if camera is None else camera.exposure_ms,
         averages=None if camera is None else float(camera.averages),

@@ -24,6 +24,7 @@ from flexdt.library.reading.zeiss_table import ZEISS
 from flexdt.runtime.files.reading_within import opened
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
@@ -33,6 +34,7 @@ KINDS: Final = {3: "u1", 5: "<u2", 10: "<f4"}
 REFERENCES: Final = ("ReferenceData", "MultiReferenceData")
 """Storages with images of the open beam, `Image` or `Image1` and so on."""
 NOT_APPLIED: Final = ("ImageInfo/CameraOffset", "ImageInfo/CameraFineRotation")
+VOLTAGE: Final = "ImageInfo/Voltage"
 SHOWN: Final = ("ImageInfo/", "ReconSettings/", "Alignment/")
 """Beginnings of the streams whose numbers the provenance shows."""
 GEOMETRY_STREAMS: Final = (
@@ -130,6 +132,15 @@ class _Streams:
     def whole(self, name: str, default: float | None = None) -> int:
         return int(self.values(name, "<u4", default=default)[0])
 
+    def voltage(self) -> ScanSettings | None:
+        """Take the tube's voltage; settings with it alone, None without one above 0."""
+        held = self.ole.get_size(VOLTAGE) if self.ole.exists(VOLTAGE) else 0
+        value = float(self.values(VOLTAGE, "<f4")[0]) if 4 <= held <= self.size else 0.0
+        if 0.0 < value < np.inf:
+            return ScanSettings(kV=value)
+        self.said.ignore(VOLTAGE, "it is no voltage above 0")
+        return None
+
     def images(
         self, names: Sequence[str], code: int, shape: tuple[int, int]
     ) -> npt.NDArray[Any]:
@@ -226,6 +237,7 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
         reason = f"{taken} of {planned} images were taken"
     else:
         reason = ""
+    voltage = file.voltage()
     values = file.said.finish()
     return replace(
         data,
@@ -233,6 +245,7 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
         reason=reason,
         warnings=(*data.warnings, *file.said.warnings),
         provenance=values,
+        settings=voltage,
     )
 
 

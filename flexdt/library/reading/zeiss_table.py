@@ -23,6 +23,7 @@ ZEISS: Final = FormatTable(
         used(f"{INFO}PixelSize", "pixel at the axis", "the geometry", "um"),
         used(f"{INFO}YPosition", "height of the stage", "a helix is refused", "um"),
         used(f"{INFO}Angles", "angle of each view", "the views", "deg"),
+        used(f"{INFO}Voltage", "voltage of the tube", "reconstruct with material=", "kV"),
         used(f"{INFO}CameraOffset", "shift of the camera", "it is not applied"),
         used(f"{INFO}CameraFineRotation", "roll of the camera", "it is not applied"),
         used("ReconSettings/CenterShift", "shift of the axis", "the panel", "pixels"),
@@ -32,7 +33,7 @@ ZEISS: Final = FormatTable(
         used("ReferenceData/*", "open beam", "the flat image"),
         used("MultiReferenceData/*", "open beams", "the flat image"),
         *noted_all(
-            "Current Voltage XrayVoltage XrayCurrent ExpTimes ExpTime Date FocusTarget "
+            "Current XrayVoltage XrayCurrent ExpTimes ExpTime Date FocusTarget "
             "MosiacMode MosiacRows MosiacColumns AbsorptionScaleFactor "
             "AbsorptionScaleOffset Temperature Energy SourceFilterName ObjectiveName "
             "OpticalMagnification CameraBinning CameraName CamPixelSize "

@@ -85,7 +85,15 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
         )
     title = said.text("Name", folder_name(path))
     data = under_a_level(
-        said, folder, cone, names, level, size=size, name=title, told=told
+        said,
+        folder,
+        cone,
+        names,
+        level,
+        size=size,
+        name=title,
+        told=told,
+        voltage="XraykV",
     )
     return replace(data, provenance=data.provenance.and_also(more))
 

@@ -70,7 +70,7 @@ NIKON: Final = FormatTable(
             "the panel moves between views",
             "the images are taken to be put back already",
         ),
-        noted("XraykV", "voltage of the tube [kV]", "`tube=` of reconstruct takes it"),
+        used("XraykV", "voltage of the tube", "reconstruct with material=", "kV"),
         noted("XrayuA", "current of the tube [uA]", "the white level stands for it"),
         noted("Filter_ThicknessMM", "filter", "`tube=` of reconstruct takes it"),
         noted("Filter_Material", "filter", "`tube=` of reconstruct takes it"),

@@ -60,7 +60,15 @@ def read_phoenix(path: Path, geometry: ConeVec | None) -> DataSet:
     folder = list_folder(path.parent)
     names, told = projections_in(folder, len(cone), prefix=path.stem)
     return under_a_level(
-        said, folder, cone, names, level, size=size, name=path.stem, told=told
+        said,
+        folder,
+        cone,
+        names,
+        level,
+        size=size,
+        name=path.stem,
+        told=told,
+        voltage="Xray/Voltage",
     )
 
 

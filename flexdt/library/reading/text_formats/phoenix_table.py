@@ -31,6 +31,7 @@ PHOENIX: Final = FormatTable(
         used("Image/DimY", "rows", "the images are compared with it"),
         used("Image/FreeRay", "counts of the open beam", "the flat image"),
         used("CT/FreeRayFactor", "factor of FreeRay", "the flat image"),
+        used("Xray/Voltage", "voltage of the tube", "reconstruct with material=", "kV"),
         dropped(
             "Geometry/CalibValue",
             "shift of the axis [pixels]",
@@ -121,7 +122,7 @@ PHOENIX: Final = FormatTable(
             under="Detector/",
         ),
         *noted_all(
-            "ComPort Name ID InitTimeout Voltage Current Mode Filter Collimation WaitTime "
+            "ComPort Name ID InitTimeout Current Mode Filter Collimation WaitTime "
             "WaitForStable FocDistX FocDistY SpinStepkV SpinStepuA Macro RestrictNumSpots "
             "PreWarning MinGainCurrent",
             "of the tube",

@@ -90,6 +90,7 @@ def read_skyscan(path: Path, geometry: ConeVec | None) -> DataSet:
         name=path.stem,
         told=told,
         corrected=True,
+        voltage="Source Voltage (kV)",
     )
 
 

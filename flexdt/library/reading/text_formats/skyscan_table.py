@@ -128,8 +128,14 @@ SKYSCAN: Final = FormatTable(
             "whole images are read",
             divider="; ",
         ),
+        used(
+            "Source Voltage (kV)",
+            "voltage of the tube",
+            "reconstruct with material=",
+            "kV",
+        ),
         *noted_all(
-            "Source Voltage (kV); Source Current (uA); Filter; Source Type; "
+            "Source Current (uA); Filter; Source Type; "
             "Source focus mode; Source target type; External Filter; Filter assembly",
             "of the tube",
             "`tube=` of reconstruct takes it",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -16,7 +17,8 @@ from flexdt.library.datasets.scan_inputs import NO_DARK
 from flexdt.library.reading.listed_images import listed
 from flexdt.runtime.files.dataset_folder import Folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.dataset.format_table import Ledger, as_number
+from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.plausibility import PlausibilityCode, settled
 from flexdt.twin.plausibility.image_order import ordered
@@ -161,6 +163,7 @@ def under_a_level(
     name: str = "",
     told: Sequence[str] = (),
     corrected: bool = False,
+    voltage: str = "",
 ) -> DataSet:
     """Make the data set of images under an open beam of one level, without dark images.
 
@@ -174,6 +177,7 @@ def under_a_level(
         name: of the data set.
         told: doubts so far.
         corrected: the maker has divided the images by the open beam.
+        voltage: name of the field of the tube's voltage [kV]; "" for none.
 
     Raises:
         DatasetError: images are missing or of another shape than the text states, or the
@@ -192,6 +196,7 @@ def under_a_level(
             f"{said.path}: the open beam is {level:g}", level, "counts above 0"
         )
     white = np.full((1, *data.shape), level, np.float32)
+    settings = stated_voltage(said, voltage)
     values = said.finish()
     own = [doubt for doubt in data.warnings if not doubt.startswith(NO_DARK)]
     return replace(
@@ -199,7 +204,25 @@ def under_a_level(
         arrays=Arrays(None, np.zeros_like(white), white),
         warnings=(*own, *told, *said.warnings),
         provenance=values,
+        settings=settings,
     )
+
+
+def stated_voltage(said: Ledger, name: str) -> ScanSettings | None:
+    """Take the tube's voltage [kV], which `material=` of reconstruct needs.
+
+    Args:
+        said: what the file states.
+        name: of its field.
+
+    Returns:
+        Settings with it alone; None where it is missing or no number above 0.
+    """
+    value = as_number(said.stated(name) or "")
+    if not 0.0 < value < math.inf:
+        return None
+    said.use(name)
+    return ScanSettings(kV=value)
 
 
 def folder_name(path: Path) -> str:

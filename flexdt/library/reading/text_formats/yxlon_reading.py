@@ -77,6 +77,7 @@ def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
         name=path.parent.name,
         told=told,
         corrected=True,
+        voltage="Voltage",
     )
 
 

@@ -27,6 +27,7 @@ YXLON: Final = FormatTable(
         used("ScanTrajectory/NumberOfProjections", "number of images", "the views"),
         used("ScanTrajectory/StartAngle", "angle of the first view", "the views", "deg"),
         used("ScanTrajectory/Rotation", "turn of all views", "the views", "deg"),
+        used("Voltage", "voltage of the tube", "reconstruct with material=", "kV"),
         refused(
             "ScanTrajectory@type",
             "kind of trajectory",
@@ -70,7 +71,7 @@ YXLON: Final = FormatTable(
             "words",
         ),
         *noted_all(
-            "Voltage Current FilterMaterial FilterThickness IntegrationTime",
+            "Current FilterMaterial FilterThickness IntegrationTime",
             "of the exposure",
             "`tube=` of reconstruct takes it",
         ),

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_parsing import require_memory, xml_values
+from flexdt.library.reading.text_formats.text_scans import stated_voltage
 from flexdt.library.reading.varian_formats.varian_table import VARIAN
 from flexdt.library.reading.varian_formats.xim_images import XimImage, read_xim
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
@@ -81,8 +82,14 @@ def read_varian(path: Path, geometry: ConeVec | None) -> DataSet:
         flat=np.ones(shape),
         name=path.resolve().parent.name,
     )
+    settings = stated_voltage(said, "xim/KVKiloVolts")
     values = said.finish()
-    return replace(data, warnings=(*said.warnings, *data.warnings), provenance=values)
+    return replace(
+        data,
+        warnings=(*said.warnings, *data.warnings),
+        provenance=values,
+        settings=settings,
+    )
 
 
 def _projections(said: Ledger, path: Path) -> list[Path]:

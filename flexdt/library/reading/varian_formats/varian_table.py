@@ -28,6 +28,9 @@ VARIAN: Final = FormatTable(
         used("xim/KVDetectorVrt", "axis to panel, below 0", "it is compared", "cm"),
         used("xim/PixelWidth", "pitch of columns", "it is compared", "cm"),
         used("xim/PixelHeight", "pitch of rows", "it is compared", "cm"),
+        used(
+            "xim/KVKiloVolts", "voltage of the tube", "reconstruct with material=", "kV"
+        ),
         used("air/KVNormChamber", "that of the open beam", "scale of the open beam"),
         used("air/KVSourceRtn", "angle of the source", "the open beam's views", "deg"),
         used("air/GantryRtn", "that of the gantry", "the open beam's views", "deg"),
@@ -58,7 +61,7 @@ VARIAN: Final = FormatTable(
             "the images say where each was taken",
         ),
         *noted_all(
-            "KVKiloVolts KVMilliAmperes KVMilliSeconds KVFocalSpot KVFilter KVFoil "
+            "KVMilliAmperes KVMilliSeconds KVFocalSpot KVFilter KVFoil "
             "KVCollimatorX1 KVCollimatorX2 KVCollimatorY1 KVCollimatorY2 KVCollimatorShape "
             "KVAirKermaStart KVAirKermaStop KVBeamHold KVBeamPulseCounter "
             "KVFluoroLevelControl KVAutoBrightnessControl",
