@@ -209,9 +209,15 @@ def test_angles_and_pixels_need_two_distances(path):
     np.testing.assert_array_equal(folder.counts(), data.counts())
 
 
-@pytest.mark.parametrize("lacking", ["angles", "pixel"])
-def test_what_else_is_missing_asks_for_a_geometry(path, lacking):
+@pytest.mark.parametrize(
+    ("lacking", "way"),
+    [
+        ("angles", r"give angles=DEGREES"),
+        ("pixel", r"give geometry=fx\.ConeVec\.circular"),
+    ],
+)
+def test_what_else_is_missing_is_asked_for(path, lacking, way):
     with h5py.File(path, "w") as file:
         entry(file, **{lacking: None})
-    with pytest.raises(DatasetError, match=r"give geometry=fx\.ConeVec\.circular"):
+    with pytest.raises(DatasetError, match=way):
         fx.open(path, distances=(100.0, 200.0))

@@ -23,6 +23,7 @@ from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_doubts import SATURATED
 from flexdt.library.datasets.image_sources import (
     Reference,
+    angles_deg,
     hdf5_numbers,
     hdf5_place,
     matching,
@@ -134,9 +135,9 @@ def load_dataset(
         folder: a folder of TIFFs with flexdt.json, or with a scanner's settings texts; a scan
             file (.toml) that says images, geometry and options;
             Nikon's .xtekct, SkyScan's .log, phoenix's .pca or YXLON's
-            ScanParameter.xml with its TIFFs; Varian's Scan.xml; Zeiss's .txrm; a Data
-            Exchange or NXtomo file; or a folder with one of these; with a `geometry` a file
-            of images, too.
+            ScanParameter.xml with its TIFFs; Varian's Scan.xml; Zeiss's .txrm; a
+            Data Exchange or NXtomo file; or a folder with one of these; with a `geometry`
+            a file of images, too.
         machine: the scanner, for texts that do not name one that ships with the package.
             Ignored, like `profile`, unless flexdt.json or texts are read.
         profile: zero offsets to use; default: those of the file, or the profile that
@@ -168,7 +169,11 @@ def load_dataset(
         # Angles of a geometry of one view make the others.
         given = None if geometry is None else geometry_said(geometry, options)
         kept = options if given is None else _without_angles(options)
-        return looked_at(with_options(open_file(source, given, distances), kept))
+        said = kept.get("angles")
+        angles = None if said is None else angles_deg(said, source.parent)
+        kept = cast(ScanOptions, {**kept, "angles": angles})
+        made = open_file(source, given, distances, angles)
+        return looked_at(with_options(made, kept))
     content = list_folder(source)
     if UNFINISHED in content.names:
         raise DatasetMissingError(

@@ -36,6 +36,7 @@ from flexdt.runtime.files.image_files import raw_advice
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import FormatTable
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class ScanFormat:
         name: of the format or its maker.
         endings: of its files, in lower case.
         read: from a path and a geometry in place of the file's, or None, to the data set.
-        distant: whether `read` takes distances too, where the file has only angles and
-            pixels.
+        distant: whether `read` takes distances and angles [deg] too, where the file lacks
+            them; either may be None.
         table: of its fields; None where it has none yet.
         holds: whether a file with such an ending is of this format; None: every one is.
     """
@@ -83,7 +84,10 @@ SCAN_FORMATS: Final = (
 
 
 def open_file(
-    path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None = None
+    path: Path,
+    geometry: ConeVec | None,
+    distances: tuple[float, float] | None = None,
+    angles: FloatArray | None = None,
 ) -> DataSet:
     """Open the data set in a file, by its ending, whatever its case.
 
@@ -92,6 +96,8 @@ def open_file(
         geometry: one view for each projection, in place of the file's; None for the
             file's.
         distances: source to axis and to panel [mm]; only for formats that lack them.
+        angles: of the projections [deg], for formats whose files may lack them; others do
+            without.
 
     Raises:
         DatasetError: another kind of file, one that is damaged or lacks data, or
@@ -101,7 +107,7 @@ def open_file(
     if form is not None:
         if distances is not None and not form.distant:
             refuse_distances(path, form.name, distances)
-        more = () if distances is None else (distances,)
+        more = (distances, angles) if form.distant else ()
         with parsing(path, form.name):
             return form.read(path, geometry, *more)
     advice = raw_advice(path)

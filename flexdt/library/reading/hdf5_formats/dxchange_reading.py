@@ -23,7 +23,9 @@ from flexdt.library.reading.hdf5_formats.hdf5_values import (
     angles_rad,
     lengths_mm,
     members_of,
+    said_angles,
     text_of,
+    what_gives,
 )
 from flexdt.library.reading.hdf5_formats.one_exposure import on_one_exposure
 from flexdt.library.reading.text_formats.text_scans import compared
@@ -59,7 +61,10 @@ def is_data_exchange(path: Path) -> bool:
 
 
 def read_data_exchange(
-    path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None = None
+    path: Path,
+    geometry: ConeVec | None,
+    distances: tuple[float, float] | None = None,
+    angles: FloatArray | None = None,
 ) -> DataSet:
     """Read a Data Exchange file into memory; the file is closed again.
 
@@ -67,6 +72,7 @@ def read_data_exchange(
         path: the file.
         geometry: one view for each projection, in place of the file's.
         distances: source to axis and to panel [mm], in place of the file's.
+        angles: of the projections [deg], where the file has none.
 
     Raises:
         DatasetFormatError: no images, or no geometry that is possible.
@@ -80,7 +86,7 @@ def read_data_exchange(
             said.state(place, text_of(item))
             if hasattr(item, "attrs"):
                 members[place] = item
-        return _read(said, members, path, geometry, distances)
+        return _read(said, members, path, geometry, distances, angles)
 
 
 def _read(
@@ -89,6 +95,7 @@ def _read(
     path: Path,
     geometry: ConeVec | None,
     distances: tuple[float, float] | None,
+    degrees: FloatArray | None,
 ) -> DataSet:
     """Read images and geometry of an open file.
 
@@ -96,7 +103,7 @@ def _read(
         said: all values of the file.
         members: path -> dataset.
         path: for messages.
-        geometry, distances: as for `read_data_exchange`.
+        geometry, distances, degrees: as for `read_data_exchange`.
     """
     data = members.get("exchange/data")
     if data is None or data.ndim != 3:
@@ -115,7 +122,7 @@ def _read(
     told = []
     if not len(kinds[FLAT]) and data.dtype.kind in "ui":
         told.append(f"{path.name}: no exchange/data_white, so counts have no integrals")
-    cone = _geometry(said, members, path, data.shape, geometry, distances)
+    cone = _geometry(said, members, path, data.shape, geometry, distances, degrees)
     scaled = _one_exposure(said, members, path, kinds)
     made = DataSet.from_arrays(
         scaled.views,
@@ -218,6 +225,7 @@ def _geometry(
     shape: tuple[int, ...],
     given: ConeVec | None,
     distances: tuple[float, float] | None,
+    degrees: FloatArray | None,
 ) -> ConeVec:
     """Take the geometry of the file, or compare a given one with it.
 
@@ -226,6 +234,8 @@ def _geometry(
     """
     detector = f"{INSTRUMENT}/detector"
     angles = _angles(said, members, path, shape[0])
+    if angles is None and given is None:
+        angles = said_angles(degrees, shape[0], path)
     pitches = []
     for what, names in PIXELS.items():
         stated = [
@@ -256,13 +266,8 @@ def _geometry(
         name for name, value in quantities.items() if value is None or not np.any(value)
     ]
     if angles is None or pitches[0] is None or sod is None or beyond is None or missing:
-        way = "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"
-        if {*missing} <= {"source distance", "detector distance"}:
-            way = (
-                "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
-            )
         raise DatasetFormatError(
-            f"{path}: the file has no {', '.join(missing)}; give {way}",
+            f"{path}: the file has no {', '.join(missing)}; give {what_gives(missing)}",
             {"missing": missing},
         )
     pixel = (pitches[0], pitches[1] or pitches[0])

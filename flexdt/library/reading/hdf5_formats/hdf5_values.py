@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.length_units import UNITS_RAD, angle_rad, length_mm
 
 KNOWN_LENGTHS: Final = "m, cm, mm, um, nm, inch"
@@ -21,6 +23,8 @@ STRUCTURE: Final = (
     "reference_list name "
 )
 """Attributes, in lower case, that say how a file is built, or describe a value in words."""
+ANGLES: Final = ("rotation_angle", "theta")
+"""Names of the angles of projections."""
 SHOWN_VALUES: Final = 100_000
 """Members of an array of one dimension whose first and last are shown."""
 
@@ -143,3 +147,38 @@ def angles_rad(dataset: Any, usual: str = "deg") -> npt.NDArray[np.float64]:
     """Read angles (n,) [rad] of a dataset; raises DatasetFormatError for an unknown unit."""
     scale = _scale(dataset, usual, angle_rad, KNOWN_ANGLES)
     return np.ravel(np.asarray(dataset[()], dtype=np.float64)) * scale
+
+
+def said_angles(
+    degrees: FloatArray | None, projections: int, path: Path
+) -> FloatArray | None:
+    """Return the angles [rad] that the caller says in place of those that a file lacks.
+
+    Args:
+        degrees: of each projection [deg]; None: none are said.
+        projections: number of them in the file.
+        path: for messages.
+
+    Raises:
+        DatasetFormatError: another number of angles than projections.
+    """
+    if degrees is None:
+        return None
+    if len(degrees) != projections:
+        said = f"{path}: {len(degrees)} angles for {projections} projections"
+        raise DatasetFormatError.instead(said, len(degrees), projections)
+    return np.deg2rad(degrees)
+
+
+def what_gives(missing: Sequence[str]) -> str:
+    """Name the arguments that give quantities which a file lacks."""
+    ways = []
+    if any("distance" in one for one in missing):
+        ways.append(
+            "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
+        )
+    if any(one in ANGLES for one in missing):
+        ways.append("angles=DEGREES, one for each projection")
+    if all("distance" in one or one in ANGLES for one in missing):
+        return " and ".join(ways)
+    return "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"

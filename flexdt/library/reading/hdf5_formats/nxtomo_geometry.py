@@ -17,7 +17,9 @@ from flexdt.library.datasets.nxtomo_writing import HALF_SEEN
 from flexdt.library.reading.hdf5_formats.hdf5_values import (
     angles_rad,
     lengths_mm,
+    said_angles,
     text_of,
+    what_gives,
 )
 from flexdt.library.reading.hdf5_formats.nxtomo_scan import NxScan
 from flexdt.library.reading.hdf5_formats.nxtomo_table import DETECTOR
@@ -25,6 +27,7 @@ from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility import PlausibilityCode, settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
@@ -59,7 +62,10 @@ GEOMETRY_PLACES: Final = (
 
 
 def file_geometry(
-    scan: NxScan, shape: tuple[int, int], distances: tuple[float, float] | None
+    scan: NxScan,
+    shape: tuple[int, int],
+    distances: tuple[float, float] | None,
+    degrees: FloatArray | None = None,
 ) -> tuple[ConeVec, list[str]]:
     """Take the geometry from the file's cone_vec, or from its angles, pixel, distances,
     axis, flips and heights.
@@ -73,6 +79,7 @@ def file_geometry(
         scan: of the file.
         shape: of an image (rows, cols).
         distances: source to axis and to panel [mm], in place of the file's.
+        degrees: angles of the projections [deg], where the file has none.
 
     Returns:
         The geometry, and a sentence on the assumptions made; none with cone_vec.
@@ -86,6 +93,8 @@ def file_geometry(
     if rows is not None:
         return ConeVec(rows), []
     angles = _angles(scan.file, scan.name, scan.projections, scan.ledger)
+    if angles is None:
+        angles = said_angles(degrees, int(np.count_nonzero(scan.projections)), path)
     lengths = {
         what: scan.length(place)
         for what, place in LENGTHS.items()
@@ -311,11 +320,9 @@ def _too_little(path: Path, missing: Sequence[str]) -> DatasetFormatError:
     """Make the error for quantities that a geometry needs and the file lacks; it names the
     argument that gives them.
     """
-    way = "geometry=fx.ConeVec.circular(sod=..., sdd=..., angles=..., pixel=...)"
-    if {*missing} <= {"source distance", "detector distance"}:
-        way = "distances=(SOD_MM, SDD_MM), from the source to the axis and to the panel"
+    listed = ", ".join(missing)
     return DatasetFormatError(
-        f"{path}: the file has no cone_vec and no {', '.join(missing)}; give {way}",
+        f"{path}: the file has no cone_vec and no {listed}; give {what_gives(missing)}",
         {"missing": missing},
     )
 

@@ -24,6 +24,7 @@ from flexdt.library.reading.hdf5_formats.nxtomo_table import DETECTOR
 from flexdt.library.reading.hdf5_formats.one_exposure import on_one_exposure
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility import settled
 
 KNOWN_KEYS: Final = (PROJECTION, FLAT, DARK, INVALID)
@@ -34,7 +35,10 @@ SMALL_BYTES: Final = 1 << 30
 
 
 def read_nxtomo(
-    path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None = None
+    path: Path,
+    geometry: ConeVec | None,
+    distances: tuple[float, float] | None = None,
+    angles: FloatArray | None = None,
 ) -> DataSet:
     """Read an NXtomo file into memory; the file is closed again.
 
@@ -44,6 +48,7 @@ def read_nxtomo(
             its angles, pixels and distances.
         distances: source to axis and to panel [mm], in place of the file's; ignored where
             `geometry` or the file's cone_vec is used.
+        angles: of the projections [deg], where the file has none.
 
     Raises:
         DatasetFormatError: no HDF5, no NXtomo, missing images, no geometry, or one that
@@ -53,7 +58,7 @@ def read_nxtomo(
     h5py = package("h5py", "NXtomo")
     try:
         with h5py.File(path) as file:
-            return _read(file, path, geometry, distances)
+            return _read(file, path, geometry, distances, angles)
     except FileNotFoundError:
         raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
     except OSError:
@@ -63,7 +68,11 @@ def read_nxtomo(
 
 
 def _read(
-    file: Any, path: Path, geometry: ConeVec | None, distances: tuple[float, float] | None
+    file: Any,
+    path: Path,
+    geometry: ConeVec | None,
+    distances: tuple[float, float] | None,
+    angles: FloatArray | None,
 ) -> DataSet:
     """Read the images of an open file, and their geometry.
 
@@ -73,7 +82,7 @@ def _read(
     Args:
         file: open.
         path: for messages.
-        geometry, distances: as for `read_nxtomo`.
+        geometry, distances, angles: as for `read_nxtomo`.
 
     Returns:
         The data set in memory, with its doubts as warnings.
@@ -109,7 +118,7 @@ def _read(
         )
     given = geometry
     if given is None:
-        given, told = file_geometry(scan, data.shape[1:], distances)
+        given, told = file_geometry(scan, data.shape[1:], distances, angles)
         doubts += told
     else:
         replaced_by(scan, "geometry=")
