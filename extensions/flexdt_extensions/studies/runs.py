@@ -265,8 +265,8 @@ def _mae(errors: Mapping[str, float]) -> float:
 
 
 def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
-    """Compute |value - truth| of each parameter in `values`, [mm, deg]; whole turns of
-    alpha do not count.
+    """Compute |value - truth| of each offset in `values`, [mm, deg]; whole turns of alpha do
+    not count, nor told lengths, which are no offsets.
     """
     edge = truth.to_edge()
     return {
@@ -274,6 +274,7 @@ def errors_of(values: dict[str, float], truth: Offsets) -> dict[str, float]:
             math.remainder(v - edge[name], 360.0) if name == "alpha" else v - edge[name]
         )
         for name, v in values.items()
+        if name in edge
     }
 
 

@@ -81,7 +81,7 @@ def calibrated(
     fit, true = result.fit, truth.to_edge()
     assert fit is not None
     return result, max(
-        abs(fit.values[n] - true[n]) / sigma for n, sigma in fit.sigmas.items()
+        abs(fit.values[n] - true.get(n, 0.0)) / sigma for n, sigma in fit.sigmas.items()
     )
 
 

@@ -234,5 +234,6 @@ def test_the_joint_region_follows_its_bend() -> None:
             tracks, model, poses(), shape=SHAPE, priors=ASSUMED, strain=(1e-3, 1e-3)
         )  # fmt: skip
         names = found.certificate.estimates
-        inside.append(found.certificate.inside_95({n: truth[n] for n in names}))
+        asked = {n: truth[n] for n in names if n in truth}
+        inside.append(found.certificate.inside_95(asked))
     assert np.mean(inside) >= 0.87

@@ -41,10 +41,10 @@ def test_a_source_that_jumps_is_not_followed_as_an_object(asked: tuple[str, ...]
 
 
 def test_an_unasked_jump_of_the_source_is_named_with_its_frame() -> None:
-    (said,) = calibrated(drawn("source_jumps", 9304)).errors
+    (said,) = calibrated(drawn("source_jumps", 9304)).findings
     assert said.text.startswith("dS_x by 0.2")
     assert "at frame 44" in said.text
-    assert "dS_x follows it" in said.text
+    assert "the source moves aside" in said.text
 
 
 @pytest.mark.daily(2)
@@ -141,7 +141,7 @@ def test_a_misfit_named_a_vibration_is_not_dropped_with_a_motion(
     """What was asked for does not move here, and the shaking is still there."""
     monkeypatch.setattr(fitted_motion, "MOVABLE", ())
     scan = drawn("vibration", 3)
-    assert "vibration" in [f.code for f in calibrated(scan).errors]
+    assert "vibration" in [f.code for f in calibrated(scan).findings]
     result = calibrated(scan, ("alpha",))
     assert not result.identifiable, result.findings
 
