@@ -108,6 +108,7 @@ def _reconstruction() -> None:
 def _edges() -> None:
     """Compile the kernels of pixels that edges of solids and meshes reach."""
     from flexdt.twin.projection import Box, Scene, Solid, TriangleMesh
+    from flexdt.twin.projection.finer_pixels import averaged
     from flexdt.twin.projection.pixel_areas import area_means
 
     scan = ConeVec.circular(sod=10, sdd=20, angles=1, shape=(4, 6), pixel=1.0)
@@ -115,6 +116,7 @@ def _edges() -> None:
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     mesh = TriangleMesh(corners, faces)
+    averaged(np.zeros((1, 2, 2), np.float32), 2)
     area_means([(solids, 1.0), (mesh, 0.1)], scan, (4, 6), "auto")
 
 

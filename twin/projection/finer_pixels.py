@@ -20,7 +20,10 @@ from flexdt.twin.rays_a_pixel import MAX_RAYS, Rays, check_rays
 RAYS_A_VOXEL: Final = 2
 """Rays along each side of a voxel's shadow."""
 FINE_BYTES: Final = 128 << 20
-"""Size of the divided images that are held at a time [bytes], at least those of one view."""
+"""Size of the divided images that are held at a time [bytes], at least those of one view: of the
+adjoint, which adds a volume for each such batch."""
+FORWARD_BYTES: Final = 32 << 20
+"""The same of the projection, whose room is used again: the system clears less memory."""
 
 
 def finer(geometry: ConeVec, shape: tuple[int, int], n: int) -> ConeVec:
@@ -57,24 +60,24 @@ def voxel_rays_a_side(
     return min(max(wanted, RAYS_A_VOXEL), MAX_RAYS)
 
 
-def batches(views: int, shape: tuple[int, int], n: int) -> list[slice]:
-    """List ranges of views whose divided images fit into `FINE_BYTES`."""
-    step = max(1, FINE_BYTES // max(1, 4 * n * n * shape[0] * shape[1]))
+def batches(
+    views: int, shape: tuple[int, int], n: int, most: int = FINE_BYTES
+) -> list[slice]:
+    """List ranges of views whose divided images fit into `most` bytes."""
+    step = max(1, most // max(1, 4 * n * n * shape[0] * shape[1]))
     return [slice(at, min(at + step, views)) for at in range(0, views, step)]
 
 
-def averaged(images: Float32Array, n: int) -> npt.NDArray[np.float32]:
+def averaged(
+    images: Float32Array, n: int, out: Float32Array | None = None
+) -> npt.NDArray[np.float32]:
     """Average divided images (k, n rows, n cols) over the pixels, (k, rows, cols)."""
+    from flexdt.twin.projection.kernels import within_kernels
+
     k, rows, cols = images.shape
-    parts = images.reshape(k, rows // n, n, cols)
-    down = parts[:, :, 0].copy()
-    for i in range(1, n):
-        down += parts[:, :, i]
-    sides = down.reshape(k, rows // n, cols // n, n)
-    out = sides[..., 0].copy()
-    for i in range(1, n):
-        out += sides[..., i]
-    out *= np.float32(1.0 / n**2)
+    if out is None:
+        out = np.empty((k, rows // n, cols // n), np.float32)
+    within_kernels.average_parts(images, n, out)
     return out
 
 

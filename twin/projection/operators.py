@@ -48,6 +48,7 @@ from flexdt.twin.projection.fan_plan import (
     MIN_FACING_COSINE,
 )
 from flexdt.twin.projection.finer_pixels import (
+    FORWARD_BYTES,
     averaged,
     batches,
     divided,
@@ -332,11 +333,11 @@ def _of_areas(
         if side == 1:
             return forward(volume, geometry, shape, result)
         room: Float32Array | None = None
-        for some in batches(len(geometry), shape, side):
+        for some in batches(len(geometry), shape, side, FORWARD_BYTES):
             fine = finer(geometry[some], shape, side)
             if room is None or len(room) != len(fine):
                 room = np.empty((len(fine), shape[0] * side, shape[1] * side), np.float32)
-            result[some] = averaged(forward(volume, fine, out=room), side)
+            averaged(forward(volume, fine, out=room), side, result[some])
         return result
     geometry = run_through(geometry, corners_of(volume))
     for some, order in _by_steepness(volume, geometry, shape):

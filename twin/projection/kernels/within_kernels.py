@@ -32,7 +32,8 @@ CURVED_SPREAD = 24.0
 RIM_REACHES = 2.0
 """Half pixels from the outline of a curved solid within which its chord counts as bent."""
 BLOCK, CELL = 16, 4
-"""Pixels along a side of the squares that are looked at first, and then."""
+"""Pixels along a side of the squares that are looked at first, of which quarters follow, and of
+those from which on only the nearest surfaces are."""
 
 
 @inline
@@ -46,7 +47,11 @@ def rays_for_step(change, error, counts, least=0.0):
         counts: whether signals are averaged, which differ by less than line integrals.
         least: no line integral of the pixel is below it.
     """
-    height = math.exp(-least) * (1.0 - math.exp(-change)) if counts else change
+    height = change
+    if counts:
+        height = 1.0 - math.exp(-change)
+        if least > 0.0:
+            height *= math.exp(-least)
     return min(math.ceil(math.sqrt(height / (STEP_SPREAD * error))), MAX_RAYS)
 
 
@@ -87,8 +92,9 @@ def slab_ranges(low, high, at, speed, reach):
     """
     size = abs(speed)
     if size > reach:
-        slow = 1.0 / (size - reach)
-        fast = 1.0 / (size + reach)
+        inverse = 1.0 / ((size - reach) * (size + reach))
+        slow = (size + reach) * inverse
+        fast = (size - reach) * inverse
         near, far = (low - at, high - at) if speed > 0.0 else (at - high, at - low)
         a0, a1 = (near * fast, near * slow) if near >= 0.0 else (near * slow, near * fast)
         b0, b1 = (far * fast, far * slow) if far >= 0.0 else (far * slow, far * fast)
@@ -102,7 +108,7 @@ def slab_ranges(low, high, at, speed, reach):
 
 
 @inline
-def quadric_ranges(q, d, u, v, size_px):
+def quadric_ranges(q, d, u, v, size_px, side):
     """Compute the ranges, over a pixel, at which its rays enter and leave |q + t d| <= 1, as
     `slab_ranges`, and whether the outline is near.
 
@@ -111,12 +117,11 @@ def quadric_ranges(q, d, u, v, size_px):
         d: (3,) ray to the pixel's centre.
         u, v: (3,) sides of a detector pixel.
         size_px: detector pixels along a side.
+        side: lengths of u and v together.
     """
     a = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     size = math.sqrt(a)
-    uu = math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-    vv = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    half = 0.5 * size_px * (uu + vv)
+    half = 0.5 * size_px * side
     if size <= 2.0 * half:  # (nearly) along the axis of a cylinder
         return 0.0, 1.0, 0.0, 1.0, True
     middle = -(q[0] * d[0] + q[1] * d[1] + q[2] * d[2]) / a
@@ -147,16 +152,19 @@ def quadric_ranges(q, d, u, v, size_px):
     )
 
 
-@kernel
-def side_needed(c, r, size, curved, forms, room, g, weight, filled, error, counts):
-    """Compute the rays along each side that a square of pixels needs for one convex solid, 0
-    where none of its rays meets the solid.
+@inline
+def side_needed(c, r, size, curved, forms, slabs, room, g, weight, filled, error, counts):
+    """Compute the rays along each side that a pixel needs for one convex solid, 0 where none of
+    its rays meets the solid; of a larger square, 2 where one of its pixels may need several.
 
     Args:
         c, r: column and row of the square's middle.
         size: its side [pixels].
         curved: whether the solid has a quadric.
-        forms, room: of `solid_forms`; room[4] is overwritten.
+        forms: of `solid_forms`; the first `slabs` count. Their last two columns are filled with
+            the largest entry and the least exit.
+        room: of `solid_forms`; room[4] is spare, room[5, 1:] filled with the least entry into
+            the solid and the largest exit.
         g: (12,) the view's rays [mm].
         weight, filled, error, counts: as of `mark_convex`.
     """
@@ -168,40 +176,69 @@ def side_needed(c, r, size, curved, forms, room, g, weight, filled, error, count
     if curved:
         for i in range(3):
             room[4, i] = room[1, i] + c * room[2, i] + r * room[3, i]
-        a0, qa, qb, b1, rim = quadric_ranges(room[0], room[4], room[2], room[3], size)
+        a0, qa, qb, b1, rim = quadric_ranges(
+            room[0], room[4], room[2], room[3], size, room[5, 0]
+        )
         e0, e1 = max(e0, a0), max(e1, qa)
         l0, l1 = min(l0, qb), min(l1, b1)
         if l1 <= e0:
             return 0
-    for j in range(len(forms)):
+    for j in range(slabs):
         a0, a1, b0, b1 = ranges_of(forms[j], c, r, size)
+        forms[j, 6], forms[j, 7] = a1, b0
         e0, e1 = max(e0, a0), max(e1, a1)
         l0, l1 = min(l0, b0), min(l1, b1)
         if l1 <= e0:
             return 0
+    room[5, 1], room[5, 2] = e0, l1
     x = g[3] + c * g[6] + r * g[9]
     y = g[4] + c * g[7] + r * g[10]
     z = g[5] + c * g[8] + r * g[11]
     scale = math.sqrt(x * x + y * y + z * z) * weight
     sure = max(l0 - e1, 0.0)
     change = ((l1 - e0) - sure) * scale
+    if change <= STEP_SPREAD * error:  # signals differ by less still
+        return 1
     least = sure * scale if filled else 0.0
-    need = rays_for_step(change, error, counts, least)
-    if need <= 1 or rim or l0 <= e1:
-        return need
+    if rim or l0 <= e1:
+        return 2 if size > 1 else rays_for_step(change, error, counts, least)
     # All rays meet it. Bent where more than one surface may be the first, or the last.
     entries = exits = 0
     entries += e0 <= 0.0
     exits += l1 >= 1.0
     entries += qa >= e0
     exits += qb <= l1
-    for j in range(len(forms)):
-        _, a1, b0, _ = ranges_of(forms[j], c, r, size)
-        entries += a1 >= e0
-        exits += b0 <= l1
-    if entries <= 1 and exits <= 1:
-        return min(need, rays_for_slope(change, error, counts, least))
-    return need
+    for j in range(slabs):
+        entries += forms[j, 6] >= e0
+        exits += forms[j, 7] <= l1
+    if entries > 1 or exits > 1:
+        return 2 if size > 1 else rays_for_step(change, error, counts, least)
+    if change * change <= CURVED_SPREAD * error:
+        return 1
+    if size > 1:
+        return 2
+    return min(
+        rays_for_step(change, error, counts, least),
+        rays_for_slope(change, error, counts, least),
+    )
+
+
+@kernel
+def nearest_forms(forms, slabs, room, near):
+    """Take the slabs by which a solid may be entered or left within a square of pixels, and so
+    within all of its pixels, and count them.
+
+    Args:
+        forms, slabs, room: as `side_needed` has left them.
+        near: (k, 8) filled.
+    """
+    count = 0
+    for j in range(slabs):
+        if forms[j, 6] >= room[5, 1] or forms[j, 7] <= room[5, 2]:
+            for i in range(6):
+                near[count, i] = forms[j, i]
+            count += 1
+    return count
 
 
 @inline
@@ -219,10 +256,10 @@ def solid_forms(quadric, slabs, first, last, g, forms, room):
     Args:
         quadric: (13,) of the solid; slabs, first, last: its slabs.
         g: (12,) the view's rays [mm].
-        forms: (k, 6) filled for each slab: limits, the source's height, and the height of the
-            ray to a pixel as a form of column and row.
-        room: (5, 3) filled: source, first pixel's ray and the pixel's sides, mapped by the
-            quadric's matrix; the last row is spare.
+        forms: (k, 8) filled for each slab: limits, the source's height, and the height of the
+            ray to a pixel as a form of column and row; two are spare.
+        room: (6, 3) filled: source, first pixel's ray and the pixel's sides, mapped by the
+            quadric's matrix; a spare row; and the lengths of both sides together.
     """
     if quadric[0] != 0.0:
         for i in range(3):
@@ -231,6 +268,10 @@ def solid_forms(quadric, slabs, first, last, g, forms, room):
         mapped(quadric[1:10], g[3:6], room[1])
         mapped(quadric[1:10], g[6:9], room[2])
         mapped(quadric[1:10], g[9:12], room[3])
+        u, v = room[2], room[3]
+        room[5, 0] = math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]) + math.sqrt(
+            v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+        )
     for j in range(first, last):
         b = slabs[j]
         form = forms[j - first]
@@ -239,10 +280,18 @@ def solid_forms(quadric, slabs, first, last, g, forms, room):
             form[2 + i] = b[0] * g[3 * i] + b[1] * g[3 * i + 1] + b[2] * g[3 * i + 2]
 
 
+@inline
+def odd_bits(k):
+    """Take bits 0, 2, 4 and 6 of a number."""
+    return (k & 1) | (k >> 1 & 2) | (k >> 2 & 4) | (k >> 3 & 8)
+
+
 @kernel
 def mark_block(
     curved,
     forms,
+    slabs,
+    near,
     room,
     g,
     top,
@@ -257,60 +306,49 @@ def mark_block(
     counts,
     marks,
 ):
-    """Raise the marks of a block of BLOCK x BLOCK pixels: of those of its cells in which the
-    chord bends, because a cell without a bend has none in any of its pixels.
+    """Raise the marks of a block of BLOCK x BLOCK pixels: of those of its squares in which the
+    chord bends, because a square without a bend has none in any of its pixels.
 
     Args:
-        curved, forms, room, g, weight, filled, error, counts: as of `side_needed`.
+        curved, forms, slabs, room, g, weight, filled, error, counts: as of `side_needed`.
+        near: room for as many forms.
         top, left: the block's first pixel.
         r0, r1, c0, c1: pixels that count.
         marks: (rows, cols) changed in place.
     """
-    half = 0.5 * (BLOCK - 1)
-    if (
-        side_needed(
-            left + half,
-            top + half,
-            BLOCK,
-            curved,
-            forms,
-            room,
-            g,
-            weight,
-            filled,
-            error,
-            counts,
-        )
-        <= 1
-    ):
-        return
-    half = 0.5 * (CELL - 1)
-    for i in range(top, min(top + BLOCK, r1), CELL):
-        for j in range(left, min(left + BLOCK, c1), CELL):
-            if (
-                side_needed(
-                    j + half,
-                    i + half,
-                    CELL,
-                    curved,
-                    forms,
-                    room,
-                    g,
-                    weight,
-                    filled,
-                    error,
-                    counts,
-                )
-                <= 1
-            ):
-                continue
-            for r in range(max(i, r0), min(i + CELL, r1)):
-                for c in range(max(j, c0), min(j + CELL, c1)):
-                    need = side_needed(
-                        c, r, 1.0, curved, forms, room, g, weight, filled, error, counts
-                    )
-                    if need > marks[r, c]:
-                        marks[r, c] = need
+    # Along a curve on which each square's quarters follow one another: a square that needs no
+    # rays is passed over, of others the quarters are next. Squares before them are done.
+    k, size, few = 0, BLOCK, 0
+    while k < BLOCK * BLOCK:
+        i, j = top + odd_bits(k >> 1), left + odd_bits(k)
+        half = 0.5 * (size - 1)
+        need = 0
+        if i < r1 and j < c1 and i + size > r0 and j + size > c0:
+            need = side_needed(
+                j + half,
+                i + half,
+                size,
+                curved,
+                forms if size >= CELL else near,
+                slabs if size >= CELL else few,
+                room,
+                g,
+                weight,
+                filled,
+                error,
+                counts,
+            )
+        if need > 1 and size > 1:
+            if size == CELL:
+                few = nearest_forms(forms, slabs, room, near)
+            size //= 2
+            continue
+        if need > 1:
+            marks[i, j] = max(marks[i, j], need)
+        k += size * size
+        size = 1
+        while k % (4 * size * size) == 0 and size < BLOCK:
+            size *= 2
 
 
 @kernel
@@ -417,6 +455,33 @@ def chords_within(
                 n += 1
 
 
+@parallel
+def average_parts(images, n, out):
+    """Average images over n x n pixels: columns first, then rows of sums, in single precision.
+
+    Args:
+        images: float32 (k, n rows, n cols).
+        n: pixels along a side.
+        out: float32 (k, rows, cols), filled.
+    """
+    rows, cols = out.shape[1], out.shape[2]
+    share = np.float32(1.0 / (n * n))
+    for job in prange(out.shape[0] * rows):
+        view = job // rows
+        r = job - view * rows
+        down = images[view, n * r].copy()
+        for i in range(1, n):
+            part = images[view, n * r + i]
+            for c in range(n * cols):
+                down[c] += part[c]
+        line = out[view, r]
+        for c in range(cols):
+            total = down[n * c]
+            for j in range(1, n):
+                total += down[n * c + j]
+            line[c] = total * share
+
+
 @kernel
 def raise_marks(marks, x, y, need):
     """Raise the marks of every pixel that a triangle touches to `need`; of two equal corners
@@ -520,8 +585,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             row0 = (job - view * bands) * BLOCK
             row1 = min(rows, row0 + BLOCK)
             g = rays[view]
-            room = np.empty((5, 3))
-            forms = np.empty((most, 6))
+            room = np.empty((6, 3))
+            forms, near = np.empty((most, 8)), np.empty((most, 8))
             for s in range(shadow.shape[1]):
                 c0, c1 = shadow[view, s, 2], shadow[view, s, 3]
                 r0, r1 = max(row0, shadow[view, s, 0]), min(row1, shadow[view, s, 1])
@@ -532,7 +597,9 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 for left in range(c0 // BLOCK * BLOCK, c1, BLOCK):
                     mark_block(
                         quadric[s, 0] != 0.0,
-                        forms[: last - first],
+                        forms,
+                        last - first,
+                        near,
                         room,
                         g,
                         row0,
