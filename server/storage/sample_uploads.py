@@ -61,8 +61,10 @@ class UploadHead(SampleUpload):
         return cls.model_validate(given | {"unit": unit, "place": chunk.place or "keep"})
 
 
-@dataclass
-class _Open:
+@dataclass(eq=False)
+class Upload:
+    """One upload under way: another one of the same name is another."""
+
     head: UploadHead
     file: BinaryIO
     received: int = 0
@@ -86,10 +88,10 @@ class Incoming:
         self._folder = folder
         self._limit = limit
         self._disk = room
-        self._open: dict[str, _Open] = {}
+        self._open: dict[str, Upload] = {}
         self._lock = threading.Lock()
 
-    def receive(self, head: UploadHead, start: int, data: bytes) -> int:
+    def receive(self, head: UploadHead, start: int, data: bytes) -> tuple[int, Upload]:
         """Append a chunk to an upload's nameless file.
 
         Bytes that have come before are skipped, so a client may send a chunk again. A
@@ -103,7 +105,7 @@ class Incoming:
             data: the chunk.
 
         Returns:
-            Number of bytes received so far.
+            Number of bytes received so far, and the upload that they are of.
 
         Raises:
             LimitError: a gap before this chunk, or the upload was dropped for newer ones.
@@ -135,14 +137,15 @@ class Incoming:
                 self._close(head.name)
                 raise
             known.received += len(new)
-            return known.received
+            return known.received, known
 
-    def take(self, name: str) -> tuple[UploadHead, bytes]:
+    def take(self, upload: Upload) -> tuple[UploadHead, bytes]:
         """Read a complete upload, and remove it and its file; it is removed, too, if
         reading fails.
 
         Args:
-            name: of the sample.
+            upload: as `receive` told it: of the requester, whoever has sent another
+                under its name since.
 
         Returns:
             Its description and its bytes.
@@ -152,8 +155,9 @@ class Incoming:
             DatasetWriteError: its file cannot be read.
         """
         with self._lock:
+            name = upload.head.name
             known = self._open.get(name)
-            if known is None or known.received < known.head.total:
+            if known is not upload or known.received < known.head.total:
                 raise self._gap(name, 0, 0 if known is None else known.received)
             try:
                 with self._writing():
@@ -162,7 +166,7 @@ class Incoming:
             finally:
                 self._close(name)
 
-    def _begin(self, head: UploadHead) -> _Open:
+    def _begin(self, head: UploadHead) -> Upload:
         """Begin an upload with a nameless file; its namesake, and the oldest uploads from
         `MAX_UPLOADS` on, are dropped.
 
@@ -178,7 +182,7 @@ class Incoming:
         self._folder.make()
         with self._writing():
             file = self._folder.nameless()
-        self._open[head.name] = upload = _Open(head, file)
+        self._open[head.name] = upload = Upload(head, file)
         return upload
 
     def _make_room(self, name: str, more: int) -> None:

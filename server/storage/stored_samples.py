@@ -27,7 +27,12 @@ from flexdt.runtime.files import own_documents as documents
 from flexdt.runtime.files.directory import TEMPORARY, Directory
 from flexdt.server.storage.disk_room import DiskRoom
 from flexdt.server.storage.mesh_workers import mesh_apart, scene_apart
-from flexdt.server.storage.sample_uploads import MAX_UPLOAD_BYTES, Incoming, UploadHead
+from flexdt.server.storage.sample_uploads import (
+    MAX_UPLOAD_BYTES,
+    Incoming,
+    Upload,
+    UploadHead,
+)
 from flexdt.twin.errors import LimitError, UnknownNameError
 from flexdt.twin.scanner.state import EMPTY_STAGE
 
@@ -217,7 +222,7 @@ class SampleStore:
 
     def receive(
         self, head: UploadHead, start: int, data: bytes, *, observer: bool = False
-    ) -> int:
+    ) -> tuple[int, Upload]:
         """Check an upload's size and name, and write one chunk of it, see
         `Incoming.receive`.
 
@@ -230,7 +235,7 @@ class SampleStore:
             observer: whether another client has control.
 
         Returns:
-            Number of bytes received so far.
+            Number of bytes received so far, and the upload that they are of.
 
         Raises:
             RpcError: -32008, larger than allowed.
@@ -287,14 +292,14 @@ class SampleStore:
         )
 
     def parse(
-        self, name: str, material: str | None = None, *, observer: bool = False
+        self, complete: Upload, material: str | None = None, *, observer: bool = False
     ) -> ReceivedSample:
         """Parse a complete upload, which may take seconds; nothing is stored.
 
         It is removed from the uploads under way, so a second call fails.
 
         Args:
-            name: the upload's.
+            complete: the upload, as `receive` told it.
             material: also parse it of this material, in which it is on the stage; None:
                 not.
             observer: whether another client has control.
@@ -303,7 +308,7 @@ class SampleStore:
             PhantomError, UnknownNameError: its content does not hold.
             LimitError: observers have sent too much meanwhile.
         """
-        head, raw = self._incoming.take(name)
+        head, raw = self._incoming.take(complete)
         head = head.model_copy(update={"observer": observer})
         if observer:
             self.require_observers_room(head)

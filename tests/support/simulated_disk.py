@@ -112,7 +112,7 @@ class Disk:
         """
         self.off = True
         keep: dict[Path, int] = {}
-        for folder in {folder for folder, _ in self._names}:
+        for folder in sorted({folder for folder, _ in self._names}):
             keep[folder] = self._rng.randint(0, sum(f == folder for f, _ in self._names))
         seen: dict[Path, int] = {}
         lost = []
@@ -122,7 +122,7 @@ class Disk:
                 lost.append(back)
         for back in reversed(lost):
             back()
-        for file in self.root.rglob("*"):
+        for file in sorted(self.root.rglob("*")):
             if file.is_file() and file.stat().st_ino in self._bytes:
                 os.truncate(file, self._rng.randint(0, file.stat().st_size))
             if file.is_file():

@@ -9,7 +9,7 @@ from flexdt.server.storage.stored_samples import SampleStore
 
 def completed(store: SampleStore, name: str) -> Phantom:
     """Read and keep an upload of which all bytes have come."""
-    upload = store.parse(name)
+    upload = store.parse(store._incoming._open[name])
     with Changes() as changes:
         store.prepare(upload)
         store.store(changes, upload)

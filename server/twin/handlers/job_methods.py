@@ -120,8 +120,8 @@ async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSta
 async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.JobStatus:
     """End a job with X-rays off; its data set stays, marked incomplete with the reason.
 
-    Without `job` it is the current or last one. The answer waits until the state is on
-    the disk, and at most `PATIENCE_S` for the job's end.
+    Without `job` it is the current or last one. The answer waits at most
+    `PATIENCE_S` for the job's end, and then until that is on the disk.
 
     Returns:
         The job's status; a disk that fails is a warning in it, no error.
@@ -129,12 +129,14 @@ async def abort(twin: TwinServer, client: h.Client, params: p.JobAbort) -> w.Job
     job = twin.jobs.get(params.job)
     twin.jobs.abort(job, params.reason, client.name)
     unsaved = ""
+    # The end first, then the disk: what the answer says is what a restart finds.
+    await _when(twin, job, lambda: job.phase in ENDED_PHASES)
     try:
         await twin.state_store.flush(job.id)
     except (OSError, DatasetError) as error:  # an abort does not fail because of the disk
         reason = from_root(str(error), twin.root)
         unsaved = f"the abort is not on the disk, and a killed server would not know it: {reason}"
-    status = await _when(twin, job, lambda: job.phase in ENDED_PHASES)
+    status = twin.jobs.status(job)
     if unsaved:
         warnings = [*status.warnings, unsaved]
     else:

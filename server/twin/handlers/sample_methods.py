@@ -151,7 +151,7 @@ async def upload(
     head = UploadHead.of(params)
     _ensure_replaceable(twin, client, head.name)
     observer = twin.control.is_observer(client.name)
-    received = await asyncio.to_thread(
+    received, came = await asyncio.to_thread(
         twin.samples.receive, head, params.start, params.data, observer=observer
     )
     if received < head.total:
@@ -165,7 +165,7 @@ async def upload(
         material = stands.material if there else None
         observer = twin.control.is_observer(client.name)
         upload = await asyncio.to_thread(
-            twin.samples.parse, head.name, material, observer=observer
+            twin.samples.parse, came, material, observer=observer
         )
         warnings = list(upload.phantom.assumed)
 
