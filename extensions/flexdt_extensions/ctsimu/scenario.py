@@ -253,12 +253,16 @@ class ScenarioImages:
         Raises:
             ExchangeError: nothing reaches the detector.
         """
-        energy, variance = self._collected_energy(0, samples=False)
+        nothing = ExchangeError(
+            f"{self.path}: nothing of the open beam reaches and stays in the detector; "
+            "allowed: thinner windows, filters and environment, a thicker scintillator"
+        )
+        try:
+            energy, variance = self._collected_energy(0, samples=False)
+        except LimitError:  # too little for an effective energy
+            raise nothing from None
         if not min(energy.max(), variance.max()) > 0.0:
-            raise ExchangeError(
-                f"{self.path}: nothing of the open beam reaches and stays in the detector; "
-                "allowed: thinner windows, filters and environment, a thicker scintillator"
-            )
+            raise nothing
         return energy, variance
 
     @property
