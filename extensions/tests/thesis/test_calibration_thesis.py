@@ -36,7 +36,7 @@ def test_damping_of_zero_stays_zero_and_a_bad_start_stalls() -> None:
         exact_tracks(poses, truth, model), model, poses, free=SIX, shape=SHAPE
     )
     turned = np.zeros_like(problem.base)
-    turned[3] = np.pi
+    turned[..., 3] = np.pi
     far = problem.with_base(problem.base + turned)
     result = algorithm_2(far, 0.0)
     assert result.lam == 0.0

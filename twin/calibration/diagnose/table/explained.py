@@ -49,6 +49,8 @@ FIRST_TABLES: Final = 3
 SETTLED_PART: Final = 0.1
 """Root mean square change of the predicted positions, in standard deviations of their noise, at
 which a table stays."""
+HALVINGS: Final = 30
+"""Of a step that leaves what is possible; after so many nothing of it is left in float64."""
 LEAST_RIVAL: Final = 1e-4
 """Least probability of an explanation that is kept by itself."""
 
@@ -126,7 +128,7 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
         names = frozenset(_name(some, g) for g in model.widths)
         step = table.geometry @ model.solved.mean[: table.parameters]
         change = math.sqrt(float(step @ step) / max(table.count, 1.0))
-        state = _state(search, model.solved.mean, tuple(model.widths), state)
+        state = _stepped(search, model, state)
         widths = {
             _name(some, g): w / float(search.products.units[g[0]][g[1]]) ** 2
             for g, w in model.widths.items()
@@ -146,7 +148,7 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
         model = search.with_open(model, further, group)
         further = search.further(model)
     if held:
-        state = _state(search, model.solved.mean, tuple(model.widths), table.state)
+        state = _stepped(search, model, table.state)
     posterior = search.mixture(model, further, held)
     return _made(fit, search, posterior, state, frozenset(held), known)
 
@@ -174,6 +176,20 @@ def _group_weights(
         out[f, g] = mean[at : at + count] / search.products.units[f][g]
         at += count
     return out
+
+
+def _stepped(search: Search, model: Model, before: State) -> State:
+    """Return the state that a model makes of the one before; of a step that would bring a bead
+    behind the source, half, a quarter and so on.
+    """
+    mean = model.solved.mean
+    for _ in range(HALVINGS):
+        state = _state(search, mean, tuple(model.widths), before)
+        problem, x = moved(search.table.plain, state)
+        if np.isfinite(problem.evaluate(x, problem.seen, 0)[0]):
+            return state
+        mean = mean / 2.0
+    return before
 
 
 def _state(
