@@ -13,6 +13,7 @@ from flexdt.twin.calibration.diagnose.table.group import Acts, Family, Known
 from flexdt.twin.calibration.diagnose.table.groups import (
     bead_places,
     every_family,
+    moving,
     spots,
     strain,
     tiles,
@@ -139,9 +140,10 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
         if settled and (not names or before == (names, factor)):
             break
         before = (names, factor)
+    moves = [some[f].places[g] for f, g in model.widths if some[f].cause == moving.NAME]
     held = [
         at[name]
-        for name in _never_exact(table, known)
+        for name in (*_never_exact(table, known), *moving.confused(moves, table))
         if name in at and at[name] not in model.widths
     ]
     for group in held:
@@ -149,7 +151,7 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
         further = search.further(model)
     if held:
         state = _stepped(search, model, table.state)
-    posterior = search.mixture(model, further, held)
+    posterior = search.mixture(model, further)
     return _made(fit, search, posterior, state, frozenset(held), known)
 
 

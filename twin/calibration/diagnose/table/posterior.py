@@ -10,7 +10,7 @@ mixture of the best model and of it with one group more, one less, or one exchan
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -189,6 +189,7 @@ class Search:
         self.base = self.products.block(np.column_stack([base, every]))
         self.draws = every.shape[1]
         self._totals = np.einsum("md,md->d", every, every)
+        self.held: set[Group] = set()
         self._shapes: dict[int, tuple[FloatArray, FloatArray]] | None = None
         self.draw(0)
         self._gram: dict[tuple[int, int], FloatArray] = {}
@@ -299,6 +300,9 @@ class Search:
                 f, g = group
                 count = self.products.own(f).shape[1]
                 own = slice(at, at + count)
+                if group in self.held:
+                    at += count
+                    continue
                 seen = count - float(diagonal[own].sum()) / found[group]
                 told += seen
                 mean = solved.mean[own]
@@ -316,9 +320,15 @@ class Search:
                 abs(math.log(a / b)) < SETTLED for a, b in zip(after, before, strict=True)
             ):
                 break
+        return self._judged(found, noise2, factor, solved)
+
+    def _judged(
+        self, widths: dict[Group, float], noise2: float, factor: int, solved: Solved
+    ) -> Model:
+        """Make a model, with its evidence; that groups are held open is no question."""
         evidence = self._evidence(solved, noise2) + FACTORS[factor][1]
-        evidence += sum(self.chance(group) for group in found)
-        return Model(found, noise2, factor, solved, evidence)
+        evidence += sum(self.chance(group) for group in widths if group not in self.held)
+        return Model(widths, noise2, factor, solved, evidence)
 
     def further(self, model: Model, *, pinned: bool = False) -> dict[int, Further]:
         """Compute what each further group would add to the evidence, by its width.
@@ -466,8 +476,8 @@ class Search:
     def with_open(
         self, model: Model, further: Mapping[int, Further], group: Group
     ) -> Model:
-        """Return a model with a group as wide as the residuals leave it open: the largest
-        width that they speak against by odds of `OPEN_LOG_ODDS` at most.
+        """Return a model with a group, held from now on, as wide as the residuals leave it
+        open: the largest width that they speak against by odds of `OPEN_LOG_ODDS` at most.
 
         Args:
             model: without the group.
@@ -478,21 +488,20 @@ class Search:
         gain = further[f].gain[g]
         open_ = GRID[gain >= max(float(gain.max()), 0.0) - OPEN_LOG_ODDS]
         widths = {**model.widths, group: model.noise2 * float(open_.max()) ** 2}
+        self.held.add(group)
         solved = self.solve(widths, model.noise2, model.factor)
-        return Model(widths, model.noise2, model.factor, solved, model.evidence)
+        return self._judged(widths, model.noise2, model.factor, solved)
 
     def mixture(
         self,
         model: Model,
         further: Mapping[int, Further],
-        held: Collection[Group] = (),
     ) -> Posterior:
         """Average over a model and those with one group more, one less, or one exchanged.
 
         Args:
             model: the most probable.
-            further: what further groups would add to it.
-            held: groups that are in all of them.
+            further: what further groups would add to it. Groups that are held are in all.
         """
         count = self.table.parameters
         parts: list[tuple[float, frozenset[Group], FloatArray, FloatArray]] = []
@@ -529,7 +538,7 @@ class Search:
         take(model, 0.0)
         take_further(model, further, 0.0)
         for group in model.widths:
-            if group in held:
+            if group in self.held:
                 continue
             less = self.model(_without(model.widths, group), model.noise2, model.factor)
             take(less, less.evidence - model.evidence)

@@ -3,15 +3,16 @@
 A motion is a ramp, a jump, a wander (half waves that fade with their number), a swing (harmonics
 of the turn) or a jitter (each frame by itself), of object, source or panel along an axis, or of
 the angle. All have a mean of zero over the scan: the geometry is that of the mean. A swing once
-a turn looks like a phantom aside on its mount, and is taken for that as far as nothing else of it
-is seen.
+a turn aside looks like a phantom aside on its mount: where nothing else of it is seen, it is taken
+for that; of what is seen to move aside, that part is left open (`confused`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +64,9 @@ HARMONICS: Final = 3
 """Of the turn, that a swing follows."""
 LEAST_SWINGING: Final = 12
 """Frames of which a swing is told."""
+ONCE: Final = "swings once a turn"
+NEVER: Final = -1e6
+"""Logarithm of the odds of a group that is no answer by itself."""
 KINDS: Final = 4
 """Smooth kinds of motion, which share the odds."""
 
@@ -114,6 +118,12 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                     table, [Moves(name, how, number) for name in names], where,
                     np.stack([_in(table.n, frames, course)]), chance,
                 )  # fmt: skip
+        # Never chosen: held open beside what moves.
+        once = swing[:, [0, HARMONICS]]
+        size = float(np.ptp(table.problem.model.beads, axis=0).max())
+        aside = [Moves(name, ONCE, number) for name in MOVERS if name.endswith("x")]
+        courses = np.stack([_in(table.n, frames, once)])
+        yield replace(_family(table, aside, where, courses, NEVER), widest=size)
         jumps = np.unique(
             np.linspace(1, count - 1, min(count - 1, MOST_JUMPS)).round().astype(int)
         )
@@ -145,6 +155,25 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 table, [Moves(name, "differs", -1) for name in names], " between scans",
                 apart[None], LOG_CHANCE - math.log(KINDS),
             )  # fmt: skip
+
+
+def confused(places: Iterable[object], table: Linearised) -> list[str]:
+    """Name the swings once a turn of all that moves aside: whatever it does else, how much of
+    the phantom's place on its mount is theirs is open, but for its magnification. Of a jitter
+    that part is as wide as any other.
+
+    Args:
+        places: of the groups of motion that are there.
+        table: of their scans.
+    """
+    many = len(table.scans) > 1
+    return sorted(
+        {
+            f"{move.what} {ONCE}{f' in scan {move.scan + 1}' if many else ''}"
+            for _, move in cast("Iterable[tuple[object, Moves]]", places)
+            if move.what.endswith("x") and move.scan >= 0 and move.how != "jitters"
+        }
+    )
 
 
 def _alike(names: tuple[str, ...]) -> list[list[str]]:
