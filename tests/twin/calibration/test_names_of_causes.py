@@ -44,7 +44,8 @@ ALIKE = {
     # An arc draws a turning phantom in.
     "arc": {"strain"},
     # A rise that is told wrong is an object that rises.
-    "told": {"motion"},
+    # Millimetres of the motors against those of the phantom, which may be stretched.
+    "told": {"motion", "strain"},
 }
 """Cause -> causes that explain the same."""
 
