@@ -231,6 +231,31 @@ def test_the_wheel_of_the_extensions_holds_only_them(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.campaign(1)
+def test_nothing_is_left_after_uninstalling(wheel: Path, tmp_path: Path) -> None:
+    """Compiled kernels lay beside the package: its empty folder was imported still."""
+    python = environment_with(tmp_path / "env")
+    pip = [sys.executable, "-m", "pip", "--python", str(python)]
+    quiet = ["--quiet", "--disable-pip-version-check"]
+    subprocess.run(
+        [*pip, "install", *quiet, "--no-deps", "--no-index", wheel], check=True
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+    environment["FLEXDT_CACHE"] = str(tmp_path / "kernels")
+    use = (
+        "from flexdt.twin.projection.kernels.compiling import serial\n"
+        "import flexdt; print(flexdt.__file__); serial(lambda x: x)(1)"
+    )
+    used = subprocess.run(
+        [python, "-c", use], env=environment, capture_output=True, text=True, check=True
+    )
+    assert used.stdout.startswith(str(tmp_path / "env"))
+    subprocess.run([*pip, "uninstall", *quiet, "--yes", "flexdt"], check=True)
+    (site,) = (tmp_path / "env").glob("lib/python*/site-packages")
+    assert [path.name for path in site.iterdir() if "flexdt" in path.name] == []
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(1)
 def test_the_wheel_imports_as_flexdt_and_nothing_else(
     installed: Path, tmp_path: Path
 ) -> None:

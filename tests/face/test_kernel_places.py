@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -195,3 +196,12 @@ def test_options_are_part_of_the_name() -> None:
         for options in ({}, {"error_model": "numpy"}, {"fastmath": {"nsz", "contract"}})
     }
     assert len(names) == 3
+
+
+def test_a_kernel_without_a_source_file_is_compiled_and_not_kept() -> None:
+    """As in a notebook's cell, whose file is not there."""
+    scope: dict[str, Any] = {}
+    exec(compile("def third(x):\n    return x / 3.0", "<cell 7>", "exec"), scope)
+    third = compiling.serial(scope["third"])
+    assert third(6.0) == 2.0
+    assert not third._cache.is_kept()

@@ -205,10 +205,13 @@ class KeptCode(FunctionCache):  # type: ignore[misc]
         return repr(kernel_store.store())
 
     @cached_property
-    def beginning(self) -> str:
-        """Beginning of the names of all this function's items that suit this process."""
+    def beginning(self) -> str | None:
+        """Beginning of the names of all this function's items that suit this process; None
+        where its source cannot be read, as of a notebook's cell: nothing is kept then."""
         function = self._py_func
         source = _text(inspect.getfile(function))
+        if source is None:
+            return None
         codegen = numba.core.registry.cpu_target.target_context.codegen()
         _, processor, code = self._index_key((), codegen)
         version = (numba.__version__, sys.version_info[:2], sys.implementation.name)
@@ -217,20 +220,24 @@ class KeptCode(FunctionCache):  # type: ignore[misc]
 
     def is_kept(self) -> bool:
         """Return whether code that this process can use is kept, for any signature."""
-        return kernel_store.store().holds(self.beginning)
+        return self.beginning is not None and kernel_store.store().holds(self.beginning)
 
-    def _name(self, signature: Any) -> str:
+    def _name(self, signature: Any) -> str | None:
+        if self.beginning is None:
+            return None
         return self.beginning + _short_hash(str(signature))
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
-        data = kernel_store.store().load(self._name(sig))
+        name = self._name(sig)
+        data = None if name is None else kernel_store.store().load(name)
         if data is None:
             return None
         return CompileResult._rebuild(target_context, *pickle.loads(data))
 
     def _save_overload(self, sig: Any, data: Any) -> None:
-        if not data.library.has_dynamic_globals:
-            kernel_store.store().save(self._name(sig), dumps(data._reduce()))
+        name = self._name(sig)
+        if name is not None and not data.library.has_dynamic_globals:
+            kernel_store.store().save(name, dumps(data._reduce()))
 
     def flush(self) -> None:
         """Do nothing: what is kept stays right."""
@@ -283,9 +290,12 @@ def sources(*modules: ModuleType) -> int:
 
 
 @cache
-def _text(file: str) -> str:
-    with open(file, encoding="utf-8") as opened:
-        return opened.read()
+def _text(file: str) -> str | None:
+    try:
+        with open(file, encoding="utf-8") as opened:
+            return opened.read()
+    except OSError:
+        return None
 
 
 COMPILING = sources(sys.modules[__name__])
