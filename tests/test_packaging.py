@@ -246,7 +246,12 @@ def test_nothing_is_left_after_uninstalling(wheel: Path, tmp_path: Path) -> None
         "import flexdt; print(flexdt.__file__); serial(lambda x: x)(1)"
     )
     used = subprocess.run(
-        [python, "-c", use], env=environment, capture_output=True, text=True, check=True
+        [python, "-c", use],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert used.stdout.startswith(str(tmp_path / "env"))
     subprocess.run([*pip, "uninstall", *quiet, "--yes", "flexdt"], check=True)
