@@ -29,7 +29,8 @@ def test_every_safety_answer_comes_at_every_state_of_a_few_histories() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
+@pytest.mark.campaign
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("block", range(40))
 def test_every_answer_comes_at_every_state_of_two_thousand_histories(block: int) -> None:
     assert found(range(50 * block, 50 * (block + 1)), 8, dear=True) == []
