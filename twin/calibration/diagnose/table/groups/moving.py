@@ -65,6 +65,8 @@ HARMONICS: Final = 3
 LEAST_SWINGING: Final = 12
 """Frames of which a swing is told."""
 ONCE: Final = "swings once a turn"
+TURNING: Final = ("swings", "wanders")
+"""Ways of motion of which a swing once a turn may be a part; a jump or a ramp is all that it is."""
 NEVER: Final = -1e6
 """Logarithm of the odds of a group that is no answer by itself."""
 KINDS: Final = 4
@@ -158,9 +160,8 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
 
 
 def confused(places: Iterable[object], table: Linearised) -> list[str]:
-    """Name the swings once a turn of all that moves aside: whatever it does else, how much of
-    the phantom's place on its mount is theirs is open, but for its magnification. Of a jitter
-    that part is as wide as any other.
+    """Name the swings once a turn of all that swings or wanders aside: how much of the phantom's
+    place on its mount is theirs is open, but for its magnification.
 
     Args:
         places: of the groups of motion that are there.
@@ -171,7 +172,7 @@ def confused(places: Iterable[object], table: Linearised) -> list[str]:
         {
             f"{move.what} {ONCE}{f' in scan {move.scan + 1}' if many else ''}"
             for _, move in cast("Iterable[tuple[object, Moves]]", places)
-            if move.what.endswith("x") and move.scan >= 0 and move.how != "jitters"
+            if move.what.endswith("x") and move.scan >= 0 and move.how in TURNING
         }
     )
 
