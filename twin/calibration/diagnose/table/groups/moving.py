@@ -65,8 +65,8 @@ HARMONICS: Final = 3
 LEAST_SWINGING: Final = 12
 """Frames of which a swing is told."""
 ONCE: Final = "swings once a turn"
-TURNING: Final = ("swings", "wanders")
-"""Ways of motion of which a swing once a turn may be a part; a jump or a ramp is all that it is."""
+TURNING: Final = ("swings", "wanders", "ramps")
+"""Ways of motion of which a swing once a turn may be a part; a jump is all that it is."""
 NEVER: Final = -1e6
 """Logarithm of the odds of a group that is no answer by itself."""
 KINDS: Final = 4
@@ -160,8 +160,8 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
 
 
 def confused(places: Iterable[object], table: Linearised) -> list[str]:
-    """Name the swings once a turn of all that swings or wanders aside: how much of the phantom's
-    place on its mount is theirs is open, but for its magnification.
+    """Name the swings once a turn of all that swings, wanders or drifts aside: how much of the
+    phantom's place on its mount is theirs is open, but for its magnification.
 
     Args:
         places: of the groups of motion that are there.
