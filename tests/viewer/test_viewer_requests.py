@@ -98,6 +98,7 @@ WRONG = [
     ("viewer.layers", {"beam": "yes"}),
     ("viewer.layers", {"opacity": []}),
     ("viewer.theme", {"dark": 3}),
+    ("viewer.person", {"name": 7}),
     ("viewer.camera", {"view": 7}),
     ("viewer.feed", {"kind": "films"}),
     ("viewer.plan", {"text": 12}),
@@ -377,7 +378,7 @@ def test_a_viewer_of_which_a_part_has_died_ends_with_a_code(
     """So that the supervisor starts it again."""
 
     class Dying:
-        def __init__(self, *_: object) -> None:
+        def __init__(self, *_: object, **__: object) -> None:
             self.failed, self.front = asyncio.Event(), SimpleNamespace(port=1)
             self.stopped = False
 

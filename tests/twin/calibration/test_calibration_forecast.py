@@ -112,6 +112,7 @@ def test_images(kind: str, priors: Given | None) -> None:
 
 @pytest.mark.slow
 @pytest.mark.campaign(1)
+@pytest.mark.xfail(reason="open in issue 76: ratios of 1.01, not above 1.06", strict=True)
 def test_what_causes_leave_open_is_forecast() -> None:
     """Of eight drawn scans with all causes looked for: the median of stated over forecast
     sigmas. What each leaves open depends on how far its own phantom is strained."""

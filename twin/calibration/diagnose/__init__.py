@@ -57,7 +57,7 @@ class CalibrationCode(FindingCode):
     IMAGE_MIRRORED = "image_mirrored", ERROR, "the images are mirrored left to right"
     IMAGE_UPSIDE_DOWN = "image_upside_down", ERROR, "the images are upside down"
     IMAGE_TURNED = "image_turned", ERROR, "the images are turned by 180 deg"
-    EXTRA_SPOTS = "extra_spots", WARNING, "balls that are none of the phantom's"
+    EXTRA_SPOTS = "extra_spots", ERROR, "balls that are none of the phantom's"
     HELD_UNCHECKED = (
         "held_unchecked",
         WARNING,
