@@ -223,7 +223,12 @@ def test_no_drawn_cause_is_offered_wrong(kind: str, seed: int) -> None:
                 strict=True,
             ),
         ),
-        72022,
+        pytest.param(
+            72022,
+            marks=pytest.mark.xfail(
+                reason="open in issue 76: offered with dD_z 4.9 sigmas off", strict=True
+            ),
+        ),
     ],
 )
 def test_beads_freed_for_a_tile_are_not_given_up_for_a_loose_prior(seed: int) -> None:
