@@ -99,7 +99,7 @@ def layers_model() -> type[Params]:
 class Person(Params):
     """The name of the page's user, for the others."""
 
-    name: str = ""
+    name: ShortText = ""
 
 
 class Theme(Params):

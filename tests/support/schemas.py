@@ -237,7 +237,11 @@ def _object(schemas: Schemas, s: Schema, value: Any) -> bool:
 
 
 _KINDS: Mapping[str, Callable[[Schemas, Schema, Any], bool]] = {
-    "integer": lambda m, s, v: isinstance(v, int) and _number(m, s, v),
+    # JSON has one kind of number: 1e16 is an integer.
+    "integer": lambda m, s, v: (
+        (isinstance(v, int) or (isinstance(v, float) and v.is_integer()))
+        and _number(m, s, v)
+    ),
     "number": _number,
     "string": _text,
     "boolean": lambda m, s, v: isinstance(v, bool),
