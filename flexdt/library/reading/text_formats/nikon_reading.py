@@ -24,6 +24,7 @@ from flexdt.library.reading.text_formats.text_scans import (
     folder_name,
     ini_values,
     projections_in,
+    stated_views,
     under_a_level,
 )
 from flexdt.runtime.files.dataset_folder import list_folder
@@ -36,7 +37,6 @@ from flexdt.twin.length_units import MORE_UNITS_MM, UNITS_MM, length_mm
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
-MOST_VIEWS: Final = 1_000_000
 SAME_AXIS_PX: Final = 0.01
 """Difference of two places of the axis that no images tell [pixels]."""
 GEOMETRY_FIELDS: Final = (
@@ -62,17 +62,13 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
 
     Raises:
         DatasetError: the file lacks a number or states two, has impossible distances, no
-            open beam or not 1 to `MOST_VIEWS` projections; or images are missing or of
+            open beam or not 1 to a million projections; or images are missing or of
             another shape than it states.
     """
     said = Ledger(NIKON, str(path))
     values = ini_values(head_text(path))
     said.state_all((key, value) for _, key, value in values)
-    views = said.whole("Projections")
-    if not 0 < views <= MOST_VIEWS:
-        raise DatasetFormatError.instead(
-            f"{path}: Projections is {views}", views, f"1 to {MOST_VIEWS}"
-        )
+    views = stated_views(said, "Projections")
     size = said.whole("DetectorPixelsY"), said.whole("DetectorPixelsX")
     cone, more = _geometry(said, path, views, size, geometry)
     place = said.text("InputFolderName", ".").replace("\\", "/")

@@ -19,6 +19,7 @@ from flexdt.library.reading.text_formats.text_scans import (
     compared,
     ini_values,
     projections_in,
+    stated_views,
     under_a_level,
 )
 from flexdt.runtime.files.dataset_folder import list_folder
@@ -28,7 +29,6 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
 
-MOST_VIEWS: Final = 1_000_000
 GEOMETRY_FIELDS: Final = (
     "Geometry/FDD", "Geometry/FOD", "Geometry/VoxelSizeX", "Geometry/VoxelSizeY",
     "Geometry/Magnification", "Geometry/cx", "Geometry/cy", "CT/RotationSector",
@@ -50,10 +50,7 @@ def read_phoenix(path: Path, geometry: ConeVec | None) -> DataSet:
     """
     said = Ledger(PHOENIX, str(path))
     said.state_all((f"{s}/{key}", value) for s, key, value in ini_values(head_text(path)))
-    views = said.whole("CT/NumberImages")
-    if not 0 < views <= MOST_VIEWS:
-        problem = f"{path}: CT/NumberImages is {views}"
-        raise DatasetFormatError.instead(problem, views, f"1 to {MOST_VIEWS}")
+    views = stated_views(said, "CT/NumberImages")
     size = said.whole("Image/DimY"), said.whole("Image/DimX")
     cone = _geometry(said, path, views, size, geometry)
     level = said.number("Image/FreeRay") * said.number("CT/FreeRayFactor", 1.0)

@@ -23,6 +23,7 @@ from flexdt.library.reading.text_formats.text_scans import (
     compared,
     ini_values,
     projections_in,
+    stated_views,
     under_a_level,
 )
 from flexdt.runtime.files.dataset_folder import Folder, list_folder
@@ -35,7 +36,6 @@ from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 OWN_SECTIONS: Final = ("", "System", "User", "Acquisition")
 """Sections whose keys are named without them."""
-MOST_VIEWS: Final = 1_000_000
 HALF_A_TURN: Final = (180.0, 270.0)
 """Spans of a scan that is not a full turn: half of one and a fan [deg]."""
 SHIFT_HEAD_LINES: Final = 5
@@ -69,11 +69,7 @@ def read_skyscan(path: Path, geometry: ConeVec | None) -> DataSet:
     for section, key, value in ini_values(head_text(path)):
         name = key if section in OWN_SECTIONS else f"{section}/{key}"
         said.state(name, value)
-    views = said.whole("Number of Files")
-    if not 0 < views <= MOST_VIEWS:
-        allowed = f"1 to {MOST_VIEWS}"
-        problem = f"{path}: Number of Files is {views}"
-        raise DatasetFormatError.instead(problem, views, allowed)
+    views = stated_views(said, "Number of Files")
     size = said.whole("Number of Rows"), said.whole("Number of Columns")
     folder = list_folder(path.parent)
     cone = _geometry(said, path, folder, views, size, geometry)

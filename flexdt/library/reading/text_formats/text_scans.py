@@ -31,6 +31,7 @@ TIFFS: Final = (".tif", ".tiff")
 NEVER_FULL: Final = 1 << 17
 """Largest count of images that the maker has divided by the open beam, which lies at the top of
 the counts: no count of uint16 says that the panel was saturated."""
+MOST_VIEWS: Final = 1_000_000
 COMMENT: Final = ("#", ";")
 """Beginnings of lines without a value."""
 
@@ -137,6 +138,19 @@ def compared(
         pixel_findings(given, pitch),
     ):
         said.warnings += settled(found, DatasetFormatError, said.file)
+
+
+def stated_views(said: Ledger, field: str) -> int:
+    """Take the number of images that a field states.
+
+    Raises:
+        DatasetFormatError: not 1 to `MOST_VIEWS`.
+    """
+    views = said.whole(field)
+    if not 0 < views <= MOST_VIEWS:
+        problem = f"{said.path}: {field} is {views}"
+        raise DatasetFormatError.instead(problem, views, f"1 to {MOST_VIEWS}")
+    return views
 
 
 def assume_sense(said: Ledger, why: str) -> None:

@@ -16,6 +16,7 @@ from flexdt.library.reading.foreign_parsing import xml_values
 from flexdt.library.reading.text_formats.text_scans import (
     compared,
     projections_in,
+    stated_views,
     under_a_level,
 )
 from flexdt.library.reading.text_formats.yxlon_table import YXLON
@@ -29,7 +30,6 @@ from flexdt.twin.plausibility.scan_geometry import distance_findings
 PARAMETERS: Final = "ConeBeamScanParameter"
 FOLDERS: Final = ("Projections", "Projektionen")
 """Names of the folder of the images, beside the file."""
-MOST_VIEWS: Final = 1_000_000
 GEOMETRY_FIELDS: Final = (
     "PixelSize/Width", "PixelSize/Height", "ScanTrajectory/PixelPitch",
     "ScanTrajectory/Fdd", "ScanTrajectory/Fod", "ScanTrajectory/StartAngle",
@@ -57,10 +57,7 @@ def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
     """
     said = Ledger(YXLON, str(path))
     said.state_all(xml_values(path, PARAMETERS))
-    views = said.whole("ScanTrajectory/NumberOfProjections")
-    if not 0 < views <= MOST_VIEWS:
-        problem = f"{path}: NumberOfProjections is {views}"
-        raise DatasetFormatError.instead(problem, views, f"1 to {MOST_VIEWS}")
+    views = stated_views(said, "ScanTrajectory/NumberOfProjections")
     size = said.whole("ProjectionSize/Height"), said.whole("ProjectionSize/Width")
     cone = _geometry(said, path, views, geometry)
     level = 2.0 ** said.whole("ProjectionBitdepth", 16) - 1.0
