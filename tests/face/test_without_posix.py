@@ -15,7 +15,8 @@ import pytest
 TAKE_AWAY = """
 import asyncio, concurrent.futures.process, multiprocessing.popen_spawn_posix, subprocess, tempfile
 import os, shutil, signal, socket, sys
-import cv2, fcl, numba, numpy, pydantic, scipy.ndimage, scipy.optimize, tifffile, trimesh
+import cv2, fcl, numba, numpy, platformdirs, pydantic, scipy.ndimage, scipy.optimize, tifffile
+import trimesh
 
 MODULES = ("fcntl", "resource", "pwd", "grp", "termios", "tty", "pty", "syslog")
 
