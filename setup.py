@@ -1,6 +1,6 @@
 """Build flexdt from a checkout whose links are links, or text files that hold their targets.
 
-Git on Windows and some archives make text files of links (docs/decisions/0001-mapped-folders.md).
+Git on Windows and some archives make text files of links (ARCHITECTURE.md, decision 1).
 A wheel is then built from a copy in which each is what it names; all else is in pyproject.toml.
 """
 

@@ -35,7 +35,6 @@ extensions = [
     "made_figures",
     "plain_docstrings",
     "links_outside",
-    "redirects",
 ]
 exclude_patterns = [
     "_build",

@@ -1,6 +1,6 @@
 """The pages for users of other programs, run: each peer's lines beside ours, smaller.
 
-    python examples/coming_from.py [astra cil five-tasks gvxr tigre]
+    python examples/coming_from.py [astra cil gvxr tigre ...]
 
 Takes the code blocks of docs/coming-from/ as they stand, makes panel, views and volume small,
 runs ours, then runs each peer's line by line. A line that fails (nothing installed, no CUDA
@@ -41,7 +41,6 @@ PACKAGES = {
     "ASTRA": "astra-toolbox",
     "gVXR": "gvxr",
     "TIGRE": "pytigre",
-    "diffdrr": "diffdrr",
 }
 MONO_KEV = 60.0
 """One energy, so that the two sides differ by geometry alone."""
@@ -129,58 +128,6 @@ def spread_mm(rows: np.ndarray, wanted: fx.ConeVec, upwards: bool) -> float:
     return float(np.abs(rows - ours).max()) if rows.shape == ours.shape else float("nan")
 
 
-def fifth_task() -> list[fx.ConeVec]:
-    """Return the 100 geometries of the library page's fifth task, each with its own
-    offset [mm] and roll [deg].
-    """
-    rng = np.random.default_rng(1)
-    scan = {"sod": 600, "sdd": 1059, "angles": 4, "shape": (48, 60), "pixel": 2.4}
-    offsets, rolls = rng.normal(0, 0.5, (100, 2)), rng.normal(0, 0.3, 100)
-    return [
-        fx.ConeVec.circular(**scan, offset=o, tilts=(r, 0, 0))
-        for o, r in zip(offsets, rolls, strict=True)
-    ]
-
-
-def of_five(caption: str, theirs: dict[str, Any]) -> dict[str, float]:
-    """Compare the result of a block of the five tasks with flexdt's.
-
-    Args:
-        caption: of the block.
-        theirs: names after its code.
-
-    Returns:
-        `geometry_mm`, the largest difference, or `mean_difference_part`, the mean
-        absolute difference of every tenth image divided by the mean of flexdt's; {} for
-        other blocks, or if the code did not make the result.
-    """
-    if caption.endswith("task 2"):
-        vectors = fx.ConeVec(np.load("vectors.npy"))
-        if caption.startswith("tomosipo") and "scan" in theirs:
-            own = fx.ConeVec.from_tomosipo(theirs["scan"]).rows
-            return {"geometry_mm": spread_mm(own, vectors, upwards=False)}
-        if caption.startswith("CIL") and "volume" in theirs:
-            return {"geometry_mm": spread_mm(cil_rows(theirs), vectors, upwards=False)}
-    scans = theirs.get("scans", ())
-    if caption == "tomosipo, task 5" and len(scans) == 100:
-        pairs = zip(scans, fifth_task(), strict=True)
-        rest = [
-            spread_mm(fx.ConeVec.from_tomosipo(a).rows, b, upwards=False)
-            for a, b in pairs
-        ]
-        return {"geometry_mm": max(rest)}
-    images = theirs.get("images", ())
-    if caption == "diffdrr, task 5" and len(images) == 100:
-        # diffdrr scales its voxels to 1.
-        volume = fx.Volume(theirs["array"], 1.0)
-        ours = np.stack([fx.project(volume, g) for g in fifth_task()[::10]])
-        theirs_now = np.stack([np.asarray(i) for i in images[::10]]) * volume.data.max()
-        return {
-            "mean_difference_part": float(np.abs(theirs_now - ours).mean() / ours.mean())
-        }
-    return {}
-
-
 def cil_rows(theirs: dict[str, Any]) -> np.ndarray:
     """Return the geometry (n, 12) of CIL's `scan`, as CIL gives it to ASTRA for its
     `volume`.
@@ -266,8 +213,7 @@ def page(name: str) -> dict[str, object]:
                 start = ours if peer in ("flexdt", "CIL with flexdt") else given()
                 names = ours if peer == "flexdt" else dict(start)
                 found = {"lines": lines, "version": named(peer), **run(code, names)}
-                task = of_five(caption, names)
-                out[caption] = {**found, **compared(peer, names, ours), **task}
+                out[caption] = {**found, **compared(peer, names, ours)}
             return out
         finally:
             os.chdir(here)
@@ -275,7 +221,7 @@ def page(name: str) -> dict[str, object]:
 
 def main() -> None:
     """Run the named pages, or all, and print the results as JSON."""
-    every = sorted(path.stem for path in PAGES.glob("*.md"))
+    every = sorted(path.stem for path in PAGES.glob("*.md") if blocks(path.stem))
     parser = argparse.ArgumentParser(
         description="the pages for users of other programs, run"
     )

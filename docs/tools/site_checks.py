@@ -7,28 +7,23 @@ not generated or of a figure that has other numbers than the one in the reposito
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 DOCS = Path(__file__).parents[1]
-NOTEBOOKS = [*DOCS.glob("tutorials/*.md"), *DOCS.glob("questions/*.md")]
+NOTEBOOKS = [DOCS / "own-scanner.md"]
+"""Pages that the build executes; the story is executed by a weekly job, from the wheel."""
 SHOWN = {
     "_generated/wire.html": "state.get",
     "_generated/commands.html": 'id="flexdt-phantom-design"',
     "_generated/python/flexdt.twin.geometry.cone_vec.html": "project_points",
     "reference/python.html": "flexdt.twin.geometry.cone_vec.html",
-    # Evidence is rendered, and old addresses forward.
+    # Evidence is rendered.
     "_generated/evidence/calibration.html": 'id="coverage-of-the-joint-95-region"',
     "_generated/evidence/bench.html": "itk-rtk",
-    "how-to.html": 'url=use.html"',
 }
 """Page -> text that it holds."""
-FIGURES = 8
-"""Computed pictures that notebooks show, at least."""
-TRUE_DO_Y = -1.1
-"""What the tutorial's calibration has to find again [mm]."""
 
 
 def executed(html: Path) -> Iterator[str]:
@@ -45,19 +40,6 @@ def executed(html: Path) -> Iterator[str]:
             yield f"{name}: an error is on its page"
         if cells and "cell_output" not in page:
             yield f"{name}: no output is on its page"
-    pictures = len([*(html / "_images").glob("*.png")])
-    if pictures <= FIGURES:
-        yield f"{pictures} pictures on the site, more than {FIGURES} are wanted"
-
-
-def calibrated(html: Path) -> Iterator[str]:
-    """Faults of the tutorial: the secret is not found again within five of its sigmas."""
-    page = (html / "tutorials" / "calibrate.html").read_text("utf-8")
-    found = re.search(r"dO_y\s+(-?\d\.\d+) \+- (\d\.\d+)", page)
-    if found is None:
-        yield "tutorials/calibrate.html: no dO_y"
-    elif not abs(float(found[1]) - TRUE_DO_Y) < 5 * float(found[2]):
-        yield f"tutorials/calibrate.html: {found[0]}, and it is {TRUE_DO_Y}"
 
 
 def shown(html: Path) -> Iterator[str]:
@@ -88,7 +70,6 @@ def near(made: dict[str, float], kept: dict[str, float]) -> bool:
 
 CHECKS: tuple[Callable[[Path], Iterator[str]], ...] = (
     executed,
-    calibrated,
     shown,
     figures,
 )

@@ -156,7 +156,6 @@ def mesh_wire() -> object:
 def mesh_pages() -> object:
     texts = (
         page("phantoms.md", "\n\nSTL, ", "files become"),
-        page("tutorials/own-sample.md", "surfaces in STL, ", ". GLB"),
         argument(fx.phantoms.mesh_phantom, "source").split(" file,")[0],
         argument(phantom_commands.make, "mesh").rstrip("."),
     )

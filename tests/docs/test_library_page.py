@@ -108,38 +108,3 @@ def test_the_readmes_lines_run(there: Path, capsys: pytest.CaptureFixture[str]) 
 def test_every_name_of_the_face_is_on_the_page() -> None:
     named = set(re.findall(r"`(\w+)`", PAGE.split("\n## ")[0]))
     assert {n for n in fx.__all__ if n != "__version__"} <= named
-
-
-BY_COMPLETION = ROOT / "docs" / "tutorials" / "by-completion.md"
-
-
-def cells_of_completion() -> list[str]:
-    """Read the cells of the notebook that is written by completion alone."""
-    text = BY_COMPLETION.read_text(encoding="utf-8")
-    cells = re.findall(r"```\{code-cell\} python\n(.*?)```", text, re.S)
-    return [cell for cell in cells if ":tags: [remove-cell]" not in cell]
-
-
-def test_a_stranger_needs_one_import_and_finds_every_name() -> None:
-    """The notebook itself is executed when the site is built."""
-    cells = cells_of_completion()
-    imports = [line for cell in cells for line in cell.splitlines() if "import " in line]
-    assert imports == ["import flexdt as fx"]
-    text = BY_COMPLETION.read_text(encoding="utf-8")
-    assert {n for n in fx.__all__ if f"fx.{n}" not in text} == {"__version__"}
-
-
-@pytest.mark.slow
-@pytest.mark.campaign
-def test_the_cells_of_completion_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All but those of servers, in the test's process."""
-    pytest.importorskip("matplotlib", reason="the extra `plots`").use("Agg")
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    for cell in cells_of_completion():
-        if "LocalTwin" not in cell:
-            exec(compile(cell, "by-completion.md", "exec"), names)
-    assert (tmp_path / "lego.nrrd").stat().st_size > 0
-    assert "6 parameters from 30 frames" in repr(names["found"])

@@ -348,7 +348,7 @@ def test_astra_sees_the_balls_where_they_are(
 
 
 class Flexible:
-    """CIL's geometry of one pose a view, panels' origins at the bottom left."""
+    """CIL's geometry of one pose a view."""
 
     def __init__(self, *sides: FloatArray) -> None:
         self.sides = [np.asarray(side) for side in sides]
@@ -357,7 +357,8 @@ class Flexible:
     def create_Cone3D_Flex(cls, *sides: FloatArray) -> Flexible:
         return cls(*sides)
 
-    def set_panel(self, num_pixels: Any, pixel_size: Any) -> None:
+    def set_panel(self, num_pixels: Any, pixel_size: Any, origin: str) -> None:
+        assert origin == "top-left"  # rows are counted downwards, as u and v are
         self.pixels, self.size = num_pixels, pixel_size
 
     def allocate(self, value: float) -> SimpleNamespace:
@@ -380,40 +381,60 @@ def test_cil_sees_the_balls_where_they_are(
         for side, size in zip(directions, space["scan"].size, strict=True)
     )
     cols, rows = space["scan"].pixels
-    places = of_vectors(np.concatenate([source, middle, u, v], axis=1), (rows, cols))
-    assert through_the_balls(space["images"].kept[0], places)
+    # CIL's direction of rows is upwards; the first row is the top one.
+    places = of_vectors(np.concatenate([source, middle, u, -v], axis=1), (rows, cols))
+    pictures = space["images"].kept[0]
+    assert through_the_balls(pictures, places)
+    assert not through_the_balls(pictures[:, ::-1], places)
+    assert not through_the_balls(pictures[:, :, ::-1], places)
 
 
 @pytest.mark.parametrize("scan", ["nikon", "zeiss", "own"])
 def test_tigre_sees_the_balls_where_they_are(
     scan: str, scans: dict[str, fx.DataSet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The source stands on +x and turns anticlockwise by the angle, together with the panel:
-    its columns go to +y, its rows, from the lowest, to +z.
+    """The source stands on +x, columns of the panel go to +y and rows, from the lowest, to
+    +z; the panel is turned about its middle (x, y, z, in this order), then both turn
+    anticlockwise by the angle.
     """
     tigre = ModuleType("tigre")
     tigre.geometry = lambda mode: SimpleNamespace(mode=mode)  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "tigre", tigre)
     space = ran(BLOCKS["To TIGRE"], {"data": scans[scan]})
-    geo, angles = space["geo"], space["angles"]
-    zero, one = np.zeros(VIEWS), np.ones(VIEWS)
-    low, left = -(geo.nDetector - 1) / 2 * geo.dDetector
-    corner = [
-        geo.DSO - geo.DSD,
-        left + geo.offDetector[:, 1],
-        low + geo.offDetector[:, 0],
-    ]
-    standing = np.array([
-        [geo.DSO * one, zero, zero], corner, [zero, geo.dDetector[1] * one, zero],
-        [zero, zero, geo.dDetector[0] * one],
-    ])  # fmt: skip
-    c, s = np.cos(angles), np.sin(angles)
-    turn = np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]])
-    places = crossed(*np.einsum("ijn,kjn->kni", turn, standing))
+    geo, angles = space["geo"], np.ravel(space["angles"])
+
+    dso, dsd = (np.ravel(np.broadcast_to(d, VIEWS)) for d in (geo.DSO, geo.DSD))
+    aside = np.broadcast_to(geo.offDetector, (VIEWS, 2))
+    moved = np.broadcast_to(geo.offOrigin, (VIEWS, 3))[:, ::-1]
+    turns = np.broadcast_to(geo.rotDetector, (VIEWS, 3))
+    sides: list[list[FloatArray]] = [[], [], [], []]
+    for view, angle in enumerate(angles):
+        x, y, z = turns[view]
+        panel = _about(2, z) @ _about(1, y) @ _about(0, x)
+        u = panel @ [0.0, geo.dDetector[1], 0.0]
+        v = panel @ [0.0, 0.0, geo.dDetector[0]]
+        middle = np.array([dso[view] - dsd[view], aside[view, 1], aside[view, 0]])
+        corner = middle - (geo.nDetector[1] - 1) / 2 * u - (geo.nDetector[0] - 1) / 2 * v
+        turn = _about(2, angle)
+        sides[0].append(turn @ [dso[view], 0.0, 0.0] - moved[view])
+        sides[1].append(turn @ corner - moved[view])
+        sides[2].append(turn @ u)
+        sides[3].append(turn @ v)
+    places = crossed(*map(np.array, sides))
     np.testing.assert_allclose(geo.sDetector, geo.nDetector * geo.dDetector)
     assert through_the_balls(space["images"], places)
     assert not through_the_balls(space["images"][:, ::-1], places)
     assert not through_the_balls(space["images"][:, :, ::-1], places)
+
+
+def _about(axis: int, angle: float) -> FloatArray:
+    """The matrix of a right-handed turn about an axis."""
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    out = np.eye(3)
+    out[a, a] = out[b, b] = np.cos(angle)
+    out[b, a] = np.sin(angle)
+    out[a, b] = -out[b, a]
+    return out
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ PAGES = (
     "reconstruction",
     "corrections",
     "data-sets",
-    "progress",
     "exchange",
 )
 BLOCKS = [

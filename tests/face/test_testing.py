@@ -37,7 +37,9 @@ ROOT = Path(__file__).resolve().parents[2]
 FAST = 100.0
 """Twin seconds a second of the loop, where nobody looks at what is between."""
 BLOCKS = re.findall(
-    r"```python\n(.*?)```", (ROOT / "docs/testing.md").read_text("utf-8"), re.S
+    r"```\{code-block\} python\n(.*?)```",
+    (ROOT / "docs/clients.md").read_text("utf-8"),
+    re.S,
 )
 
 
@@ -45,7 +47,7 @@ def block(mark: str) -> dict[str, Any]:
     (text,) = (b for b in BLOCKS if mark in b)
     assert len([line for line in text.splitlines() if line.strip()]) <= 15
     space: dict[str, Any] = {}
-    exec(compile(text, "testing.md", "exec"), space)
+    exec(compile(text, "clients.md", "exec"), space)
     return space
 
 

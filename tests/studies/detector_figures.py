@@ -1,6 +1,6 @@
 """Variance, sharpness, noise power and quantum efficiency of simulated images beside theory,
 and the scintillator's response beside published curves: figures and plots of
-docs/image-quality.md.
+docs/physics.md.
 
     python tests/studies/detector_figures.py [--plots docs/images]
 

@@ -43,7 +43,7 @@ ROOMS: tuple[type[FindingCode], ...] = (
 )
 CODES = [code for room in ROOMS for code in room]
 DOCUMENTED = {
-    ScriptCode: "docs/reference/script-problems.md",
+    ScriptCode: "docs/reference/problems.md",
     CalibrationCode: "docs/calibration-method.md",
 }
 RANK = [Severity.NOTE, Severity.WARNING, Severity.ERROR]
@@ -131,6 +131,7 @@ def test_each_code_is_used_and_no_finding_is_graver_than_its_code() -> None:
 @pytest.mark.parametrize("room", DOCUMENTED)
 def test_each_code_is_documented_with_its_severity(room: type[FindingCode]) -> None:
     page = (ROOT / DOCUMENTED[room]).read_text(encoding="utf-8")
+    page = page.partition("## Alarms")[0]  # they have kinds of their own
     rows = [row for row in page.splitlines() if row.startswith("| `")]
     for code in room:
         told = [row.split("|") for row in rows if f"`{code}`" in row.split("|")[1]]

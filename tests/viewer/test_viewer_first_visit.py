@@ -4,7 +4,7 @@ Clicks are counted as a hand makes them: a press is one, held or dragged too, a 
 list two (open it, take one), a field to type into one, a file to pick one. Keys are not
 counted.
 
-The clicks of the table in docs/page-tour.md are those counted here, on a small desktop screen,
+The clicks of the table in docs/viewer.md are those counted here, on a small desktop screen,
 a tablet and a phone; `pytest -s tests/viewer/test_viewer_first_visit.py` prints the seconds,
 too.
 """
@@ -317,8 +317,8 @@ def test_the_table_of_the_page_lists_these_tasks() -> None:
 
 
 def table() -> dict[str, tuple[str, str]]:
-    """Task -> clicks, and what is seen then, in docs/page-tour.md."""
-    text = (Path(__file__).parents[2] / "docs" / "page-tour.md").read_text("utf-8")
+    """Task -> clicks, and what is seen then, in docs/viewer.md."""
+    text = (Path(__file__).parents[2] / "docs" / "viewer.md").read_text("utf-8")
     rows = text.partition(HEAD)[2].partition("\n\n")[0].splitlines()
     cells = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)
     return {task: (clicks, seen) for task, clicks, seen in cells}

@@ -25,7 +25,7 @@ from flexdt_extensions.bluesky.flyer import fly_scan
 
 __all__ = ["flexdt_twin"]
 
-PAGE = Path(__file__).parents[3] / "docs" / "testing.md"
+PAGE = Path(__file__).parents[3] / "docs" / "extensions" / "bluesky.md"
 MAX = pytest.mark.parametrize(
     "flexdt_twin", [{"speed_up": "max", "sample": "normal-5"}], indirect=True
 )
@@ -53,10 +53,12 @@ def threads() -> int:
 
 
 def test_the_pages_plan_runs_and_leaves_no_thread() -> None:
-    (text,) = (b for b in re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.S)
-               if "RunEngine" in b)  # fmt: skip
+    blocks = re.findall(
+        r"```\{code-block\} python\n(.*?)```", PAGE.read_text("utf-8"), re.S
+    )
+    (text,) = (b for b in blocks if "RunEngine" in b)
     before = threads()
-    exec(compile(text, "testing.md", "exec"), {})
+    exec(compile(text, "bluesky.md", "exec"), {})
     assert threads() == before
 
 
