@@ -465,7 +465,8 @@ def test_people_have_names(
     page.fill("#person", "Ada <b>")
     page.press("#person", "Enter")
     wait(lambda: "Ada" in (page.evaluate(connected) or ""), "the name")
-    page.click("#take")
+    if page.inner_text("#take") != "Release":  # control follows a new name
+        page.click("#take")
     page.locator("#holder", has_text="you control").wait_for()
     assert (twin.state().controller or "").startswith("Ada <b> #")
     other = open_page()

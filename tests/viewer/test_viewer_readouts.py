@@ -140,7 +140,7 @@ def test_near_contact_then_blocked_then_reset(
     wait(lambda: not twin.state().axes["mag_det"].moving)
     page.locator("#near .meter.touch").wait_for()
     distance, _ = page.inner_text("#near .mm").split()
-    assert 0.0 < float(distance) < 2.0
+    assert 0.0 < float(distance) <= 2.0  # 1.96 mm is shown as 2.0
     bad = page.locator("#warnings .bad", has_text="mm apart")
     bad.wait_for()
     # The pair on the way there may have been another one.
