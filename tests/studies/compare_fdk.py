@@ -34,7 +34,7 @@ def circle(views: int) -> ConeVec:
 
 
 def by_rtk(
-    data: np.ndarray, views: int, voxels: int, size: float
+    data: np.ndarray, views: int, voxels: int, size: float, pixel: float = PIXEL
 ) -> tuple[np.ndarray, float]:
     """Reconstruct by RTK's FDK, and turn the volume to flexdt's axes: RTK's (x, y, z) is
     our (x, z, -y), and its detector rows grow upwards.
@@ -44,6 +44,7 @@ def by_rtk(
         views: n.
         voxels: along each side of the cube.
         size: of a voxel [mm].
+        pixel: edge of a pixel [mm].
 
     Returns:
         The volume (z, y, x), and the time of the reconstruction alone [s].
@@ -55,9 +56,9 @@ def by_rtk(
     for i in range(views):
         geometry.AddProjection(SOD, SDD, 360.0 * i / views)
     stack = itk.image_from_array(np.ascontiguousarray(data[:, ::-1]))
-    stack.SetSpacing([PIXEL, PIXEL, 1.0])
+    stack.SetSpacing([pixel, pixel, 1.0])
     rows, cols = data.shape[1:]
-    stack.SetOrigin([-(cols - 1) / 2 * PIXEL, -(rows - 1) / 2 * PIXEL, 0.0])
+    stack.SetOrigin([-(cols - 1) / 2 * pixel, -(rows - 1) / 2 * pixel, 0.0])
     kind = type(stack)
     empty = rtk.ConstantImageSource[kind].New()
     empty.SetOrigin([-(voxels - 1) / 2 * size] * 3)

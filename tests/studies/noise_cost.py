@@ -1,34 +1,49 @@
-"""What a volume's `sigma` and `bias_bound` cost: FDK without and with both, in turns; and of it
-the comparison of images and geometry, where they fit and where all explanations are tried.
+"""What it costs to look at a volume: FDK with and without `errors`, in turns in one run.
 
-    python tests/studies/noise_cost.py [NUMBER OF CASES]
+    python tests/studies/noise_cost.py [--sizes small,96,256,384] [--rtk] [--turns 3]
 
-Images of a cylinder that the panel sees whole, and of one that it cuts off. Processor seconds,
-the better of three.
+Images of a cylinder with two bodies in it that the panel sees whole, and of one that it cuts off,
+clean and noisy, of users' size (380 x 478 pixels) and smaller. Processor seconds, the least of all
+turns; peak memory above what the images take. `--rtk`: beside itk-rtk's FDK of the same images
+(needs `pip install itk-rtk`).
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
+import tracemalloc
 import warnings
-from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
+from compare_fdk import by_rtk
 
 import flexdt as fx
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.reconstruction.checked_fdk import checked_fdk
-from flexdt.twin.reconstruction.coarse_scan import CoarseScan
-from flexdt.twin.reconstruction.consistency.agreement import compared
+from flexdt.twin.projection import project_scene
+from flexdt.twin.projection.analytic_solids import Box, Cylinder, Scene, Solid, Sphere
 
-CASES = (
-    (360, (128, 128), 1.17, fx.Grid((96, 96, 96), 0.6)),
-    (360, (380, 478), 0.2992, fx.Grid((256, 256, 256), 0.3)),
-    (144, (96, 96), 1.56, fx.Grid((96, 96, 96), 0.6)),
-    (720, (760, 956), 0.1496, fx.Grid((400, 400, 400), 0.2)),
-)
-SOD, SDD = 600.0, 1059.0
+SOD, SDD, WIDE_MM = 600.0, 1059.0, 143.0
+SIZES = {
+    "tiny": (9, (48, 48), (28, 28, 28)),
+    "small": (48, (48, 48), (28, 48, 48)),
+    "96 of few pixels": (144, (96, 96), (96, 96, 96)),
+    "96": (360, (380, 478), (96, 96, 96)),
+    "256": (360, (380, 478), (256, 256, 256)),
+    "384": (720, (760, 956), (384, 384, 384)),
+}
+OBJECTS = {"seen whole": 26.0, "cut off": 48.0}
+
+
+def images_of(radius: float, scan: fx.ConeVec, shape: tuple[int, int]) -> Float32Array:
+    """Line integrals of a cylinder about the axis, of 0.02 / mm, with a ball and a box."""
+    solids = (
+        Solid(Cylinder((0.0, 0.0, 0.0), radius, 18.0), "a", 0.02),
+        Solid(Sphere((9.0, -6.0, 5.0), 6.0), "b", 0.01),
+        Solid(Box((-8.0, 5.0, -6.0), (10.0, 6.0, 8.0)), "c", -0.01),
+    )
+    return np.asarray(project_scene(Scene(solids), scan, shape), np.float32)
 
 
 def image_of(radius: float, shape: tuple[int, int], pixel: float) -> Float32Array:
@@ -42,56 +57,69 @@ def image_of(radius: float, shape: tuple[int, int], pixel: float) -> Float32Arra
     )
 
 
-def comparison_times(
-    image: Float32Array, scan: fx.ConeVec, shape: tuple[int, int]
-) -> tuple[str, str]:
-    """Processor seconds of a comparison, the least of three, as texts: of images that fit
-    the geometry, and of ones on a panel moved aside by five pixels.
-    """
-    pixel = float(np.linalg.norm(scan.u[0]))
-    aside = fx.ConeVec.circular(
-        sod=SOD,
-        sdd=SDD,
-        angles=len(scan),
-        shape=shape,
-        pixel=pixel,
-        offset=(5.0 * pixel, 0.0),
-    )
-    found = []
-    for geometry in (scan, aside):
-        coarse = CoarseScan.of(lambda number: image, geometry, shape, None)
-        times = []
-        for _ in range(3):
-            begun = time.process_time()
-            compared(coarse)
-            times.append(time.process_time() - begun)
-        found.append(f"{min(times):.3f}")
-    return found[0], found[1]
+def seconds_of(made: object) -> float:
+    """Processor seconds of a call without arguments."""
+    begun = time.process_time()
+    made()  # type: ignore[operator]
+    return time.process_time() - begun
 
 
-if __name__ == "__main__":
+def peak_of(made: object) -> float:
+    """Largest memory that a call without arguments allocates [MiB]."""
+    tracemalloc.start()
+    made()  # type: ignore[operator]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 2**20
+
+
+def main() -> None:
+    """Print a line for each size, object and noise."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sizes", default=",".join(SIZES))
+    parser.add_argument("--rtk", action="store_true")
+    parser.add_argument("--turns", type=int, default=3)
+    options = parser.parse_args()
     warnings.simplefilter("ignore")
-    for views, shape, pixel, grid in CASES[: int(sys.argv[1]) if sys.argv[1:] else None]:
+    for name in options.sizes.split(","):
+        views, shape, cells = SIZES[name]
+        pixel = WIDE_MM / shape[1]
         scan = fx.ConeVec.circular(
             sod=SOD, sdd=SDD, angles=views, shape=shape, pixel=pixel
         )
-        for what, radius in (("seen whole", 30.0), ("cut off", 55.0)):
-            image = image_of(radius, shape, pixel)
-            chunk = np.broadcast_to(image, (8, *shape))
+        grid = fx.Grid(cells, 57.6 / cells[2])
+        for what, radius in OBJECTS.items():
+            clean = images_of(radius, scan, shape)
+            for sigma in (0.0, 0.01):
+                noise = np.random.default_rng(1).normal(0.0, 1.0, clean.shape)
+                images = (clean + sigma * noise).astype(np.float32)
+                del noise
 
-            def parts(
-                chunk: Float32Array = chunk, views: int = views
-            ) -> Iterator[Float32Array]:
-                return (chunk.copy() for _ in range(views // 8))
+                ways = [
+                    partial(fx.fdk, images, scan, grid, errors=looks, progress=False)
+                    for looks in (False, True)
+                ]
+                least = [np.inf] * 3
+                for turn in range(options.turns + 1):
+                    for k, way in enumerate(ways):
+                        took = seconds_of(way)
+                        least[k] = min(least[k], took if turn else np.inf)
+                    if options.rtk and turn:
+                        begun = time.process_time()
+                        by_rtk(images, views, cells[0], 57.6 / cells[2], pixel)
+                        least[2] = min(least[2], time.process_time() - begun)
+                memory = [peak_of(way) for way in ways]
+                text = (
+                    f"{name}: {views} views of {shape} into {cells}, {what}, "
+                    f"{'noisy' if sigma else 'clean'}: {least[0]:.3f} and {least[1]:.3f} "
+                    f"CPU s, {least[1] / least[0]:.2f} times, "
+                    f"{1000.0 * (least[1] - least[0]):.0f} ms; {memory[0]:.0f} and "
+                    f"{memory[1]:.0f} MiB, {memory[1] / memory[0]:.2f} times"
+                )
+                if options.rtk:
+                    text += f"; itk-rtk {least[2]:.2f} CPU s, {least[1] / least[2]:.3f}"
+                print(text, flush=True)
 
-            best = [np.inf, np.inf]
-            for turn in range(6):
-                begun = time.process_time()
-                checked_fdk(
-                    lambda number, image=image: image, parts, scan, shape, grid,
-                    errors=bool(turn % 2),
-                )  # fmt: skip
-                best[turn % 2] = min(best[turn % 2], time.process_time() - begun)
-            print(f"{views} views of {shape} into {grid.shape}, {what}: {best[0]:.2f} and "
-                  f"{best[1]:.2f} s, {best[1] / best[0]:.3f}; comparison "
-                  f"{', '.join(comparison_times(image, scan, shape))} s", flush=True)  # fmt: skip
+
+if __name__ == "__main__":
+    main()

@@ -11,9 +11,9 @@ voxel's bound is what all of them come to about it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import pairwise
 from typing import Final
 
@@ -26,12 +26,21 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import Accuracy
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
-from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, NODES, CoarseScan
+from flexdt.twin.reconstruction.coarse_scan import (
+    FINE_NODES,
+    NODES,
+    CoarseScan,
+    ScanCopies,
+)
 from flexdt.twin.reconstruction.consistency.agreement import (
+    MIN_DOUBTED_MISFIT,
     SMOOTH_CHANGE_SHARE,
+    Comparison,
     Contradiction,
     Undetermined,
     compared,
+    first_look,
+    in_doubt,
     still_misfits,
     too_few,
 )
@@ -56,6 +65,10 @@ USUAL_SHARE: Final = {
 """Cause -> share of its bound that half of a scan's uniform regions stay below. Causes
 that reach their bound in narrow places have small ones
 (`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
+ALL_CAUSES: Final = frozenset(USUAL_SHARE)
+"""All causes."""
+STREAK_ROWS: Final = 6
+"""Rows of a scan in which what few views do is looked at: streaks are in each alike."""
 USUAL_FLOOR: Final = 0.001
 """Usual error of FDK without flaws, relative to the attenuation."""
 MAX_VOXEL_NODES: Final = 4.0
@@ -145,10 +158,184 @@ class Bias:
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
         return Accuracy(half, most, worst, "beyond" in off)
 
+    def warnings(self, grid: Grid | Volume) -> list[str]:
+        """List what is wrong: a contradiction, or large errors."""
+        if self.contradiction is not None:
+            return [str(self.contradiction)]
+        accuracy = self.accuracy(grid)
+        return [] if accuracy is None else accuracy.warnings
+
     def too_coarse(self, grid: Grid | Volume) -> bool:
         """Return whether a grid's voxels are too large to hold a uniform region."""
-        edge = np.max(grid.voxel_mm)
-        return bool(edge > MAX_VOXEL_NODES * max(self.found.voxel_xyz))
+        return too_coarse(grid, self.found)
+
+
+def too_coarse(grid: Grid | Volume, nodes: Volume) -> bool:
+    """Return whether a grid's voxels are too large to hold a uniform region.
+
+    Args:
+        grid: of a volume.
+        nodes: the coarse grid.
+    """
+    return bool(np.max(grid.voxel_mm) > MAX_VOXEL_NODES * max(nodes.voxel_xyz))
+
+
+class BiasOnDemand:
+    """Possible errors of FDK's volume of a scan, from coarse copies of it.
+
+    Whether images and geometry contradict each other is looked at when this is made, in
+    the stated geometry alone; other geometries are tried at once only where that leaves a
+    doubt. All else is found when it is asked for, and then kept.
+
+    Args:
+        copied: makes a coarse copy of the whole scan, of so many nodes.
+        sides_known: beads have told the direction of rotation and mirrored images.
+
+    Attributes:
+        contradiction: that was found at once; None without one.
+
+    Raises:
+        GeometryError: a coarse copy cannot be reconstructed.
+    """
+
+    def __init__(
+        self, copied: Callable[[int], CoarseScan], *, sides_known: bool = False
+    ) -> None:
+        """Look at the scan once; see the class."""
+        self._copied = copied
+        self._sides_known = sides_known
+        self._trial = first_look(copied(NODES))
+        self.contradiction: Contradiction | None = None
+        trial = self._trial
+        self._doubtful = trial is not None and in_doubt(trial, MIN_DOUBTED_MISFIT)
+        if self._doubtful:
+            self.contradiction = self._contradicted
+
+    @classmethod
+    def of(
+        cls, copied: ScanCopies | None, *, sides_known: bool = False
+    ) -> BiasOnDemand | None:
+        """Look at copies of a scan; None where a coarse copy cannot be reconstructed (any
+        GeometryError), as of a steep helix or of neither a circle nor a helix.
+
+        Args:
+            copied: that have taken all images they want; None where they cannot be made.
+            sides_known: see the class.
+        """
+        if copied is None:
+            return None
+        try:
+            return cls(copied, sides_known=sides_known)
+        except GeometryError:
+            return None
+
+    @property
+    def found(self) -> Volume:
+        """The grid of nodes."""
+        return self._copied(NODES).grid
+
+    @cached_property
+    def bias(self) -> Bias:
+        """The errors, cause by cause.
+
+        If images and geometry contradict each other, nothing else is bounded; a misfit
+        that nothing explains must be there on a finer copy, too. Bounds are
+        `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing
+        angles, the rungs of `ladder`, another continuation of truncated rows ("beyond"),
+        or for complete rows their level beside the object ("drift"). A whole scan whose
+        images fit another geometry as well, also those of a finer copy, or do not show
+        whether they fit their own, has a contradiction besides its causes.
+        """
+        if self._contradicted is not None:
+            scan = self._copied(NODES)
+            values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
+            nodes = UniformNodes.of(values, scan.rim)
+            found = scan.grid.like(nodes.found)
+            return Bias(found, nodes.even, nodes.inside, {}, self._contradicted)
+        bias = self._bounded
+        if self._comparison is not None:
+            bias = replace(bias, widening=self._comparison.widening)
+        return replace(bias, contradiction=self._undecided(bias))
+
+    def bound(self, grid: Volume) -> Float32Array | None:
+        """Compute the bound of the error at each voxel of a grid; see `Bias.bound`."""
+        return self.bias.bound(grid)
+
+    def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
+        """Compute the relative accuracy of uniform regions in a grid; see
+        `Bias.accuracy`.
+        """
+        return self.bias.accuracy(grid)
+
+    def warnings(self, grid: Grid | Volume) -> list[str]:
+        """List what is wrong at first sight: a contradiction, too few views to find one,
+        or large errors by the trajectory and the panel's edges. Those are not looked for
+        in a scan that fits and is `CoarseScan.easy`; of one that has few views, but is
+        easy otherwise, only what few views do to some of its rows.
+
+        Args:
+            grid: of the volume.
+        """
+        if self.contradiction is not None:
+            return [str(self.contradiction)]
+        scan = self._copied(NODES)
+        trial = self._trial
+        if (trial is not None and not trial.telling.any()) or too_few(scan):
+            self.accuracy(grid)
+            if self.bias.contradiction is not None:
+                return [str(self.bias.contradiction)]
+        if not scan.easy or self._doubtful:
+            return self._bounded.warnings(grid)
+        if scan.sparse:
+            thin = scan.thinned(all_views=True, least_rows=STREAK_ROWS)
+            return _bounded(thin, {"angles"}).warnings(grid)
+        return []
+
+    @cached_property
+    def _bounded(self) -> Bias:
+        """The errors, but for what the comparison adds."""
+        return _bounded(self._copied(NODES))
+
+    @cached_property
+    def _comparison(self) -> Comparison | None:
+        """The images, compared with other geometries."""
+        if self._trial is None:
+            return None
+        return compared(self._copied(NODES), self._trial)
+
+    @cached_property
+    def _contradicted(self) -> Contradiction | None:
+        """What contradicts, if a misfit alone does not, or does on a finer copy, too."""
+        if self._comparison is None:
+            return None
+        found = self._comparison.contradiction()
+        return _confirmed(found, self._copied(NODES), self._copied)
+
+    def _undecided(self, bias: Bias) -> Contradiction | Undetermined | None:
+        """Find geometries that images do not exclude, or why they exclude none.
+
+        Args:
+            bias: with its causes.
+        """
+        scan = self._copied(NODES)
+        comparison = self._comparison
+        sides_known = self._sides_known
+        accuracy = bias.accuracy(bias.found)
+        if accuracy is None or accuracy.cut_off:
+            return None
+        if too_few(scan):
+            return Undetermined(np.inf)
+        if comparison is None:
+            return None
+        if (undetermined := comparison.undetermined) is not None:
+            return undetermined
+        undecided = comparison.undecided(accuracy.most, sides_known=sides_known)
+        if undecided is not None and undecided.finer_copy_decides:
+            fine = self._copied(FINE_NODES)
+            if fine.binned != scan.binned:
+                closer = comparison.finer(undecided, fine)
+                undecided = closer.undecided(accuracy.most, sides_known=sides_known)
+        return undecided
 
 
 def bias_of(
@@ -159,76 +346,46 @@ def bias_of(
     *,
     sides_known: bool = False,
 ) -> Bias | None:
-    """Find the possible errors of FDK's volume of a scan, from a coarse copy of it.
+    """Find the possible errors of FDK's volume of a scan at once.
 
     Args:
-        image: gives the line integrals of a view, (rows, cols), by its number.
+        image: gives the line integrals of a view, (rows, cols), by its number; read once.
         cone_vec: of all views.
         shape: (rows, cols).
         truncation: of `truncation_of`.
         sides_known: beads have told the direction of rotation and mirrored images.
 
     Returns:
-        None where a coarse scan cannot be reconstructed (any GeometryError), as of a
-        steep helix or of neither a circle nor a helix.
+        None where a coarse scan cannot be reconstructed; see `BiasOnDemand.of`.
     """
-
-    @cache
-    def copied(nodes: int) -> CoarseScan:
-        """Make a coarse copy, which reads all images; each once."""
-        return CoarseScan.of(image, cone_vec, shape, truncation, nodes)
-
+    copies = copies_of(cone_vec, shape, truncation)
+    if copies is None:
+        return None
+    for number in copies.wanted:
+        copies.take(number, image(number))
+    found = BiasOnDemand.of(copies, sides_known=sides_known)
     try:
-        return _bias_of(copied, sides_known)
+        return None if found is None else found.bias
     except GeometryError:
         return None
 
 
-def _bias_of(copied: Callable[[int], CoarseScan], sides_known: bool) -> Bias:
-    """Reconstruct a coarse scan and bound its errors, cause by cause.
-
-    If images and geometry contradict each other, nothing else is bounded; a misfit that
-    nothing explains must be there on a finer copy, too. Bounds are `SAFETY_FACTOR` times
-    the change of the coarse volume by each flaw: missing angles, the rungs of `ladder`,
-    another continuation of truncated rows ("beyond"), or for complete rows their level
-    beside the object ("drift"). A whole scan whose images fit another geometry as well,
-    also those of a finer copy, or do not show whether they fit their own, has a
-    contradiction besides its causes.
+def copies_of(
+    cone_vec: ConeVec, shape: tuple[int, int], truncation: Truncation | None = None
+) -> ScanCopies | None:
+    """Make copies of a scan, which take its images; None where it cannot be copied.
 
     Args:
-        copied: makes a coarse copy of the whole scan, of so many nodes.
-        sides_known: see `bias_of`.
-
-    Returns:
-        The bound, with the contradiction if there is one.
+        cone_vec: of all views.
+        shape: (rows, cols).
+        truncation: of `truncation_of`.
     """
-    scan = copied(NODES)
-    values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
-    nodes = UniformNodes.of(values, scan.rim)
-    bias = Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, {})
-    comparison = compared(scan)
-    if comparison is not None:
-        seen = _confirmed(comparison.contradiction(), scan, copied)
-        if seen is not None:
-            return replace(bias, contradiction=seen)
-        bias = replace(bias, widening=comparison.widening)
-    bias = replace(bias, causes=_causes(scan, nodes, np.nan_to_num(values)))
-    accuracy = bias.accuracy(bias.found)
-    if accuracy is None or accuracy.cut_off:
-        return bias
-    if too_few(scan):
-        return replace(bias, contradiction=Undetermined(np.inf))
-    if comparison is None:
-        return bias
-    if (undetermined := comparison.undetermined) is not None:
-        return replace(bias, contradiction=undetermined)
-    undecided = comparison.undecided(accuracy.most, sides_known=sides_known)
-    if undecided is not None and undecided.finer_copy_decides:
-        fine = copied(FINE_NODES)
-        if fine.binned != scan.binned:
-            closer = comparison.finer(undecided, fine)
-            undecided = closer.undecided(accuracy.most, sides_known=sides_known)
-    return replace(bias, contradiction=undecided)
+    try:
+        copies = ScanCopies(cone_vec, shape)
+    except GeometryError:
+        return None
+    copies.truncation = truncation
+    return copies
 
 
 def _confirmed(
@@ -245,15 +402,32 @@ def _confirmed(
     return seen
 
 
+def _bounded(scan: CoarseScan, only: Container[str] = ALL_CAUSES) -> Bias:
+    """Bound the errors of a coarse volume, by cause (`BiasOnDemand.bias`).
+
+    Args:
+        scan: the coarse copy.
+        only: causes that are looked for.
+    """
+    values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
+    nodes = UniformNodes.of(values, scan.rim)
+    causes = _causes(scan, nodes, np.nan_to_num(values), only)
+    return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
+
+
 def _causes(
-    scan: CoarseScan, nodes: UniformNodes, data: Float32Array
+    scan: CoarseScan,
+    nodes: UniformNodes,
+    data: Float32Array,
+    only: Container[str] = ALL_CAUSES,
 ) -> dict[str, FloatArray]:
-    """Bound the errors of a coarse volume, by cause (`_bias_of`).
+    """Bound the errors of a coarse volume, by cause (`BiasOnDemand.bias`).
 
     Args:
         scan: the coarse copy.
         nodes: of its volume.
         data: that volume, its unreconstructed voxels 0, (nz, ny, nx).
+        only: causes that are looked for; of `ALL_CAUSES`.
 
     Returns:
         Cause -> largest error of each node, (nz, ny, nx) [1/mm].
@@ -263,7 +437,7 @@ def _causes(
     def add(cause: str, share: float, change: Float32Array) -> None:
         causes[cause] = causes.get(cause, 0.0) + share * _about(change, nodes.even)
 
-    if scan.sparse:
+    if scan.sparse and "angles" in only:
         # Streaks come from edges, and do not cancel about a node.
         wide = (max(scan.ends),) * 2
         best, ours = (
@@ -271,6 +445,8 @@ def _causes(
             for t in (None, scan.angles)
         )
         add("angles", SAFETY_FACTOR, np.abs(ours - best))
+    if only is not ALL_CAUSES:
+        return causes
     rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in scan.ladder()]
     for (_, before), (flaw, after) in pairwise(rungs):
         add(flaw, SAFETY_FACTOR, after - before)

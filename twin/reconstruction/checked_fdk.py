@@ -24,11 +24,14 @@ from flexdt.twin.projection.operators import (
 )
 from flexdt.twin.reconstruction.acquisition.coverage import LostVoxels
 from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
-from flexdt.twin.reconstruction.bias import Bias, bias_of
+from flexdt.twin.reconstruction.bias import Bias, BiasOnDemand, copies_of, too_coarse
 from flexdt.twin.reconstruction.feldkamp.backprojection import CHUNK, PIXELS
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.reconstruction.volume_errors import with_errors
 from flexdt.twin.signatures import public
+
+CHECKING_SHARE = 0.1
+"""Share of the progress that is left for looking at the volume, about."""
 
 
 @public
@@ -156,18 +159,30 @@ def checked_fdk(
         accuracy, then lost voxels.
     """
     truncation = truncation_of(image, cone_vec, shape)
-    volume = fdk_parts(
-        parts, cone_vec, shape, like, window, progress, truncation, errors=errors
-    )
-    lost = LostVoxels.of(volume.data).warnings()
     if not errors:
-        return volume, lost
-    bias = bias_of(image, cone_vec, shape, truncation)
-    volume = with_errors(volume, bias=bias)
-    return volume, [*bias_warnings(bias, volume), *lost]
+        volume = fdk_parts(parts, cone_vec, shape, like, window, progress, truncation)
+        return volume, LostVoxels.of(volume.data).warnings()
+    copies = copies_of(cone_vec, shape, truncation)
+
+    def seen() -> Iterable[Float32Array]:
+        """Yield the parts, and copy them on the way."""
+        return parts() if copies is None else copies.passing(parts())
+
+    def told(part: float) -> None:
+        """Report the part of FDK that is done."""
+        if progress is not None:
+            progress((1.0 - CHECKING_SHARE) * part)
+
+    volume = fdk_parts(seen, cone_vec, shape, like, window, told, truncation, errors=True)
+    lost = LostVoxels.of(volume.data).warnings()
+    bias = BiasOnDemand.of(copies)
+    doubts = bias_warnings(bias, volume)
+    if progress is not None:
+        progress(1.0)
+    return with_errors(volume, bias=bias), [*doubts, *lost]
 
 
-def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
+def bias_warnings(bias: BiasOnDemand | Bias | None, grid: Grid | Volume) -> list[str]:
     """List warnings about uniform regions that may deviate, or of which nothing is known.
 
     The first of: accuracy unknown as there is no bias, a contradiction, voxels too large;
@@ -183,16 +198,11 @@ def bias_warnings(bias: Bias | None, grid: Grid | Volume) -> list[str]:
             "accuracy is not known: a coarse copy of the scan, by which it is found, "
             "cannot be reconstructed"
         ]
-    if bias.contradiction is not None:
-        return [str(bias.contradiction)]
-    if bias.too_coarse(grid):
+    if bias.contradiction is None and too_coarse(grid, bias.found):
         edge = float(np.max(grid.voxel_mm))
         return [
             f"accuracy is not known: voxels of {edge:g} mm are too large to hold a "
             "uniform region; "
             f"choose at most {max(bias.found.voxel_xyz):.2g} mm"
         ]
-    accuracy = bias.accuracy(grid)
-    if accuracy is None:
-        return []
-    return accuracy.warnings
+    return bias.warnings(grid)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -25,7 +25,6 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
     Circle,
     circle_of,
     distinct_angles,
-    mean_image,
     panel_reach,
 )
 from flexdt.twin.reconstruction.acquisition.truncation import ACCURACY, Truncation
@@ -47,6 +46,12 @@ COMPARED_VIEWS: Final = 2.0
 """Views per column, about, of a scan whose images are compared with its volume."""
 COMPARED_ROWS: Final = 16
 """Least rows of that scan, if the panel has so many."""
+MAX_EASY_CLIMB: Final = 0.08
+"""Largest tangent of rays with the plane of the circle for which the error of a cone is
+small: of plates one above the other, the worst object, FDK's volume is 1 % off."""
+MAX_EASY_LEVEL: Final = 0.01
+"""Largest level beside the object, over the largest line integral, that is a small error:
+it is about the error in the volume, of which `WARNING_BOUND` tells from 3 % on."""
 PARALLEL_SOURCE_RADII: Final = 50.0
 """Distance of the source for parallel rays, in radii of the scan."""
 
@@ -119,46 +124,10 @@ class CoarseScan:
         Raises:
             GeometryError: neither a circle nor a helix, or a panel that lies flat.
         """
-        circle = circle_of(cone_vec)
-        flip = on_its_side(cone_vec)
-        if flip:
-            cone_vec = swapped(cone_vec)
-            shape = (shape[1], shape[0])
-        at, same = distinct_angles(circle)
-        chosen = _every(cone_vec[at], -(-len(at) // VIEWS), circle)
-        low, high = panel_reach(circle, upright(cone_vec), shape[1])
-        overlap = min(low, high) / (low + high) * shape[1]
-        wide = -(-shape[1] // nodes)
-        across = min(wide, max(1, int(overlap / MIN_AXIS_COLUMNS)))
-        down = max(min(wide, shape[0] // 2), -(-shape[0] // nodes), 1)
-        rows = shape[0] // down
-        cols = shape[1] // across
-        part = window(cone_vec[at[chosen]], shape, (0, rows * down), (0, cols * across))
-        images = np.empty((len(chosen), rows, cols), np.float32)
-        for k, place in enumerate(chosen.tolist()):
-            full = mean_image(image, np.flatnonzero(same == place))
-            images[k] = binned_mean(full.T if flip else full, (down, across))
-        if circle.rise:  # the outermost half rows count, too, in how steep a helix may be
-            images = np.pad(images, ((0, 0), (1, 1), (0, 0)), "edge")
-        if truncation is not None:
-            first = 1.0 if circle.rise else 0.0
-            rows_of_bands = (truncation.rows + 0.5) / down - 0.5 + first
-            truncation = replace(truncation, rows=rows_of_bands)
-        scan = ConeVec.from_vectors(
-            part.source, part.detector, part.u * across, part.v * down
-        )
-        numbers = at[chosen]
-        return cls(
-            images,
-            scan,
-            circle,
-            circle.angle[numbers],
-            truncation,
-            numbers,
-            (down, across),
-            nodes,
-            (shape[0] / down - rows, shape[1] / across - cols),
-        )
+        copy = CoarseCopy(cone_vec, shape, nodes)
+        for number in copy.wanted:
+            copy.take(number, image(number))
+        return copy.scan(truncation)
 
     def thinned(
         self,
@@ -330,7 +299,8 @@ class CoarseScan:
         most `ACCURACY` of the images'.
         """
         count = self.images.shape[1]
-        ends = float(np.abs(self.images[:, [0, -1]]).mean())
+        # Means of rows first: noise is no object.
+        ends = float(np.abs(self.images[:, [0, -1]].mean(axis=2)).mean())
         if count == 1 or ends <= ACCURACY * float(np.abs(self.images).mean()):
             return 0
         nearest = max(self.circle.radius - max(self.ends), 0.5 * self.circle.radius)
@@ -346,6 +316,27 @@ class CoarseScan:
         apart = float(np.ptp(step)) > float(np.median(step))
         few = len(self.angles) < 0.5 * np.pi * self.images.shape[2]
         return not self.circle.rise and (apart or few or not self.circle.full)
+
+    @cached_property
+    def easy(self) -> bool:
+        """True if nothing of the trajectory and the panel's edges can be a large error:
+        a full circle, a panel in the middle, rays that climb at most
+        `MAX_EASY_CLIMB`, and an object that ends within the panel, with the open beam
+        beside it within `MAX_EASY_LEVEL`.
+        """
+        low, high = self.ends
+        cols = self.images.shape[2]
+        aside = abs(high - low) > (low + high) / cols
+        cut_off = self.truncation is not None and bool(self.truncation.cut_off.any())
+        if self.circle.rise or not self.circle.full or aside or cut_off or self.more:
+            return False
+        level = self.level
+        away = np.linalg.norm((level.detector - level.source)[:, :2], axis=1)
+        half = 0.5 * self.images.shape[1] * np.linalg.norm(level.v, axis=1)
+        climb = float(((np.abs(level.detector - level.source)[:, 2] + half) / away).max())
+        ends = np.abs(self.images[:, :, [0, -1]].mean(axis=1)).min(axis=1)
+        beside = float(ends.mean()) <= MAX_EASY_LEVEL * float(self.images.max())
+        return climb <= MAX_EASY_CLIMB and beside
 
     def fdk(
         self,
@@ -492,6 +483,151 @@ class CoarseScan:
         if rows > 1:
             rungs.append(Rung("rows" if self.more else cone, self.level, (rows, cols)))
         return rungs if len(rungs) > 1 else []
+
+
+class CoarseCopy:
+    """The images of a coarse scan, taken as those of the scan pass by; see
+    `CoarseScan.of`.
+
+    Args:
+        cone_vec: of all views.
+        shape: (rows, cols).
+        nodes: columns, rows and voxels along the longest side.
+
+    Raises:
+        GeometryError: neither a circle nor a helix, or a panel that lies flat.
+    """
+
+    def __init__(
+        self, cone_vec: ConeVec, shape: tuple[int, int], nodes: int = NODES
+    ) -> None:
+        """Choose views, rows and columns, and make room for their means."""
+        circle = circle_of(cone_vec)
+        self._flip = on_its_side(cone_vec)
+        if self._flip:
+            cone_vec = swapped(cone_vec)
+            shape = (shape[1], shape[0])
+        at, same = distinct_angles(circle)
+        chosen = _every(cone_vec[at], -(-len(at) // VIEWS), circle)
+        low, high = panel_reach(circle, upright(cone_vec), shape[1])
+        overlap = min(low, high) / (low + high) * shape[1]
+        wide = -(-shape[1] // nodes)
+        across = min(wide, max(1, int(overlap / MIN_AXIS_COLUMNS)))
+        down = max(min(wide, shape[0] // 2), -(-shape[0] // nodes), 1)
+        rows = shape[0] // down
+        cols = shape[1] // across
+        part = window(cone_vec[at[chosen]], shape, (0, rows * down), (0, cols * across))
+        self._views = ConeVec.from_vectors(
+            part.source, part.detector, part.u * across, part.v * down
+        )
+        self._circle = circle
+        self._nodes = nodes
+        self._numbers = at[chosen]
+        self._binned = down, across
+        self._rest = shape[0] / down - rows, shape[1] / across - cols
+        slots = np.full(len(at), -1)
+        slots[chosen] = np.arange(len(chosen))
+        self._slots: npt.NDArray[np.intp] = slots[same]
+        self._taken = np.zeros(len(same), bool)
+        self._sums = np.zeros((len(chosen), rows, cols), np.float32)
+
+    @property
+    def wanted(self) -> list[int]:
+        """Numbers of the views that are taken."""
+        return np.flatnonzero(self._slots >= 0).tolist()
+
+    def take(self, number: int, image: npt.NDArray[np.generic]) -> None:
+        """Add a view's image, averaged over pixels, unless it is not wanted or has been
+        taken.
+
+        Args:
+            number: of the view among all.
+            image: line integrals, (rows, cols); not changed.
+        """
+        slot = self._slots[number]
+        if slot < 0 or self._taken[number]:
+            return
+        self._taken[number] = True
+        values = np.asarray(image, np.float32)
+        self._sums[slot] += binned_mean(values.T if self._flip else values, self._binned)
+
+    def scan(self, truncation: Truncation | None) -> CoarseScan:
+        """Return the coarse scan once all wanted images have been taken.
+
+        Args:
+            truncation: of the scan; None if the object is not cut off.
+        """
+        wanted = self._slots >= 0
+        assert self._taken[wanted].all()
+        counts = np.bincount(self._slots[wanted], minlength=len(self._sums))
+        images = np.asarray(self._sums / counts[:, None, None], np.float32)
+        if self._circle.rise:
+            # The outermost half rows count, too, in how steep a helix may be.
+            images = np.pad(images, ((0, 0), (1, 1), (0, 0)), "edge")
+        if truncation is not None:
+            first = 1.0 if self._circle.rise else 0.0
+            rows = (truncation.rows + 0.5) / self._binned[0] - 0.5 + first
+            truncation = replace(truncation, rows=rows)
+        return CoarseScan(
+            images,
+            self._views,
+            self._circle,
+            self._circle.angle[self._numbers],
+            truncation,
+            self._numbers,
+            self._binned,
+            self._nodes,
+            self._rest,
+        )
+
+
+class ScanCopies:
+    """Copies of a scan of `NODES` and of `FINE_NODES`, from images that are seen once.
+
+    Args:
+        cone_vec: of all views.
+        shape: (rows, cols).
+
+    Raises:
+        GeometryError: see `CoarseScan.of`.
+    """
+
+    def __init__(self, cone_vec: ConeVec, shape: tuple[int, int]) -> None:
+        """Make room for both copies."""
+        self._copies = {
+            nodes: CoarseCopy(cone_vec, shape, nodes) for nodes in (NODES, FINE_NODES)
+        }
+        self._scans: dict[int, CoarseScan] = {}
+        self.truncation: Truncation | None = None
+
+    @property
+    def wanted(self) -> list[int]:
+        """Numbers of the views that are taken; the same of both copies."""
+        return self._copies[NODES].wanted
+
+    def take(self, number: int, image: npt.NDArray[np.generic]) -> None:
+        """Take a view's image; see `CoarseCopy.take`."""
+        for copy in self._copies.values():
+            copy.take(number, image)
+
+    def passing(self, parts: Iterable[Float32Array]) -> Iterator[Float32Array]:
+        """Yield all images of the scan in parts, unchanged, and take them on the way.
+
+        Args:
+            parts: (k, rows, cols) each, in the order of the views.
+        """
+        number = 0
+        for part in parts:
+            for image in part:
+                self.take(number, image)
+                number += 1
+            yield part
+
+    def __call__(self, nodes: int) -> CoarseScan:
+        """Return the copy of `NODES` or `FINE_NODES`, with the `truncation`."""
+        if nodes not in self._scans:
+            self._scans[nodes] = self._copies.pop(nodes).scan(self.truncation)
+        return self._scans[nodes]
 
 
 def _every(cone_vec: ConeVec, each: int, circle: Circle) -> npt.NDArray[np.intp]:

@@ -71,7 +71,6 @@ from flexdt.twin.reconstruction import (
     LostVoxels,
     Polychromatic,
     Truncation,
-    bias_of,
     bias_warnings,
     fdk_parts,
     field_of_view,
@@ -81,13 +80,14 @@ from flexdt.twin.reconstruction import (
 )
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, distinct_angles
 from flexdt.twin.reconstruction.acquisition.truncation import SAMPLES as TRUNCATION_VIEWS
-from flexdt.twin.reconstruction.coarse_scan import VIEWS as BIAS_VIEWS
+from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of
+from flexdt.twin.reconstruction.coarse_scan import ScanCopies
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 if TYPE_CHECKING:
     from flexdt.twin.physics.scatter import ScanScatter
     from flexdt.twin.physics.tube import Tube, TubeModel
-    from flexdt.twin.reconstruction import Bias, Hardening
+    from flexdt.twin.reconstruction import Hardening
 
 Progress = Callable[[float, float], None]
 """Called with the work done and the total, in the algorithm's own units."""
@@ -164,6 +164,7 @@ class ScanFrames:
         kept: store of images that are needed again; None reads them again.
         sides_known: their geometry is corrected by beads, which determine the direction of
             rotation and mirrored images.
+        copies: take the corrected images as they are read, to find the errors of FDK.
     """
 
     dataset: ImageSet
@@ -177,6 +178,7 @@ class ScanFrames:
     doubts: tuple[str, ...] = ()
     kept: KeptImages | None = None
     sides_known: bool = False
+    copies: ScanCopies | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -218,9 +220,11 @@ class ScanFrames:
             image = subtracted(image, self.scatter.signal(number))
         if self.rings is not None:
             image = image - self.rings
-        if self.harden is None:
-            return image
-        return self.harden(image)
+        if self.harden is not None:
+            image = self.harden(image)
+        if self.copies is not None:
+            self.copies.take(number, image)
+        return image
 
     def measured(self, dataset: ImageSet, number: int) -> Float32Array:
         """Read one frame's line integrals, binned, from a data set of the same frames."""
@@ -332,7 +336,7 @@ class ReconstructionTask:
         """Images that are needed more than once even of a single slab, at most all.
 
         All, with ring correction or detector lag; else those that the scatter correction
-        and, for a direct method, the estimates of truncation and bias read once more.
+        and, for a direct method, the estimate of truncation reads once more.
         """
         count = len(self.views.indices)
         panel = self.views.dataset.panel
@@ -344,7 +348,7 @@ class ReconstructionTask:
             some = SCATTER_VIEWS + 1
         if self.direct:
             angles = len(distinct_angles(circle_of(self.views.cone_vec))[0])
-            some += (TRUNCATION_VIEWS + BIAS_VIEWS) * -(-count // angles)
+            some += TRUNCATION_VIEWS * -(-count // angles)
         return min(some, count)
 
     def plan(self, memory: int | None, *, slabs: bool = True) -> MemoryPlan:
@@ -451,7 +455,7 @@ def reconstruct_dataset(
             views = _apply_corrections(task.views, task.request)
             by_workers = extension("slabs", "a reconstruction by workers")
             doubts = by_workers(views, task.grid, task.request, out, pool, tell)
-        bias = _bias(views)
+        bias = _bias_read_again(views)
         if task.request.png:
             slices.take(read_volume(out).data)
     accuracy = None
@@ -492,16 +496,25 @@ def _untold(done: float, total: float) -> None:
     """Ignore progress."""
 
 
-def _bias(views: ScanFrames) -> Bias | None:
-    """Estimate the bias of FDK from views and their truncation; None where it cannot be
-    estimated."""
-    return bias_of(
-        views.view,
-        views.cone_vec,
-        views.shape,
-        views.truncation,
-        sides_known=views.sides_known,
-    )
+def _copied(views: ScanFrames) -> ScanFrames:
+    """Return the views with copies that take their images as they are read."""
+    copies = copies_of(views.cone_vec, views.shape, views.truncation)
+    return replace(views, copies=copies)
+
+
+def _bias(views: ScanFrames) -> BiasOnDemand | None:
+    """Find what the copies of all views tell of FDK's errors; None where the scan cannot
+    be copied.
+    """
+    return BiasOnDemand.of(views.copies, sides_known=views.sides_known)
+
+
+def _bias_read_again(views: ScanFrames) -> BiasOnDemand | None:
+    """Find the same where other processes have read the images: some are read again."""
+    views = _copied(views)
+    for number in () if views.copies is None else views.copies.wanted:
+        views.view(number, again=False)
+    return _bias(views)
 
 
 def _reconstruct_in_process(
@@ -510,7 +523,7 @@ def _reconstruct_in_process(
     out: Path,
     slices: MiddleSlices,
     tell: Progress,
-) -> tuple[ScanFrames, Bias | None, list[str]]:
+) -> tuple[ScanFrames, BiasOnDemand | None, list[str]]:
     """Reconstruct into a file in this process.
 
     The disk must have room for kept images, else LimitError before any work. Doubts are
@@ -539,14 +552,14 @@ def _reconstruct_in_process(
             write(volume.data)
             slices.take(volume.data)
             return views, None, []
-        # Before images are prepared: this looks at images as they were recorded.
-        bias = _bias(views)
+        views = _copied(views)
         lost = LostVoxels()
         for slab in _fdk_slabs(task, views, kept_images, plan, work):
             write(slab.data)
             slices.take(slab.data)
             lost += LostVoxels.of(slab.data)
             del slab  # before there is another
+        bias = _bias(views)
     return views, bias, lost.warnings()
 
 
@@ -669,7 +682,8 @@ def reconstruct_volume(
             warn_caller(doubt)
         if not fdk:
             return _iterative(views, grid, task.request, tell)
-        bias = _bias(views) if errors else None
+        if errors:
+            views = _copied(views)
         slabs = _fdk_slabs(
             task, views, kept_images, plan, work, errors=errors and in_memory
         )
@@ -679,6 +693,7 @@ def reconstruct_volume(
             volume = _in_a_file(slabs, grid, folder)
     doubts = LostVoxels.of(volume.data).warnings()
     if errors:
+        bias = _bias(views)
         volume = with_errors(volume, bias=bias)
         doubts = [*bias_warnings(bias, volume), *doubts]
     for doubt in doubts:

@@ -42,6 +42,9 @@ MIN_DOUBTFUL_MISFIT: Final = 1.4
 """Residual over that of the second reconstruction, below which an explanation counts
 only if its volume differs: more than half of right scans. Above it bounds grow in
 proportion."""
+MIN_DOUBTED_MISFIT: Final = 2.0
+"""The same, from which on explanations are looked for at once, not only when the accuracy
+is asked for: few right scans have so much (`tests/studies/misfits.py --right`)."""
 MIN_CHANGE: Final = 0.01
 """Least relative change of uniform regions by an explanation that is named: a tilted
 panel's images may fit mirrored rows better, whose volume is the same."""
@@ -201,26 +204,18 @@ class Undetermined:
         )
 
 
-def compared(scan: CoarseScan) -> Comparison | None:
-    """Compare a scan's images with the projections of its volume, and with those of other
-    geometries (`Comparison`), which takes most of the time.
+def first_look(scan: CoarseScan) -> Trial | None:
+    """Project a scan's coarse volume again, in its stated geometry alone.
 
     Some views and rows are tried first; all views if the expected residual of values or
-    edges is too large; averaged columns while that of both is (`_reliable`). The
-    comparison is `doubtful` if the misfit is at least `MIN_DOUBTFUL_MISFIT` or centroids
-    wander (`MAX_WANDER`); orders are then tried on all views (`_with_orders`). Else it is
-    made once more, with at least `RIVALS_ROWS` rows, and judged by that misfit. Orders
-    are then tried on some views alone, where the right one may leave uneven angles and fit
-    no better: what that misses are wrong orders that leave no larger misfit than most right
-    scans have, as of bodies that look nearly alike from all sides.
+    edges is too large; averaged columns while that of both is (`_reliable`).
 
     Args:
         scan: coarse.
 
     Returns:
-        None for scans of too few views or columns (`too_few`), for images without an
-        object (`MIN_SIGNAL_INTEGRAL`), and where images fit of which the panel cuts a part
-        off.
+        None for scans of too few views or columns (`too_few`), and for images without an
+        object (`MIN_SIGNAL_INTEGRAL`).
     """
     if too_few(scan):
         return None
@@ -230,10 +225,43 @@ def compared(scan: CoarseScan) -> Comparison | None:
     trial = Trial(thin)
     if not trial.telling.all() and len(thin.images) < len(scan.images):
         trial = Trial(scan.thinned(all_views=True))
-    trial = _reliable(scan, trial, COMPARED_ROWS)
+    return _reliable(scan, trial, COMPARED_ROWS)
+
+
+def in_doubt(trial: Trial, least: float = MIN_DOUBTFUL_MISFIT) -> bool:
+    """Return whether images fit their geometry so badly that explanations are looked for:
+    a misfit of at least `least`, or centroids that wander (`MAX_WANDER`).
+    """
+    if not trial.telling.any():
+        return False
+    return trial.excess >= least or trial.wander > MAX_WANDER
+
+
+def compared(scan: CoarseScan, trial: Trial | None = None) -> Comparison | None:
+    """Compare a scan's images with the projections of its volume, and with those of other
+    geometries (`Comparison`), which takes most of the time.
+
+    The comparison is `doubtful` if the first look is (`in_doubt`); orders are then tried
+    on all views (`_with_orders`). Else it is made once more, with at least `RIVALS_ROWS`
+    rows, and judged by that misfit. Orders are then tried on some views alone, where the
+    right one may leave uneven angles and fit no better: what that misses are wrong orders
+    that leave no larger misfit than most right scans have, as of bodies that look nearly
+    alike from all sides.
+
+    Args:
+        scan: coarse.
+        trial: its `first_look`, if that has been made.
+
+    Returns:
+        None for scans without a first look, and where images fit of which the panel cuts
+        a part off.
+    """
+    trial = trial or first_look(scan)
+    if trial is None:
+        return None
     if not trial.telling.any():
         return Comparison(trial, doubtful=False)
-    if trial.excess >= MIN_DOUBTFUL_MISFIT or trial.wander > MAX_WANDER:
+    if in_doubt(trial):
         comparison = Comparison(trial, doubtful=True)
         fewer = len(trial.scan.images) < len(scan.images)
         # Of a scan that is cut off no orders are suspected.

@@ -33,7 +33,11 @@ from flexdt.twin.reconstruction.feldkamp.backprojection import (
     device_takes,
 )
 from flexdt.twin.reconstruction.feldkamp.fdk_plan import FdkPlan, plan_fdk
-from flexdt.twin.reconstruction.feldkamp.noise import Noise, NoiseMeter, NoiseOfSlabs
+from flexdt.twin.reconstruction.feldkamp.noise import (
+    NoiseMeter,
+    NoiseOfSlabs,
+    NoiseOfViews,
+)
 from flexdt.twin.reconstruction.feldkamp.slabs import layers
 from flexdt.twin.reconstruction.volume_errors import with_errors
 
@@ -65,7 +69,7 @@ class Task:
 
     def onto(
         self, target: Backprojector, like: Volume, progress: Progress | None
-    ) -> tuple[Float32Array, Noise | None]:
+    ) -> tuple[Float32Array, NoiseOfViews | None]:
         """Reconstruct into one grid: plan, add all views, scale voxels that some views do
         not see.
 
@@ -168,7 +172,7 @@ def _on_device(
         return with_errors(replace(like, data=data), noise)
     nz, ny, nx = like.shape
     data = np.empty((ny, nx, nz), np.float32).transpose(2, 0, 1)
-    noises: list[Noise] = []
+    noises: list[NoiseOfViews] = []
     for k, (first, last) in enumerate(slabs):
         slab = layers(like, first, last)
         tell = _share(progress, k, len(slabs))

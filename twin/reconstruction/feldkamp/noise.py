@@ -11,6 +11,7 @@ views see it. On a grid of every few voxels, both cost little.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -24,7 +25,7 @@ from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
 from flexdt.twin.reconstruction.feldkamp.slabs import layers
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
-NODES: Final = 32
+NODES: Final = 24
 """Largest number of nodes of the coarse grid along a side: noise changes smoothly."""
 MIN_ROW_DISTANCE: Final = 3
 """Least distance of two compared rows of the panel: blur correlates neighbours."""
@@ -74,6 +75,26 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
+class NoiseOfViews:
+    """Noise that is computed when it is first asked for, and then kept.
+
+    Attributes:
+        meter: what the views gave.
+    """
+
+    meter: NoiseMeter
+
+    @cached_property
+    def noise(self) -> Noise:
+        """The variances."""
+        return self.meter.measured()
+
+    def sigma(self, grid: Volume) -> Float32Array:
+        """Compute the standard deviation at each voxel of a grid; see `Noise`."""
+        return self.noise.sigma(grid)
+
+
+@dataclass(frozen=True, eq=False)
 class NoiseOfSlabs:
     """Noise of a volume that was made slab by slab.
 
@@ -83,7 +104,7 @@ class NoiseOfSlabs:
     """
 
     slabs: tuple[tuple[int, int], ...]
-    noises: tuple[Noise, ...]
+    noises: tuple[NoiseOfViews, ...]
 
     def sigma(self, grid: Volume) -> Float32Array:
         """Compute the standard deviation on the complete grid; see `Noise`."""
@@ -175,7 +196,9 @@ class NoiseMeter:
 
         signs = self.note(views)
         rows = views.sizes[3]
-        columns[: len(signs)] *= signs[:, None, None]
+        for column, sign in zip(columns, signs, strict=False):
+            if sign <= 0.0:  # half of them: those with a plus stay as they are
+                np.multiply(column, sign, out=column)
         first, size = first_and_steps(self.grid)
         fdk_kernels.backproject(
             columns, rows, views.shares, views.table, *first, *size, self.data, threads()
@@ -229,12 +252,8 @@ class NoiseMeter:
         )
         return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
 
-    def found(self) -> Noise | None:
-        """Compute the noise after all views.
-
-        The variance of the views' own noise is local, from differences of neighbouring
-        layers of the alternating sum if there are more than two; that common to all views
-        is given over the radius from the rotation axis.
+    def found(self) -> NoiseOfViews | None:
+        """Return the noise after all views, which is computed when it is asked for.
 
         Returns:
             None if at most `MIN_ROW_DISTANCE` + 1 rows see the grid, or no voxel is seen.
@@ -242,6 +261,15 @@ class NoiseMeter:
         assert self._means is not None
         if self._means.shape[1] <= MIN_ROW_DISTANCE + 1 or np.isnan(self.data).all():
             return None
+        return NoiseOfViews(self)
+
+    def measured(self) -> Noise:
+        """Compute the noise.
+
+        The variance of the views' own noise is local, from differences of neighbouring
+        layers of the alternating sum if there are more than two; that common to all views
+        is given over the radius from the rotation axis.
+        """
         alternating = self.data
         if (
             alternating.shape[2] > 2
