@@ -221,7 +221,7 @@ def _type(value: Any) -> Any:
     if kind in PLAIN_TYPES:
         return kind
     if kind is tuple:
-        inner = tuple(map(_type, value))
+        inner = tuple(map(_type, value[:MAX_CHECKED_MEMBERS]))
         return None if None in inner else inner
     # A type has a hash, whatever mypy says of its metaclass.
     if _has_content(kind) or hasattr(value, "mask"):  # type: ignore[arg-type]

@@ -68,6 +68,11 @@ class Folder:
     path: Path
     names: frozenset[str]
 
+    @cached_property
+    def in_order(self) -> tuple[str, ...]:
+        """The names, sorted."""
+        return tuple(sorted(self.names))
+
     @property
     def document(self) -> str | None:
         """Name of flexdt.json, if it is there."""
@@ -143,7 +148,10 @@ class Folder:
 
     def _find(self, wanted: str) -> str | None:
         """Find a name regardless of case."""
-        return next((n for n in sorted(self.names) if n.lower() == wanted.lower()), None)
+        plain = wanted.lower()
+        if wanted in self.names:
+            return wanted
+        return next((n for n in self.in_order if n.lower() == plain), None)
 
     @cached_property
     def duplicate(self) -> tuple[str, str] | None:
@@ -163,7 +171,7 @@ class Folder:
         """
         found: dict[str, dict[int, str]] = {prefix: {} for prefix in ("di", "io", "scan")}
         twice: dict[str, tuple[str, str]] = {}
-        for name in sorted(self.names):
+        for name in self.in_order:
             match = _IMAGE.fullmatch(name)
             if match is None:
                 continue

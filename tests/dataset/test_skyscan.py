@@ -133,7 +133,7 @@ def test_what_is_not_honoured_is_told(
         ({"Rotation Step (deg)": "x"}, r"Rotation Step \(deg\) is x; allowed: a number"),
         ({"Rotation Step (deg)": None}, r"Rotation Step \(deg\) is missing"),
         ({"Rotation Direction": "UP"}, "Direction is UP; allowed: CC"),
-        ({"Reference Intensity": 0}, "the open beam is 0"),
+        ({"Reference Intensity": 0}, "Reference Intensity is 0"),
     ],
 )
 def test_the_impossible_is_refused(

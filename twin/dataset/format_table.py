@@ -10,22 +10,28 @@ from __future__ import annotations
 import fnmatch
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from typing import Final, NoReturn
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.provenance import Provenance, Stated, Use, shortened
+from flexdt.twin.dataset.provenance import Part, Provenance, Stated, Use, shortened
 
 DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 """A number as programs of some countries write it."""
 SPACES: Final = re.compile(r"\s+")
+SLASH: Final = re.compile(r" ?/ ?")
 OFF: Final = ("", "0", "off", "no", "false", "none")
 """Values of a switch that is off."""
 
 
+GEOMETRY: Final = Part.GEOMETRY
+ANGLES: Final = Part.ANGLES
+BEAM: Final = Part.BEAM
+DARK: Final = Part.DARK
+"""What a field states, for tables."""
 MOST_NAMED: Final = 60
 """Unknown fields that one warning names."""
 
@@ -56,6 +62,7 @@ class Field:
         unit: of a number; empty for none.
         neutral: values without effect, in lower case, for the last two roles; what follows
             them in brackets does not count.
+        of: what of the scan it states, whose place another statement may take.
     """
 
     name: str
@@ -64,6 +71,7 @@ class Field:
     why: str
     unit: str = ""
     neutral: tuple[str, ...] = OFF
+    of: Part = Part.NONE
 
     def without_effect(self, value: str) -> bool:
         """Return whether a value is one of `neutral`; numbers count as numbers."""
@@ -76,9 +84,9 @@ class Field:
         )
 
 
-def used(name: str, meaning: str, by: str, unit: str = "") -> Field:
+def used(name: str, meaning: str, by: str, unit: str = "", of: Part = Part.NONE) -> Field:
     """Make a field that the reader takes; `by` says for what."""
-    return Field(name, meaning, Role.USED, by, unit)
+    return Field(name, meaning, Role.USED, by, unit, of=of)
 
 
 def noted(name: str, meaning: str, because: str = "no part of the geometry") -> Field:
@@ -107,16 +115,23 @@ def dropped(
     consequence: str,
     unit: str = "",
     neutral: tuple[str, ...] = OFF,
+    of: Part = Part.NONE,
 ) -> Field:
     """Make a field that is not applied, with what follows from that."""
-    return Field(name, meaning, Role.DROPPED, consequence, unit, neutral)
+    return Field(name, meaning, Role.DROPPED, consequence, unit, neutral, of)
 
 
 def refused(
-    name: str, meaning: str, because: str, neutral: tuple[str, ...] = OFF
+    name: str,
+    meaning: str,
+    because: str,
+    neutral: tuple[str, ...] = OFF,
+    of: Part = Part.NONE,
 ) -> Field:
-    """Make a field whose value makes a scan impossible to read."""
-    return Field(name, meaning, Role.REFUSED, because, neutral=neutral)
+    """Make a field whose value makes a scan impossible to read, unless what it states is
+    given in its place.
+    """
+    return Field(name, meaning, Role.REFUSED, because, neutral=neutral, of=of)
 
 
 @dataclass(frozen=True)
@@ -164,7 +179,7 @@ def plain_name(name: str) -> str:
     """Return a field's name in lower case, with single spaces and none about a slash."""
     text = SPACES.sub(" ", name.strip().lower())
     text = text.replace("[", "(").replace("]", ")")  # brackets mean sets in patterns
-    return re.sub(r" ?/ ?", "/", text)
+    return SLASH.sub("/", text)
 
 
 def as_number(text: str) -> float:
@@ -308,6 +323,16 @@ class Ledger:
         for name in names:
             self._mark(name, Use.CONTRADICTED, f"{by} takes its place")
 
+    def give(self, parts: Collection[Part], by: str) -> None:
+        """Say that the caller gave some parts of the scan, such as by "geometry=": the values
+        that state them, whatever their fields, are contradicted.
+        """
+        for entry in self._entries:
+            rule = self.table.field(entry.rule)
+            if rule is not None and rule.of in parts:
+                entry.use = Use.CONTRADICTED
+                entry.consequence = f"{by} takes its place"
+
     def use(self, name: str, by: str = "") -> None:
         """Say that a value is used."""
         self._mark(name, Use.USED, by or self._meaning(name))
@@ -379,11 +404,19 @@ class Ledger:
                 more = f"{len(lost) - MOST_NAMED} more, which data.provenance.unknown has"
                 named.append(more)
             self.warnings.append(f"{self.file}: {many}, ignored: {', '.join(named)}")
-        return Provenance(
-            Stated(
-                e.name, e.value, e.use or Use.IGNORED, e.consequence, self.file, e.known
-            )
-            for e in self._entries
+        return Provenance(self._stated(one) for one in self._entries)
+
+    def _stated(self, entry: _Entry) -> Stated:
+        """Return a value with what became of it."""
+        rule = self.table.field(entry.rule)
+        return Stated(
+            entry.name,
+            entry.value,
+            entry.use or Use.IGNORED,
+            entry.consequence,
+            self.file,
+            entry.known,
+            Part.NONE if rule is None else rule.of,
         )
 
     def _explain(self, entry: _Entry) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from typing import Final, Self
 
@@ -24,6 +24,17 @@ class Use(StrEnum):
     """It is in nothing."""
 
 
+class Part(StrEnum):
+    """What of a scan a value states, as far as a user may say it otherwise."""
+
+    GEOMETRY = "geometry"
+    """Places of source, panel and axis, and how images lie on the panel."""
+    ANGLES = "angles"
+    BEAM = "open beam"
+    DARK = "dark"
+    NONE = ""
+
+
 @dataclass(frozen=True)
 class Stated:
     """One value of a file.
@@ -35,6 +46,7 @@ class Stated:
         consequence: what it is used for, or what its being left aside means.
         file: name of the file.
         known: whether the format's table has the field.
+        of: what of the scan it states.
     """
 
     field: str
@@ -43,17 +55,18 @@ class Stated:
     consequence: str
     file: str = ""
     known: bool = True
+    of: Part = Part.NONE
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON form, of `flexdt describe --json` and saved data sets."""
-        return {**asdict(self), "use": self.use.value}
+        return {**asdict(self), "use": self.use.value, "of": self.of.value}
 
     @classmethod
     def from_dict(cls, members: Mapping[str, object]) -> Self:
         """Make it of its JSON form.
 
         Raises:
-            ValueError: a use of another name.
+            ValueError: a use or a part of another name.
             KeyError: a member is missing.
         """
         return cls(
@@ -63,6 +76,7 @@ class Stated:
             str(members["consequence"]),
             str(members.get("file", "")),
             bool(members.get("known", True)),
+            Part(str(members.get("of", ""))),
         )
 
 
@@ -99,6 +113,20 @@ class Provenance(tuple[Stated, ...]):
         """Keep the values of a field, by its name or the last part of it."""
         return Provenance(
             one for one in self if one.field == name or one.field.endswith(f"/{name}")
+        )
+
+    def replaced(self, parts: Collection[Part], by: str) -> Provenance:
+        """Mark the values of some parts as contradicted by what the caller gave.
+
+        Args:
+            parts: of the scan.
+            by: what takes their place, such as "angles=".
+        """
+        return Provenance(
+            replace(one, use=Use.CONTRADICTED, consequence=f"{by} takes its place")
+            if one.of in parts
+            else one
+            for one in self
         )
 
     def and_also(self, more: Iterable[Stated]) -> Provenance:

@@ -43,6 +43,7 @@ class ScanGeometry:
         files: the images' names, () if unknown.
         notes: remarks for the reader.
         full_scale: largest count of the images; None if unknown.
+        kV: voltage of the tube; None if unknown.
         provenance: values of the files that it came from, with their uses.
     """
 
@@ -54,6 +55,7 @@ class ScanGeometry:
     notes: tuple[str, ...] = field(default=(), compare=False)
     full_scale: int | None = field(default=None, compare=False)
     provenance: Provenance = field(default=Provenance(), compare=False)
+    kV: float | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         """Check the lengths of `real` and of `files`, where given, and the detector's

@@ -281,6 +281,7 @@ class _Document(BaseModel):
     files: Texts = ()
     notes: Texts = ()
     full_scale: int | None = None
+    kV: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
     provenance: list[dict[str, str | bool]] = []
 
 
@@ -288,7 +289,7 @@ def geometry_text(geometry: ScanGeometry) -> str:
     """Format a geometry as this project's JSON file, one line a view, with a final newline.
 
     It has kind, schema, name, detector size (null if unknown), notes, files, `cone_vec`,
-    and `full_scale`, `provenance` and `real_cone_vec` where known.
+    and `full_scale`, `kV`, `provenance` and `real_cone_vec` where known.
     """
     if geometry.shape is not None:
         rows, cols = geometry.shape
@@ -302,6 +303,7 @@ def geometry_text(geometry: ScanGeometry) -> str:
         "notes": list(geometry.notes),
         "files": list(geometry.files),
         **({} if geometry.full_scale is None else {"full_scale": geometry.full_scale}),
+        **({} if geometry.kV is None else {"kV": geometry.kV}),
         **({"provenance": geometry.provenance.to_list()} if geometry.provenance else {}),
     }
     parts = [
@@ -360,6 +362,7 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         content.notes,
         content.full_scale,
         _provenance(content.provenance, file),
+        content.kV,
     )
 
 

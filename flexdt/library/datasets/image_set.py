@@ -171,33 +171,17 @@ class ImageSet:
         warnings: Sequence[str] = (),
         truth: Any = None,
     ) -> Self:
-        """Make a data set in memory.
+        """Make a data set in memory; see `DataSet.from_arrays`.
 
         Args:
-            counts: (n, rows, cols), integers from 0 to 65535; with a flat image also
-                images of any other scale, such as floats, or negative values after a dark
-                image was subtracted; or line integrals, which are floats without a flat
-                image. Line integrals are kept as they are, and as counts of an open beam
-                of 60000, or down to 20000 where pixels are brighter than it, for
-                functions of counts; a warning gives the number beyond the range of
-                counts.
+            counts: (n, rows, cols).
             geometry: one view for each image.
             dark, flat: (rows, cols), or several images (k, rows, cols), of which the mean
-                is taken. Without a flat image, counts have no line integrals.
-            name: of the data set.
-            warnings: doubts about it.
-            truth: sample and settings of a simulation.
+                is taken.
+            name, warnings, truth: of the data set.
 
         Raises:
-            DatasetFormatError: shapes that do not fit, values that are no counts, line
-                integrals that are not finite, or an implausible geometry. Images that are
-                zero everywhere make the data set incomplete.
-
-        Example:
-            >>> import numpy as np
-            >>> scan = ConeVec.circular(sod=100, sdd=200, angles=3, shape=(4, 5), pixel=1)
-            >>> DataSet.from_arrays(np.full((3, 4, 5), 500), scan, name="mine")
-            <DataSet 'mine': 3 projections of 4 x 5 (rows x columns), complete, 1 warning>
+            DatasetFormatError: as of `DataSet.from_arrays`.
         """
         values = np.asarray(counts)
         if values.ndim != 3 or 0 in values.shape:

@@ -180,7 +180,6 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
     exposure, camera = (
         getattr(data.truth, name, None) for name in ("exposure", "camera")
     )
-    beam = exposure or data.settings
     before = [name[:2] for name, _ in references(data)]
     start, last = np.degrees(even[[0, -1]]).tolist()
     return ScanSettings(
@@ -188,7 +187,7 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
         **figures.stated,
         sample_name=data.name,
         software="flexdt",
-        kV=None if beam is None else beam.kV,
+        kV=stated_voltage(data),
         power_W=None if exposure is None else exposure.power_W,
         exposure_ms=None if camera is None else camera.exposure_ms,
         averages=None if camera is None else float(camera.averages),
@@ -200,6 +199,14 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
         post_flats=0,
         darks=before.count("di"),
     )
+
+
+def stated_voltage(data: ImageSet) -> float | None:
+    """Return the tube's voltage [kV], of the simulated exposure or of the files; None where
+    it is unknown.
+    """
+    beam = getattr(data.truth, "exposure", None) or data.settings
+    return None if beam is None or not beam.kV else float(beam.kV)
 
 
 def _geometry(data: ImageSet) -> tuple[str, bytes]:
@@ -221,6 +228,7 @@ def _geometry(data: ImageSet) -> tuple[str, bytes]:
             notes=data.warnings,
             full_scale=data.full_scale,
             provenance=data.provenance,
+            kV=stated_voltage(data),
         )
         return GEOMETRY, geometry_text(geometry).encode()
     entry = CorrectionEntry.of(data.correction)

@@ -15,9 +15,13 @@ from flexdt.library.datasets.image_set import Arrays, Images
 from flexdt.library.datasets.image_sources import Reference, angles_deg, reference
 from flexdt.library.datasets.scan_options import Said, ScanOptions
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.provenance import Part
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import rotation_z
 from flexdt.twin.geometry.poses import Poses
+from flexdt.twin.plausibility import settled
+from flexdt.twin.plausibility.scan_geometry import azimuths
+from flexdt.twin.plausibility.stated_figures import angle_findings
 
 NO_DARK: Final = "no dark image"
 NO_FLAT: Final = "no flat image"
@@ -132,8 +136,18 @@ def with_references(data: Images, options: ScanOptions) -> Images:
         done for done, said in ((NO_DARK, dark), (NO_FLAT, flat)) if said is not None
     ]
     kept = tuple(w for w in data.warnings if not any(done in w for done in settled))
+    values = data.provenance
+    for part, name in (
+        (Part.DARK, "dark"),
+        (Part.BEAM, "flat"),
+        (Part.BEAM, "open_beam"),
+    ):
+        if options.get(name) is not None:
+            values = values.replaced((part,), f"{name}=")
     # The document lists the scan's own reference images.
-    return replace(placed(data, dark, flat), warnings=kept, document=None)
+    return replace(
+        placed(data, dark, flat), warnings=kept, document=None, provenance=values
+    )
 
 
 def placed(data: Images, dark: Reference | None, flat: Reference | None) -> Images:
@@ -172,8 +186,16 @@ def with_options(data: Images, options: ScanOptions) -> Images:
                 len(turned),
                 len(data),
             )
+        found = angle_findings(turned, azimuths(data.cone_vec))
+        doubts = settled(found, DatasetFormatError, data.where)
         data = replace(
-            data, cone_vec=turned, nominal=None, correction=None, document=None
+            data,
+            cone_vec=turned,
+            nominal=None,
+            correction=None,
+            document=None,
+            warnings=(*data.warnings, *doubts),
+            provenance=data.provenance.replaced((Part.ANGLES,), "angles="),
         )
     data = with_references(data, options)
     return cut(data, options.get("crop"), options.get("binning"), options.get("views"))

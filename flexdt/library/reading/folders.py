@@ -80,7 +80,7 @@ from flexdt.twin.dataset.file_names import (
     XRE_SETTINGS,
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
-from flexdt.twin.dataset.provenance import Provenance
+from flexdt.twin.dataset.provenance import Part, Provenance
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
@@ -236,7 +236,8 @@ def _with_given(data: DataSet, geometry: ConeVec) -> DataSet:
         *pixel_findings(geometry, pixel_mm),
     )
     doubts = settled(findings, DatasetFormatError, data.where)
-    return replace(replaced, warnings=(*replaced.warnings, *doubts))
+    values = data.provenance.replaced((Part.GEOMETRY, Part.ANGLES), "geometry=")
+    return replace(replaced, warnings=(*replaced.warnings, *doubts), provenance=values)
 
 
 @public
@@ -309,7 +310,7 @@ def _of_folder(
     content: Folder, geometry: Geometry, frames: str | None, options: ScanOptions
 ) -> DataSet:
     """Read the images of a folder; see `read_tiffs`."""
-    names = sorted(content.names)
+    names = content.in_order
     dark, flat = references_said(options, content.path)
     if dark is None:
         dark = _by_pattern(content, names, DARK_PATTERN)
@@ -560,9 +561,7 @@ def _foreign_file(content: Folder) -> Path | None:
         return None
     known = tuple(ending for form in SCAN_FORMATS for ending in form.endings)
     named = [
-        content.path / name
-        for name in sorted(content.names)
-        if name.lower().endswith(known)
+        content.path / name for name in content.in_order if name.lower().endswith(known)
     ]
     found = [path for path in named if format_of(path) is not None]
     if len(found) == 1:
@@ -577,7 +576,7 @@ def _other_scan(content: Folder) -> str:
     for form in SCAN_FORMATS:
         named = [
             name
-            for name in sorted(content.names)
+            for name in content.in_order
             if name.lower().endswith(form.endings)
             and format_of(content.path / name) is form
         ]
@@ -652,18 +651,22 @@ def _from_geometry(content: Folder) -> DataSet:
         warnings=notes,
         full_scale=geometry.full_scale,
         provenance=geometry.provenance,
-        settings=_settings_beside(content),
+        settings=_settings_beside(content, geometry.kV),
     )
 
 
-def _settings_beside(content: Folder) -> ScanSettings | None:
-    """Read the settings of a scanner's text beside a saved geometry, such as the tube's
-    voltage; None without one that can be read, which nothing here depends on.
+def _settings_beside(content: Folder, kV: float | None) -> ScanSettings | None:
+    """Read the settings of a scanner's text beside a saved geometry, with the voltage that
+    this states; None without either. A text that cannot be read is none: nothing here
+    depends on it.
     """
     try:
-        return read_settings(content, [])
+        found = read_settings(content, [])
     except DatasetError:
-        return None
+        found = None
+    if kV is None:
+        return found
+    return ScanSettings(kV=kV) if found is None else replace(found, kV=kV)
 
 
 def _from_texts(

@@ -23,7 +23,7 @@ from flexdt.library.extras import package
 from flexdt.library.reading.zeiss_table import ZEISS
 from flexdt.runtime.files.reading_within import opened
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.dataset.format_table import ANGLES, GEOMETRY, Ledger
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -37,12 +37,6 @@ NOT_APPLIED: Final = ("ImageInfo/CameraOffset", "ImageInfo/CameraFineRotation")
 VOLTAGE: Final = "ImageInfo/Voltage"
 SHOWN: Final = ("ImageInfo/", "ReconSettings/", "Alignment/")
 """Beginnings of the streams whose numbers the provenance shows."""
-GEOMETRY_STREAMS: Final = (
-    "ImageInfo/StoRADistance", "ImageInfo/DtoRADistance", "ImageInfo/PixelSize",
-    "ImageInfo/Angles", "ImageInfo/YPosition", "ReconSettings/CenterShift",
-    "Alignment/X-Shifts", "Alignment/Y-Shifts", *NOT_APPLIED,
-)  # fmt: skip
-"""Streams whose place a given geometry takes."""
 GEOMETRY_HINT: Final = ", or give it: geometry=ConeVec"
 
 
@@ -211,7 +205,7 @@ def _read(file: _Streams, geometry: ConeVec | None, name: str) -> DataSet:
         cone, doubts = _geometry(file, taken, rows)
     else:
         cone, doubts = geometry, []
-        file.said.replaced(GEOMETRY_STREAMS, "geometry=")
+        file.said.give((GEOMETRY, ANGLES), "geometry=")
     names = [f"ImageData{k // 100 + 1}/Image{k + 1}" for k in range(taken)]
     images = file.images(names, code, (rows, cols))
     flats = _reference(file, code, (rows, cols))

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Final
 
-from flexdt.twin.dataset.format_table import FormatTable, noted, noted_all, used
+from flexdt.twin.dataset.format_table import (
+    ANGLES,
+    BEAM,
+    GEOMETRY,
+    FormatTable,
+    noted,
+    noted_all,
+    used,
+)
 
 INFO: Final = "ImageInfo/"
 ZEISS: Final = FormatTable(
@@ -18,20 +26,55 @@ ZEISS: Final = FormatTable(
         used(f"{INFO}ImagesTaken", "images that were taken", "the views"),
         used(f"{INFO}DataType", "type of the pixels", "the images"),
         used(f"{INFO}XrayGeometry", "1: a cone beam", "a parallel beam is refused"),
-        used(f"{INFO}StoRADistance", "source to axis of each view", "the geometry", "mm"),
-        used(f"{INFO}DtoRADistance", "axis to panel of each view", "the geometry", "mm"),
-        used(f"{INFO}PixelSize", "pixel at the axis", "the geometry", "um"),
-        used(f"{INFO}YPosition", "height of the stage", "a helix is refused", "um"),
-        used(f"{INFO}Angles", "angle of each view", "the views", "deg"),
+        used(
+            f"{INFO}StoRADistance",
+            "source to axis of each view",
+            "the geometry",
+            "mm",
+            of=GEOMETRY,
+        ),
+        used(
+            f"{INFO}DtoRADistance",
+            "axis to panel of each view",
+            "the geometry",
+            "mm",
+            of=GEOMETRY,
+        ),
+        used(f"{INFO}PixelSize", "pixel at the axis", "the geometry", "um", of=GEOMETRY),
+        used(
+            f"{INFO}YPosition",
+            "height of the stage",
+            "a helix is refused",
+            "um",
+            of=GEOMETRY,
+        ),
+        used(f"{INFO}Angles", "angle of each view", "the views", "deg", of=ANGLES),
         used(f"{INFO}Voltage", "voltage of the tube", "reconstruct with material=", "kV"),
-        used(f"{INFO}CameraOffset", "shift of the camera", "it is not applied"),
-        used(f"{INFO}CameraFineRotation", "roll of the camera", "it is not applied"),
-        used("ReconSettings/CenterShift", "shift of the axis", "the panel", "pixels"),
-        used("Alignment/X-Shifts", "shift of each view", "the panel", "pixels"),
-        used("Alignment/Y-Shifts", "the same upwards", "the panel", "pixels"),
+        used(
+            f"{INFO}CameraOffset", "shift of the camera", "it is not applied", of=GEOMETRY
+        ),
+        used(
+            f"{INFO}CameraFineRotation",
+            "roll of the camera",
+            "it is not applied",
+            of=GEOMETRY,
+        ),
+        used(
+            "ReconSettings/CenterShift",
+            "shift of the axis",
+            "the panel",
+            "pixels",
+            of=GEOMETRY,
+        ),
+        used(
+            "Alignment/X-Shifts", "shift of each view", "the panel", "pixels", of=GEOMETRY
+        ),
+        used(
+            "Alignment/Y-Shifts", "the same upwards", "the panel", "pixels", of=GEOMETRY
+        ),
         used("ImageData*", "images", "the images"),
-        used("ReferenceData/*", "open beam", "the flat image"),
-        used("MultiReferenceData/*", "open beams", "the flat image"),
+        used("ReferenceData/*", "open beam", "the flat image", of=BEAM),
+        used("MultiReferenceData/*", "open beams", "the flat image", of=BEAM),
         *noted_all(
             "Current XrayVoltage XrayCurrent ExpTimes ExpTime Date FocusTarget "
             "MosiacMode MosiacRows MosiacColumns AbsorptionScaleFactor "

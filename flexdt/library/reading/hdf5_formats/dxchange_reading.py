@@ -42,12 +42,6 @@ PIXELS: Final = {
 }
 """Names of the pitches in the group of the detector, the winner first."""
 FLATS: Final = "process/acquisition/flat_fields"
-GEOMETRY_PLACES: Final = (
-    "exchange/theta",
-    f"{INSTRUMENT}/source/distance",
-    f"{INSTRUMENT}/detector/distance",
-    *(f"{INSTRUMENT}/detector/{name}" for several in PIXELS.values() for name in several),
-)
 
 
 def is_data_exchange(path: Path) -> bool:
@@ -250,7 +244,7 @@ def _geometry(
     )
     if given is not None:
         turned = np.zeros(0) if angles is None else np.degrees(angles)
-        compared(said, given, pitches[0] or 0.0, turned, GEOMETRY_PLACES)
+        compared(said, given, pitches[0] or 0.0, turned)
         return given
     if distances is not None:
         sod, beyond = distances[0], distances[1] - distances[0]

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from typing import Final
 
-from flexdt.twin.dataset.format_table import FormatTable, dropped, noted_all, used
+from flexdt.twin.dataset.format_table import (
+    ANGLES,
+    BEAM,
+    DARK,
+    GEOMETRY,
+    FormatTable,
+    dropped,
+    noted_all,
+    used,
+)
 
 INSTRUMENT: Final = "measurement/instrument"
 
@@ -19,32 +28,65 @@ DATA_EXCHANGE: Final = FormatTable(
     "dxfile's definition, dxchange's readers and 2-BM's and 7-BM's lists of places",
     (
         used("exchange/data", "images (angle, row, column)", "the images"),
-        used("exchange/data_white", "flat images", "the flat image"),
-        used("exchange/data_dark", "dark images", "the dark image"),
-        used("exchange/theta", "angle of each image", "the views", "deg"),
+        used("exchange/data_white", "flat images", "the flat image", of=BEAM),
+        used("exchange/data_dark", "dark images", "the dark image", of=DARK),
+        used("exchange/theta", "angle of each image", "the views", "deg", of=ANGLES),
         used(
             "process/acquisition/rotation/rotation_start",
             "angle of the first image",
             "the views, without theta",
             "deg",
+            of=ANGLES,
         ),
         used(
             "process/acquisition/rotation/rotation_step",
             "turn from image to image",
             "the views, without theta",
             "deg",
+            of=ANGLES,
         ),
         used(
             f"{INSTRUMENT}/detector/pixel_size_x",
             "pitch of columns",
             "the geometry",
             "m",
+            of=GEOMETRY,
         ),
-        used(f"{INSTRUMENT}/detector/pixel_size_y", "pitch of rows", "the geometry", "m"),
-        used(f"{INSTRUMENT}/detector/x_pixel_size", "pitch of columns", "the same", "m"),
-        used(f"{INSTRUMENT}/detector/y_pixel_size", "pitch of rows", "the same", "m"),
-        used(f"{INSTRUMENT}/source/distance", "source to sample", "the geometry", "m"),
-        used(f"{INSTRUMENT}/detector/distance", "sample to panel", "the geometry", "m"),
+        used(
+            f"{INSTRUMENT}/detector/pixel_size_y",
+            "pitch of rows",
+            "the geometry",
+            "m",
+            of=GEOMETRY,
+        ),
+        used(
+            f"{INSTRUMENT}/detector/x_pixel_size",
+            "pitch of columns",
+            "the same",
+            "m",
+            of=GEOMETRY,
+        ),
+        used(
+            f"{INSTRUMENT}/detector/y_pixel_size",
+            "pitch of rows",
+            "the same",
+            "m",
+            of=GEOMETRY,
+        ),
+        used(
+            f"{INSTRUMENT}/source/distance",
+            "source to sample",
+            "the geometry",
+            "m",
+            of=GEOMETRY,
+        ),
+        used(
+            f"{INSTRUMENT}/detector/distance",
+            "sample to panel",
+            "the geometry",
+            "m",
+            of=GEOMETRY,
+        ),
         used(
             f"{INSTRUMENT}/detector/exposure_time",
             "exposure of projections",
@@ -56,11 +98,13 @@ DATA_EXCHANGE: Final = FormatTable(
             "exposure of flat images",
             "flat images are put on that of projections",
             "s",
+            of=BEAM,
         ),
         used(
             "process/acquisition/flat_fields/different_flat_exposure",
             "whether it is another",
             "flat images",
+            of=BEAM,
         ),
         used("exchange/theta_white", "angles of the flat images", "nothing"),
         used("exchange/theta_dark", "angles of the dark images", "nothing"),
@@ -68,11 +112,13 @@ DATA_EXCHANGE: Final = FormatTable(
             f"{INSTRUMENT}/detector/rotation_center",
             "column of the axis",
             "the axis is taken in the middle column; `align` finds it",
+            of=GEOMETRY,
         ),
         dropped(
             "exchange/center",
             "column of the axis",
             "the axis is taken in the middle column; `align` finds it",
+            of=GEOMETRY,
         ),
         *noted_all("implements exchange/title exchange/name", "how the file is built"),
         *noted_all(

@@ -24,7 +24,8 @@ from flexdt.library.reading.hdf5_formats.hdf5_values import (
 from flexdt.library.reading.hdf5_formats.nxtomo_scan import NxScan
 from flexdt.library.reading.hdf5_formats.nxtomo_table import DETECTOR
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.dataset.format_table import ANGLES, GEOMETRY, Ledger
+from flexdt.twin.dataset.provenance import Part
 from flexdt.twin.findings import Finding, warning
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
@@ -50,15 +51,6 @@ FLIPS: Final = (
     "sample/z_translation",
 )
 """Figures that are told where another geometry takes their place."""
-GEOMETRY_PLACES: Final = (
-    *LENGTHS.values(),
-    f"{DETECTOR}/x_rotation_axis_pixel_position",
-    f"{DETECTOR}/y_rotation_axis_pixel_position",
-    f"{DETECTOR}/estimated_cor_from_motor",
-    f"{DETECTOR}/field_of_view",
-    *FLIPS,
-)
-"""Places whose figures another geometry replaces."""
 
 
 def file_geometry(
@@ -294,17 +286,19 @@ def _cone_rows(scan: NxScan) -> npt.NDArray[Any] | None:
     for place in ("cone_vec", "flexdt/cone_vec"):
         found = scan.members.get(place)
         if found:
-            replaced_by(scan, "flexdt's cone_vec")
+            replaced_by(scan, "flexdt's cone_vec", (GEOMETRY,))
             scan.ledger.use(place)
             return np.asarray(found[0][()])
     return None
 
 
-def replaced_by(scan: NxScan, by: str) -> None:
+def replaced_by(
+    scan: NxScan, by: str, parts: Sequence[Part] = (GEOMETRY, ANGLES)
+) -> None:
     """Set aside the figures whose place another geometry takes; a flip, a turn of the
     panel or a movement of the sample among them is told.
     """
-    scan.ledger.replaced(GEOMETRY_PLACES, by)
+    scan.ledger.give(parts, by)
     for place in (*FLIPS, *TRANSLATIONS):
         found = scan.members.get(place, [])
         values = [np.ravel(one[()]) for one in found if one.dtype.kind in "biuf"]

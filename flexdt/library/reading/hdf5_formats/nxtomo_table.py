@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from flexdt.twin.dataset.format_table import (
+    ANGLES,
+    GEOMETRY,
     FormatTable,
     dropped,
     noted,
@@ -29,37 +31,67 @@ NXTOMO: Final = FormatTable(
     (
         used(f"{DETECTOR}/data", "images", "the images"),
         used(f"{DETECTOR}/image_key", "kind of each image", "the images"),
-        used(f"{DETECTOR}/x_pixel_size", "pitch of columns", "the geometry", "m"),
-        used(f"{DETECTOR}/y_pixel_size", "pitch of rows", "the geometry", "m"),
-        used(f"{DETECTOR}/distance", "sample to panel", "the geometry", "m"),
-        used("instrument/source/distance", "source to sample", "the geometry", "m"),
-        used("*rotation_angle", "angle of each image", "the views", "deg"),
+        used(
+            f"{DETECTOR}/x_pixel_size",
+            "pitch of columns",
+            "the geometry",
+            "m",
+            of=GEOMETRY,
+        ),
+        used(
+            f"{DETECTOR}/y_pixel_size", "pitch of rows", "the geometry", "m", of=GEOMETRY
+        ),
+        used(f"{DETECTOR}/distance", "sample to panel", "the geometry", "m", of=GEOMETRY),
+        used(
+            "instrument/source/distance",
+            "source to sample",
+            "the geometry",
+            "m",
+            of=GEOMETRY,
+        ),
+        used("*rotation_angle", "angle of each image", "the views", "deg", of=ANGLES),
         used(
             f"{DETECTOR}/x_rotation_axis_pixel_position",
             "column of the axis; 0 and below count from the middle, as ESRF's files do",
             "the axis",
             "pixels",
+            of=GEOMETRY,
         ),
         used(
             f"{DETECTOR}/y_rotation_axis_pixel_position",
             "row of the source's plane, likewise",
             "the panel's height",
             "pixels",
+            of=GEOMETRY,
         ),
         used(
             f"{DETECTOR}/estimated_cor_from_motor",
             "column of the axis, from the middle",
             "the axis",
             "pixels",
+            of=GEOMETRY,
         ),
-        used(f"{DETECTOR}/x_flipped", "columns are mirrored", "the geometry"),
-        used(f"{DETECTOR}/y_flipped", "rows are mirrored", "the geometry"),
-        used(f"{DETECTOR}/transformations/rz", "180 deg mirror columns", "the geometry"),
-        used(f"{DETECTOR}/transformations/ry", "180 deg mirror rows", "the geometry"),
+        used(
+            f"{DETECTOR}/x_flipped", "columns are mirrored", "the geometry", of=GEOMETRY
+        ),
+        used(f"{DETECTOR}/y_flipped", "rows are mirrored", "the geometry", of=GEOMETRY),
+        used(
+            f"{DETECTOR}/transformations/rz",
+            "180 deg mirror columns",
+            "the geometry",
+            of=GEOMETRY,
+        ),
+        used(
+            f"{DETECTOR}/transformations/ry",
+            "180 deg mirror rows",
+            "the geometry",
+            of=GEOMETRY,
+        ),
         used(
             f"{DETECTOR}/field_of_view",
             "Half: the axis stands at a side",
             "it is compared with the axis",
+            of=GEOMETRY,
         ),
         used(
             f"{DETECTOR}/count_time",
@@ -72,14 +104,19 @@ NXTOMO: Final = FormatTable(
             "current or monitor of each image",
             "counts are put on one current",
         ),
-        used("sample/z_translation", "height of the sample", "a helix", "m"),
-        used("cone_vec", "flexdt's geometry, which wins", "the geometry", "mm"),
-        used("flexdt/cone_vec", "the same in the entry", "the geometry", "mm"),
+        used("sample/z_translation", "height of the sample", "a helix", "m", of=GEOMETRY),
+        used(
+            "cone_vec", "flexdt's geometry, which wins", "the geometry", "mm", of=GEOMETRY
+        ),
+        used(
+            "flexdt/cone_vec", "the same in the entry", "the geometry", "mm", of=GEOMETRY
+        ),
         *(
             dropped(
                 f"sample/{axis}_translation",
                 f"movement of the sample {way}, where it differs between views [m]",
                 "whether it is above or below the rotation is not said; give geometry=",
+                of=GEOMETRY,
             )
             for axis, way in (("x", "along the beam"), ("y", "across the beam"))
         ),
@@ -99,6 +136,7 @@ NXTOMO: Final = FormatTable(
             f"{DETECTOR}/transformations/*",
             "a turn or shift of the panel",
             "the panel is taken to stand upright at the central ray",
+            of=GEOMETRY,
         ),
         dropped(
             "sample/transformations/*",

@@ -10,7 +10,7 @@ import numpy as np
 
 from flexdt.library.reading.foreign_parsing import head_text
 from flexdt.library.reading.text_formats.nikon_table import NIKON
-from flexdt.runtime.files.dataset_folder import list_folder
+from flexdt.runtime.files.dataset_folder import Folder
 from flexdt.twin.dataset.format_table import Ledger, as_number
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.geometry.conventions import FloatArray
@@ -21,7 +21,7 @@ from flexdt.twin.plausibility.stated_figures import (
 
 
 def chosen_angles(
-    said: Ledger, path: Path, planned: FloatArray
+    said: Ledger, path: Path, beside: Folder, planned: FloatArray
 ) -> tuple[FloatArray, Provenance]:
     """Choose between the angles of the lists beside a file and the planned ones.
 
@@ -32,12 +32,13 @@ def chosen_angles(
     Args:
         said: what the file states; AngularStep is set aside if it differs from the list.
         path: of the file.
+        beside: its folder.
         planned: angles by InitialAngle and AngularStep [deg].
 
     Returns:
         Angles (n,) [deg], and what became of the lists' values.
     """
-    lists = [_angle_list(one) for one in _lists_beside(path)]
+    lists = [_angle_list(one) for one in _lists_beside(path, beside)]
     taken = None
     for one in lists:
         if len(one.angles) != len(planned):
@@ -97,11 +98,11 @@ def _set_aside_if_other(
     )
 
 
-def _lists_beside(path: Path) -> list[Path]:
+def _lists_beside(path: Path, beside: Folder) -> list[Path]:
     """List the files with angles beside a .xtekct file, the winner first: `_ctdata.txt`,
     with or without the scan's name before it, then NAME.ang, or the only .ang.
     """
-    names = sorted(list_folder(path.parent).names)
+    names = beside.in_order
     measured = [n for n in names if n.lower().endswith("_ctdata.txt")]
     planned = [n for n in names if n.lower().endswith(".ang")]
     found = []

@@ -23,11 +23,10 @@ from flexdt.library.reading.text_formats.text_scans import (
     compared,
     folder_name,
     ini_values,
-    projections_in,
     stated_views,
     under_a_level,
 )
-from flexdt.runtime.files.dataset_folder import list_folder
+from flexdt.runtime.files.dataset_folder import Folder, list_folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.dataset.provenance import Provenance
@@ -39,12 +38,6 @@ from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 SAME_AXIS_PX: Final = 0.01
 """Difference of two places of the axis that no images tell [pixels]."""
-GEOMETRY_FIELDS: Final = (
-    "SrcToObject", "SrcToDetector", "DetectorPixelSizeX", "DetectorPixelSizeY",
-    "AngularStep", "InitialAngle", "ObjectOffsetX", "ObjectRoll", "ObjectTilt",
-    "CentreOfRotation", "CentreOfRotationTop", "CentreOfRotationBottom", "Units",
-)  # fmt: skip
-"""Fields whose place a given geometry takes."""
 
 
 def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -70,38 +63,38 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     said.state_all((key, value) for _, key, value in values)
     views = stated_views(said, "Projections")
     size = said.whole("DetectorPixelsY"), said.whole("DetectorPixelsX")
-    cone, more = _geometry(said, path, views, size, geometry)
+    beside = list_folder(path.parent)
+    cone, more = _geometry(said, path, beside, views, size, geometry)
     place = said.text("InputFolderName", ".").replace("\\", "/")
-    folder = list_folder(path.parent / place)
-    names, told = projections_in(folder, len(cone))
-    level = said.number("WhiteLevel")
-    if level <= 0.0:
-        raise DatasetFormatError.instead(
-            f"{path}: WhiteLevel is {level:g}", level, "counts of the open beam, above 0"
-        )
-    title = said.text("Name", folder_name(path))
+    at = path.parent / place
+    folder = beside if at == path.parent else list_folder(at)
     data = under_a_level(
         said,
         folder,
         cone,
-        names,
-        level,
+        said.number("WhiteLevel"),
         size=size,
-        name=title,
-        told=told,
+        name=said.text("Name", folder_name(path)),
         voltage="XraykV",
+        beam="WhiteLevel",
     )
     return replace(data, provenance=data.provenance.and_also(more))
 
 
 def _geometry(
-    said: Ledger, path: Path, views: int, size: tuple[int, int], given: ConeVec | None
+    said: Ledger,
+    path: Path,
+    beside: Folder,
+    views: int,
+    size: tuple[int, int],
+    given: ConeVec | None,
 ) -> tuple[ConeVec, Provenance]:
     """Take the geometry of the file and the lists of angles beside it.
 
     Args:
         said: what the file states.
         path: of the file.
+        beside: its folder.
         views: that it states.
         size: rows and columns that it states.
         given: geometry in its place, or None.
@@ -124,9 +117,9 @@ def _geometry(
     tilts = np.deg2rad((roll, -said.number("ObjectTilt", 0.0)))
     start = said.number("InitialAngle", 0.0)
     planned = start + said.number("AngularStep") * np.arange(views, dtype=np.float64)
-    angles, values = chosen_angles(said, path, planned)
+    angles, values = chosen_angles(said, path, beside, planned)
     if given is not None:
-        compared(said, given, across, angles, GEOMETRY_FIELDS)
+        compared(said, given, across, angles)
         return given, values
     place = np.array(
         [[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]]

@@ -7,7 +7,6 @@ turn clockwise seen from above: the files do not say, and a wrong sense mirrors 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from flexdt.library.reading.text_formats.text_scans import (
     assume_sense,
     compared,
     ini_values,
-    projections_in,
     stated_views,
     under_a_level,
 )
@@ -28,13 +26,6 @@ from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import distance_findings
-
-GEOMETRY_FIELDS: Final = (
-    "Geometry/FDD", "Geometry/FOD", "Geometry/VoxelSizeX", "Geometry/VoxelSizeY",
-    "Geometry/Magnification", "Geometry/cx", "Geometry/cy", "CT/RotationSector",
-    "Detector/PixelsizeX", "Detector/PixelsizeY",
-)  # fmt: skip
-"""Fields whose place a given geometry takes."""
 
 
 def read_phoenix(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -53,19 +44,16 @@ def read_phoenix(path: Path, geometry: ConeVec | None) -> DataSet:
     views = stated_views(said, "CT/NumberImages")
     size = said.whole("Image/DimY"), said.whole("Image/DimX")
     cone = _geometry(said, path, views, size, geometry)
-    level = said.number("Image/FreeRay") * said.number("CT/FreeRayFactor", 1.0)
-    folder = list_folder(path.parent)
-    names, told = projections_in(folder, len(cone), prefix=path.stem)
     return under_a_level(
         said,
-        folder,
+        list_folder(path.parent),
         cone,
-        names,
-        level,
+        said.number("Image/FreeRay") * said.number("CT/FreeRayFactor", 1.0),
         size=size,
         name=path.stem,
-        told=told,
         voltage="Xray/Voltage",
+        beam="Image/FreeRay",
+        prefix=path.stem,
     )
 
 
@@ -118,7 +106,7 @@ def _geometry(
         said.number("Geometry/cy", middle[0]),
     )
     if given is not None:
-        compared(said, given, pitches[0], angles, GEOMETRY_FIELDS)
+        compared(said, given, pitches[0], angles)
         return given
     offset = ((middle[1] - column) * pitches[0], (middle[0] - row) * pitches[1])
     return ConeVec.circular(sod=sod, sdd=sdd, angles=angles, pixel=pitches, offset=offset)

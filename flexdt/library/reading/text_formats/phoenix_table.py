@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 from flexdt.twin.dataset.format_table import (
+    ANGLES,
+    BEAM,
+    GEOMETRY,
     FormatTable,
     dropped,
     noted_all,
@@ -16,34 +19,66 @@ PHOENIX: Final = FormatTable(
     "phoenix",
     "public .pca files of a v|tome|x m and a nanotom; no images of Waygate's were at hand",
     (
-        used("Geometry/FDD", "source to panel", "the geometry", "mm"),
-        used("Geometry/FOD", "source to axis", "the geometry", "mm"),
-        used("Geometry/VoxelSizeX", "pixel at the axis", "the panel's columns", "mm"),
-        used("Geometry/VoxelSizeY", "the same of rows", "the panel's rows", "mm"),
-        used("Geometry/Magnification", "FDD / FOD", "it is compared"),
-        used("Geometry/cx", "column of the central ray", "the axis", "pixels"),
-        used("Geometry/cy", "row of the source's plane", "the panel's height", "pixels"),
+        used("Geometry/FDD", "source to panel", "the geometry", "mm", of=GEOMETRY),
+        used("Geometry/FOD", "source to axis", "the geometry", "mm", of=GEOMETRY),
+        used(
+            "Geometry/VoxelSizeX",
+            "pixel at the axis",
+            "the panel's columns",
+            "mm",
+            of=GEOMETRY,
+        ),
+        used(
+            "Geometry/VoxelSizeY",
+            "the same of rows",
+            "the panel's rows",
+            "mm",
+            of=GEOMETRY,
+        ),
+        used("Geometry/Magnification", "FDD / FOD", "it is compared", of=GEOMETRY),
+        used(
+            "Geometry/cx", "column of the central ray", "the axis", "pixels", of=GEOMETRY
+        ),
+        used(
+            "Geometry/cy",
+            "row of the source's plane",
+            "the panel's height",
+            "pixels",
+            of=GEOMETRY,
+        ),
         used("CT/NumberImages", "number of images", "the views"),
-        used("CT/RotationSector", "turn of all views", "the views", "deg"),
-        used("Detector/PixelsizeX", "pixel of the panel", "it is compared", "mm"),
-        used("Detector/PixelsizeY", "the same of rows", "it is compared", "mm"),
+        used("CT/RotationSector", "turn of all views", "the views", "deg", of=ANGLES),
+        used(
+            "Detector/PixelsizeX",
+            "pixel of the panel",
+            "it is compared",
+            "mm",
+            of=GEOMETRY,
+        ),
+        used(
+            "Detector/PixelsizeY", "the same of rows", "it is compared", "mm", of=GEOMETRY
+        ),
         used("Image/DimX", "columns", "the images are compared with it"),
         used("Image/DimY", "rows", "the images are compared with it"),
-        used("Image/FreeRay", "counts of the open beam", "the flat image"),
-        used("CT/FreeRayFactor", "factor of FreeRay", "the flat image"),
+        used("Image/FreeRay", "counts of the open beam", "the flat image", of=BEAM),
+        used("CT/FreeRayFactor", "factor of FreeRay", "the flat image", of=BEAM),
         used("Xray/Voltage", "voltage of the tube", "reconstruct with material=", "kV"),
         dropped(
             "Geometry/CalibValue",
             "shift of the axis [pixels]",
             "its sign is not documented: the axis is taken at cx; `align` or "
             "`fx.find_convention` decides",
+            of=GEOMETRY,
         ),
         dropped(
             "Geometry/DetectorRot",
             "roll of the panel [deg]",
             "the panel is taken to stand upright; `align` finds its roll",
+            of=GEOMETRY,
         ),
-        dropped("Geometry/Tilt", "tilt of the panel [deg]", "it is taken as 0"),
+        dropped(
+            "Geometry/Tilt", "tilt of the panel [deg]", "it is taken as 0", of=GEOMETRY
+        ),
         *(
             dropped(
                 f"Image/{name}",
@@ -57,18 +92,23 @@ PHOENIX: Final = FormatTable(
             )
         ),
         dropped(
-            "CT/NoRotation", "views without a turn", "even steps of a turn are taken"
+            "CT/NoRotation",
+            "views without a turn",
+            "even steps of a turn are taken",
+            of=ANGLES,
         ),
         dropped(
             "DetectorShift/Enable",
             "the panel moves between views against rings",
             "the images are taken to be put back",
+            of=GEOMETRY,
         ),
         *(
             refused(
                 f"{section}/Active",
                 what,
                 "give geometry= for another trajectory than one circle",
+                of=GEOMETRY,
             )
             for section, what in (
                 ("Trajectory", "a helix or another trajectory"),

@@ -22,7 +22,6 @@ from flexdt.library.reading.text_formats.text_scans import (
     assume_sense,
     compared,
     ini_values,
-    projections_in,
     stated_views,
     under_a_level,
 )
@@ -39,12 +38,6 @@ OWN_SECTIONS: Final = ("", "System", "User", "Acquisition")
 HALF_A_TURN: Final = (180.0, 270.0)
 """Spans of a scan that is not a full turn: half of one and a fan [deg]."""
 SHIFT_HEAD_LINES: Final = 5
-GEOMETRY_FIELDS: Final = (
-    "Object to Source (mm)", "Camera to Source (mm)", "Image Pixel Size (um)",
-    "Camera Pixel Size (um)", "Camera binning", "Optical Axis (line)",
-    "Rotation Step (deg)", "Scanning Start Angle", "Rotation Direction",
-)  # fmt: skip
-"""Fields whose place a given geometry takes."""
 
 
 def is_skyscan(path: Path) -> bool:
@@ -73,20 +66,18 @@ def read_skyscan(path: Path, geometry: ConeVec | None) -> DataSet:
     size = said.whole("Number of Rows"), said.whole("Number of Columns")
     folder = list_folder(path.parent)
     cone = _geometry(said, path, folder, views, size, geometry)
-    level = _open_beam(said)
-    prefix = said.text("Filename Prefix", path.stem)
-    names, told = projections_in(folder, len(cone), _endings(said), prefix)
     return under_a_level(
         said,
         folder,
         cone,
-        names,
-        level,
+        _open_beam(said),
         size=size,
         name=path.stem,
-        told=told,
-        corrected=True,
         voltage="Source Voltage (kV)",
+        beam="Reference Intensity",
+        prefix=said.text("Filename Prefix", path.stem),
+        endings=_endings(said),
+        corrected=True,
     )
 
 
@@ -139,7 +130,7 @@ def _geometry(
     line = said.number("Optical Axis (line)", (size[0] - 1) / 2)
     shifts = _shifts(said, path, folder, views)
     if given is not None:
-        compared(said, given, pitch, angles, GEOMETRY_FIELDS)
+        compared(said, given, pitch, angles)
         return given
     cone = ConeVec.circular(sod=sod, sdd=sdd, angles=angles, pixel=pitch, shape=size)
     rows = np.array(cone.rows)

@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 from flexdt.twin.dataset.format_table import (
+    ANGLES,
+    BEAM,
+    GEOMETRY,
     FormatTable,
     dropped,
     noted_all,
@@ -25,57 +28,86 @@ SKYSCAN: Final = FormatTable(
         used("Number of Files", "number of images", "the views"),
         used("Number of Rows", "rows", "the images are compared with it"),
         used("Number of Columns", "columns", "the images are compared with it"),
-        used("Object to Source (mm)", "source to axis", "the geometry", "mm"),
-        used("Camera to Source (mm)", "source to panel", "the geometry", "mm"),
+        used(
+            "Object to Source (mm)", "source to axis", "the geometry", "mm", of=GEOMETRY
+        ),
+        used(
+            "Camera to Source (mm)", "source to panel", "the geometry", "mm", of=GEOMETRY
+        ),
         used(
             "Image Pixel Size (um)",
             "pixel at the axis, from which the panel's follows",
             "the geometry",
             "um",
+            of=GEOMETRY,
         ),
         used(
             "Camera Pixel Size (um)",
             "pixel of the panel, unbinned",
             "it is compared, or taken without Image Pixel Size",
             "um",
+            of=GEOMETRY,
         ),
-        used("Camera binning", "pixels that are joined", "the panel's pixel"),
+        used(
+            "Camera binning", "pixels that are joined", "the panel's pixel", of=GEOMETRY
+        ),
         used(
             "Optical Axis (line)",
             "row of the source's plane, from the lowest row, 0",
             "the panel's height",
+            of=GEOMETRY,
         ),
-        used("Rotation Step (deg)", "turn from view to view", "the views", "deg"),
-        used("Scanning Start Angle", "angle of the first view", "the views", "deg"),
+        used(
+            "Rotation Step (deg)", "turn from view to view", "the views", "deg", of=ANGLES
+        ),
+        used(
+            "Scanning Start Angle",
+            "angle of the first view",
+            "the views",
+            "deg",
+            of=ANGLES,
+        ),
         used(
             "Rotation Direction",
             "CC as TIGRE reads it, CW the other way",
             "the views; the wrong one mirrors the volume",
+            of=ANGLES,
         ),
-        used("Use 360 Rotation", "a full turn or half of one", "it is compared"),
+        used(
+            "Use 360 Rotation", "a full turn or half of one", "it is compared", of=ANGLES
+        ),
         used(
             "Reference Intensity",
             "counts of the open beam",
             "the open beam, before depth",
+            of=BEAM,
         ),
-        used("Depth (bits)", "of the counts", "the open beam, 2^depth - 1"),
+        used("Depth (bits)", "of the counts", "the open beam, 2^depth - 1", of=BEAM),
         used("Image Format", "TIFF or BMP", "the images"),
-        used("*.csv/shifts", "shift of each view [unbinned pixels]", "the panel's place"),
+        used(
+            "*.csv/shifts",
+            "shift of each view [unbinned pixels]",
+            "the panel's place",
+            of=GEOMETRY,
+        ),
         refused(
             "Scanning Trajectory",
             "ROUND or another",
             "give geometry= for a helix",
             neutral=("", "round"),
+            of=GEOMETRY,
         ),
         dropped(
             "Random Movement",
             "views are shifted at random against rings",
             "without a .csv of shifts the images are taken to be put back",
+            of=GEOMETRY,
         ),
         dropped(
             "Image Rotation",
             "turn of the camera [deg]",
             "the panel is taken to stand upright; `align` finds its roll",
+            of=GEOMETRY,
         ),
         *(
             dropped(
@@ -83,6 +115,7 @@ SKYSCAN: Final = FormatTable(
                 "width over height of a pixel",
                 "pixels are taken to be square",
                 neutral=("1", ""),
+                of=GEOMETRY,
             )
             for name in ("Camera X/Y Ratio", "CameraXYRatio")
         ),
@@ -102,18 +135,26 @@ SKYSCAN: Final = FormatTable(
             "Camera Offset",
             "the camera stands aside",
             "the axis is taken in the middle column; `align` finds it",
+            of=GEOMETRY,
         ),
-        dropped("List mode", "views in an order of their own", "even steps are taken"),
+        dropped(
+            "List mode",
+            "views in an order of their own",
+            "even steps are taken",
+            of=ANGLES,
+        ),
         dropped(
             f"{RECONSTRUCTION}/Postalignment",
             "shift of the axis in NRecon [pixels]",
             "its sign is not documented: the axis is taken in the middle column; `align` "
             "or `fx.find_convention` decides",
+            of=GEOMETRY,
         ),
         dropped(
             f"{RECONSTRUCTION}/Sub-scan post alignment*",
             "the same of parts [pixels]",
             "the axis is taken in the middle column; `align` finds it",
+            of=GEOMETRY,
         ),
         *noted_all(
             "Flat Field Correction; Geometrical Correction; Median Filtering; "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -17,7 +17,7 @@ from flexdt.library.datasets.scan_inputs import NO_DARK
 from flexdt.library.reading.listed_images import listed
 from flexdt.runtime.files.dataset_folder import Folder
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
-from flexdt.twin.dataset.format_table import Ledger, as_number
+from flexdt.twin.dataset.format_table import ANGLES, GEOMETRY, Ledger, as_number
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.plausibility import PlausibilityCode, settled
@@ -53,7 +53,7 @@ def ini_values(text: str) -> list[tuple[str, str, str]]:
 
 
 def projections_in(
-    folder: Folder, views: int, endings: Sequence[str] = TIFFS, prefix: str = ""
+    folder: Folder, views: int, endings: Sequence[str], prefix: str
 ) -> tuple[list[str], list[str]]:
     """List the names of the projections by their numbers, missing ones included.
 
@@ -121,7 +121,6 @@ def compared(
     given: ConeVec,
     pitch: float,
     angles_deg: np.ndarray,
-    names: Collection[str],
 ) -> None:
     """Set the figures of a file aside for a given geometry, and tell where they differ.
 
@@ -130,9 +129,8 @@ def compared(
         given: geometry in its place.
         pitch: of the columns by the file [mm].
         angles_deg: of the views by the file.
-        names: fields whose place it takes.
     """
-    said.replaced(names, "geometry=")
+    said.give((GEOMETRY, ANGLES), "geometry=")
     for found in (
         angle_findings(given, np.deg2rad(angles_deg)),
         pixel_findings(given, pitch),
@@ -170,36 +168,40 @@ def under_a_level(
     said: Ledger,
     folder: Folder,
     cone: ConeVec,
-    names: Sequence[str],
     level: float,
     *,
-    size: tuple[int, int] | None = None,
-    name: str = "",
-    told: Sequence[str] = (),
+    size: tuple[int, int],
+    name: str,
+    voltage: str,
+    beam: str,
+    prefix: str = "",
+    endings: Sequence[str] = TIFFS,
     corrected: bool = False,
-    voltage: str = "",
 ) -> DataSet:
-    """Make the data set of images under an open beam of one level, without dark images.
+    """Make the data set of a folder's images under an open beam of one level, without dark
+    images.
 
     Args:
         said: what the text states; it is finished here.
         folder: of the images.
         cone: one view for each of them.
-        names: of the images.
         level: counts of the open beam.
-        size: rows and columns that the text states; None: it does not.
+        size: rows and columns that the text states.
         name: of the data set.
-        told: doubts so far.
+        voltage: name of the field of the tube's voltage [kV].
+        beam: name of the field of the level.
+        prefix: of the images' names, where some have it.
+        endings: of images, in lower case.
         corrected: the maker has divided the images by the open beam.
-        voltage: name of the field of the tube's voltage [kV]; "" for none.
 
     Raises:
         DatasetError: images are missing or of another shape than the text states, or the
             open beam is not above 0.
     """
+    names, told = projections_in(folder, len(cone), endings, prefix)
     top = NEVER_FULL if corrected else None
     data = listed(folder, cone, names, (), (), name, full_scale=top)
-    if size is not None and data.shape != size:
+    if data.shape != size:
         raise DatasetFormatError(
             f"{said.path} says {size[1]} x {size[0]} pixels, {names[0]} has "
             f"{data.shape[1]} x {data.shape[0]}",
@@ -207,7 +209,7 @@ def under_a_level(
         )
     if level <= 0.0:
         raise DatasetFormatError.instead(
-            f"{said.path}: the open beam is {level:g}", level, "counts above 0"
+            f"{said.path}: {beam} is {level:g}", level, "counts of the open beam, above 0"
         )
     white = np.full((1, *data.shape), level, np.float32)
     settings = stated_voltage(said, voltage)

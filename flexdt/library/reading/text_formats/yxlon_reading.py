@@ -15,7 +15,6 @@ from flexdt.library.data_set import DataSet
 from flexdt.library.reading.foreign_parsing import xml_values
 from flexdt.library.reading.text_formats.text_scans import (
     compared,
-    projections_in,
     stated_views,
     under_a_level,
 )
@@ -30,12 +29,6 @@ from flexdt.twin.plausibility.scan_geometry import distance_findings
 PARAMETERS: Final = "ConeBeamScanParameter"
 FOLDERS: Final = ("Projections", "Projektionen")
 """Names of the folder of the images, beside the file."""
-GEOMETRY_FIELDS: Final = (
-    "PixelSize/Width", "PixelSize/Height", "ScanTrajectory/PixelPitch",
-    "ScanTrajectory/Fdd", "ScanTrajectory/Fod", "ScanTrajectory/StartAngle",
-    "ScanTrajectory/Rotation",
-)  # fmt: skip
-"""Fields whose place a given geometry takes."""
 
 
 def is_yxlon(path: Path) -> bool:
@@ -60,21 +53,17 @@ def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
     views = stated_views(said, "ScanTrajectory/NumberOfProjections")
     size = said.whole("ProjectionSize/Height"), said.whole("ProjectionSize/Width")
     cone = _geometry(said, path, views, geometry)
-    level = 2.0 ** said.whole("ProjectionBitdepth", 16) - 1.0
     there = [path.parent / name for name in FOLDERS if (path.parent / name).is_dir()]
-    folder = list_folder(there[0] if there else path.parent)
-    names, told = projections_in(folder, len(cone))
     return under_a_level(
         said,
-        folder,
+        list_folder(there[0] if there else path.parent),
         cone,
-        names,
-        level,
+        2.0 ** said.whole("ProjectionBitdepth", 16) - 1.0,
         size=size,
         name=path.parent.name,
-        told=told,
-        corrected=True,
         voltage="Voltage",
+        beam="ProjectionBitdepth",
+        corrected=True,
     )
 
 
@@ -94,6 +83,6 @@ def _geometry(said: Ledger, path: Path, views: int, given: ConeVec | None) -> Co
     span = said.number("ScanTrajectory/Rotation", 360.0)
     angles = start - span / views * np.arange(views, dtype=np.float64)
     if given is not None:
-        compared(said, given, pixel[0], angles, GEOMETRY_FIELDS)
+        compared(said, given, pixel[0], angles)
         return given
     return ConeVec.circular(sod=sod, sdd=sdd, angles=angles, pixel=pixel)

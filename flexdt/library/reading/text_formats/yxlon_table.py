@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 from flexdt.twin.dataset.format_table import (
+    ANGLES,
+    BEAM,
+    GEOMETRY,
     FormatTable,
     dropped,
     noted_all,
@@ -16,35 +19,69 @@ YXLON: Final = FormatTable(
     "YXLON",
     "TIGRE's YXLONDataLoader; from documentation, no file of YXLON's seen",
     (
-        used("PixelSize/Width", "pitch of columns", "the geometry", "mm"),
-        used("PixelSize/Height", "pitch of rows", "the geometry", "mm"),
+        used("PixelSize/Width", "pitch of columns", "the geometry", "mm", of=GEOMETRY),
+        used("PixelSize/Height", "pitch of rows", "the geometry", "mm", of=GEOMETRY),
         used("ProjectionSize/Width", "columns", "the images are compared with it"),
         used("ProjectionSize/Height", "rows", "the images are compared with it"),
-        used("ProjectionBitdepth", "bits of the counts", "the open beam, 2^bits - 1"),
-        used("ScanTrajectory/PixelPitch", "unit of the trajectory", "the geometry", "mm"),
-        used("ScanTrajectory/Fdd", "source to panel", "the geometry", "PixelPitch"),
-        used("ScanTrajectory/Fod", "source to axis", "the geometry", "PixelPitch"),
+        used(
+            "ProjectionBitdepth",
+            "bits of the counts",
+            "the open beam, 2^bits - 1",
+            of=BEAM,
+        ),
+        used(
+            "ScanTrajectory/PixelPitch",
+            "unit of the trajectory",
+            "the geometry",
+            "mm",
+            of=GEOMETRY,
+        ),
+        used(
+            "ScanTrajectory/Fdd",
+            "source to panel",
+            "the geometry",
+            "PixelPitch",
+            of=GEOMETRY,
+        ),
+        used(
+            "ScanTrajectory/Fod",
+            "source to axis",
+            "the geometry",
+            "PixelPitch",
+            of=GEOMETRY,
+        ),
         used("ScanTrajectory/NumberOfProjections", "number of images", "the views"),
-        used("ScanTrajectory/StartAngle", "angle of the first view", "the views", "deg"),
-        used("ScanTrajectory/Rotation", "turn of all views", "the views", "deg"),
+        used(
+            "ScanTrajectory/StartAngle",
+            "angle of the first view",
+            "the views",
+            "deg",
+            of=ANGLES,
+        ),
+        used(
+            "ScanTrajectory/Rotation", "turn of all views", "the views", "deg", of=ANGLES
+        ),
         used("Voltage", "voltage of the tube", "reconstruct with material=", "kV"),
         refused(
             "ScanTrajectory@type",
             "kind of trajectory",
             "give geometry= for another than a circle",
             neutral=("circletrajectory", ""),
+            of=GEOMETRY,
         ),
         dropped(
             "ScanTrajectory/YoCenter",
             "shift of the axis [PixelPitch]",
             "its sign is not documented: the axis is taken in the middle column; `align` or "
             "`fx.find_convention` decides",
+            of=GEOMETRY,
         ),
         *(
             dropped(
                 f"DejustmentParameter/{name}",
                 what,
                 "it is taken as 0; `align` finds the axis and the panel's roll",
+                of=GEOMETRY,
             )
             for name, what in (
                 ("HorizontalDetectorOffset", "shift of the panel [PixelPitch]"),

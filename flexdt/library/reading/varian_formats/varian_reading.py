@@ -22,7 +22,7 @@ from flexdt.library.reading.text_formats.text_scans import stated_voltage
 from flexdt.library.reading.varian_formats.varian_table import VARIAN
 from flexdt.library.reading.varian_formats.xim_images import XimImage, read_xim
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
-from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.dataset.format_table import ANGLES, GEOMETRY, Ledger
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 from flexdt.twin.plausibility import settled
@@ -31,12 +31,6 @@ from flexdt.twin.plausibility.scan_geometry import distance_findings
 
 SOURCE_BEFORE_GANTRY_DEG: Final = 90.0
 MM_PER_CM: Final = 10.0
-GEOMETRY_FIELDS: Final = (
-    "SAD", "SID", "ImagerResX", "ImagerResY", "ImagerLat", "xim/KVSourceRtn",
-    "xim/GantryRtn", "xim/KVDetectorLat", "xim/KVDetectorLng", "xim/KVSourceVrt",
-    "xim/KVDetectorVrt", "xim/PixelWidth", "xim/PixelHeight",
-)  # fmt: skip
-"""Fields whose place a given geometry takes."""
 LEAST_OPEN: Final = 1e-6
 """Of the brightest pixel of the open beam: what a dead one counts as."""
 
@@ -69,10 +63,10 @@ def read_varian(path: Path, geometry: ConeVec | None) -> DataSet:
         f"{said.file}: Varian's format is read from documentation, no file of Varian's was "
         "seen: compare a part whose handedness and size you know",
     )
-    cone = _geometry(said, path, images, geometry)
+    at = images.angles()
+    cone = _geometry(said, path, images, at, geometry)
     beam = _Images(said, "air", shape)
     opened = beam.read(_open_beam(said, path), path)
-    at = images.angles()
     for share, angle in zip(shares, at, strict=True):
         share /= _between(opened, beam.angles() if len(opened) > 1 else at[:1], angle)
     data = DataSet.from_arrays(
@@ -247,20 +241,20 @@ def _between(
 
 
 def _geometry(
-    said: Ledger, path: Path, images: _Images, given: ConeVec | None
+    said: Ledger, path: Path, images: _Images, angles: FloatArray, given: ConeVec | None
 ) -> ConeVec:
-    """Take the geometry of the file, or the given one in its place.
+    """Take the geometry of the file, at the source's angles [deg], or the given one in its
+    place.
 
     Raises:
         DatasetFormatError: a number is missing, or distances are such as no scanner has.
     """
-    angles = images.angles()
     across = MM_PER_CM * images.numbers("KVDetectorLat", _lat(said) / MM_PER_CM)
     along = MM_PER_CM * images.numbers("KVDetectorLng", 0.0)
     sod, sdd = said.number("SAD"), said.number("SID")
     pitch = said.number("ImagerResX"), said.number("ImagerResY")
     if given is not None:
-        said.replaced(GEOMETRY_FIELDS, "geometry=")
+        said.give((GEOMETRY, ANGLES), "geometry=")
         return given
     source = images.millimetres("KVSourceVrt")
     panel = images.millimetres("KVDetectorVrt")

@@ -4,40 +4,83 @@ from __future__ import annotations
 
 from typing import Final
 
-from flexdt.twin.dataset.format_table import FormatTable, dropped, noted, noted_all, used
+from flexdt.twin.dataset.format_table import (
+    ANGLES,
+    BEAM,
+    GEOMETRY,
+    FormatTable,
+    dropped,
+    noted,
+    noted_all,
+    used,
+)
 
 VARIAN: Final = FormatTable(
     "Varian",
     "TIGRE's Varian reader, RTK's reader of ProBeam and pylinac; from documentation, no "
     "file of Varian's seen",
     (
-        used("SAD", "source to axis", "the geometry", "mm"),
-        used("SID", "source to panel", "the geometry", "mm"),
+        used("SAD", "source to axis", "the geometry", "mm", of=GEOMETRY),
+        used("SID", "source to panel", "the geometry", "mm", of=GEOMETRY),
         used("ImagerSizeX", "columns", "the images are compared with it"),
         used("ImagerSizeY", "rows", "the images are compared with it"),
-        used("ImagerResX", "pitch of columns", "the geometry", "mm"),
-        used("ImagerResY", "pitch of rows", "the geometry", "mm"),
-        used("ImagerLat", "the panel aside", "it is compared", "mm"),
+        used("ImagerResX", "pitch of columns", "the geometry", "mm", of=GEOMETRY),
+        used("ImagerResY", "pitch of rows", "the geometry", "mm", of=GEOMETRY),
+        used("ImagerLat", "the panel aside", "it is compared", "mm", of=GEOMETRY),
         used("Bowtie", "a filter before the patient", "which image of the open beam"),
-        used("xim/KVSourceRtn", "angle of the source", "the views", "deg"),
-        used("xim/GantryRtn", "that of the gantry", "the views, 90 deg before", "deg"),
-        used("xim/KVDetectorLat", "the panel aside", "the geometry", "cm"),
-        used("xim/KVDetectorLng", "the panel along the axis", "the geometry", "cm"),
+        used("xim/KVSourceRtn", "angle of the source", "the views", "deg", of=ANGLES),
+        used(
+            "xim/GantryRtn",
+            "that of the gantry",
+            "the views, 90 deg before",
+            "deg",
+            of=ANGLES,
+        ),
+        used("xim/KVDetectorLat", "the panel aside", "the geometry", "cm", of=GEOMETRY),
+        used(
+            "xim/KVDetectorLng",
+            "the panel along the axis",
+            "the geometry",
+            "cm",
+            of=GEOMETRY,
+        ),
         used("xim/KVNormChamber", "reading of the beam's chamber", "scale of the images"),
-        used("xim/KVSourceVrt", "source to axis", "it is compared", "cm"),
-        used("xim/KVDetectorVrt", "axis to panel, below 0", "it is compared", "cm"),
-        used("xim/PixelWidth", "pitch of columns", "it is compared", "cm"),
-        used("xim/PixelHeight", "pitch of rows", "it is compared", "cm"),
+        used("xim/KVSourceVrt", "source to axis", "it is compared", "cm", of=GEOMETRY),
+        used(
+            "xim/KVDetectorVrt",
+            "axis to panel, below 0",
+            "it is compared",
+            "cm",
+            of=GEOMETRY,
+        ),
+        used("xim/PixelWidth", "pitch of columns", "it is compared", "cm", of=GEOMETRY),
+        used("xim/PixelHeight", "pitch of rows", "it is compared", "cm", of=GEOMETRY),
         used(
             "xim/KVKiloVolts", "voltage of the tube", "reconstruct with material=", "kV"
         ),
-        used("air/KVNormChamber", "that of the open beam", "scale of the open beam"),
-        used("air/KVSourceRtn", "angle of the source", "the open beam's views", "deg"),
-        used("air/GantryRtn", "that of the gantry", "the open beam's views", "deg"),
+        used(
+            "air/KVNormChamber",
+            "that of the open beam",
+            "scale of the open beam",
+            of=BEAM,
+        ),
+        used(
+            "air/KVSourceRtn",
+            "angle of the source",
+            "the open beam's views",
+            "deg",
+            of=BEAM,
+        ),
+        used(
+            "air/GantryRtn", "that of the gantry", "the open beam's views", "deg", of=BEAM
+        ),
         noted("air/*", "of the open beam's images", "of their calibration"),
         *(
             dropped(
-                f"xim/{name}", what, "the panel and the source are taken to stand upright"
+                f"xim/{name}",
+                what,
+                "the panel and the source are taken to stand upright",
+                of=GEOMETRY,
             )
             for name, what in (
                 ("KVDetectorRtn", "roll of the panel"),
@@ -53,6 +96,7 @@ VARIAN: Final = FormatTable(
             "angle of the source against the gantry [deg]",
             "KVSourceRtn has it, else 90 is taken",
             neutral=("", "90", "-90", "270"),
+            of=ANGLES,
         ),
         *noted_all(
             "@schemaLocation @noNamespaceSchemaLocation @Version StartAngle "
