@@ -18,7 +18,11 @@ from flexdt.library.datasets.cutting import cut
 from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.datasets.reference_look import looked_at, order_doubts
-from flexdt.library.datasets.scan_inputs import geometry_said, references_said
+from flexdt.library.datasets.scan_inputs import (
+    geometry_said,
+    references_said,
+    with_statements,
+)
 from flexdt.library.datasets.scan_options import ScanOptions
 from flexdt.twin import long_work
 from flexdt.twin.algorithms import DEFAULT, PLAIN
@@ -119,15 +123,17 @@ class DataSet(ImageSet):
         values = np.asarray(counts)
         shape = values.shape[1:] if values.ndim == 3 else None
         before, opened = references_said(options)
+        stated = geometry_said(geometry, options, shape)
         made = super().from_arrays(
             values,
-            geometry_said(geometry, options, shape),
+            stated.cone_vec,
             dark=before.read(shape, "dark") if before and shape else None,
             flat=opened.read(shape, "flat") if opened and shape else None,
             name=name,
             warnings=warnings,
             truth=truth,
         )
+        made = with_statements(made, stated)
         made = looked_at(replace(made, warnings=(*made.warnings, *order_doubts(made))))
         kept = {key: options.get(key) for key in ("crop", "binning", "views")}
         return cut(made, **kept)  # type: ignore[arg-type]

@@ -5,8 +5,7 @@ The formats are in `flexdt.twin.exchange`, their files in `flexdt.library.datase
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -15,22 +14,19 @@ import numpy as np
 
 from flexdt.library.datasets.exchange import (
     FORMATS,
-    Format,
-    Given,
-    import_geometry,
-    load_geometry,
+    format_of_ending,
+    load_stated,
     save_geometry,
-    text_of,
     write_geometry,
 )
 from flexdt.library.datasets.exchange_formats import OWN_ENDINGS
+from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.cil_arrays import ORIGIN, PANEL, POSES, cil_arrays
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.leap_arrays import leap_arrays
 from flexdt.twin.exchange.number_tables import (
     TOMOSIPO_NAMES,
-    read_json,
     read_tomosipo,
     tomosipo_arrays,
 )
@@ -277,49 +273,14 @@ def load(
 ) -> ConeVec:
     """Read a geometry from a file; see `ConeVec.load`.
 
-    Args:
-        file: its path.
-        format: name of `FORMATS`; None: that of the file's ending, where .json is
-            flexdt's own document or a CTSimU scenario.
-        shape: detector (rows, cols), for formats that lack it; others must agree.
-        pixel: its edge, or edges along columns and rows [mm], likewise.
+    Doubts about it, and what of its file is not applied or not known, are warnings.
 
-    Raises:
-        ExchangeError: an unknown format or ending, an invalid file, or one that
-            contradicts shape or pixel.
+    Args and errors as of `load_stated`.
     """
-    path = Path(file)
-    pitch = None if pixel is None else _pair(pixel)
-    # Numbers of a damaged file may have any size; what they contradict is found by checks.
-    with np.errstate(all="ignore"):
-        if format is None and path.suffix.lower() == OWN_ENDING:
-            return _value(_json(path, Given(shape, pitch)))
-        chosen = format or _format(path, [form for form in FORMATS.values() if form.read])
-        return _value(import_geometry(path, chosen, Given(shape, pitch)))
-
-
-def _json(path: Path, given: Given) -> ScanGeometry:
-    """Read our own document, or a CTSimU scenario, by its content.
-
-    A document with a "file" section is a scenario.
-
-    Args:
-        path: file.
-        given: shape and pitch, which must agree with the file's or complete it.
-
-    Raises:
-        ExchangeError: the file is neither.
-        GeometryError: it contradicts `given`.
-    """
-    if "file" in read_json(text_of(path), str(path)):
-        return import_geometry(path, "ctsimu", given)
-    stored = load_geometry(path)
-    if given.shape is not None:
-        stored.cone_vec.with_shape(stored.shape).of_shape(given.shape)
-    given.check_pitch(stored, path)
-    if stored.shape is not None:
-        return stored
-    return ScanGeometry(stored.cone_vec, given.shape)
+    stated = load_stated(file, format, shape, pixel)
+    for note in stated.notes:
+        warn_caller(note)
+    return _value(stated)
 
 
 def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
@@ -339,57 +300,10 @@ def save(cone_vec: ConeVec, file: File, format: str | None) -> None:
     if format is None and path.suffix.lower() == OWN_ENDING:
         save_geometry(_scan(cone_vec), path)
     else:
-        chosen = format or _format(
+        chosen = format or format_of_ending(
             path, [form for form in FORMATS.values() if form.write]
         )
         write_geometry(_scan(cone_vec), path, chosen)
-
-
-def _format(path: Path, among: Iterable[Format]) -> str:
-    """Return the name of the format with a file's ending, in either case; `OWN_ENDING`,
-    flexdt's own, matches none.
-
-    Args:
-        path: file.
-        among: the formats.
-
-    Raises:
-        ExchangeError: no format has this ending; the message lists all.
-    """
-    by_ending = {
-        ending: form.name
-        for form in among
-        for ending in form.endings
-        if ending != OWN_ENDING
-    }
-    name = by_ending.get(path.suffix.lower())
-    if name is None:
-        endings = [OWN_ENDING, *by_ending]
-        raise ExchangeError(
-            f"{path.name}: the ending of a geometry file is one of {', '.join(endings)}",
-            {"asked": path.suffix, "allowed": endings},
-        )
-    return name
-
-
-def _pair(pixel: float | Sequence[float]) -> tuple[float, float]:
-    """Convert one pixel edge, or two along columns and rows, to two floats [mm].
-
-    Raises:
-        GeometryError: anything but one or two numbers above 0.
-    """
-    try:
-        along_columns, along_rows = np.broadcast_to(
-            np.asarray(pixel, dtype=np.float64), (2,)
-        )
-    except (TypeError, ValueError):
-        along_columns = along_rows = math.nan
-    if not (along_columns > 0 and along_rows > 0):
-        raise GeometryError(
-            f"pixel is {pixel!r}; allowed: one number or two above 0 [mm]",
-            {"asked": repr(pixel), "allowed": "> 0"},
-        )
-    return float(along_columns), float(along_rows)
 
 
 def _scan(cone_vec: ConeVec) -> ScanGeometry:

@@ -112,8 +112,10 @@ def test_the_voltage_of_a_file_is_saved(tilt: float, tmp_path: Path) -> None:
     data = fx.open(write(tmp_path / "nikon", draw))
     data.save(tmp_path / "kept")
     again = fx.open(tmp_path / "kept")
-    assert again.settings is not None and again.settings.kV == 143.5
+    assert again.settings is not None
+    assert again.settings.kV == 143.5
     again.save(tmp_path / "twice")
     twice = fx.open(tmp_path / "twice")
-    assert twice.settings is not None and twice.settings.kV == 143.5
+    assert twice.settings is not None
+    assert twice.settings.kV == 143.5
     assert twice.provenance == data.provenance

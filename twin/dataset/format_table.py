@@ -18,6 +18,7 @@ from typing import Final, NoReturn
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.provenance import Part, Provenance, Stated, Use, shortened
+from flexdt.twin.errors import TwinError
 
 DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 """A number as programs of some countries write it."""
@@ -193,6 +194,13 @@ def as_number(text: str) -> float:
         return math.nan
 
 
+def series(values: Sequence[str]) -> str:
+    """Return the values of a field in all views as one: itself, or their number and ends."""
+    if len(set(values)) <= 1:
+        return values[0] if values else ""
+    return f"{len(values)} values: {values[0]} to {values[-1]}"
+
+
 @dataclass
 class _Entry:
     """A value while its file is read: `use` is None until something is made of it."""
@@ -213,11 +221,13 @@ class Ledger:
         table: of its format.
         path: for messages.
         warnings: what a user should know, in the order in which it was found.
+        error: type of the errors that it raises.
     """
 
     table: FormatTable
     path: str
     warnings: list[str] = field(default_factory=list)
+    error: type[TwinError] = DatasetFormatError
     _entries: list[_Entry] = field(default_factory=list)
     _by_name: dict[str, list[_Entry]] = field(default_factory=dict)
 
@@ -226,16 +236,22 @@ class Ledger:
         """The file's name."""
         return re.split(r"[/\\]", self.path)[-1]
 
-    def state(self, name: str, value: object, place: str = "") -> None:
+    def state(
+        self, name: str, value: object, place: str = "", *, listed: bool = False
+    ) -> None:
         """Enter a value of the file, in its order; every one is entered once.
 
         Args:
             name: of its field, as the table has it.
             value: as text.
             place: where it stands in the file, if that is not the field's name.
+            listed: whether it belongs to a member of a list, whose others state other
+                things.
         """
         entry = _Entry(place or name, name, str(value))
         self._entries.append(entry)
+        if listed:
+            return
         self._by_name.setdefault(plain_name(name), []).append(entry)
 
     def state_all(self, values: Iterable[tuple[str, object]]) -> None:
@@ -336,6 +352,14 @@ class Ledger:
     def use(self, name: str, by: str = "") -> None:
         """Say that a value is used."""
         self._mark(name, Use.USED, by or self._meaning(name))
+
+    def use_all(self) -> None:
+        """Say that all values whose fields the reader takes by the table are used."""
+        for entry in self._entries:
+            rule = self.table.field(entry.rule)
+            if entry.use is None and rule is not None and rule.role is Role.USED:
+                entry.use = Use.USED
+                entry.consequence = rule.why or rule.meaning
 
     def use_place(self, place: str, by: str) -> None:
         """Say that the value at a place of the file is used, whatever its field."""
@@ -468,4 +492,4 @@ class Ledger:
         """Raise the error of a field, with the file, what it says and what is allowed."""
         message = f"{self.path}: {name} is {shortened(said)}; allowed: {allowed}"
         facts = {"path": self.path, "missing": name, "asked": said}
-        raise DatasetFormatError(message, facts)
+        raise self.error(message, facts)

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_panel
+from flexdt.twin.exchange.geometry_tables import CIL
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.exchange.view_arrays import (
     Arrays,
@@ -23,6 +24,7 @@ from flexdt.twin.exchange.view_arrays import (
     require_names,
     require_shape,
     sizes_of,
+    stated,
     vectors_of,
 )
 
@@ -100,4 +102,7 @@ def read_cil(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
         raise ExchangeError.instead(f"{file}: origin {origin!r}", origin, tuple(ORIGINS))
     along_x, along_y = ORIGINS[origin]
     parts = (source, detector, along_x * pitch_u * right, along_y * pitch_v * up)
-    return ScanGeometry(cone_vec_of(np.concatenate(parts, axis=1), file), (rows, columns))
+    cone = cone_vec_of(np.concatenate(parts, axis=1), file)
+    said = stated(CIL, arrays, file)
+    said.use_all()
+    return ScanGeometry(cone, (rows, columns)).accounted(said)

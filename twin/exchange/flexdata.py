@@ -15,9 +15,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange import geometry as g
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry_tables import FLEXDATA
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import (
     FloatArray,
@@ -33,8 +35,8 @@ VERSION: Final = "0.1.0"
 ROUNDED_MM: Final = 1e-4
 """Largest deviation of any number of a view from the format's value [mm]. Scripts of
 step scans write angles with six decimals, which is some 1e-5 mm."""
-UNSUPPORTED: Final = ("axs_roll", "axs_pitch", "vol_rot")
-"""Names of the format's numbers that must be zero to be read; see the documentation."""
+SAME_DISTANCE: Final = 1e-6
+"""Relative difference of two statements of a distance that is none."""
 _NUMBERS: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("src2obj", "det2obj", "src2det"), math.nan),
     **dict.fromkeys(("det_rows", "det_cols", "det_pixel"), math.nan),
@@ -157,7 +159,7 @@ def read_flexdata(
         file: for messages.
 
     Raises:
-        ExchangeError: not such a file, a number of `UNSUPPORTED` that is not 0, no number
+        ExchangeError: not such a file, a leaning axis or a turned volume, no number
             of views, or distances that are not a scanner's.
     """
     # flexDATA writes tuples, which are no TOML, and repairs them itself on reading.
@@ -171,13 +173,6 @@ def read_flexdata(
             f"{file} is not valid TOML: {error}", {"path": file}
         ) from None
     numbers = {name: _values(name, records, file) for name in _NUMBERS}
-    for name in UNSUPPORTED:
-        if np.any(numbers[name]):
-            raise ExchangeError(
-                f"{file}: {name} is not zero: flexDATA tilts source and detector orbits about "
-                "different points then, which is not imitated",
-                {"path": name, "allowed": 0},
-            )
     if views is None:
         count = records.get("proj_count", views)
     else:
@@ -189,6 +184,7 @@ def read_flexdata(
     if shape is None and "det_rows" in records and "det_cols" in records:
         shape = (int(numbers["det_rows"]), int(numbers["det_cols"]))
     sod, odd, sdd = (float(numbers[name]) for name in ("src2obj", "det2obj", "src2det"))
+    both = {"src2obj and det2obj": sod + odd, "src2det": sdd}
     sod, odd = (
         (sdd - odd if math.isnan(sod) else sod),
         (sdd - sod if math.isnan(odd) else odd),
@@ -218,7 +214,17 @@ def read_flexdata(
     version = records.get("flextoml_version")
     note = f"flextoml_version is {version!r}; this reads {VERSION}"
     notes = () if version == VERSION else (note,)
-    return ScanGeometry(cone_vec_of(rows, file), shape, notes=notes).rows_up()
+    geometry = ScanGeometry(cone_vec_of(rows, file), shape, notes=notes).rows_up()
+    said = Ledger(FLEXDATA, file, error=ExchangeError)
+    for name, value in records.items():
+        zeros = isinstance(value, list) and not any(value)
+        said.state(name, "0" if zeros else str(value))
+    said.use_all()
+    first, other = both.values()
+    if abs(first - other) > SAME_DISTANCE * abs(other):
+        why = f"src2obj and det2obj say {first:.6g} mm, src2det {other:.6g} mm"
+        said.set_aside("src2det", f"{why}; the former are taken")
+    return geometry.accounted(said)
 
 
 def _values(name: str, records: Mapping[str, Any], file: str) -> FloatArray:

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -73,6 +74,17 @@ class ScanGeometry:
             raise ExchangeError(
                 f"detector shape {self.shape}; allowed: at least one pixel"
             )
+
+    def accounted(self, said: Ledger) -> ScanGeometry:
+        """Return the geometry with what became of its file's values, and what they told as
+        notes.
+
+        Raises:
+            TwinError: of the ledger: a value that is refused has an effect.
+        """
+        values = said.finish()
+        notes = (*self.notes, *said.warnings)
+        return replace(self, notes=notes, provenance=self.provenance.and_also(values))
 
     def __len__(self) -> int:
         """Return the number of views."""

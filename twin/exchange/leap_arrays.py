@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.exchange.geometry import ScanGeometry, require_panel
+from flexdt.twin.exchange.geometry_tables import LEAP
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.exchange.view_arrays import (
     SPACE,
@@ -27,6 +28,7 @@ from flexdt.twin.exchange.view_arrays import (
     require_names,
     require_shape,
     sizes_of,
+    stated,
 )
 
 SOURCE: Final = "sourcePositions"
@@ -79,4 +81,7 @@ def read_leap(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     source, detector = (numbers_of(arrays, n, file, shape) for n in (SOURCE, DETECTOR))
     down, right = (directions_of(arrays, name, file, views) for name in (ROWS, COLUMNS))
     parts = (source, detector, pitch_u * right, pitch_v * down)
-    return ScanGeometry(cone_vec_of(np.concatenate(parts, axis=1), file), (rows, columns))
+    cone = cone_vec_of(np.concatenate(parts, axis=1), file)
+    said = stated(LEAP, arrays, file)
+    said.use_all()
+    return ScanGeometry(cone, (rows, columns)).accounted(said)

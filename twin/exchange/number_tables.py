@@ -18,9 +18,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
+from flexdt.twin.dataset.format_table import Ledger, series
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
+from flexdt.twin.exchange.geometry_tables import ASTRA, CSV, OWN, TOMOSIPO
+from flexdt.twin.exchange.view_arrays import stated
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.json_text import parse_json
@@ -30,6 +33,8 @@ VECTOR_NAMES: Final = tuple(
 )
 TOMOSIPO_NAMES: Final = ("shape", "src_pos", "det_pos", "det_v", "det_u")
 _SHAPE = re.compile(r"^\s*#\s*detector rows (\d+), columns (\d+)\s*$", re.MULTILINE)
+LONGEST_SHOWN: Final = 200
+"""Characters of an unknown key's value that are kept."""
 KIND: Final = "flexdt geometry"
 SCHEMA: Final = 1
 Rows = list[Annotated[list[float], Field(min_length=12, max_length=12)]]
@@ -47,9 +52,9 @@ def vectors_text(geometry: ScanGeometry) -> str:
     )
 
 
-def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
+def read_vectors_text(text: str, file: str = "<text>") -> ScanGeometry:
     """Read a line of twelve numbers for each view, between blanks, commas or semicolons;
-    # begins a comment.
+    # begins a comment, which is told.
 
     Empty lines are skipped; at least one view must be there.
 
@@ -58,15 +63,37 @@ def read_vectors_text(text: str, file: str = "<text>") -> ConeVec:
             line or view.
     """
     rows = []
+    comments: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
-        content = line.split("#", 1)[0].strip()
-        if not content:
-            continue
-        rows.append(_numbers(re.split(r"[\s,;]+", content.strip(" \t,;")), file, number))
-    return cone_vec_of(rows, file)
+        content, mark, comment = line.partition("#")
+        comments += [comment.strip()] if mark and comment.strip() else []
+        if content.strip():
+            words = re.split(r"[\s,;]+", content.strip(" \t,;"))
+            rows.append(_numbers(words, file, number))
+    return _vectors(rows, file, comments)
 
 
-def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") -> ConeVec:
+def _vectors(
+    rows: npt.ArrayLike, file: str, comments: Sequence[str] = ()
+) -> ScanGeometry:
+    """Make the geometry of ASTRA's vectors, with what its file states."""
+    cone = cone_vec_of(rows, file)
+    said = Ledger(ASTRA, file, error=ExchangeError)
+    said.state("vectors", f"{len(cone)} x 12 numbers")
+    said.use("vectors")
+    _comment(said, comments)
+    return ScanGeometry(cone).accounted(said)
+
+
+def _comment(said: Ledger, comments: Sequence[str]) -> None:
+    """Enter the comments of a file as one value."""
+    if comments:
+        said.state("comment", "; ".join(dict.fromkeys(comments)))
+
+
+def read_vectors_array(
+    array: npt.NDArray[np.generic], file: str = "<array>"
+) -> ScanGeometry:
     """Read ASTRA's cone_vec from an array (n, 12) of integers or floats.
 
     Raises:
@@ -75,7 +102,7 @@ def read_vectors_array(array: npt.NDArray[np.generic], file: str = "<array>") ->
     if array.ndim != 2 or array.shape[1] != 12 or not _real(array):
         message = f"{file}: an array of {array.dtype}"
         raise ExchangeError.of_shape(message, array.shape, ("n", 12), ", numbers")
-    return cone_vec_of(array, file)
+    return _vectors(array, file)
 
 
 def csv_text(geometry: ScanGeometry) -> str:
@@ -102,7 +129,7 @@ def csv_text(geometry: ScanGeometry) -> str:
 
 def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
     """Parse a table whose header names the twelve numbers, in any order; other columns
-    are ignored.
+    are told.
 
     Empty lines and lines that begin with # are skipped. A `file` column gives file names
     if no row leaves it empty. Without a comment of the shape that is None.
@@ -137,11 +164,24 @@ def read_csv(text: str, file: str = "<csv>") -> ScanGeometry:
             raise ExchangeError.instead(problem, len(cells), len(header), line=number)
         rows.append(_numbers([cells[i] for i in at], file, number))
         files.append(cells[header.index("file")] if "file" in header else "")
-    return ScanGeometry(
+    geometry = ScanGeometry(
         cone_vec_of(rows, file),
         (int(shape[1]), int(shape[2])) if shape else None,
         files=tuple(files) if all(files) else (),
     )
+    said = Ledger(CSV, file, error=ExchangeError)
+    if shape:
+        said.state("# detector rows, columns", f"{shape[1]}, {shape[2]}")
+    for i, name in enumerate(header):
+        said.state(name, series([cells[i] for _, cells in lines[1:]]))
+    said.use_all()
+    comments = [
+        line[1:].strip()
+        for line in text.splitlines()
+        if line.startswith("#") and not _SHAPE.match(line)
+    ]
+    _comment(said, comments)
+    return geometry.accounted(said)
 
 
 def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
@@ -202,7 +242,10 @@ def read_tomosipo(
         raise ExchangeError(f"{file}: shape must be two whole numbers (rows, columns)")
     source, detector, v, u = (np.asarray(a, dtype=np.float64)[:, ::-1] for a in vectors)
     rows = np.concatenate([source, detector, u, v], axis=1)
-    return ScanGeometry(cone_vec_of(rows, file), (int(shape[0]), int(shape[1])))
+    said = stated(TOMOSIPO, arrays, file)
+    said.use_all()
+    cone = cone_vec_of(rows, file)
+    return ScanGeometry(cone, (int(shape[0]), int(shape[1]))).accounted(said)
 
 
 def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
@@ -324,7 +367,7 @@ def _rows(name: str, cone_vec: ConeVec) -> str:
 def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
     """Parse and validate the project's JSON file of a geometry.
 
-    Keys that are null count as absent, unknown keys are ignored; of rows and columns both
+    Keys that are null count as absent, unknown keys are told; of rows and columns both
     or neither is given.
 
     Args:
@@ -353,7 +396,7 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         raise ExchangeError(
             f"{file}: detector: rows and columns must be whole numbers above 0"
         )
-    return ScanGeometry(
+    geometry = ScanGeometry(
         cone_vec_of(content.cone_vec, f"{file}: cone_vec"),
         None if rows is None or columns is None else (rows, columns),
         None if real is None else cone_vec_of(real, f"{file}: real_cone_vec"),
@@ -364,6 +407,20 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
         _provenance(content.provenance, file),
         content.kV,
     )
+    return _with_unknown(geometry, document, file)
+
+
+def _with_unknown(
+    geometry: ScanGeometry, document: Mapping[str, Any], file: str
+) -> ScanGeometry:
+    """Return the geometry with the keys of its document that are not flexdt's, told."""
+    said = Ledger(OWN, file, error=ExchangeError)
+    panel = document.get("detector")
+    inner = panel if isinstance(panel, dict) else {}
+    for name, value in (*document.items(), *((f"detector/{k}", inner[k]) for k in inner)):
+        if OWN.field(name) is None and name != "detector":
+            said.state(name, json.dumps(value)[:LONGEST_SHOWN])
+    return geometry.accounted(said)
 
 
 def _provenance(members: list[dict[str, str | bool]], file: str) -> Provenance:

@@ -11,13 +11,16 @@ negative distances. Curved detectors are not supported.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
 
+from flexdt.twin.dataset.format_table import Ledger, as_number, series
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry, require_panel
+from flexdt.twin.exchange.geometry_tables import RTK
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.geometry.conventions import (
     FloatArray,
@@ -54,13 +57,6 @@ NAMES: Final = (
 """Names of the nine numbers: angles [deg], then lengths [mm]."""
 MATRIX: Final = "Matrix"
 """Element of a view's projection matrix."""
-_PASSED_OVER = (
-    MATRIX,
-    "CollimationUInf",
-    "CollimationUSup",
-    "CollimationVInf",
-    "CollimationVSup",
-)
 _ROOT = "RTKThreeDCircularGeometry"
 
 
@@ -169,8 +165,8 @@ def read_rtk(
 
     Raises:
         ExchangeError: no such XML, another version, a number that is not finite, a
-            parallel view, a matrix that contradicts the numbers of its view, or an unknown
-            element that is not 0, such as a curved detector.
+            parallel view, a matrix that contradicts the numbers of its view, a number that
+            a view states twice, or a curved detector.
     """
     try:
         require_bytes("xml", len(text), file)
@@ -184,36 +180,68 @@ def read_rtk(
     if root.tag != _ROOT or root.get("version") != VERSION:
         problem = f"{file}: {root.tag} version {root.get('version')}"
         raise ExchangeError.instead(problem, root.tag, f"{_ROOT} version {VERSION}")
-    common = dict.fromkeys(NAMES, 0.0)  # numbers before the views hold for all
+    said = Ledger(RTK, file, error=ExchangeError)
+    said.state_all((f"@{name}", value) for name, value in root.attrib.items())
+    common: dict[str, str] = {}  # numbers before the views hold for all
+    each: dict[str, list[str]] = {}
     rows: list[FloatArray] = []
     stated: list[tuple[float, float]] = []
     twice: list[tuple[str, FloatArray, tuple[float, ...]]] = []
     for element in root:
-        if element.tag == "Projection":
-            where = f"{file}: view {len(rows)}"
-            values = dict(common)
-            for entry in element:
-                _take(entry, values, file)
-            matrix = _matrix(element, where)
-            numbers = tuple(values[n] for n in NAMES)
-            distances = numbers[3], numbers[4]
-            if matrix is not None and not any(numbers):
-                distances, row = view_of_matrix(matrix, pitch_mm, where)
-            elif values["SourceToDetectorDistance"] == 0.0:
-                problem = f"{where} is parallel (no source-detector distance)"
-                raise ExchangeError.instead(problem, 0.0, "a cone beam", row=len(rows))
-            else:
-                row = row_of(numbers, pitch_mm)
-                if matrix is not None:
-                    twice.append((where, matrix, numbers))
-            rows.append(row)
-            stated.append(distances)
-        else:
+        if element.tag != "Projection":
             _take(element, common, file)
+            continue
+        where = f"{file}: view {len(rows)}"
+        own = {f"Projection@{name}": value for name, value in element.attrib.items()}
+        for entry in element:
+            _take(entry, own, file)
+        for name, text_of in own.items():
+            each.setdefault(name, []).append(text_of)
+        values = common | own
+        numbers = tuple(_number(name, values, file) for name in NAMES)
+        matrix = _matrix(own.get(MATRIX), where)
+        distances = numbers[3], numbers[4]
+        if matrix is not None and not any(numbers):
+            distances, row = view_of_matrix(matrix, pitch_mm, where)
+        elif numbers[4] == 0.0:
+            problem = f"{where} is parallel (no source-detector distance)"
+            raise ExchangeError.instead(problem, 0.0, "a cone beam", row=len(rows))
+        else:
+            row = row_of(numbers, pitch_mm)
+            if matrix is not None:
+                twice.append((where, matrix, numbers))
+        rows.append(row)
+        stated.append(distances)
     _require_distances(stated, file)
     for where, matrix, numbers in twice:
         _require_agreement(matrix, numbers, pitch_mm, where)
-    return ScanGeometry(cone_vec_of(rows, file), shape)
+    _account(said, common, each)
+    return ScanGeometry(cone_vec_of(rows, file), shape).accounted(said)
+
+
+def _account(
+    said: Ledger, common: Mapping[str, str], each: Mapping[str, Sequence[str]]
+) -> None:
+    """Enter the numbers of all views and of each in a ledger, and compare them.
+
+    Args:
+        said: of the file.
+        common: name -> text of what stands before the views.
+        each: name -> texts of the views that state it.
+    """
+    for name, value in common.items():
+        said.state(name, value, f"all views/{name}")
+    for name, values in each.items():
+        shown = series(values) if name != MATRIX else f"{len(values)} matrices"
+        said.state(name, shown)
+    said.use_all()
+    for name, value in common.items():
+        others = [one for one in each.get(name, ()) if as_number(one) != as_number(value)]
+        if others and RTK.field(name) is not None:
+            both = (
+                f"{name} is {value} for all views and {others[0]} in one, which is taken"
+            )
+            said.set_place_aside(f"all views/{name}", both)
 
 
 def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
@@ -304,23 +332,19 @@ def view_of_matrix(
     return (sid, sdd), row
 
 
-def _matrix(view: ElementTree.Element, where: str) -> FloatArray | None:
-    """Return the projection matrix (3, 4) of a view's XML, or None if it has none.
+def _matrix(text: str | None, where: str) -> FloatArray | None:
+    """Return the projection matrix (3, 4) of a view, or None if it has none.
 
     Args:
-        view: its element.
+        text: of its element.
         where: file and view, for messages.
 
     Raises:
         ExchangeError: it has not twelve finite numbers.
     """
-    text = view.findtext(MATRIX)
     if text is None:
         return None
-    try:
-        values = np.array([float(part) for part in text.split()])
-    except ValueError:
-        values = np.array([math.nan])
+    values = np.array([as_number(part) for part in text.split()])
     if values.shape != (12,) or not np.isfinite(values).all():
         problem = f"{where}: its Matrix is {' '.join(text.split())[:60]!r}"
         raise ExchangeError.instead(problem, text[:60], "12 finite numbers", path=MATRIX)
@@ -363,31 +387,30 @@ def _require_agreement(
         raise ExchangeError.instead(problem, far, allowed, path=MATRIX)
 
 
-def _take(entry: ElementTree.Element, values: dict[str, float], file: str) -> None:
-    """Parse the number of one XML element and put it into `values`.
-
-    Elements of `_PASSED_OVER`, and unknown ones that are 0, are skipped.
-
-    Args:
-        entry: the element.
-        values: name -> number of a view, changed in place.
-        file: for messages.
+def _take(entry: ElementTree.Element, values: dict[str, str], file: str) -> None:
+    """Put the text of an XML element, and of its attributes and members, into `values`.
 
     Raises:
-        ExchangeError: it is not finite, or an unknown element is not 0.
+        ExchangeError: the view states it a second time, differently.
     """
-    if entry.tag in _PASSED_OVER:
-        return
-    try:
-        value = float(entry.text or "")
-    except ValueError:
-        value = math.nan
+    found = [(entry.tag, (entry.text or "").strip())] if not len(entry) else []
+    found += [(f"{entry.tag}@{name}", value) for name, value in entry.attrib.items()]
+    found += [(f"{entry.tag}/{one.tag}", (one.text or "").strip()) for one in entry]
+    for name, text in found:
+        if values.setdefault(name, text) != text:
+            problem = f"{file}: {name} is {values[name][:40]} and {text[:40]}"
+            raise ExchangeError.instead(problem, text[:40], "one value", path=name)
+
+
+def _number(name: str, values: Mapping[str, str], file: str) -> float:
+    """Return one of the nine numbers of a view; 0 where it is not stated, as RTK does.
+
+    Raises:
+        ExchangeError: it is not finite.
+    """
+    text = values.get(name, "0")
+    value = as_number(text)
     if not math.isfinite(value):
-        text = (entry.text or "")[:40]
-        problem = f"{file}: {entry.tag} is {text!r}"
-        raise ExchangeError.instead(problem, text, "a finite number", path=entry.tag)
-    if entry.tag in values:
-        values[entry.tag] = value
-    elif value != 0.0:  # RadiusCylindricalDetector and whatever else bends the geometry
-        problem = f"{file}: {entry.tag} = {value:g} is not understood"
-        raise ExchangeError.instead(problem, value, NAMES, path=entry.tag)
+        problem = f"{file}: {name} is {text[:40]!r}"
+        raise ExchangeError.instead(problem, text[:40], "a finite number", path=name)
+    return value

@@ -18,12 +18,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.exchange.geometry import (
-    ExchangeError,
     ScanGeometry,
     require_each,
     require_panel,
 )
+from flexdt.twin.exchange.geometry_tables import TIGRE
 from flexdt.twin.exchange.number_tables import cone_vec_of
 from flexdt.twin.exchange.view_arrays import (
     SPACE,
@@ -33,6 +34,7 @@ from flexdt.twin.exchange.view_arrays import (
     require_names,
     require_shape,
     sizes_of,
+    stated,
     views_of,
 )
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
@@ -48,6 +50,8 @@ turns [rad]."""
 PANEL: Final = ("nDetector", "dDetector", "sDetector")
 """Counts and sizes; the direction of rows (v) comes first, as z does in offOrigin."""
 ANGLES: Final = "angles"
+SAME_SIZE: Final = 1e-6
+"""Relative difference of two statements of the panel's size that is none."""
 
 
 def tigre_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
@@ -151,7 +155,7 @@ def _turns(axes: FloatArray) -> FloatArray:
 def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert TIGRE's attributes and angles to a geometry.
 
-    A COR of zeros is allowed; other attributes are ignored.
+    A COR of zeros is allowed.
 
     Args:
         arrays: name -> array, as from `tigre_arrays`.
@@ -162,10 +166,7 @@ def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
             rotation (COR).
     """
     require_names(arrays, (*PER_VIEW, "nDetector", "dDetector", ANGLES), file)
-    if "COR" in arrays and np.any(arrays["COR"]):
-        raise ExchangeError.instead(
-            f"{file}: COR is not zero", "COR", "offOrigin", path="COR"
-        )
+    said = stated(TIGRE, arrays, file)
     views = views_of(arrays, ANGLES, file)
     angles = numbers_of(arrays, ANGLES, file, (views,))
     dso, dsd, off_origin, off_detector, turned = (
@@ -181,7 +182,25 @@ def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     parts = [np.einsum("nij,nj->ni", turn, part) for part in placed]
     for place in parts[:2]:
         place -= off_origin[:, ::-1]
-    return ScanGeometry(cone_vec_of(np.concatenate(parts, axis=1), file), (rows, columns))
+    cone = cone_vec_of(np.concatenate(parts, axis=1), file)
+    said.use_all()
+    _compare_sizes(said, arrays, (rows * pitch_v, columns * pitch_u))
+    return ScanGeometry(cone, (rows, columns)).accounted(said)
+
+
+def _compare_sizes(said: Ledger, arrays: Arrays, sizes: tuple[float, float]) -> None:
+    """Set the panel's stated size aside where it is not that of its pixels [mm]."""
+    if "sDetector" not in arrays:
+        return
+    stated_mm = np.ravel(arrays["sDetector"])
+    fits = stated_mm.dtype.kind in "iuf" and stated_mm.shape == (len(sizes),)
+    if not fits or not np.allclose(stated_mm, sizes, rtol=SAME_SIZE):
+        shown = " x ".join(f"{one:.6g}" if fits else str(one) for one in stated_mm)
+        pixels = " x ".join(f"{one:.6g}" for one in sizes)
+        why = (
+            f"sDetector is {shown} mm, nDetector x dDetector {pixels} mm, which is taken"
+        )
+        said.set_aside("sDetector", why)
 
 
 def _each(arrays: Arrays, name: str, size: int, file: str, views: int) -> FloatArray:

@@ -10,12 +10,37 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.dataset.format_table import FormatTable, Ledger
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.geometry.conventions import FloatArray
 
 Arrays = Mapping[str, npt.NDArray[np.generic]]
 SPACE: Final = 3
 """Number of coordinates of a place or a direction."""
+
+
+def stated(table: FormatTable, arrays: Arrays, file: str) -> Ledger:
+    """Enter the arrays of a file in a ledger, each as its shape or its value.
+
+    Args:
+        table: of the format.
+        arrays: name -> array.
+        file: for messages.
+    """
+    said = Ledger(table, file, error=ExchangeError)
+    for name, array in arrays.items():
+        said.state(name, _shown(np.asarray(array)))
+    return said
+
+
+def _shown(values: npt.NDArray[np.generic]) -> str:
+    """Return an array's value, its few values, or its shape."""
+    flat = values.ravel()
+    if flat.size and (flat == flat[0]).all():
+        return str(flat[0])
+    if flat.size <= SPACE:
+        return " ".join(map(str, flat))
+    return f"{' x '.join(map(str, values.shape))} of {values.dtype}"
 
 
 def require_shape(geometry: ScanGeometry, format_name: str) -> tuple[int, int]:

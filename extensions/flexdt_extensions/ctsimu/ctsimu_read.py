@@ -11,13 +11,20 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from flexdt.twin.exchange import ExchangeError, ScanGeometry, cone_vec_of, read_json
+from flexdt.twin.exchange import (
+    CTSIMU,
+    ExchangeError,
+    Ledger,
+    ScanGeometry,
+    cone_vec_of,
+    read_json,
+)
 from flexdt.twin.geometry.conventions import FloatArray, rotation_about
 
 MOST: Final = 1_000_000
@@ -110,7 +117,60 @@ def read_ctsimu(
     Raises:
         ExchangeError: names file, key and the allowed values.
     """
-    return ScenarioReader(read_json(text, file), file, beside).geometry()
+    reader = ScenarioReader(read_json(text, file, Watched), file, beside)
+    return reader.geometry().accounted(reader.account())
+
+
+class Watched(dict[str, Any]):
+    """A JSON object that records which of its keys were read."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.seen: set[str] = set()
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return a member, which counts as read."""
+        self.seen.add(key)
+        return super().get(key, default)
+
+    def __getitem__(self, key: str) -> Any:
+        self.seen.add(key)
+        return super().__getitem__(key)
+
+    def stated(self, where: str = "", field: str = "") -> Iterator[_Stated]:
+        """Yield what the document states below a place: each number with its unit and its
+        drifts as one value, each text, and lists of numbers as one.
+        """
+        for key, value in self.items():
+            at, name = f"{where}.{key}".lstrip("."), f"{field}/{key}".lstrip("/")
+            seen = key in self.seen
+            if isinstance(value, Watched) and "value" in value:
+                used = seen and {"value", "drifts"} & value.seen != set()
+                yield at, name, _shown(value), used
+                for inner in value.keys() - _OF_NUMBERS:
+                    yield f"{at}.{inner}", f"{name}/{inner}", _shown(value[inner]), False
+            elif isinstance(value, Watched) and value:
+                yield from value.stated(at, name)
+            elif isinstance(value, list) and any(isinstance(v, Watched) for v in value):
+                for i, one in enumerate(value):
+                    inner_of = Watched({"": one}) if not isinstance(one, Watched) else one
+                    yield from inner_of.stated(f"{at}[{i}]", name)
+            elif value != [] and value != {}:
+                yield at, name, _shown(value), seen
+
+
+_Stated = tuple[str, str, str, bool]
+"""Place, name of the field, value, and whether it was read."""
+_OF_NUMBERS: Final = frozenset({"value", "unit", "drifts", "uncertainty"})
+"""Members of a number that stand for it."""
+
+
+def _shown(value: object) -> str:
+    """Return a value of the document as text: a number with its unit; null is nothing."""
+    if isinstance(value, dict) and set(value) <= {"value", "unit"}:
+        unit = value["unit"] if value.get("unit") else ""
+        return f"{_shown(value['value'])} {unit}".strip()
+    return "" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
 class ScenarioReader:
@@ -135,6 +195,31 @@ class ScenarioReader:
         self._beside = beside
         self._check_version()
         self._count = self._size("acquisition", "number_of_projections")
+
+    def account(self, images: bool = False) -> Ledger:
+        """Enter the values of the document in a ledger, those that were read as used.
+
+        Args:
+            images: whether images are made of it, so that what changes them and was not
+                read is told.
+        """
+        said = Ledger(CTSIMU, self._file, error=ExchangeError)
+        document = self._document
+        for place, name, value, read in (
+            document.stated() if isinstance(document, Watched) else ()
+        ):
+            said.state(name, value, place, listed="[" in place)
+            rule = CTSIMU.field(name)
+            if read and rule is not None:
+                said.use_place(place, "it is read")
+            elif (
+                images
+                and rule is not None
+                and rule.role == "used"
+                and not rule.without_effect(value)
+            ):
+                said.set_place_aside(place, f"{place} is {value}, which is not applied")
+        return said
 
     def geometry(self) -> ScanGeometry:
         """Compute the geometry of the scenario's frames, known and real.

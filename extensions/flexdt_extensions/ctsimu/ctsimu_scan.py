@@ -6,7 +6,7 @@ values that are not used become notes. Nothing is ignored in silence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final, TypeVar
 
@@ -33,6 +33,7 @@ from flexdt_extensions.ctsimu.ctsimu_read import (
     Beside,
     Pose,
     ScenarioReader,
+    Watched,
     drifts_of,
     place,
     seen_from,
@@ -43,33 +44,6 @@ _MA: Final = {"mA": 1.0, "uA": 1e-3, "A": 1e3}
 _S: Final = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 _G_CM3: Final = {"g/cm^3": 1.0, "kg/m^3": 1e-3}
 _PER_J: Final = {"1/J": 1.0}
-_WORDS: Final = frozenset(
-    (
-        "comment",
-        "contact",
-        "date_changed",
-        "date_created",
-        "dead_time",
-        "description",
-        "drifts",
-        "endian",
-        "gain",
-        "headersize",
-        "id",
-        "known_to_reconstruction",
-        "manufacturer",
-        "model",
-        "name",
-        "scan_mode",
-        "scan_speed",
-        "temperature",
-        "type",
-        "uncertainty",
-        "unit",
-        "version",
-    )
-)
-"""Keys that change no image here, or only in combination with one that is read."""
 _MIN_CHANGE: Final = 1e-9
 """Changes of place [mm] and direction that count as zero."""
 DUPLEX_WIRE: Final = 0.69
@@ -197,51 +171,7 @@ def read_scenario(text: str, file: str, beside: Beside) -> ScenarioScan:
     Raises:
         ExchangeError: names file, key and the allowed values.
     """
-    return _ScanReader(read_json(text, file, _Watched), file, beside).scan()
-
-
-class _Watched(dict[str, Any]):
-    """A JSON object that records which of its keys were read."""
-
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
-        self.seen: set[str] = set()
-
-    def get(self, key: str, default: Any = None) -> Any:
-        self.seen.add(key)
-        return super().get(key, default)
-
-    def __getitem__(self, key: str) -> Any:
-        self.seen.add(key)
-        return super().__getitem__(key)
-
-    def unseen(self, where: str = "") -> Iterator[str]:
-        """Yield the paths of values that nobody has read, also in nested objects that
-        were read.
-
-        Keys in `_WORDS`, such as comments, and values that say nothing are left out.
-        """
-        for key, value in self.items():
-            at = f"{where}.{key}".lstrip(".")
-            if key not in self.seen and key not in _WORDS and _says_something(value):
-                yield at
-            elif key in self.seen:
-                for i, one in enumerate(value if isinstance(value, list) else [value]):
-                    if isinstance(one, _Watched):
-                        yield from one.unseen(
-                            f"{at}[{i}]" if isinstance(value, list) else at
-                        )
-
-
-def _says_something(value: object) -> bool:
-    """Return whether a value holds anything but None, False, zero, and empty texts and
-    lists; an object does if a member outside `_WORDS` does.
-    """
-    if isinstance(value, dict):
-        return any(
-            _says_something(one) for key, one in value.items() if key not in _WORDS
-        )
-    return value not in (None, False, "", [], 0)
+    return _ScanReader(read_json(text, file, Watched), file, beside).scan()
 
 
 class _ScanReader(ScenarioReader):
@@ -304,8 +234,8 @@ class _ScanReader(ScenarioReader):
             (),
         )
         self._check(scan)
-        left = [f"{place} is ignored" for place in self._document.unseen()]  # type: ignore[attr-defined]
-        return replace(scan, notes=(*geometry.notes, *self._notes, *left))
+        told = geometry.accounted(self.account(images=True)).notes
+        return replace(scan, notes=(*told, *self._notes))
 
     def _check(self, scan: ScenarioScan) -> None:
         """Check that a scan with scattering has one spectrum, and samples that rest on

@@ -7,10 +7,13 @@ detector's size, are arguments.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+
+import numpy as np
 
 from flexdt.library.datasets.exchange_formats import (
     FORMATS,
@@ -24,13 +27,16 @@ from flexdt.library.datasets.exchange_formats import (
 from flexdt.library.datasets.geometry_content import Given, arrays_of, text_of
 from flexdt.library.datasets.image_set import Images, ImageSet
 from flexdt.runtime.files.whole_files import write_whole
+from flexdt.twin.dataset.provenance import Part
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import (
     geometry_text,
     read_geometry_text,
+    read_json,
     read_vectors_array,
 )
-from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.cone_vec import ConeVec, Shape2
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.plausibility import Operation, examine, settled
 from flexdt.twin.signatures import File
@@ -42,9 +48,11 @@ __all__ = [
     "Given",
     "ScanGeometry",
     "export_dataset",
+    "format_of_ending",
     "geometry_of",
     "import_geometry",
     "load_geometry",
+    "load_stated",
     "save_geometry",
     "text_of",
     "with_geometry",
@@ -275,10 +283,115 @@ def load_geometry(path: str | PathLike[str]) -> ScanGeometry:
     """
     file = Path(path)
     if file.suffix.lower() == NPY:
-        geometry = ScanGeometry(read_vectors_array(arrays_of(file)["array"], str(file)))
+        geometry = read_vectors_array(arrays_of(file)["array"], str(file))
     else:
         geometry = read_geometry_text(text_of(file), str(file))
     return _with_doubts(geometry, file)
+
+
+def load_stated(
+    file: File,
+    format: str | None = None,
+    shape: Shape2 | None = None,
+    pixel: float | Sequence[float] | None = None,
+) -> ScanGeometry:
+    """Read a geometry from a file, with what became of the file's values, and what is new to
+    a user as notes.
+
+    Args:
+        file: its path.
+        format: name of `FORMATS`; None: that of the file's ending, where .json is
+            flexdt's own document or a CTSimU scenario.
+        shape: detector (rows, cols), for formats that lack it; others must agree.
+        pixel: its edge, or edges along columns and rows [mm], likewise.
+
+    Raises:
+        ExchangeError: an unknown format or ending, an invalid file, or one that
+            contradicts shape or pixel.
+    """
+    path = Path(file)
+    pitch = None if pixel is None else _pair(pixel)
+    # Numbers of a damaged file may have any size; what they contradict is found by checks.
+    with np.errstate(all="ignore"):
+        if format is None and path.suffix.lower() == OWN_ENDINGS[0]:
+            return _json(path, Given(shape, pitch))
+        chosen = format or format_of_ending(
+            path, [form for form in FORMATS.values() if form.read]
+        )
+        return import_geometry(path, chosen, Given(shape, pitch))
+
+
+def _json(path: Path, given: Given) -> ScanGeometry:
+    """Read our own document, or a CTSimU scenario, by its content.
+
+    A document with a "file" section is a scenario. Notes that our own document keeps are
+    left out: they were told when it was written.
+
+    Args:
+        path: file.
+        given: shape and pitch, which must agree with the file's or complete it.
+
+    Raises:
+        ExchangeError: the file is neither.
+        GeometryError: it contradicts `given`.
+    """
+    document = read_json(text_of(path), str(path))
+    if "file" in document:
+        return import_geometry(path, "ctsimu", given)
+    stored = load_geometry(path)
+    kept = document.get("notes") or ()
+    stored = replace(stored, notes=tuple(n for n in stored.notes if n not in kept))
+    if given.shape is not None:
+        stored.cone_vec.with_shape(stored.shape).of_shape(given.shape)
+    given.check_pitch(stored, path)
+    return stored if stored.shape is not None else replace(stored, shape=given.shape)
+
+
+def format_of_ending(path: Path, among: Iterable[Format]) -> str:
+    """Return the name of the format with a file's ending, in either case; the first of
+    `OWN_ENDINGS`, flexdt's own, matches none.
+
+    Args:
+        path: file.
+        among: the formats.
+
+    Raises:
+        ExchangeError: no format has this ending; the message lists all.
+    """
+    by_ending = {
+        ending: form.name
+        for form in among
+        for ending in form.endings
+        if ending != OWN_ENDINGS[0]
+    }
+    name = by_ending.get(path.suffix.lower())
+    if name is None:
+        endings = [OWN_ENDINGS[0], *by_ending]
+        raise ExchangeError(
+            f"{path.name}: the ending of a geometry file is one of {', '.join(endings)}",
+            {"asked": path.suffix, "allowed": endings},
+        )
+    return name
+
+
+def _pair(pixel: float | Sequence[float]) -> tuple[float, float]:
+    """Convert one pixel edge, or two along columns and rows, to two floats [mm].
+
+    Raises:
+        GeometryError: anything but one or two numbers above 0.
+    """
+    try:
+        along_columns, along_rows = np.broadcast_to(
+            np.asarray(pixel, dtype=np.float64), (2,)
+        )
+    except (TypeError, ValueError):
+        along_columns = along_rows = math.nan
+    if not (along_columns > 0 and along_rows > 0):
+        raise GeometryError(
+            f"pixel is {pixel!r}; allowed: one number or two above 0 [mm]",
+            {"asked": repr(pixel), "allowed": "> 0"},
+        )
+    return float(along_columns), float(along_rows)
 
 
 def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> Images:
@@ -295,7 +408,7 @@ def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> I
         ExchangeError: another number of projections, or another detector.
     """
     if not isinstance(geometry, ScanGeometry | ConeVec):
-        geometry = ConeVec.load(geometry)
+        geometry = load_stated(geometry)
     if isinstance(geometry, ConeVec):
         geometry = ScanGeometry(geometry, geometry.detector_shape)
     if len(geometry) != len(dataset):
@@ -312,4 +425,12 @@ def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> I
             {"asked": geometry.shape, "allowed": list(dataset.shape)},
         )
     # Its correction belongs to the geometry that is replaced.
-    return replace(dataset, cone_vec=geometry.cone_vec, nominal=None, correction=None)
+    values = dataset.provenance.replaced((Part.GEOMETRY, Part.ANGLES), "geometry=")
+    return replace(
+        dataset,
+        cone_vec=geometry.cone_vec,
+        nominal=None,
+        correction=None,
+        provenance=values.and_also(geometry.provenance),
+        warnings=(*dataset.warnings, *geometry.notes),
+    )

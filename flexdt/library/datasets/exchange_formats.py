@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -144,14 +144,13 @@ def _read_astra(path: Path, given: Given) -> ScanGeometry:
         ExchangeError: the file has no rows of twelve numbers.
     """
     from flexdt.library.datasets.geometry_content import arrays_of, text_of
-    from flexdt.twin.exchange.geometry import ScanGeometry
     from flexdt.twin.exchange.number_tables import read_vectors_array, read_vectors_text
 
     if path.suffix.lower() == NPY:
-        return ScanGeometry(
-            read_vectors_array(arrays_of(path)["array"], str(path)), given.shape
-        )
-    return ScanGeometry(read_vectors_text(text_of(path), str(path)), given.shape)
+        geometry = read_vectors_array(arrays_of(path)["array"], str(path))
+    else:
+        geometry = read_vectors_text(text_of(path), str(path))
+    return replace(geometry, shape=given.shape)
 
 
 def _write_tomosipo(geometry: ScanGeometry, out: Path) -> Content:

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 
+from flexdt.library.datasets.exchange import load_stated
 from flexdt.library.datasets.image_sources import hdf5_place, named_paths
 from flexdt.library.datasets.scan_options import ScanOptions
 from flexdt.runtime.files.dataset_folder import read_text
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.errors import nearest_name
-from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.input_limits import LIMITS, parse_toml
 
 ENDING: Final = ".toml"
@@ -34,7 +35,7 @@ class ScanFile:
     """
 
     images: str
-    geometry: ConeVec
+    geometry: ScanGeometry
     frames: str | None
     options: ScanOptions
 
@@ -63,7 +64,7 @@ def scan_file(path: Path) -> ScanFile:
                 f'{path}: {key} is missing; allowed: {key} = "PATH"', {"missing": [key]}
             )
     at = path.parent
-    geometry = ConeVec.load(
+    geometry = load_stated(
         at / said["geometry"],
         shape=_pair(said.get("shape"), path, "shape"),
         pixel=said.get("pixel"),

@@ -11,11 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.datasets.cutting import cut
+from flexdt.library.datasets.exchange import load_stated
 from flexdt.library.datasets.image_set import Arrays, Images
 from flexdt.library.datasets.image_sources import Reference, angles_deg, reference
 from flexdt.library.datasets.scan_options import Said, ScanOptions
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.provenance import Part
+from flexdt.twin.exchange.geometry import ScanGeometry
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import rotation_z
 from flexdt.twin.geometry.poses import Poses
@@ -26,7 +28,7 @@ from flexdt.twin.plausibility.stated_figures import angle_findings
 NO_DARK: Final = "no dark image"
 NO_FLAT: Final = "no flat image"
 """Beginnings of what a data set without such images is told, which later ones settle."""
-Geometry = ConeVec | npt.ArrayLike | str | PathLike[str]
+Geometry = ScanGeometry | ConeVec | npt.ArrayLike | str | PathLike[str]
 
 
 def geometry_said(
@@ -34,8 +36,9 @@ def geometry_said(
     options: ScanOptions,
     shape: tuple[int, int] | None = None,
     folder: Path | None = None,
-) -> ConeVec:
-    """Return the geometry that a user means, at the angles that are said.
+) -> ScanGeometry:
+    """Return the geometry that a user means, at the angles that are said, with what became
+    of the values of its file.
 
     Args:
         geometry: a value, its rows (n, 12), or a file that `ConeVec.load` reads.
@@ -46,22 +49,38 @@ def geometry_said(
     Raises:
         TwinError: no such file, no geometry, or another number of angles than views.
     """
-    if isinstance(geometry, ConeVec):
-        cone = geometry
+    if isinstance(geometry, ScanGeometry):
+        stated = geometry
+    elif isinstance(geometry, ConeVec):
+        stated = ScanGeometry(geometry, geometry.detector_shape)
     elif isinstance(geometry, str | PathLike):
-        cone = _loaded(Path(geometry), shape)
+        stated = _loaded(Path(geometry), shape)
     else:
-        cone = ConeVec(np.asarray(geometry))
-    return at_angles(cone, options, folder)
+        stated = ScanGeometry(ConeVec(np.asarray(geometry)))
+    cone = stated.cone_vec.with_shape(stated.shape)
+    values = stated.provenance
+    if options.get("angles") is not None:
+        values = values.replaced((Part.ANGLES,), "angles=")
+    turned = at_angles(cone, options, folder)
+    return replace(stated, cone_vec=turned, provenance=values, files=(), real=None)
 
 
-def _loaded(path: Path, shape: tuple[int, int] | None) -> ConeVec:
+def with_statements(data: Images, stated: ScanGeometry) -> Images:
+    """Return the data set with what the file of its geometry states and tells."""
+    return replace(
+        data,
+        provenance=data.provenance.and_also(stated.provenance),
+        warnings=(*data.warnings, *stated.notes),
+    )
+
+
+def _loaded(path: Path, shape: tuple[int, int] | None) -> ScanGeometry:
     """Load a geometry's file; one that states its own shape is not given another."""
     if not path.is_file():
         raise DatasetFormatError(
             f"geometry is {str(path)!r}: there is no such file", {"missing": [str(path)]}
         )
-    return ConeVec.load(path, shape=shape)
+    return load_stated(path, shape=shape)
 
 
 def at_angles(cone: ConeVec, options: ScanOptions, folder: Path | None = None) -> ConeVec:
@@ -210,4 +229,5 @@ __all__ = [
     "references_said",
     "with_options",
     "with_references",
+    "with_statements",
 ]

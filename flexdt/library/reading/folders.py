@@ -38,6 +38,7 @@ from flexdt.library.datasets.scan_inputs import (
     placed,
     references_said,
     with_options,
+    with_statements,
 )
 from flexdt.library.datasets.scan_options import ScanOptions
 from flexdt.library.reading.foreign_files import (
@@ -80,7 +81,7 @@ from flexdt.twin.dataset.file_names import (
     XRE_SETTINGS,
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
-from flexdt.twin.dataset.provenance import Part, Provenance
+from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
@@ -167,12 +168,15 @@ def load_dataset(
         return read_tiffs(folder, geometry, **options)
     if source.is_file():
         # Angles of a geometry of one view make the others.
-        given = None if geometry is None else geometry_said(geometry, options)
+        stated = None if geometry is None else geometry_said(geometry, options)
+        given = None if stated is None else stated.cone_vec
         kept = options if given is None else _without_angles(options)
         said = kept.get("angles")
         angles = None if said is None else angles_deg(said, source.parent)
         kept = cast(ScanOptions, {**kept, "angles": angles})
         made = open_file(source, given, distances, angles)
+        if stated is not None:
+            made = with_statements(made, stated)
         return looked_at(with_options(made, kept))
     content = list_folder(source)
     if UNFINISHED in content.names:
@@ -195,20 +199,17 @@ def load_dataset(
         data = _from_texts(content, machine, profile)
     if geometry is None:
         return looked_at(with_options(data, options))
-    given = geometry_said(geometry, options, data.shape, content.path)
-    return looked_at(with_options(_with_given(data, given), _without_angles(options)))
+    stated = geometry_said(geometry, options, data.shape, content.path)
+    placed_as_given = with_statements(_with_given(data, stated.cone_vec), stated)
+    return looked_at(with_options(placed_as_given, _without_angles(options)))
 
 
 def _of_scan_file(path: Path, geometry: Geometry | None, options: ScanOptions) -> DataSet:
     """Open what a scan file says; a geometry and options given besides come before its own."""
     said = scan_files.scan_file(path)
     both = cast(ScanOptions, {**said.options, **options})
-    made = read_tiffs(
-        said.images,
-        said.geometry if geometry is None else geometry,
-        frames=said.frames,
-        **both,
-    )
+    given = said.geometry if geometry is None else geometry
+    made = _of_images(said.images, given, said.frames, both)
     return replace(made, name=path.stem)
 
 
@@ -236,8 +237,7 @@ def _with_given(data: DataSet, geometry: ConeVec) -> DataSet:
         *pixel_findings(geometry, pixel_mm),
     )
     doubts = settled(findings, DatasetFormatError, data.where)
-    values = data.provenance.replaced((Part.GEOMETRY, Part.ANGLES), "geometry=")
-    return replace(replaced, warnings=(*replaced.warnings, *doubts), provenance=values)
+    return replace(replaced, warnings=(*replaced.warnings, *doubts))
 
 
 @public
@@ -280,6 +280,16 @@ def read_tiffs(
         >>> data.geometry.shape, round(float(data[0][0, 0]), 4)
         ((3, 4, 5), 0.6931)
     """
+    return _of_images(folder, geometry, frames, options)
+
+
+def _of_images(
+    folder: str | PathLike[str],
+    geometry: Geometry,
+    frames: str | None,
+    options: ScanOptions,
+) -> DataSet:
+    """Read images with a geometry; see `read_tiffs`."""
     source = Path(folder)
     if (place := hdf5_place(str(folder))) is not None:
         data = _of_hdf5(*place, geometry, options)
@@ -302,8 +312,9 @@ def _of_hdf5(
             f"{path}:{inside}", images.shape, ("n", "rows", "cols")
         )
     dark, flat = references_said(options, path.parent)
-    cone = geometry_said(geometry, options, images.shape[1:], path.parent)
-    return in_memory(images, cone, dark, flat, path.stem)
+    stated = geometry_said(geometry, options, images.shape[1:], path.parent)
+    made = in_memory(images, stated.cone_vec, dark, flat, path.stem)
+    return with_statements(made, stated)
 
 
 def _of_folder(
@@ -321,12 +332,13 @@ def _of_folder(
     if not chosen:
         raise _no_projections(content.path, names, frames, others)
     head = image_head(content.path / chosen[0])
-    cone = geometry_said(geometry, options, head.shape, content.path)
+    stated = geometry_said(geometry, options, head.shape, content.path)
+    cone = stated.cone_vec
     said, unknown = _said_by(head, chosen[0])
     if head.images > 1:
         several, doubts = in_order(content, chosen, -1)
         paths = [content.path / name for name in several]
-        made = _of_stacks(paths, content.path.name, cone, {}, dark, flat)
+        made = _of_stacks(paths, content.path.name, stated, {}, dark, flat)
         return replace(made, warnings=(*made.warnings, *doubts))
     chosen, doubts = in_order(content, chosen, len(cone))
     doubts += unknown
@@ -340,8 +352,9 @@ def _of_folder(
             if images.dtype.kind in "ui"
             else [d for d in doubts if NO_FLAT not in d]
         )
-        return replace(made, warnings=(*made.warnings, *told), provenance=said)
-    return listed(
+        made = replace(made, warnings=(*made.warnings, *told), provenance=said)
+        return with_statements(made, stated)
+    made = listed(
         content,
         cone,
         chosen,
@@ -351,6 +364,7 @@ def _of_folder(
         references=(dark, flat),
         provenance=said,
     )
+    return with_statements(made, stated)
 
 
 def _said_by(head: ImageHead, file: str) -> tuple[Provenance, list[str]]:
@@ -423,7 +437,8 @@ def _of_stacks(
     if len({head.shape for head in heads}) > 1:
         sizes = ", ".join(f"{h.shape[1]} x {h.shape[0]}" for h in heads[:3])
         raise DatasetFormatError(f"{paths[0].parent}: files of images of {sizes} pixels")
-    cone = geometry_said(geometry, options, heads[0].shape, paths[0].parent)
+    stated = geometry_said(geometry, options, heads[0].shape, paths[0].parent)
+    cone = stated.cone_vec
     said, unknown = _said_by(heads[0], paths[0].name)
     many = sum(head.images for head in heads)
     if many != len(cone):
@@ -438,14 +453,15 @@ def _of_stacks(
             ]
         )
         made = in_memory(images, cone, dark, flat, name)
-        return replace(made, warnings=(*made.warnings, *unknown), provenance=said)
+        made = replace(made, warnings=(*made.warnings, *unknown), provenance=said)
+        return with_statements(made, stated)
     places = [
         (p, i) for p, head in zip(paths, heads, strict=True) for i in range(head.images)
     ]
     doubts = unknown if flat else [*unknown, without_flat(name, [])]
     made = of_places(places, heads[0].shape, cone, name, doubts, dark_told=not dark)
     made = placed(made, dark or Reference(), flat or Reference())
-    return replace(made, provenance=said)
+    return with_statements(replace(made, provenance=said), stated)
 
 
 def _countable(path: Path, head: ImageHead) -> bool:

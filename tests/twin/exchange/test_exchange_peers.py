@@ -182,7 +182,7 @@ def test_tigre_refuses_what_its_angles_cannot_hold() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        ("COR", np.array([0.2]), "COR is not zero"),
+        ("COR", np.array([0.2]), "COR is 0.2"),
         ("DSD", np.array([1.0, 2.0]), r"DSD of shape \(2,\)"),
         ("offOrigin", np.full(3, np.nan), "not finite"),
         ("nDetector", np.array([0, 9]), "whole numbers"),
