@@ -23,21 +23,25 @@ def page(form: Any) -> str:
     """Describe a format of `SCAN_FORMATS` with a table: from its file to a volume, where its
     facts come from, which of two statements wins, and every field.
     """
-    table = form.table
     endings = ", ".join(f"`{ending}`" for ending in form.endings)
+    lines = [f"data = {form.table.example}", 'volume = data.reconstruct("fdk")']
+    return _described(f"{form.name}: fields of {endings}", form.table, lines)
+
+
+def _described(title: str, table: Any, lines: list[str]) -> str:
+    """Describe a table under a title, with lines of Python that read such a file."""
     rows = [
         f"| `{field.name}` | {_cell(field.meaning)}{_unit(field.unit)} | "
         f"{_cell(ROLE_WORDS[field.role.value].format(field.why))} |"
         for field in table.fields
     ]
     return "\n".join([
-        f"# {form.name}: fields of {endings}",
+        f"# {title}",
         "",
         "```python",
         "import flexdt as fx",
         "",
-        f"data = {table.example}",
-        'volume = data.reconstruct("fdk")',
+        *lines,
         "```",
         "",
         f"Facts from {table.source}.",
@@ -59,6 +63,26 @@ def pages() -> dict[str, str]:
     from flexdt.library.reading.foreign_files import SCAN_FORMATS
 
     return {file_name(form.name): page(form) for form in SCAN_FORMATS if form.table}
+
+
+def other_pages() -> dict[str, str]:
+    """Return the pages of geometry files and of the scanner's own texts, by their names."""
+    from flexdt.library.datasets.exchange_formats import FORMATS
+    from flexdt.twin.dataset.scan_tables import TEXTS
+    from flexdt.twin.exchange.geometry_tables import GEOMETRY_TABLES
+
+    made = {}
+    for name, table in GEOMETRY_TABLES.items():
+        endings = ", ".join(f"`{ending}`" for ending in FORMATS[name].endings)
+        title = f"{table.name}: fields of geometry in {endings}"
+        lines = [f"geometry = {table.example}"]
+        made[f"geometry-{name}.md"] = _described(title, table, lines)
+    for table in TEXTS:
+        title = f"FleX-ray: fields of `{table.name}`"
+        made[file_name(f"flexray {table.name}")] = _described(
+            title, table, [f"data = {table.example}"]
+        )
+    return made
 
 
 def block(text: str) -> str:

@@ -304,7 +304,8 @@ def write(app: Any) -> None:
     texts |= module_pages(pages)
     for name, text in evidence_pages.pages(pages / "evidence").items():
         texts[f"evidence/{name}"] = evidence_pages.moved(text)
-    texts |= {f"formats/{name}": text for name, text in format_pages.pages().items()}
+    tables = format_pages.pages() | format_pages.other_pages()
+    texts |= {f"formats/{name}": text for name, text in tables.items()}
     for path in generated.rglob("*.md"):
         if path.relative_to(generated).as_posix() not in texts:
             path.unlink()

@@ -472,8 +472,10 @@ class Ledger:
             values = list(dict.fromkeys(one.value.strip() for one in several))
             if len(values) > 1 and several[0].known:
                 said = f"{several[0].name} is stated twice: {' and '.join(values[:4])}"
-                self.warnings.append(f"{self.file}: {said}; none is used")
-                for one in several:
+                taken = several[0].use is Use.USED
+                end = "the first is taken" if taken else "none is used"
+                self.warnings.append(f"{self.file}: {said}; {end}")
+                for one in several[taken:]:
                     one.use = Use.CONTRADICTED
                     one.consequence = said
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from datetime import datetime
 from typing import Any, Final
@@ -19,6 +19,7 @@ from typing import Any, Final
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import SCAN_SETTINGS
 from flexdt.twin.dataset.flexdt_json import ScanRecord
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.dataset.scan_settings import (
     ENTRIES,
     Kind,
@@ -30,6 +31,8 @@ from flexdt.twin.machine.camera import Roi
 
 EOL: Final = "\r\n"
 CANCELLED: Final = "SCRIPT CANCELLED!"
+MOST_SHOWN: Final = 60
+"""Characters of a line without a key that stand for one."""
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 _START: Final = "START"
@@ -195,15 +198,17 @@ def _motor(name: str, motor: MotorLine) -> str:
     )
 
 
-def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
+def parse_scan_settings(
+    text: str, file: str = SCAN_SETTINGS, said: Ledger | None = None
+) -> ScanSettings:
     """Read `scan settings.txt`.
 
-    Unknown lines are skipped; fields that are not there are None. Of a field given twice
-    the first value counts.
+    Fields that are not there are None. Of a field given twice the first value counts.
 
     Args:
         text: its content.
         file: name for error messages.
+        said: where every line is entered, unknown ones too; None: nowhere.
 
     Raises:
         DatasetFormatError: a figure is not a number, or it is no settings file at all; names
@@ -224,7 +229,33 @@ def parse_scan_settings(text: str, file: str = SCAN_SETTINGS) -> ScanSettings:
         raise DatasetFormatError(
             f"{file} holds no line of a settings file (`key : value`)", {"path": file}
         )
+    if said is not None:
+        _enter(said, lines)
     return ScanSettings(**values, motors=motors)
+
+
+def _enter(said: Ledger, lines: Sequence[str]) -> None:
+    """Enter the lines of a text in a ledger; a date or a scan type in a line of its own
+    belongs to the heading before it.
+    """
+    heading = ""
+    for line in filter(None, lines):
+        key, value = _split(line)
+        if heading:
+            said.state(heading, line)
+            heading = ""
+        elif line.upper() in (_START, _STOP):
+            heading = line.upper()
+        elif key == "scan type" and not value:
+            heading = "scan type"
+        elif every := _EVERY.match(line):
+            said.state("Reference images every", every[1])
+        elif line.upper().startswith("SCRIPT CANCELLED"):
+            said.state(CANCELLED, line)
+        elif key is None:
+            said.state(line[:MOST_SHOWN], "")
+        else:
+            said.state(line[: len(key)].strip(), value)
 
 
 def _read_line(

@@ -1,7 +1,7 @@
 """`data settings XRE.txt` as sections of plain texts, and as the content of `scan
 settings.txt`.
 
-Unknown keys are kept without interpretation.
+Unknown keys are kept without interpretation; `enter` states all.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, assert_never
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.file_names import XRE_SETTINGS
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.dataset.scan_settings import ENTRIES, MotorLine, ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_number, parse_roi
 
@@ -95,6 +96,11 @@ class XreSettings:
             cancelled=succeeded is not None and succeeded.upper() == "FALSE",
             scan_type="smooth scan" if smooth else None,
         )
+
+    def enter(self, said: Ledger) -> None:
+        """Enter every entry in a ledger, as SECTION/KEY."""
+        for section, entries in self.sections.items():
+            said.state_all((f"{section}/{key}", value) for key, value in entries.items())
 
     @property
     def one_circle(self) -> bool:

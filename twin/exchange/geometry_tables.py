@@ -281,8 +281,16 @@ def _scenario() -> tuple[Field, ...]:
         "acquisition/scan_mode acquisition/scan_speed environment/temperature",
         "words, or a figure of the scanner",
     )
+    beam = [
+        dropped(
+            f"geometry/source/beam_divergence{end}",
+            "opening of the beam",
+            "the whole panel is taken to be lit",
+        )
+        for end in ("", "/?")
+    ]
     program = noted("simulation*", "settings of another program's simulation")
-    return (*parts, *panel, *angles, *about, *images, *words, program)
+    return (*parts, *panel, *angles, *about, *images, *words, *beam, program)
 
 
 CTSIMU: Final = FormatTable(

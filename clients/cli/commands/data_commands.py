@@ -562,14 +562,33 @@ def export(
 
 
 def describe(dataset: Path = argument(..., "DATASET")) -> Answer:
-    """Show every value of a scan's files with its use.
+    """Show every value of a scan's or a geometry's files with its use.
 
     Used, contradicted (another statement was taken) or ignored, with what follows.
 
     Yields:
-        The document of --json (name, projections, shape, complete, warnings, provenance),
-        then a line of the data set and the table. Warnings go to standard error.
+        The document of --json (name, projections, shape, complete, warnings, provenance;
+        of a geometry's file views in place of projections and complete), then a line and
+        the table. Warnings go to standard error.
     """
+    from flexdt.library.datasets.exchange import is_geometry_file, stated_in
+    from flexdt.library.datasets.scan_files import is_scan_file
+    from flexdt.library.reading.foreign_files import format_of
+
+    scan = format_of(dataset) is not None or is_scan_file(dataset)
+    if is_geometry_file(dataset) and not scan:
+        geometry = stated_in(dataset)
+        warn(geometry.notes, dataset)
+        yield {
+            "name": dataset.stem,
+            "views": len(geometry),
+            "shape": None if geometry.shape is None else list(geometry.shape),
+            "warnings": list(geometry.notes),
+            "provenance": geometry.provenance.to_list(),
+        }
+        yield f"{dataset.name}: {len(geometry)} views"
+        yield from geometry.provenance.lines
+        return
     data = scan_of(dataset, False, None)
     warn(data.warnings, dataset)
     yield {

@@ -51,9 +51,11 @@ __all__ = [
     "format_of_ending",
     "geometry_of",
     "import_geometry",
+    "is_geometry_file",
     "load_geometry",
     "load_stated",
     "save_geometry",
+    "stated_in",
     "text_of",
     "with_geometry",
     "write_geometry",
@@ -319,6 +321,23 @@ def load_stated(
             path, [form for form in FORMATS.values() if form.read]
         )
         return import_geometry(path, chosen, Given(shape, pitch))
+
+
+def is_geometry_file(path: Path) -> bool:
+    """Return whether a file has the ending of a geometry that is read."""
+    endings = {end for one in FORMATS.values() if one.read for end in one.endings}
+    return path.is_file() and path.suffix.lower() in {*endings, *OWN_ENDINGS}
+
+
+def stated_in(path: Path) -> ScanGeometry:
+    """Read a geometry's file for what it states; a pixel that it cannot know is 1 mm.
+
+    Raises:
+        ExchangeError: as `load_stated`.
+    """
+    ending = path.suffix.lower()
+    bare = any(one.no_pixel and ending in one.endings for one in FORMATS.values())
+    return load_stated(path, pixel=1.0 if bare else None)
 
 
 def _json(path: Path, given: Given) -> ScanGeometry:

@@ -39,6 +39,7 @@ class Format:
         read: from a path and values that its file does not state to a geometry; None: it
             is not read.
         rows: where the format fixes it, the way in which rows are counted.
+        no_pixel: its files do not know the pixel's size.
         states_unknown: it separates true offsets from those that a reconstruction knows.
     """
 
@@ -49,6 +50,7 @@ class Format:
     read: Callable[[Path, Given], ScanGeometry] | None = None
     rows: Literal["down", "up"] | None = None
     states_unknown: bool = False
+    no_pixel: bool = False
 
 
 def exported() -> tuple[str, ...]:
@@ -272,7 +274,7 @@ FORMATS: Final[Mapping[str, Format]] = {
             rows="down",
             states_unknown=True,
         ),
-        Format("rtk", (".xml", ".rtk"), _write_rtk, read=_read_rtk),
+        Format("rtk", (".xml", ".rtk"), _write_rtk, read=_read_rtk, no_pixel=True),
         Format("astra", (NPY, ".txt", ".geom", ".dat"), _write_astra, read=_read_astra),
         Format("tomosipo", (".npz",), _write_tomosipo, read=_read_tomosipo),
         Format("cil", (".cil",), _write_cil, read=_read_cil),

@@ -40,6 +40,16 @@ class ScanFile:
     options: ScanOptions
 
 
+def is_scan_file(path: Path) -> bool:
+    """Return whether a file is a TOML that names images."""
+    if path.suffix.lower() != ENDING or not path.is_file():
+        return False
+    try:
+        return "images" in parse_toml(read_text(path, LIMITS["toml"].file_bytes), "")
+    except ValueError:
+        return True  # its error names line and column
+
+
 def scan_file(path: Path) -> ScanFile:
     """Read a scan file; its paths are counted from its own folder.
 

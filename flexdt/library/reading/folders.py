@@ -7,8 +7,8 @@ warning in `warnings`. Missing frames are listed, and reading one is an error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence, Set
-from dataclasses import replace
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Unpack, cast
@@ -81,10 +81,13 @@ from flexdt.twin.dataset.file_names import (
     XRE_SETTINGS,
 )
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, parse_document
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.dataset.rebuild import rebuild
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.dataset.scan_settings_text import parse_scan_settings
+from flexdt.twin.dataset.scan_tables import SETTINGS_TEXT, XRE_TEXT
+from flexdt.twin.dataset.text_accounts import account, account_beside
 from flexdt.twin.dataset.xre_reading import parse_xre
 from flexdt.twin.errors import TwinError
 from flexdt.twin.exchange.number_tables import read_geometry_text
@@ -712,7 +715,8 @@ def _from_texts(
         )
     _require_one_each(content)
     warnings: list[str] = []
-    settings = read_settings(content, warnings)
+    texts: list[_Text] = []
+    settings = read_settings(content, warnings, texts)
     if settings is None:
         raise DatasetMissingError(
             f"{content.path}: none of {DOCUMENT}, {SCAN_SETTINGS!r} and {XRE_SETTINGS!r} "
@@ -743,6 +747,7 @@ def _from_texts(
             f"{count} projections are there, "
             f"the text says {settings.projections}; angles follow the text"
         )
+    values, told = _accounted(texts, rebuilt.machine)
     full_scale = None
     if rebuilt.machine is not None:
         full_scale = (1 << rebuilt.machine.detector.bits) - 1
@@ -755,7 +760,8 @@ def _from_texts(
         settings.scan_id or "",
         [shape] * count,
         ["the text says SCRIPT CANCELLED!"] if settings.cancelled else [],
-        [*warnings, *rebuilt.notes],
+        [*warnings, *rebuilt.notes, *told],
+        provenance=values,
         nominal=rebuilt.poses,
         positions=rebuilt.positions,
         machine=rebuilt.machine,
@@ -765,7 +771,9 @@ def _from_texts(
     )
 
 
-def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
+def read_settings(
+    content: Folder, warnings: list[str], accounts: list[_Text] | None = None
+) -> ScanSettings | None:
     """Read the settings of the scanner's text, or of its second text if the first is
     unusable.
 
@@ -775,6 +783,8 @@ def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
     Args:
         content: the folder.
         warnings: extended by the errors of texts that are not used.
+        accounts: extended by the texts that can be read, the one that is used first; None:
+            only that one is read.
 
     Returns:
         None where there is no text, or none usable beside a document.
@@ -782,26 +792,61 @@ def read_settings(content: Folder, warnings: list[str]) -> ScanSettings | None:
     Raises:
         DatasetError: no text is usable, and there is no document; the first text's error.
     """
-    readers: Sequence[tuple[str | None, Callable[[str, str], ScanSettings]]] = (
-        (content.scan_settings, parse_scan_settings),
-        (content.xre_settings, lambda text, name: parse_xre(text, name).settings),
-    )
     errors: list[DatasetError] = []
-    for file, parse in readers:
-        if file is None:
+    used: ScanSettings | None = None
+    for file, table, parse in (
+        (content.scan_settings, SETTINGS_TEXT, parse_scan_settings),
+        (content.xre_settings, XRE_TEXT, _parse_xre),
+    ):
+        if file is None or (used is not None and accounts is None):
             continue
         path = content.path / file
+        said = Ledger(table, str(path))
         try:
-            settings = parse(read_text(path, MAX_SETTINGS_BYTES), str(path))
+            settings = parse(read_text(path, MAX_SETTINGS_BYTES), str(path), said)
         except DatasetError as error:
             errors.append(error)
-        else:
+            continue
+        if accounts is not None:
+            accounts.append(_Text(said, settings))
+        if used is None:
             warnings += [f"{e.message}; {XRE_SETTINGS!r} is used instead" for e in errors]
-            return settings
+            used = settings
+    if used is not None:
+        return used
     if errors and content.document is None:
         raise errors[0]
     warnings += [e.message for e in errors]
     return None
+
+
+@dataclass(frozen=True)
+class _Text:
+    """A scanner's text that was read: its lines, and what they say."""
+
+    said: Ledger
+    settings: ScanSettings
+
+
+def _parse_xre(text: str, name: str, said: Ledger) -> ScanSettings:
+    """Read the scanner's second text, and enter its values in a ledger."""
+    found = parse_xre(text, name)
+    found.enter(said)
+    return found.settings
+
+
+def _accounted(
+    texts: Sequence[_Text], machine: Machine | None
+) -> tuple[Provenance, list[str]]:
+    """Explain the lines of the texts of a scan, the one that was used first."""
+    first = texts[0]
+    motors = () if machine is None else (*machine.axes, *machine.virtual_axes)
+    values, told = account(first.said, first.settings, motors)
+    for other in texts[1:]:
+        winner = first.said.file
+        more, doubts = account_beside(other.said, other.settings, first.settings, winner)
+        values, told = values.and_also(more), [*told, *doubts]
+    return values, told
 
 
 def _require_one_each(content: Folder) -> None:
