@@ -31,9 +31,9 @@ from flexdt.clients.cli.options import (
 from flexdt.library.extras import package
 from flexdt.library.failure import CommandError
 from flexdt.library.reconstruction.volume_files import volume_writer
+from flexdt.message_words import problem_words
 from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.runtime.files.whole_files import free_bytes, write_whole
-from flexdt.twin.values import message_of
 
 __all__ = [
     "Answer",
@@ -50,13 +50,13 @@ __all__ = [
     "assignments",
     "become",
     "free_bytes",
-    "message_of",
     "names",
     "note",
     "numbers",
     "option",
     "package",
     "position",
+    "problem_words",
     "size",
     "table",
     "tiff_bytes",

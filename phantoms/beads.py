@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flexdt.phantoms.phantom import Phantom
 from flexdt.twin.attenuation.materials import material
-from flexdt.twin.errors import LimitError, UnknownNameError
+from flexdt.twin.errors import LimitError, UnknownNameError, shape_words
 from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere, Vector
 from flexdt.twin.signatures import public
@@ -175,9 +175,12 @@ def bead_phantom(
     else:
         numbers = np.asarray(name_or_dims, dtype=np.float64)
         if numbers.shape[-1:] != (3,) or numbers.ndim > 2 or not numbers.size:
-            message = "a cuboid or beads"
-            more = ", or (k, 3) [mm]"
-            raise LimitError.of_shape(message, numbers.shape, (3,), more)
+            raise LimitError.instead(
+                f"{shape_words(numbers.shape)} in place of a cuboid",
+                list(numbers.shape),
+                "the name of a cuboid, its three edges [mm], or the places of beads, "
+                "three numbers each [mm]",
+            )
         if numbers.ndim == 2:
             many = len(numbers)
             x, y, z = (2.0 * (np.abs(numbers).max(axis=0) + bead_radius_mm)).tolist()

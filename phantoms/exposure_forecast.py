@@ -20,7 +20,7 @@ from flexdt.phantoms.samples import as_phantom
 from flexdt.phantoms.scan_limits import check_tube
 from flexdt.twin.attenuation.materials import material as material_of
 from flexdt.twin.attenuation.substances import Substance
-from flexdt.twin.errors import LimitError
+from flexdt.twin.errors import LimitError, require_within
 from flexdt.twin.findings import Findings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
@@ -75,6 +75,12 @@ FILTERS: Final = (
 )
 """Filters that are proposed, in addition to the tube's own."""
 VOID: Final = "void"
+ROSE_CONTRAST: Final = 5.0
+"""Contrast, in units of the noise, from which a detail is seen (Rose 1948)."""
+TIMES_MS: Final = (1e-3, 1e9)
+"""Between these the time of a contrast is looked for."""
+TIME_STEPS: Final = 48
+"""Halvings of their ratio's logarithm: the time is found to a millionth of it."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +158,9 @@ class Forecast:
         seconds: that the images take at least; of a kind of scan, all of its script.
         bytes: that they take on disk; of a kind of scan, with its dark and flat images.
         assumed: assumptions.
+        contrast, contrast_ms: the contrast that was asked for, and the exposure of one image
+            after which the detail has it at the requested voltage, power and filter [ms];
+            more than a read-out holds is averaged. None: it never has.
     """
 
     transmission: Transmission
@@ -164,14 +173,23 @@ class Forecast:
     seconds: float
     bytes: int
     assumed: tuple[str, ...]
+    contrast: float = ROSE_CONTRAST
+    contrast_ms: float | None = None
 
     def __repr__(self) -> str:
         """Format as one line: images, time [s], least transmission, pixel shares, best kV."""
         return (
             f"<Forecast: {self.images} images in {self.seconds:.0f} s, "
             f"least transmission {self.transmission.least:.3g}, {self.saturated:.1%} saturated, "
-            f"{self.starved:.1%} starved, best at {self.best[0].kV:g} kV>"
+            f"{self.starved:.1%} starved, best at {self.best[0].kV:g} kV, "
+            f"{self.contrast_words()}>"
         )
+
+    def contrast_words(self) -> str:
+        """Say how long an image must be exposed for the contrast."""
+        if self.contrast_ms is None:
+            return f"no exposure gives a contrast of {self.contrast:g}"
+        return f"contrast of {self.contrast:g} after {self.contrast_ms:.3g} ms an image"
 
 
 @public
@@ -190,6 +208,7 @@ def expose(
     sod: float | None = None,
     sdd: float | None = None,
     detail: str = f"{VOID}:0.5",
+    contrast: float = ROSE_CONTRAST,
     machine: Machine | str = "flexray",
     material: str | None = None,
     voxel_mm: float | Vector | None = None,
@@ -221,6 +240,8 @@ def expose(
             the machine (600 and 1059 on the FleX-ray).
         detail: MATERIAL:MM, a detail of so much of that material on the darkest ray, or
             void:MM, so much less of what this ray meets most of.
+        contrast: of the detail to the noise of one pixel of one image: the forecast says
+            how long an image takes to have it (`contrast_ms`).
         machine: a machine (see `flexdt.machine`) or the name of one that ships.
         material, voxel_mm: of a mesh or an array, as for `flexdt.simulate`.
         profile, start: zero offsets and the scanner before a scan of `kind`; default: the
@@ -239,7 +260,10 @@ def expose(
         >>> forecast = fx.expose(ball, kV=[50, 90], images=100)
         >>> 0.0 < forecast.transmission.least < 0.3, forecast.best[0].kV
         (True, 90.0)
+        >>> fx.expose(ball, kV=90, images=100, contrast=10).contrast_ms > forecast.contrast_ms
+        True
     """
+    require_within("contrast", contrast, 1e-3, 1e6)
     if isinstance(machine, Machine):
         scanner = machine
     else:
@@ -337,6 +361,8 @@ def expose(
         seconds,
         total,
         tuple(dict.fromkeys(part.assumed for part in parts if part.assumed)),
+        contrast,
+        seen.time_of(contrast, filter, lit),
     )
 
 
@@ -543,6 +569,34 @@ class _SeenDetail:
             contrast_to_noise(plain, changed) if seen else None,
             air_kerma_mGy(chain, at, self.sod_mm) * self.images,
         )
+
+    def time_of(
+        self, contrast: float, layer: str, asked: ExposureSettings
+    ) -> float | None:
+        """Find the time of one image after which the detail has a contrast [ms].
+
+        Args:
+            contrast: to the noise.
+            layer: name of the filter.
+            asked: voltage and power.
+
+        Returns:
+            The time, of all read-outs together; None if `TIMES_MS` has none.
+        """
+
+        def reached(time_ms: float) -> bool:
+            """Whether an image of so long shows it."""
+            whole = replace(asked, exposure_ms=time_ms, averages=1)
+            cnr = self.setting(layer, self.unsaturated(layer, whole)).cnr
+            return cnr is not None and cnr >= contrast
+
+        low, high = TIMES_MS
+        if not reached(high):
+            return None
+        for _ in range(TIME_STEPS):
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if reached(middle) else (middle, high)
+        return high
 
     def unsaturated(self, layer: str, asked: ExposureSettings) -> ExposureSettings:
         """Split a setting's time into as many read-outs as keep the open beam below

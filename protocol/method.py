@@ -5,13 +5,14 @@ The twin server's methods are in `methods`, the projector's in `projector`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Final, Generic, TypeAlias, TypeVar
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from flexdt.message_words import SUGGESTION, nearest_name, problem_words
 from flexdt.protocol.fields import Params, Result
 from flexdt.protocol.rpc_errors import Code, RpcError, clip, invalid_params, problem
 
@@ -115,7 +116,8 @@ def parse_params(
     try:
         return method.params.model_validate({} if given is None else dict(given))
     except ValidationError as error:
-        raise _explain(method.name, error, list(fields)) from None
+        named = {} if given is None else given
+        raise _explain(method.name, error, list(fields), named) from None
 
 
 def parse_result(model: type[_M], given: object) -> _M:
@@ -131,7 +133,14 @@ def parse_result(model: type[_M], given: object) -> _M:
         raise RpcError(Code.INTERNAL, message) from None
 
 
-def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcError:
+def _gravity(problem: Mapping[str, Any]) -> int:
+    """Order problems: names that there are not, then values, then what is missing."""
+    return {"extra_forbidden": 0, "missing": 2}.get(problem["type"], 1)
+
+
+def _explain(
+    method: str, error: ValidationError, allowed: list[str], given: Container[str]
+) -> RpcError:
     """Make the error -32602 of a validation error, with at most 50 problems; returned,
     not raised.
 
@@ -145,12 +154,14 @@ def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcErro
         method: its name on the wire.
         error: of the check of its parameters.
         allowed: names of the method's parameters.
+        given: names of those that were given.
     """
     problems: list[dict[str, object]] = []
-    for e in error.errors()[:50]:
+    # What is missing is often there under the name that is refused.
+    for e in sorted(error.errors(), key=_gravity)[:50]:
         problem: dict[str, object] = {
             "path": ".".join(clip(str(part), 80) for part in e["loc"]) or "params",
-            "message": e["msg"].removeprefix("Value error, "),
+            "message": problem_words(e),
             "asked": clip(e["input"], 80),
         }
         limits = {
@@ -158,6 +169,10 @@ def _explain(method: str, error: ValidationError, allowed: list[str]) -> RpcErro
         }
         if limits:
             problem["allowed"] = limits
+        if e["type"] == "extra_forbidden" and len(e["loc"]) == 1:
+            near = nearest_name(str(e["loc"][0]), allowed, given)
+            hint = "" if near is None else f"; {SUGGESTION} {near!r}?"
+            problem["message"] = f"{problem['message']}{hint}"
         problems.append(problem)
     first = problems[0]
     more = ""

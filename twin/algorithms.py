@@ -1,4 +1,5 @@
-"""The algorithms that reconstruct, and the windows of the ramp filter: the only list of either.
+"""The algorithms that reconstruct, their options, and the windows of the ramp filter: the only
+list of each.
 
 `flexdt reconstruct`, its help and completion, the library and the table of
 `docs/reconstruction.md` iterate it. Names are there without an import of what computes.
@@ -6,12 +7,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final, Literal, assert_never
 
-__all__ = ["ALGORITHMS", "DEFAULT", "PLAIN", "WINDOWS", "Algorithm", "having"]
+__all__ = [
+    "ALGORITHMS",
+    "DEFAULT",
+    "OPTIONS",
+    "PLAIN",
+    "WINDOWS",
+    "Algorithm",
+    "Option",
+    "having",
+    "misfit",
+]
 
 Kind = Literal["direct", "iterative"]
 
@@ -28,7 +39,7 @@ class Algorithm:
             that are given.
         kind: direct (goes through the views once, in parts and slab by slab), or iterative (all
             views and the whole volume in memory).
-        options: those of iterations, weight, window, materials that it has.
+        options: those of `OPTIONS` that it has, of those that not every algorithm has.
         stacks, grids: arrays as large as all images, and as the volume, that it holds at a
             time.
     """
@@ -58,6 +69,75 @@ class Algorithm:
         return function
 
 
+@dataclass(frozen=True)
+class Option:
+    """An option of a reconstruction that does not go with everything else.
+
+    Attributes:
+        name: in Python, with `_`.
+        meaning: what it states.
+        general: every algorithm has it.
+        needs: without one of these options it would have no effect; () for none.
+    """
+
+    name: str
+    meaning: str
+    general: bool = False
+    needs: tuple[str, ...] = ()
+
+
+_CORRECTIONS: Final = ("material", "scatter_correction")
+OPTIONS: Final[dict[str, Option]] = {
+    one.name: one
+    for one in (
+        Option("iterations", "how often an iterative algorithm repeats"),
+        Option("weight", "the strength of the total variation"),
+        Option("window", "the window of the ramp filter"),
+        Option("materials", "several materials, each followed through the volume"),
+        Option("errors", "the noise and the bound of the bias"),
+        Option("scheduler", "workers that share the slabs"),
+        Option("slurm", "workers that share the slabs"),
+        Option("tube", "the spectrum of a correction", general=True, needs=_CORRECTIONS),
+        Option("kv", "the voltage of a correction", general=True, needs=_CORRECTIONS),
+    )
+}
+"""Name -> option. Python and the command line refuse by this table what does not fit."""
+
+
+def misfit(
+    algorithm: str, given: Container[str], spelled: Callable[[str], str] = str
+) -> tuple[str, str] | None:
+    """Say which option of a reconstruction would have no effect.
+
+    Args:
+        algorithm: one of `ALGORITHMS`.
+        given: names of the options that the user states.
+        spelled: how the user's door writes an option.
+
+    Returns:
+        The first such option of `OPTIONS`, and the sentence that refuses it; None if all
+        have an effect.
+
+    Example:
+        >>> misfit("sirt", {"window", "iterations"})
+        ('window', 'window: sirt has none (the window of the ramp filter); allowed with: fdk')
+    """
+    for name, one in OPTIONS.items():
+        if name not in given:
+            continue
+        said = spelled(name)
+        if not one.general and name not in ALGORITHMS[algorithm].options:
+            allowed = ", ".join(having(name))
+            return (
+                name,
+                f"{said}: {algorithm} has none ({one.meaning}); allowed with: {allowed}",
+            )
+        if one.needs and not any(other in given for other in one.needs):
+            allowed = " or ".join(map(spelled, one.needs))
+            return name, f"{said}: has no effect ({one.meaning}); allowed with: {allowed}"
+    return None
+
+
 _ITERATIVE: Final = "flexdt.twin.reconstruction.iterative"
 _SEVERAL: Final = frozenset({"iterations", "materials"})
 DEFAULT: Final = "fdk"
@@ -70,7 +150,7 @@ ALGORITHMS: Final[dict[str, Algorithm]] = {
             "flexdt.twin.reconstruction.checked_fdk",
             "fdk",
             "direct",
-            frozenset({"window"}),
+            frozenset({"window", "errors", "scheduler", "slurm"}),
         ),
         Algorithm("sirt", _ITERATIVE, "sirt", options=_SEVERAL),
         Algorithm("sart", _ITERATIVE, "sart", options=_SEVERAL),

@@ -7,9 +7,21 @@ for a program. The server maps the types to wire codes.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from difflib import get_close_matches
 from numbers import Real
 from typing import Final, Self
+
+from flexdt.message_words import SUGGESTION as SUGGESTION
+from flexdt.message_words import nearest_name as nearest_name
+
+
+def shape_words(shape: Sequence[int | str]) -> str:
+    """Write the shape of an array for people.
+
+    Example:
+        >>> shape_words(()), shape_words((3,)), shape_words(("n", 12))
+        ('a single number', '3', 'n x 12')
+    """
+    return " x ".join(map(str, shape)) or "a single number"
 
 
 class TwinError(ValueError):
@@ -21,7 +33,7 @@ class TwinError(ValueError):
         ...     ConeVec([[1, 2, 3]])
         ... except TwinError as error:
         ...     print(error.message, error.data["allowed"])
-        cone_vec has shape (1, 3); allowed: (n, 12) ['n', 12]
+        cone_vec of shape 1 x 3; allowed: n x 12 ['n', 12]
     """
 
     def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
@@ -71,13 +83,43 @@ class TwinError(ValueError):
 
         Example:
             >>> print(TwinError.of_shape("points", (4, 2), ("...", 3), " [mm]"))
-            points of shape (4, 2); allowed: (..., 3) [mm]
+            points of shape 4 x 2; allowed: ... x 3 [mm]
         """
-        wanted = f"({', '.join(map(str, allowed))}{',' if len(allowed) == 1 else ''})"
         return cls(
-            f"{what} of shape {tuple(got)}; allowed: {wanted}{more}",
+            f"{what} of shape {shape_words(got)}; allowed: {shape_words(allowed)}{more}",
             {"asked": list(got), "allowed": list(allowed)},
         )
+
+
+class FileError(TwinError, OSError):
+    """A file or folder that cannot be read or written, because the system says no."""
+
+    @classmethod
+    def of(cls, error: OSError) -> FileError:
+        """Make the error for one of the system's that names a file; returned, not raised.
+
+        Example:
+            >>> print(FileError.of(FileNotFoundError(2, "No such file", "scan.json")))
+            there is no file or folder scan.json
+        """
+        data = {"asked": str(error.filename)}
+        found: FileError
+        if isinstance(error, FileNotFoundError):
+            found = MissingFileError(f"there is no file or folder {error.filename}", data)
+        else:
+            why = (error.strerror or "not to be had").lower()
+            found = cls(f"{error.filename}: {why}", data)
+        found.errno, found.strerror = error.errno, error.strerror
+        found.filename, found.filename2 = error.filename, error.filename2
+        return found
+
+    def __str__(self) -> str:
+        """Return the message, without the system's number."""
+        return self.message
+
+
+class MissingFileError(FileError, FileNotFoundError):
+    """A file or folder that is not there; the one type for it, at every call."""
 
 
 class GeometryError(TwinError):
@@ -158,29 +200,6 @@ def words_of(error: BaseException) -> str:
     """
     said = " ".join(str(error).split())
     return said[:MAX_REPEATED_CHARACTERS] or type(error).__name__
-
-
-SUGGESTION: Final = "did you mean"
-"""Words before the proposal of a name."""
-LONGEST_NAME: Final = 80
-"""Characters of a name that is compared with others."""
-
-
-def nearest_name(asked: str, names: Sequence[str]) -> str | None:
-    """Return the name that is most like `asked`; None if none is near, or `asked` is
-    longer than `LONGEST_NAME`.
-
-    Case does not matter; of names that differ in case only, the first.
-
-    Example:
-        >>> nearest_name("Axes.Move", ["axes.move", "axes.home"])
-        'axes.move'
-    """
-    if len(asked) > LONGEST_NAME:
-        return None
-    by_small = {name.lower(): name for name in reversed(names)}
-    near = get_close_matches(asked.lower(), by_small, 1)
-    return by_small[near[0]] if near else None
 
 
 class UnknownNameError(TwinError):

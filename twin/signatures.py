@@ -27,7 +27,14 @@ from typing import (
     TypeVar,
 )
 
-from flexdt.twin.errors import GeometryError, LimitError, nearest_name
+from flexdt.twin.errors import (
+    FileError,
+    GeometryError,
+    LimitError,
+    TwinError,
+    nearest_name,
+    shape_words,
+)
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -46,6 +53,10 @@ MAX_KNOWN_TYPES: Final = 256
 """Types of arguments that are remembered."""
 MAX_CHECKED_MEMBERS: Final = 100
 """Members of a list that are compared with the annotation: mistakes stand at the beginning."""
+
+
+CALLED: Final = "__flexdt_called__"
+"""Attribute of a function with the name by which users call it, where that is another."""
 
 
 class ArgumentError(GeometryError, LimitError, TypeError):
@@ -136,6 +147,19 @@ def with_options_of(declared: type) -> Callable[[Thing], Thing]:
     return declaring
 
 
+def called(name: str) -> Callable[[Thing], Thing]:
+    """Make a decorator that says by which name users call a function, for messages; it stands
+    below `public`.
+    """
+
+    def naming(function: Thing) -> Thing:
+        """Keep the name with the function, and return it."""
+        setattr(function, CALLED, name)
+        return function
+
+    return naming
+
+
 def public(thing: Thing) -> Thing:
     """Make calls of a function, or of a class and its methods, check their arguments
     (decorator).
@@ -197,7 +221,7 @@ def _checked(function: Thing, text: str) -> Thing:
         and return its result.
 
         Types that were allowed together before are not checked again, where types alone
-        decide.
+        decide. What the system says of a file becomes a `FileError`.
         """
         # Types that have been allowed together once are not looked at again.
         types_of = (*map(_type, given), *named, *map(_type, named.values()))
@@ -206,7 +230,12 @@ def _checked(function: Thing, text: str) -> Thing:
             if checked.keys() == named.keys():
                 known.allowed.add(types_of)
             named = checked
-        return function(*given, **named)
+        try:
+            return function(*given, **named)
+        except OSError as error:
+            if isinstance(error, TwinError) or error.filename is None:
+                raise
+            raise FileError.of(error) from None
 
     return call  # type: ignore[return-value]
 
@@ -254,7 +283,8 @@ class Known:
         self.function = function
         self.text = text
         self.allowed: set[tuple[Any, ...]] = set()
-        self.qualname = function.__qualname__.split("<locals>.")[-1]
+        called = getattr(function, CALLED, function.__qualname__)
+        self.qualname = called.split("<locals>.")[-1]
 
     @cached_property
     def signature(self) -> inspect.Signature:
@@ -302,7 +332,9 @@ class Known:
             bound = self.signature.bind(*given, **named).arguments
         except TypeError as error:
             raise ArgumentError.instead(
-                f"{where}: {error}", [*map(_value_words, given), *named], self._names()
+                f"{where}: {error}",
+                [*map(_value_words, given[self._own() :]), *named],
+                self._names(),
             ) from None
         for name, value in bound.items():
             kind = self.kinds.get(name)
@@ -334,6 +366,10 @@ class Known:
         known = any(base.__name__ == owner for base in called.__mro__)
         name = f"{called.__name__ if known else owner}{dot}{method}"
         return name.removesuffix(".__init__")
+
+    def _own(self) -> int:
+        """Return how many first arguments the language gives: `self` or `cls`."""
+        return int(next(iter(self.signature.parameters), "") in ("self", "cls"))
 
     def _names(self) -> list[str]:
         """List the names of the function's parameters without `self` and `cls`."""
@@ -372,7 +408,7 @@ class Known:
                 warnings.warn(text, DeprecationWarning, stacklevel=4)
                 renamed[other] = value
             else:
-                near = nearest_name(name, self._names())
+                near = nearest_name(name, self._names(), named)
                 hint = ""
                 if near is not None:
                     hint = f" (did you mean {near!r}?)"
@@ -422,7 +458,9 @@ class Known:
         )
         more = ""
         if described:
-            more = f" ({' '.join(described[1].split()).split('. ')[0].rstrip('.')})"
+            sentence = " ".join(described[1].split()).split(". ")[0].rstrip(".")
+            sentence = re.sub(r"\((\w+),\)", r"of \1", sentence)
+            more = f" ({sentence})"
         problem = f"{where}: {label} is {_value_words(value)}"
         return ArgumentError.instead(
             problem, repr(value)[:100], words + more + hint, argument=label
@@ -508,14 +546,21 @@ def _kind_of_tuple(parts: Sequence[Any]) -> Kind:
     if ... in parts:
         return _kind_of_list(parts)
     inner = [kind_of(part) for part in parts]
-    members = ", ".join(map(_member_words, inner))
-    return Kind((f"({members})",), lambda v: _is_list(v, inner))
+    members = [_member_words(kind) for kind in inner]
+    if len(set(members)) == 1:
+        words = f"{_COUNTS.get(len(members), len(members))} values, each {members[0]}"
+    else:
+        words = f"values in this order: {', '.join(members)}"
+    return Kind((words,), lambda v: _is_list(v, inner))
+
+
+_COUNTS: Final = {1: "one", 2: "two", 3: "three", 4: "four"}
 
 
 def _kind_of_list(parts: Sequence[Any]) -> Kind:
     """Make the kind of a list of any length, whose members are of the kind of the first part."""
     inner = [kind_of(parts[0])]
-    words = f"a list ({_member_words(inner[0])}, ...)"
+    words = f"a list, each member {_member_words(inner[0])}"
     return Kind((words,), lambda v: _is_list(v, inner, several=True))
 
 
@@ -650,7 +695,7 @@ def _value_words(value: object) -> str:
     """
     shape = getattr(value, "shape", None)
     if shape is not None and hasattr(value, "dtype"):
-        described = f"an array of shape {tuple(shape)}"
+        described = f"an array of shape {shape_words(shape)}"
         if _masks(value):
             return f"{described} with masked values"
         if getattr(value.dtype, "kind", "f") == "c":

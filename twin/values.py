@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import PlainSerializer, PlainValidator, TypeAdapter, ValidationError
 
+from flexdt.message_words import problem_words
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -84,16 +85,10 @@ def document_errors(name: str, error: ValidationError) -> tuple[str, dict[str, o
     At most 10, one line each, with `name` and the path of the place.
     """
     lines = [
-        f"{name}: {'.'.join(map(str, e['loc'])) or 'document'}: {message_of(e)}"
-        for e in error.errors(include_url=False, include_context=False)[:10]
+        f"{name}: {'.'.join(map(str, e['loc'])) or 'document'}: {problem_words(e)}"
+        for e in error.errors(include_url=False)[:10]
     ]
     return "\n".join(lines), {"problems": lines}
-
-
-def message_of(problem: Mapping[str, Any]) -> str:
-    """Return the message of one of pydantic's problems, without the words it puts before errors
-    of ours."""
-    return str(problem["msg"]).removeprefix("Value error, ")
 
 
 def adapter_of(cls: type[Any]) -> TypeAdapter[Any]:

@@ -14,8 +14,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from flexdt.library.failure import CommandError
+from flexdt.message_words import SUGGESTION, nearest_name, problem_words
 
 if TYPE_CHECKING:
+    import typer
+
     from flexdt.protocol.rpc_errors import RpcError
 
 DONE: Final = 0
@@ -39,7 +42,7 @@ WIRE_EXIT_CODES: Final[Mapping[object, int]] = {
 UNREACHABLE: Final = (errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.ENETUNREACH)
 
 
-def describe(error: Exception) -> tuple[tuple[str, ...], int]:
+def describe(error: Exception, words: Sequence[str] = ()) -> tuple[tuple[str, ...], int]:
     """Return the lines to print for an error, and its exit code.
 
     Usage errors exit with USAGE, limits and collisions with LIMIT, refusals of safety and
@@ -50,6 +53,7 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
 
     Args:
         error: of any kind; one that is not expected is called a defect of flexdt.
+        words: of the command line; an option that is among them is not suggested.
 
     Returns:
         Lines that begin with `flexdt:`, and the exit code.
@@ -60,7 +64,7 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     if callable(
         getattr(error, "format_message", None)
     ):  # typer's usage errors, any version
-        return _usage(error), USAGE
+        return _usage(error, words), USAGE
     if isinstance(error, RpcError):
         return _wire_error(error), wire_code(error)
     lines: Sequence[str] = str(error).splitlines()
@@ -96,7 +100,7 @@ def describe(error: Exception) -> tuple[tuple[str, ...], int]:
     return tuple(f"flexdt: {line}" for line in lines), code
 
 
-def _usage(error: Exception) -> tuple[str, ...]:
+def _usage(error: Exception, words: Sequence[str]) -> tuple[str, ...]:
     """Return the lines on a wrong use of the command line: the error, and where help is;
     the help page itself if no command was given.
 
@@ -113,11 +117,40 @@ def _usage(error: Exception) -> tuple[str, ...]:
         command = "flexdt"
     flag = getattr(error, "option_name", None)
     if flag is not None and message.startswith("No such option"):
-        from flexdt.clients.cli.settings_file import home_of
-
-        home = home_of(command, flag)
-        message += "" if home is None else f"; set {home}"
+        message = _unknown_option(command, flag, context, words)
+    elif (found := getattr(error.__cause__, "errors", None)) is not None:
+        # Newer versions of typer read values by pydantic.
+        said = str(getattr(error, "message", ""))
+        first = found(include_url=False)[0]
+        clause = problem_words(first)
+        if first["type"] != "value_error":  # those say what was given
+            clause = f"{first['input']!r}; {clause}"
+        message = message.replace(said, clause) if said else clause
     return (f"{command}: {message}", f"Try '{command} --help'.")
+
+
+def _unknown_option(
+    command: str, flag: str, context: typer.Context | None, words: Sequence[str]
+) -> str:
+    """Say that a command has no such option: where it is set instead, or which one is
+    meant, of those that were not given.
+    """
+    from flexdt.clients.cli.settings_file import home_of
+
+    message = f"No such option: {flag}"
+    if (home := home_of(command, flag)) is not None:
+        return f"{message}; set {home}"
+    if context is None:
+        return message
+    known = [
+        name.lstrip("-")
+        for parameter in context.command.params
+        for name in parameter.opts
+        if name.startswith("--")
+    ]
+    given = {word.partition("=")[0].lstrip("-") for word in words}
+    near = nearest_name(flag.lstrip("-"), known, given - {flag.lstrip("-")})
+    return message if near is None else f"{message}; {SUGGESTION} --{near}?"
 
 
 def _wire_error(error: RpcError) -> tuple[str, ...]:

@@ -459,7 +459,7 @@ def _run(argv: Sequence[str]) -> int:
     except Exception as error:
         if os.environ.get("FLEXDT_TRACEBACK"):
             traceback.print_exc()
-        lines, code = describe(error)
+        lines, code = describe(error, argv)
         for line in lines:
             note(line)
         return code

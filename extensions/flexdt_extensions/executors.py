@@ -33,7 +33,7 @@ from typing import Annotated, Any, Final
 from annotated_types import Ge
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from flexdt.extending import CommandError, message_of, package
+from flexdt.extending import CommandError, package, problem_words
 from flexdt.twin.errors import TwinError
 from flexdt_extensions.cluster_watch import ClusterWatch
 from flexdt_extensions.slurm_jobs import REFUSED, SlurmJobs, Tend, lifetime_s
@@ -57,9 +57,9 @@ def problems_of(name: str, error: ValidationError) -> list[str]:
     value given (unless that is a table).
     """
     lines = []
-    for e in error.errors(include_url=False, include_context=False):
+    for e in error.errors(include_url=False):
         path = ".".join(str(part) for part in e["loc"]) or "plan"
-        message = message_of(e)
+        message = problem_words(e)
         if isinstance(e["input"], dict | BaseModel):
             shown = ""
         else:

@@ -367,7 +367,7 @@ def fdk_on_workers(
     sent = replace(views, dataset=replace(data))
     truncation = views.truncation
     work = SlabWork(
-        sent.parts, views.cone_vec, views.shape, grid, request.window, truncation
+        sent.parts, views.cone_vec, views.shape, grid, request.ramp_window, truncation
     )
     home, made_by = folder_of(out, identity)
     store = home / STORE

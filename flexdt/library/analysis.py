@@ -18,7 +18,7 @@ from flexdt.library.datasets.exchange import with_geometry
 from flexdt.library.reading.folders import load_dataset
 from flexdt.phantoms import Phantom
 from flexdt.twin import long_work
-from flexdt.twin.algorithms import DEFAULT, PLAIN
+from flexdt.twin.algorithms import DEFAULT
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
@@ -141,14 +141,14 @@ def reconstruct(
     every: int = 1,
     iterations: int | None = None,
     weight: float | None = None,
-    window: str = PLAIN,
+    window: str | None = None,
     rings: bool = False,
     material: str | Sequence[str] | None = None,
     scatter_correction: str | Sequence[str] | None = None,
     tube: Tube | None = None,
     parameters: Offsets | None = None,
     progress: Progress = None,
-    errors: bool = True,
+    errors: bool | None = None,
 ) -> Volume:
     """Reconstruct a data set into a volume in memory.
 
@@ -163,7 +163,7 @@ def reconstruct(
         every: use every n-th frame.
         iterations: of an iterative algorithm; default: its own.
         weight: of the total variation (tv); default: its own.
-        window: of FDK's ramp filter: ram-lak, shepp-logan, cosine, hamming, hann.
+        window: of FDK's ramp filter: ram-lak (default), shepp-logan, cosine, hamming, hann.
         rings: subtract the offsets that pixels add to all views, where they exceed object
             and noise; offsets of entire columns in full turns only.
         material: the object is made of this alone: correct beam hardening. For sirt and sart
@@ -175,9 +175,9 @@ def reconstruct(
         parameters: correction; default: the one in force during the scan, if any.
         progress: a bar after two seconds; False for no bar, or a function of the fraction
             done.
-        errors: of FDK, estimate errors, `volume.bias_bound` and `volume.accuracy`, and
-            warn of them; and find the noise, `volume.sigma` (of a circle, of five rows or
-            more).
+        errors: of FDK (default: True), estimate errors, `volume.bias_bound` and
+            `volume.accuracy`, and warn of them; and find the noise, `volume.sigma` (of a
+            circle, of five rows or more).
 
     Returns:
         Volume of attenuation [1/mm].

@@ -25,7 +25,7 @@ from flexdt.library.datasets.scan_inputs import (
 )
 from flexdt.library.datasets.scan_options import ScanOptions
 from flexdt.twin import long_work
-from flexdt.twin.algorithms import DEFAULT, PLAIN
+from flexdt.twin.algorithms import DEFAULT
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.long_work import Progress
@@ -190,14 +190,14 @@ class DataSet(ImageSet):
         every: int = 1,
         iterations: int | None = None,
         weight: float | None = None,
-        window: str = PLAIN,
+        window: str | None = None,
         rings: bool = False,
         material: str | Sequence[str] | None = None,
         scatter_correction: str | Sequence[str] | None = None,
         tube: Tube | None = None,
         parameters: Offsets | None = None,
         progress: Progress = None,
-        errors: bool = True,
+        errors: bool | None = None,
     ) -> Volume:
         """Reconstruct into a volume in memory; see `flexdt.reconstruct` for the options.
 
@@ -215,6 +215,7 @@ class DataSet(ImageSet):
         from flexdt.library.reconstruction.reconstruct import (
             VolumeRequest,
             reconstruct_volume,
+            require_effect,
         )
 
         request = VolumeRequest(
@@ -232,13 +233,14 @@ class DataSet(ImageSet):
             material=_names(material) if not isinstance(material, str) else material,
             scatter_correction=_names(scatter_correction),
         )
+        require_effect(request, errors)
         with long_work.during("reconstructing", progress) as advance:
             return reconstruct_volume(
                 self,
                 request,
                 parameters=parameters,
                 progress=lambda done, whole: advance(done / whole),
-                errors=errors,
+                errors=errors is not False,
             )
 
     def save(self, folder: File, *, resume: bool = False) -> None:

@@ -6,12 +6,14 @@ Every function draws into axes that are given, or into a new figure, and returns
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.figures import require_plots
+from flexdt.library.notebook.notebook_slices import window_of
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.panel_corners import panel_corners
@@ -28,6 +30,11 @@ LAYER_LABELS = {
 }
 DOT_PT = 6.0
 """Size of the dots of sources and panels."""
+GEOMETRY_INCH = (7.0, 5.5)
+BAR_WIDTH = 0.05
+"""Of a colour bar, as a share of its picture's width."""
+MAX_TICKS = 6
+"""Of the longest axis of a geometry."""
 MAX_PANELS = 12
 """Largest number of panels drawn, evenly chosen."""
 
@@ -46,7 +53,8 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
         The axes.
     """
     if axes is None:
-        axes = _pyplot().figure().add_subplot(projection="3d")
+        figure = _pyplot().figure(figsize=GEOMETRY_INCH)
+        axes = figure.add_subplot(projection="3d")
     axes.plot(*cone_vec.source.T, "C0.", markersize=DOT_PT, label="source")
     shown = np.unique(
         np.linspace(0, len(cone_vec) - 1, min(len(cone_vec), MAX_PANELS)).astype(int)
@@ -63,7 +71,9 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
         xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views"
     )
     axes.set_aspect("equal")
-    axes.legend()
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        _spread_ticks(axis)
+    axes.legend(loc="upper left", fontsize="small")
     return axes
 
 
@@ -81,17 +91,21 @@ def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
     Raises:
         DatasetError: as `DataSet.line_integrals`.
     """
-    if axes is None:
-        axes = _pyplot().figure().add_subplot()
+    axes = _room(axes)
     shown = axes.imshow(data.line_integrals(index), cmap="gray")
-    axes.figure.colorbar(shown, ax=axes, label="line integral")
+    _colour_bar(axes, shown, "line integral")
     axes.set(
         xlabel="column", ylabel="row", title=f"{data.name}: {data.frames[index].file}"
     )
     return axes
 
 
-def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
+def plot_volume(
+    volume: Volume,
+    axes: Any = None,
+    what: str = "data",
+    window: Sequence[float] | Volume | None = None,
+) -> Any:
     """Plot the middle layer of a volume.
 
     Places are in [mm], +y up.
@@ -100,12 +114,14 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
         volume: to plot.
         axes: matplotlib's, to draw into; None makes a figure.
         what: `data`, `sigma` or `bias_bound`.
+        window: values of black and of white, or a volume whose window is taken, so that
+            both can be compared; None: percentiles of the layer.
 
     Returns:
         The axes.
 
     Raises:
-        TwinError: the volume has no such values.
+        TwinError: the volume has no such values, or the window is none.
     """
     if what in LAYER_LABELS:
         values = getattr(volume, what, None)
@@ -114,14 +130,21 @@ def plot_volume(volume: Volume, axes: Any = None, what: str = "data") -> Any:
     if values is None:
         allowed = [name for name in LAYER_LABELS if getattr(volume, name) is not None]
         raise TwinError(f"what: {what!r} is not there; there is {', '.join(allowed)}")
-    if axes is None:
-        axes = _pyplot().figure().add_subplot()
+    axes = _room(axes)
     x, y, z = volume.centers()
     middle = len(z) // 2
     half = volume.voxel_xyz[0] / 2
     ends = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
-    shown = axes.imshow(values[middle], cmap="gray", origin="lower", extent=ends)
-    axes.figure.colorbar(shown, ax=axes, label=f"{LAYER_LABELS[what]} [1/mm]")
+    if isinstance(window, Volume):
+        other = getattr(window, what)
+        seen, window = other[len(other) // 2], None
+    else:
+        seen = values[middle]
+    black, white = window_of(seen, window)
+    shown = axes.imshow(
+        values[middle], cmap="gray", origin="lower", extent=ends, vmin=black, vmax=white
+    )
+    _colour_bar(axes, shown, f"{LAYER_LABELS[what]} [1/mm]")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"z = {z[middle]:g} mm")
     return axes
 
@@ -174,6 +197,39 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
     for collision in () if report.clearance is None else report.clearance.collisions:
         space.axvline(collision.time_s, color="red")
     return figure
+
+
+def _room(axes: Any) -> Any:
+    """Return axes in whose figure colour bars and titles get room of their own: those given,
+    or of a new figure. A figure's own layout stays if it has one.
+    """
+    if axes is None:
+        return _pyplot().figure(layout="constrained").add_subplot()
+    figure = axes.figure
+    if figure.get_layout_engine() is None:
+        figure.set_layout_engine("constrained")
+    return axes
+
+
+def _colour_bar(axes: Any, shown: Any, label: str) -> None:
+    """Draw a colour bar as high as the picture beside it."""
+    beside = axes.inset_axes((1.03, 0.0, BAR_WIDTH, 1.0))
+    axes.figure.colorbar(shown, cax=beside, label=label)
+
+
+def _spread_ticks(axis: Any) -> None:
+    """Give an axis in three dimensions as many ticks as its length on the figure has room
+    for: short axes, seen from the side, get few.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    spans = {
+        one: abs(np.subtract(*one.get_view_interval()))
+        for one in (axis.axes.xaxis, axis.axes.yaxis, axis.axes.zaxis)
+    }
+    share = spans[axis] / max(spans.values())
+    axis.set_major_locator(MaxNLocator(max(1, round(MAX_TICKS * share)), min_n_ticks=2))
+    axis.set_tick_params(labelsize="small")
 
 
 def _pyplot() -> Any:

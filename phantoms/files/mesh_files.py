@@ -26,6 +26,7 @@ from flexdt.phantoms.phantom import Phantom
 from flexdt.phantoms.pieces import Surface, Voxels
 from flexdt.phantoms.placement import Place, placed
 from flexdt.twin.attenuation.materials import material as material_of
+from flexdt.twin.errors import FileError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.input_limits import LIMITS
 from flexdt.twin.json_text import parse_json
@@ -339,9 +340,7 @@ def _read(
             if size <= MAX_BYTES:
                 raw = path.read_bytes()
         except OSError as error:
-            raise PhantomError(
-                f"cannot read {path}: {error.strerror}", {"path": str(path)}
-            ) from None
+            raise FileError.of(error) from None
         _check_size(size, label)
     if kind.lower() not in FORMATS:
         message = f"{label}: {kind or 'no format'!r} is not a mesh format we read"

@@ -26,7 +26,7 @@ from flexdt.phantoms.files.mesh_files import MAX_EXTENT_MM, MAX_FACES, mesh_phan
 from flexdt.phantoms.phantom import Phantom, assemble
 from flexdt.phantoms.pieces import size_about_origin
 from flexdt.twin.attenuation.materials import material as material_of
-from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.errors import FileError, GeometryError, TwinError
 from flexdt.twin.input_limits import InputLimitError, parse_toml, read_limited
 from flexdt.twin.json_text import BYTE_ORDER_MARK, parse_json
 from flexdt.twin.length_units import UNITS_MM
@@ -57,9 +57,11 @@ def read_phantom_file(path: Path) -> Phantom:
             text = read_limited(stream, "json", str(path)).decode("utf-8")
     except InputLimitError as error:
         raise PhantomError(error.message, error.data) from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8 text"
-        raise PhantomError(f"cannot read {path}: {reason}", {"path": str(path)}) from None
+    except OSError as error:
+        raise FileError.of(error) from None
+    except UnicodeDecodeError:
+        said = f"cannot read {path}: not UTF-8 text"
+        raise PhantomError(said, {"path": str(path)}) from None
     return load_phantom_file(text, str(path), path.parent)
 
 

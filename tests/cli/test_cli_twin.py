@@ -328,11 +328,9 @@ def test_run_and_check_leave_with_the_same_code(
 def test_a_parameter_that_does_not_fit_is_one_line(flexdt: Flexdt) -> None:
     code, out, err = flexdt("tube", "--kv", "-1")
     assert (code, out) == (1, "")
-    assert err == "flexdt: tube.set: kV: Input should be greater than or equal to 0.001\n"
+    assert err == "flexdt: tube.set: kV: allowed: at least 0.001\n"
     _, _, err = flexdt("tube", "--kv", "-1", "--power", "-2")
-    assert err.splitlines()[1:] == [
-        "flexdt: power_W: Input should be greater than or equal to 0.000001"
-    ]
+    assert err.splitlines()[1:] == ["flexdt: power_W: allowed: at least 1e-06"]
 
 
 def test_names_that_cannot_be_say_what_can(

@@ -374,16 +374,14 @@ def test_files_of_markers(tmp_path: Path) -> None:
     assert np.isnan(found.tracks[0, 0]).all()
     assert found.sigma[1, 0] == 0.2
     np.save(tmp_path / "flat.npy", np.zeros((2, 3)))
-    with pytest.raises(
-        TwinError, match=r"shape \(2, 3\); allowed: \(2 frames, markers, 2\)"
-    ):
+    with pytest.raises(TwinError, match=r"shape 2 x 3; allowed: 2 frames x markers x 2"):
         read_markers(tmp_path / "flat.npy", 2)
     np.save(tmp_path / "complex.npy", np.zeros((2, 3, 2), np.complex128))
     np.save(tmp_path / "far.npy", np.full((2, 3, 2), np.inf))
     with pytest.raises(TwinError, match="pixels up to inf; allowed: 100000"):
         read_markers(tmp_path / "far.npy", 2)
     for name in ("none.npy", "complex.npy"):
-        with pytest.raises(TwinError, match="cannot read"):
+        with pytest.raises(TwinError, match=r"cannot read|there is no file"):
             read_markers(tmp_path / name, 2)
 
 

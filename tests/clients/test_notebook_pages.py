@@ -151,3 +151,39 @@ def test_widgets_show_any_layer_and_window() -> None:
     before = columns.children[0].children[0].value
     window.value = (0.0, 0.1)
     assert columns.children[0].children[0].value != before
+
+
+def test_a_live_volume_is_a_page_where_no_program_is_behind_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("ipywidgets", reason="the extra `notebook`")
+    from flexdt.library.notebook import notebook_show
+
+    monkeypatch.setattr(notebook_show, "in_notebook", lambda: True)
+    shown = fx.Volume(np.ones((4, 5, 6), np.float32), 0.5).show()
+    bundle = shown._repr_mimebundle_()
+    assert "<img" in bundle["text/html"]
+    assert "application/vnd.jupyter.widget-view+json" in bundle
+
+
+def test_a_volume_with_unknown_voxels_tells_its_finite_range() -> None:
+    values = np.full((4, 5, 6), 0.25, np.float32)
+    values[0] = np.nan
+    values[1, 0, 0] = -0.5
+    shown = fx.Volume(values, 0.5)._repr_html_()
+    assert "-0.5 to 0.25 / mm; 25 % of the voxels are not known" in shown
+    assert "nan to" not in shown
+    assert "none is known" in fx.Volume(np.full((2, 2, 2), np.nan), 0.5)._repr_html_()
+
+
+def test_two_volumes_share_a_figure_and_a_window() -> None:
+    pyplot = pytest.importorskip("matplotlib.pyplot", reason="the extra `plots`")
+    one, other = (fx.Volume(np.arange(60.0).reshape(3, 4, 5) * k, 0.5) for k in (1, 2))
+    figure, axes = pyplot.subplots(1, 2)
+    one.plot(axes[0], window=other)
+    other.plot(axes[1], window=other)
+    assert axes[0].images[0].get_clim() == axes[1].images[0].get_clim()
+    figure.canvas.draw()
+    boxes = [one.get_tightbbox() for one in axes]
+    assert boxes[0].x1 <= boxes[1].x0
+    pyplot.close(figure)

@@ -172,7 +172,7 @@ def test_formats_hold_the_same_values(
         len(list(tmp_path.glob("*.png"))) == 6
     )  # those of one file do not replace the other's
     assert sorted(Path(str(f)).name for f in _list(made["slices"])) == [
-        "whole.mha_xy.png", "whole.mha_xz.png", "whole.mha_yz.png"]  # fmt: skip
+        "whole_xy.png", "whole_xz.png", "whole_yz.png"]  # fmt: skip
     assert not list(tmp_path.glob(".*"))
     volume = read_volume(tmp_path / name)
     assert volume.voxel_xyz == (0.8, 0.8, 0.8)

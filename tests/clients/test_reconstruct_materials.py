@@ -37,7 +37,8 @@ def test_materials_reach_the_iterations(data: fx.DataSet) -> None:
     lines = data.line_integrals()
     wanted = sirt(lines, SCAN, GRID, iterations=4, hardening=both).data
     np.testing.assert_allclose(found.data, wanted, atol=1e-6)
-    plain = data.reconstruct("sirt", **given).data
+    without = {name: value for name, value in given.items() if name != "tube"}
+    plain = data.reconstruct("sirt", **without).data
     assert np.abs(found.data - plain).max() > 0.02
     one = data.reconstruct("sirt", material=["pmma"], **given).data
     np.testing.assert_array_equal(

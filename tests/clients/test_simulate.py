@@ -472,7 +472,7 @@ LINE = ConeVec.from_vectors([0, -300, 0], [0, 200, 0], [PIXEL, 0, 0], [0, 0, -PI
         ),
         ({"scatter": "first"}, "'first' has been removed, use 'mc'"),
         ({"noise": -1}, "seed >= 0"),
-        ({"shape": (0, 3)}, "both positive"),
+        ({"shape": (0, 3)}, "rows and columns from 1"),
         ({"sample": "appel"}, "no sample 'appel'"),
         ({"sample": BLOCK}, "needs voxel_mm"),
         ({"sample": {1, 2}}, "a sample cannot be set"),

@@ -346,7 +346,7 @@ def test_blocks_with_different_regions_keep_their_own_geometry(
     ("change", "message"),
     [
         ({"schema": 2}, "schema is '2'; this version reads 1"),
-        ({"frames": 3}, "frames: Input should be a valid list"),
+        ({"frames": 3}, "frames: allowed: a list"),
         ({"detector": {}}, "detector.rows"),
         ({"machine": {}}, "machine"),
         ({"duration_s": "long"}, "duration_s"),

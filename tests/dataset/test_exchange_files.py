@@ -272,7 +272,7 @@ def test_nxtomo_holds_images_and_the_geometry_asked_for(
             1,
             "no NumPy file",
         ),
-        (("import", "bad.npy", "--format", "astra", "--out", "g.json"), 1, "(n, 12)"),
+        (("import", "bad.npy", "--format", "astra", "--out", "g.json"), 1, "n x 12"),
         (("import", "good.csv", "--format", "csv", "--out", "g.txt"), 1, ".json or .npy"),
         (
             ("import", "good.csv", "--format", "csv", "--out", "g.json", "--shape", "9"),

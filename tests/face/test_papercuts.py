@@ -51,7 +51,7 @@ def test_fdk_and_iterative_algorithms_take_a_grid() -> None:
 BALL = {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}
 
 
-EDGES = r"voxel_mm is \(.*; allowed: a number, \(a number, a number, a number\)"
+EDGES = r"voxel_mm is \(.*; allowed: a number, three values, each a number"
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_a_signal_of_another_panel_is_not_read_out() -> None:
     machine = builtin_machine()
     signal = np.ones((40, 50), np.float32)
     exposure = ExposureSettings(90.0, 50.0, 100.0)
-    with pytest.raises(LimitError, match=r"of shape \(40, 50\); allowed: \(760, 956\)"):
+    with pytest.raises(LimitError, match="of shape 40 x 50; allowed: 760 x 956"):
         read_out(
             detector_of(machine.detector),
             Expected(signal, signal),
@@ -129,7 +129,7 @@ def test_messages_are_ours_and_not_a_librarys() -> None:
     with pytest.raises(fx.TwinError) as wrong:
         ScanPlan.from_dict({"machine": 1})
     assert "Value error" not in str(wrong.value)
-    assert "ScanPlan: profile: Field required" in str(wrong.value)
+    assert "ScanPlan: profile: is missing" in str(wrong.value)
     text = json.dumps({"schema": 1, "frames": [{"file": "../x.tif"}]})
     with pytest.raises(fx.TwinError, match=r"file name '\.\./x\.tif' contains") as wrong:
         parse_document(text)
@@ -257,7 +257,7 @@ def test_beads_stand_where_their_positions_say() -> None:
     assert len(phantom.scene.solids) == 2
     for wrong in (np.zeros((3, 2)), np.zeros((0, 3)), np.zeros((1, 1, 3)), [1.0, 2.0]):
         with pytest.raises(
-            fx.TwinError, match=r"of shape .*; allowed: \(3,\), or \(k, 3\)"
+            fx.TwinError, match="in place of a cuboid; allowed: the name of a cuboid"
         ):
             fx.phantoms.beads(wrong)
 

@@ -52,7 +52,7 @@ def test_a_path_gives_name_and_format(tmp_path: Path) -> None:
     assert p.name == "vase"
     assert not p.is_analytic
     assert "abs" in p.description
-    with pytest.raises(PhantomError, match=r"cannot read .*missing.stl: No such file"):
+    with pytest.raises(FileNotFoundError, match=r"there is no file .*missing.stl"):
         mesh_phantom(tmp_path / "missing.stl")
 
 

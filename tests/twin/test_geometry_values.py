@@ -180,7 +180,7 @@ def test_a_helix_rises_with_the_angle() -> None:
         ({"tilts": (math.inf, 1.0, 2.0)}, "3 finite numbers"),
         ({"angles": 0}, "number of views"),
         ({"angles": 30.0}, "number of views"),
-        ({"angles": np.zeros((2, 2))}, r"array of shape \(2, 2\)"),
+        ({"angles": np.zeros((2, 2))}, r"array of shape 2 x 2"),
         ({"angles": True}, "number of views"),
         ({"angles": [0.0, math.inf]}, "finite"),
         ({"pixel": -1.0}, "pixel"),
@@ -189,12 +189,12 @@ def test_a_helix_rises_with_the_angle() -> None:
         ({"pixel": "wide"}, "pixel is 'wide'"),
         ({"offset": 3.0}, "offset"),
         ({"tilts": (1, 2)}, "tilts"),
-        ({"shape": (0, 3)}, "detector shape"),
+        ({"shape": (0, 3)}, "a detector of"),
         (
             {"shape": (1.5, 3)},
-            r"shape is \(1.5, 3\); allowed: \(a whole number, a whole number\)",
+            r"shape is \(1.5, 3\); allowed: two values, each a whole number",
         ),
-        ({"shape": 7}, r"shape is 7; allowed: \(a whole number, a whole number\)"),
+        ({"shape": 7}, r"shape is 7; allowed: two values, each a whole number"),
     ],
 )
 def test_numbers_that_no_scanner_has_are_named(

@@ -482,10 +482,10 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('beam = "parallel"', r"beam: Input should be 'cone'; .* parallel .*limits.md"),
+        ('beam = "parallel"', r"beam: allowed: 'cone'; .* parallel .*limits.md"),
         (
             '[detector]\nshape = "curved"',
-            r"detector.shape: Input should be 'flat'; curved .*s.md",
+            r"detector.shape: allowed: 'flat'; curved .*s.md",
         ),
         (
             "[[tube]]\nmax_kV = 90.0",
@@ -501,7 +501,7 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
         ),
         (
             "[detector]\nbits = 24",
-            "detector.bits: Input should be less than or equal to 16",
+            "detector.bits: allowed: at most 16",
         ),
         (
             "[geometry]\nsource_angle = { R = 1.0 }",

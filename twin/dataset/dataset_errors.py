@@ -6,7 +6,7 @@ the file.
 
 from __future__ import annotations
 
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import MissingFileError, TwinError
 
 
 class DatasetError(TwinError):
@@ -21,7 +21,7 @@ class DatasetFormatError(DatasetError):
     """A file whose content is not of the kind that its name states."""
 
 
-class DatasetMissingError(DatasetError):
+class DatasetMissingError(DatasetError, MissingFileError):
     """A required file is missing; the message names it."""
 
 

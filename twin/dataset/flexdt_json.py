@@ -29,6 +29,7 @@ from pydantic import (
     ValidationError,
 )
 
+from flexdt.message_words import problem_words
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetNameError
 from flexdt.twin.dataset.file_names import DOCUMENT, plain_name
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -43,7 +44,7 @@ from flexdt.twin.physics.predicted_beam import PredictedExposure
 from flexdt.twin.scanner.state import NamedCorrection
 from flexdt.twin.script import SampleSize, ScanPlan
 from flexdt.twin.script.planning.plan import saved_images
-from flexdt.twin.values import ArrayValue, message_of
+from flexdt.twin.values import ArrayValue
 
 POSITION_TOLERANCE = 1e-4
 """Largest difference of positions that count as one [mm, deg]: texts have six
@@ -748,7 +749,7 @@ def _validated(model: type[_M], content: object, file: str) -> _M:
         problems = [
             {
                 "path": ".".join(str(part) for part in e["loc"]),
-                "message": message_of(e),
+                "message": problem_words(e),
                 "value": repr(e["input"])[:80],
             }
             for e in error.errors(include_url=False)[:10]

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
+from flexdt.message_words import problem_words
 from flexdt.twin.dataset.format_table import Ledger, series
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.errors import TwinError
@@ -388,7 +389,9 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise ExchangeError(f"{file}: {where}: {first['msg']}", {"path": where}) from None
+        raise ExchangeError(
+            f"{file}: {where}: {problem_words(first)}", {"path": where}
+        ) from None
     rows = content.detector.rows
     columns = content.detector.columns
     real = content.real_cone_vec

@@ -730,11 +730,11 @@ class Follower:
         longer = "less"
         if took > waiting.most_s:
             longer = "more"
-        bounds = f"{waiting.least_s:.2f} to {waiting.most_s:.2f} s"
-        message = (
-            f"{waiting.heard.text} has taken {took:.2f} s, "
-            f"{longer} than its range of {bounds}"
-        )
+        least, most = f"{waiting.least_s:.2f}", f"{waiting.most_s:.2f}"
+        expected = f"its range of {least} to {most} s"
+        if least == most:
+            expected = f"the {most} s that it always takes"
+        message = f"{waiting.heard.text} has taken {took:.2f} s, {longer} than {expected}"
         return _alarm(mirror, now, WARNING, "range", waiting.heard.words[0], message)
 
 

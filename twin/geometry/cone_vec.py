@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.backends import backend
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, shape_words
 from flexdt.twin.geometry.conventions import (
     COLUMN_DIRECTION,
     ROW_DIRECTION,
@@ -80,9 +80,8 @@ class ConeVec:
         """
         rows = np.array(as_numbers("cone_vec", self.rows), ndmin=2)
         if rows.ndim != 2 or rows.shape[1] != ROW_LENGTH:
-            raise GeometryError(
-                f"cone_vec has shape {np.shape(self.rows)}; allowed: (n, 12)",
-                {"asked": list(np.shape(self.rows)), "allowed": ["n", ROW_LENGTH]},
+            raise GeometryError.of_shape(
+                "cone_vec", np.shape(self.rows), ("n", ROW_LENGTH)
             )
         finite = np.isfinite(rows).all(axis=1)
         if not finite.all():
@@ -910,7 +909,9 @@ def check_shape(shape: Shape2) -> Shape2:
     """
     rows, cols = map(operator.index, shape)
     if rows <= 0 or cols <= 0:
-        message = f"detector shape {shape!r}; allowed: (rows, cols), both positive"
+        message = (
+            f"a detector of {rows} x {cols} pixels; allowed: rows and columns from 1"
+        )
         raise GeometryError(message, {"asked": repr(shape), "allowed": ["rows", "cols"]})
     return rows, cols
 
@@ -939,8 +940,14 @@ def _stage_angles(angles: int | npt.ArrayLike, turns: float = 1.0) -> FloatArray
             0.0, FULL_TURN_DEG * turns, max(int(angles), 0), endpoint=False
         )
     if degrees.ndim != 1 or len(degrees) == 0 or not np.isfinite(degrees).all():
-        shown = angles if np.ndim(angles) == 0 else f"an array of shape {degrees.shape}"
-        message = f"angles: {shown}; allowed: a number of views from 1, or finite angles (n,) [deg]"
+        shown = (
+            angles
+            if np.ndim(angles) == 0
+            else f"an array of shape {shape_words(degrees.shape)}"
+        )
+        message = (
+            f"angles: {shown}; allowed: a number of views from 1, or finite angles [deg]"
+        )
         raise GeometryError(
             message, {"asked": repr(angles)[:100], "allowed": "views, or (n,) deg"}
         )

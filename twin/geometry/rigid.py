@@ -117,7 +117,7 @@ class Rigid:
         """
         if isinstance(axis, str):
             if axis not in AXES:
-                message = f"axis {axis!r}; allowed: x, y, z or a direction (3,)"
+                message = f"axis {axis!r}; allowed: x, y, z or a direction of 3 numbers"
                 raise GeometryError(message, {"asked": axis, "allowed": list(AXES)})
             axis = AXES[axis]
         turn = rotation_about(axis, math.radians(angle_deg))

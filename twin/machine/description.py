@@ -27,6 +27,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from flexdt.message_words import problem_words
 from flexdt.twin.errors import LimitError, MachineFileError, TwinError, UnknownNameError
 from flexdt.twin.geometry.told_lengths import PARAMETERS, PHANTOM
 from flexdt.twin.input_limits import NAMED_PROBLEMS, InputLimitError, parse_toml
@@ -41,7 +42,6 @@ from flexdt.twin.machine.camera import (
     without_number,
 )
 from flexdt.twin.machine.stated_causes import CAUSES
-from flexdt.twin.values import message_of
 
 Positive = Annotated[float, Field(gt=0, le=1e6)]
 Length = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -1412,7 +1412,7 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
                 value = e["ctx"]["value"]
             message = "there is no such key"
             if e["type"] != "extra_forbidden":
-                message = message_of(e)
+                message = problem_words(e)
             if e["type"] in ("extra_forbidden", "literal_error", "model_type"):
                 message += _limit(path)
             lines.append(f"{file}: {path}: {message} (value: {value!r})")

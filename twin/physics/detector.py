@@ -208,6 +208,7 @@ class Detector:
             ),
             0.0,
         )
+        cls(**figures)  # so that a mistake is told beside what was given alone
         all_of_it = ((0.1, 0.1), (1e4, 1e4))
         return cls(**{"swank": 1.0, "response": all_of_it, **nothing, **figures})
 

@@ -468,8 +468,8 @@ def back(
     reads without another copy; use np.ascontiguousarray where C order matters.
 
     Args:
-        projections: (n, rows, cols); of the host, or on a CUDA device (anything with
-            `__cuda_array_interface__`), where the result stays then.
+        projections: (n, rows, cols); of the host, or on a CUDA device (of cupy,
+            PyTorch or numba), where the result stays then.
         cone_vec: ConeVec or (n, 12) [mm], one row a projection.
         like: the grid, or a volume on it, whose values are not used.
         out: an array of `room_like(like)`, overwritten and taken for the result if given:

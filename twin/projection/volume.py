@@ -288,17 +288,34 @@ class Volume:
         return f"<Volume: {nz} x {ny} x {nx} voxels (z, y, x) of {voxel} mm about ({centre}) mm>"
 
     def _repr_html_(self) -> str:
-        """Return an HTML table for a notebook: shape, size [mm], least and largest value
-        [1/mm].
+        """Return an HTML table for a notebook: shape, size [mm], least and largest finite
+        value [1/mm], the share of voxels that no data determine, and the accuracy if known.
         """
         size = " x ".join(f"{side:g}" for side in self.size_mm)
-        least = float(self.data.min())
-        most = float(self.data.max())
-        return (
-            f"<table><caption>{escape(repr(self)[1:-1])}</caption>"
-            f"<tr><th>size (x, y, z)</th><td>{size} mm</td></tr>"
-            f"<tr><th>values</th><td>{least:.4g} to {most:.4g} / mm</td></tr></table>"
+        rows = {"size (x, y, z)": f"{size} mm", "values": self._range_words()}
+        if self.accuracy is not None:
+            rows["accuracy"] = str(self.accuracy).removeprefix("accuracy: ")
+        body = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(said)}</td></tr>"
+            for name, said in rows.items()
         )
+        return f"<table><caption>{escape(repr(self)[1:-1])}</caption>{body}</table>"
+
+    def _range_words(self) -> str:
+        """Say the least and the largest finite value, and how many voxels have none."""
+        known = [np.isfinite(layer) for layer in self.data]
+        share = sum(int(layer.sum()) for layer in known) / self.data.size
+        if share == 0.0:
+            return "none is known (NaN)"
+        ends = [
+            (float(layer[mask].min()), float(layer[mask].max()))
+            for layer, mask in zip(self.data, known, strict=True)
+            if mask.any()
+        ]
+        words = f"{min(ends)[0]:.4g} to {max(most for _, most in ends):.4g} / mm"
+        if share == 1.0:
+            return words
+        return f"{words}; {100.0 * (1.0 - share):.2g} % of the voxels are not known (NaN)"
 
     def to(self, device: str) -> Any:
         """Return the volume on a device: "cpu", this volume, or "cuda", a `DeviceVolume`.
@@ -331,25 +348,32 @@ class Volume:
         there = replace(layout, flat=gpu.demand(layout.device_copy.uploaded))
         return DeviceVolume(there, self.shape, self.voxel_mm, self.center_mm)
 
-    def plot(self, axes: Any = None, what: str = "data") -> Any:
+    def plot(
+        self,
+        axes: Any = None,
+        what: str = "data",
+        window: Sequence[float] | Volume | None = None,
+    ) -> Any:
         """Show the layer in the middle; needs matplotlib (the extra `plots`).
 
         Args:
             axes: matplotlib's axes to draw into; None makes a figure.
             what: `data`, or what `reconstruct` found of its errors: `sigma` or
                 `bias_bound`.
+            window: attenuation of black and of white [1/mm], or a volume whose window is
+                taken, so that both can be compared; None: percentiles of the layer.
 
         Returns:
             The axes.
 
         Raises:
-            TwinError: there is nothing of that name.
+            TwinError: there is nothing of that name, or no such window.
 
         Example:
             >>> Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).plot().get_title()
             'z = 0.25 mm'
         """
-        return backend("plots").plot_volume(self, axes, what)
+        return backend("plots").plot_volume(self, axes, what, window)
 
     def show(self, window: Sequence[float] | None = None) -> Any:
         """Show three slices in a notebook, with a slider for each.

@@ -24,7 +24,7 @@ from flexdt.library.failure import CommandError
 from flexdt.runtime.files.limited_files import limited_text
 from flexdt.runtime.files.whole_files import bytes_of
 from flexdt.twin import long_work
-from flexdt.twin.algorithms import ALGORITHMS, DEFAULT
+from flexdt.twin.algorithms import ALGORITHMS, DEFAULT, misfit
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -119,6 +119,8 @@ def reconstruct(
     scattering = option_values.if_given(scatter_correction, option_values.names)
     made_of = option_values.if_given(material, option_values.names)
     center_mm = option_values.if_given(center, _center)
+    # A key of the settings file is for whatever has it; an option is for this command.
+    windowed = "window" in ALGORITHMS[algorithm or DEFAULT].options
     request = VolumeRequest(
         algorithm=algorithm or DEFAULT,
         voxel_mm=voxel,
@@ -127,7 +129,7 @@ def reconstruct(
         every=every or 1,
         iterations=iterations,
         weight=weight,
-        window=chosen(ReconstructSettings).window,
+        window=chosen(ReconstructSettings).window if windowed else None,
         center_mm=center_mm,
         rings=rings,
         material=made_of,
@@ -188,7 +190,9 @@ def _lines_of(document: Mapping[str, Any], out: Path) -> Iterator[str]:
         f"{duration(document['seconds'])}"
     )
     if document["accuracy"] is not None:
-        yield f"  {Accuracy(**document['accuracy'])}"
+        accuracy = str(Accuracy(**document["accuracy"]))
+        if not any(accuracy in warning for warning in document["warnings"]):
+            yield f"  {accuracy}"
     yield from (f"  {file}" for file in document["slices"])
 
 
@@ -198,8 +202,8 @@ def _check_together(
     """Check that options go together.
 
     Checked in this order, the first wrong one is raised: preview, the ending of `out`,
-    kV, options that the algorithm lacks, SLURM with a scheduler, workers for an algorithm
-    that has none, and a correction that is no report with a geometry.
+    options without effect (`twin.algorithms.OPTIONS`), SLURM with a scheduler, and a
+    correction that is no report with a geometry.
 
     Args:
         given: options by name.
@@ -212,47 +216,31 @@ def _check_together(
     """
     from flexdt.library.reconstruction.volume_files import ending, endings
 
-    algorithm = str(given.get("algorithm", DEFAULT))
-    has = ALGORITHMS[algorithm].options
-    corrects = {"material", "scatter-correction"} & given.keys()
-    for wrong, name, why in (
-        *((True, name, "--preview chooses for itself") for name in kept_out),
+    names = {name.replace("-", "_") for name in given}
+    nothing = misfit(str(given.get("algorithm", DEFAULT)), names, spelled=_option)
+    for wrong, why in (
+        *((True, f"--{name}: --preview chooses for itself") for name in kept_out),
         (
             ending(out) not in endings(),
-            "out",
-            f"{out}: the ending must be one of {', '.join(endings())}",
+            f"--out: {out}: the ending must be one of {', '.join(endings())}",
         ),
-        (
-            "kv" in given and not corrects,
-            "kv",
-            "it is for --material and --scatter-correction",
-        ),
-        *(
-            (name in given and name not in has, name, f"{algorithm} has none")
-            for name in ("iterations", "weight")
-        ),
+        (nothing is not None, nothing[1] if nothing else ""),
         (
             {"scheduler", "slurm"} <= given.keys(),
-            "slurm",
-            "not together with --scheduler",
-        ),
-        *(
-            (
-                not ALGORITHMS[algorithm].direct,
-                name,
-                f"{algorithm} is not done by workers; allowed: {DEFAULT}",
-            )
-            for name in ("scheduler", "slurm")
-            if name in given
+            "--slurm: not together with --scheduler",
         ),
         (
             "geometry" in given and given.get("correction") in ("twin", "none"),
-            "correction",
-            f"{given.get('correction')} is not for a geometry from a file",
+            f"--correction: {given.get('correction')} is not for a geometry from a file",
         ),
     ):
         if wrong:
-            raise typer.BadParameter(f"--{name}: {why}")
+            raise typer.BadParameter(why)
+
+
+def _option(name: str) -> str:
+    """Write an option of the library as the command line has it."""
+    return f"--{name.replace('_', '-')}"
 
 
 def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report | None]:

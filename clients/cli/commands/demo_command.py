@@ -8,11 +8,13 @@ is absent from the document.
 from __future__ import annotations
 
 import contextlib
+import logging
 import shlex
 import shutil
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from importlib import resources
@@ -48,6 +50,9 @@ CALIBRATION: Final = "calibration.json"
 PICTURE: Final = "demo.png"
 PICTURE_ROWS: Final = 380
 """Height of the images in the picture [pixels]."""
+PICTURE_VOXEL_MM: Final = 0.1
+PICTURE_MARGIN: Final = 30
+"""Voxels of air beside the phantom in the picture."""
 PICTURE_GAP: Final = 8
 """Distance of the images in the picture [pixels]."""
 STAY_S: Final = 3600.0
@@ -124,6 +129,9 @@ def run_demo(
     data = out / "data"
     data.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as running:
+        if not sys.stderr.isatty():
+            # Stages are told one by one; lines in place of bars would bury them.
+            running.enter_context(_quiet("flexdt.progress"))
         path = truth_file or running.enter_context(_drawn_truth())
         truth = hidden.read(path)
         tell(
@@ -144,6 +152,18 @@ def run_demo(
         if stay is not None and servers.viewer_url is not None:
             stay(servers.viewer_url)
     return document
+
+
+@contextlib.contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Keep a logger from warnings within the context."""
+    log = logging.getLogger(name)
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 @contextlib.contextmanager
@@ -226,10 +246,8 @@ def _main_job(
     push_correction(client, outcome.correction, outcome.sources)
     tell(f"correction in force on the twin: {outcome.correction.name}")
     document["inside_95"] = _compare_with_truth(outcome, truth, tell)
-    document["preview"] = _reconstruct_preview(
-        dataset, outcome, out / "preview.tif", tell
-    )
-    document["picture"] = str(_draw_picture(dataset, out / "preview.tif", out / PICTURE))
+    document["preview"] = _reconstruct_preview(dataset, outcome, out / "preview.tif")
+    document["picture"] = str(_draw_picture(dataset, outcome, out / PICTURE))
     return document
 
 
@@ -313,32 +331,29 @@ def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
 
 
 def _reconstruct_preview(
-    dataset: DataSet, outcome: Outcome[DataSet], out: Path, tell: Tell
+    dataset: DataSet, outcome: Outcome[DataSet], out: Path
 ) -> dict[str, object]:
-    """Reconstruct a small volume with the calibrated geometry into the file `out`; prints
-    the time and returns its report. The calibration must have a fit.
+    """Reconstruct a small volume with the calibrated geometry into the file `out`; returns
+    its report. The calibration must have a fit.
     """
     from flexdt.library.reconstruction.reconstruct import preview
 
     fit = outcome.calibration.fit
     assert fit is not None
     with long_work.during("making a preview"):
-        document = preview(dataset, out, parameters=fit.parameters)
-    tell(f"preview {out}: {duration(document['seconds'])}")
-    return document
+        return preview(dataset, out, parameters=fit.parameters)
 
 
-def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
-    """Draw the first radiograph and the middle layer of a volume side by side, equally
-    high, each with a title and a scale.
+def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Path:
+    """Draw the layer of one bead as the scanner believes its geometry, as calibrated, and
+    as it is, at one scale and in one window.
 
-    The radiograph is dark where the sample is dense, as one of `flexdt snap`; the layer
-    is bright there. Both are `PICTURE_ROWS` rows high, by nearest pixels, with a white
-    gap of `PICTURE_GAP` columns.
+    Both volumes are FDK of the same images. Each is `PICTURE_ROWS` rows high, by nearest
+    pixels, with white gaps of `PICTURE_GAP` columns.
 
     Args:
-        dataset: of the radiograph.
-        volume: file of the volume.
+        dataset: the scan, without a correction in force.
+        outcome: its calibration, with a fit.
         out: file of the PNG.
 
     Returns:
@@ -348,30 +363,42 @@ def _draw_picture(dataset: DataSet, volume: Path, out: Path) -> Path:
 
     from flexdt.library.datasets.labelled_pictures import labelled
     from flexdt.library.datasets.pictures import png_of, windowed
-    from flexdt.library.reconstruction.volume_files import read_volume
+    from flexdt.library.reconstruction.reconstruct import (
+        VolumeRequest,
+        reconstruct_volume,
+    )
 
-    found = read_volume(volume)
-    view = dataset.geometry[:1]
-    to_axis = np.linalg.norm(view.source[0])
-    to_panel = np.linalg.norm(view.detector[0] - view.source[0])
-    pixel_mm = float(np.linalg.norm(view.v[0]) * to_axis / to_panel)
-    layer = found.data[len(found.data) // 2][::-1]
-    radiograph = _scaled_to(dataset.line_integrals(0))
-    section = _scaled_to(layer)
-    drawn = [
-        labelled(
-            255 - windowed(radiograph),
-            "first radiograph, dark: much attenuation (scale: at the axis)",
-            pixel_mm * dataset.shape[0] / PICTURE_ROWS,
-        ),
-        labelled(
-            windowed(section),
-            "horizontal layer of the volume, bright: much attenuation",
-            found.voxel_xyz[1] * layer.shape[0] / PICTURE_ROWS,
-        ),
-    ]
-    gap = np.full((drawn[0].shape[0], PICTURE_GAP), 255, np.uint8)
-    out.write_bytes(png_of(np.hstack([drawn[0], gap, drawn[1]])))
+    fit = outcome.calibration.fit
+    assert fit is not None
+    truth = outcome.phantom.volume(PICTURE_VOXEL_MM, oversample=1)
+    rows, cols = (n + 2 * PICTURE_MARGIN for n in truth.shape[1:])
+    layer = int(np.argmin(np.abs(truth.centers()[2] - outcome.phantom.beads[0, 2])))
+    z = float(truth.centers()[2][layer])
+    request = VolumeRequest(
+        voxel_mm=PICTURE_VOXEL_MM,
+        shape=(1, rows, cols),
+        center_mm=(0.0, 0.0, z),
+    )
+    with long_work.during("drawing the picture"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the picture shows what they say
+        believed, calibrated = (
+            reconstruct_volume(dataset, request, parameters=parameters).data[0]
+            for parameters in (None, fit.parameters)
+        )
+    known = np.pad(truth.data[layer], PICTURE_MARGIN)
+    plastic = float(np.median(known[known > 0.0]))
+    window = np.array([-plastic, 3.0 * plastic])  # beads are far beyond
+    gap = np.full((1, PICTURE_GAP), 255, np.uint8)
+    drawn: list[npt.NDArray[np.uint8]] = []
+    for image, title in (
+        (believed, "as believed"),
+        (calibrated, "as calibrated from its own images"),
+        (known, "the truth"),
+    ):
+        picture = windowed(_scaled_to(image[::-1]), like=window)
+        named = labelled(picture, title, PICTURE_VOXEL_MM * rows / PICTURE_ROWS)
+        drawn += [named, np.repeat(gap, len(named), axis=0)]
+    out.write_bytes(png_of(np.hstack(drawn[:-1])))
     return out
 
 
@@ -404,7 +431,7 @@ def _print_summary(document: dict[str, Any], out: Path, tell: Tell) -> None:
     folder = shlex.quote(str(out))
     tell(f"verdict: {document['calibration']['verdict']}")
     tell(
-        f"picture: {document['picture']} (the first radiograph, and a layer of the volume)"
+        f"picture: {document['picture']} (a bead's layer as believed, as calibrated, in truth)"
     )
     tell(f"summary: {out / 'demo.json'}")
     tell("next:")
@@ -416,14 +443,30 @@ def _print_summary(document: dict[str, Any], out: Path, tell: Tell) -> None:
     tell(f"  {program} up --data {folder}/data   # the lab in the browser, until Ctrl-C")
 
 
+def _limit_of(estimate: Mapping[str, Any]) -> str:
+    """Say what most of an estimate's sigma comes from: the images, or what was assumed
+    before them, which may well be righter than its sigma says.
+    """
+    parts = {"the images": estimate["images"], **estimate["priors"]}
+    most = max(parts, key=lambda name: parts[name])
+    return f"prior of {most}" if most in _offsets() else most
+
+
+def _offsets() -> frozenset[str]:
+    """Names of the offsets that have priors."""
+    from flexdt.twin.geometry.offsets import MEANINGS
+
+    return frozenset(MEANINGS)
+
+
 def _compare_with_truth(
     outcome: Outcome[DataSet], truth: Mapping[str, float], tell: Tell
 ) -> bool:
     """Compare the calibration with the hidden truth; a miss is called a miss.
 
-    A table is printed, then one line with inside or miss. A parameter that the truth
-    lacks counts as 0 (angle_scale as 1). Only the calibration's parameters are in the
-    table.
+    A table is printed, with what limits each sigma, then one line with inside or miss. A
+    parameter that the truth lacks counts as 0 (angle_scale as 1). Only the calibration's
+    parameters are in the table.
 
     Args:
         outcome: of the calibration.
@@ -440,8 +483,10 @@ def _compare_with_truth(
     for shown, value, sigma, _, unit in parameter_rows(outcome.document):
         name = shown.strip("()")
         true = truth.get(name, 1.0 if name == "angle_scale" else 0.0)
-        rows.append((shown, f"{true:.5f}", value, sigma, unit, MEANINGS[name]))
-    tell(table(rows, ("parameter", "truth", "calibrated", "sigma", "unit", "meaning")))
+        limit = _limit_of(outcome.document["parameters"][shown])  # type: ignore[index]
+        rows.append((shown, f"{true:.5f}", value, sigma, limit, unit, MEANINGS[name]))
+    heads = ("parameter", "truth", "calibrated", "sigma", "limited by", "unit", "meaning")
+    tell(table(rows, heads))
     inside = inside_95(outcome, truth)
     if inside:
         tell("the truth lies inside the joint 95 % region")

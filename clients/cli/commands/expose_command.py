@@ -6,6 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import typer
+
 from flexdt.clients.cli import options, value_completion
 from flexdt.clients.cli.console import duration, size, table, warn
 from flexdt.clients.cli.options import Answer, argument, option
@@ -14,6 +16,8 @@ from flexdt.library import machines
 if TYPE_CHECKING:
     from flexdt.library.expose import Forecast, Measured, Transmission
 
+FRAMES: Final = 361
+DETAIL: Final = "void:0.5"
 SHOWN_SETTINGS: Final = 5
 """Number of proposed settings that are shown."""
 
@@ -33,10 +37,10 @@ def expose(
     averages: int = option(1),
     mode: str | None = option(None, metavar="NAME", proposes=value_completion.mode_names),
     roi: options.Roi = None,
-    frames: int = option(361),
+    frames: int = option(FRAMES),
     sod: float | None = option(None, metavar="MM"),
     sdd: float | None = option(None, metavar="MM"),
-    detail: str = option("void:0.5", metavar="MATERIAL:MM"),
+    detail: str = option(DETAIL, metavar="MATERIAL:MM"),
     machine: options.MachineName = None,
 ) -> Answer:
     """Predict transmission, contrast to noise, dose and the best voltage and filter.
@@ -58,14 +62,25 @@ def expose(
 
     Yields:
         The forecast (or, of a data set, the measured exposure) as document of --json,
-        then its lines. Assumptions and warnings go to standard error. With a data set all
-        other options are ignored.
+        then its lines. Assumptions and warnings go to standard error. Raises
+        typer.BadParameter for an option beside a data set, which has been made.
     """
     from flexdt.library import expose as of
     from flexdt.library.reading.folders import load_dataset
     from flexdt.twin.machine.camera import Roi
 
     if dataset is not None:
+        stated = {
+            "sample": sample != "lego", "material": material, "kV": kV, "power": power,
+            "filter": filter, "exposure": exposure, "averages": averages != 1, "mode": mode,
+            "roi": roi, "frames": frames != FRAMES, "sod": sod, "sdd": sdd,
+            "detail": detail != DETAIL, "machine": machine,
+        }  # fmt: skip
+        for name, given in stated.items():
+            if given:
+                raise typer.BadParameter(
+                    f"--{name}: has no effect on a scan that was made; allowed with: --sample"
+                )
         data = load_dataset(dataset)
         warn(data.warnings, dataset)
         measured = of.exposure_of(data)
@@ -126,7 +141,7 @@ def _forecast_lines(forecast: Forecast) -> Answer:
     seen = "not seen: these pixels are saturated"
     if asked.cnr is not None:
         seen = f"contrast {asked.cnr:.3g} times the noise"
-    yield f"{forecast.detail} on the darkest ray: {seen}"
+    yield f"{forecast.detail} on the darkest ray: {seen}; {forecast.contrast_words()}"
     yield (
         f"air kerma on the axis {asked.kerma_mGy:.3g} mGy; {forecast.images} images, at least "
         f"{duration(forecast.seconds)}, {size(forecast.bytes)}"

@@ -489,8 +489,9 @@ def find_phantom(phantom: str | Phantom) -> Phantom:
         try:
             target = load_phantom(phantom)
         except UnknownNameError:
-            if not Path(phantom).is_file():
-                raise
+            path = Path(phantom)
+            if not path.is_file() and not path.suffix and len(path.parts) == 1:
+                raise  # a name, and none that ships
             target = read_phantom_file(Path(phantom))
     if len(target.beads) == 0:
         raise TwinError(

@@ -52,7 +52,7 @@ from flexdt.twin.calibration.unknown_markers import (
     link,
     triangulate,
 )
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import FileError, TwinError
 from flexdt.twin.findings import Findings, error
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.offsets import NOMINAL, Offsets
@@ -184,7 +184,7 @@ def _of_array(path: Path, views: int) -> Markers:
     except KeyError:
         raise TwinError(f"cannot read {path}: it holds several arrays") from None
     except OSError as error:
-        raise TwinError(f"cannot read {path}: {error.strerror}") from None
+        raise FileError.of(error) from None
     except (TypeError, ValueError):
         said = f"cannot read {path}: it is no NumPy file of numbers, or a damaged one"
         raise TwinError(said) from None

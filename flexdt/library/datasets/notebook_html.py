@@ -45,7 +45,8 @@ def values_table(heads: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def thumbnail(image: npt.NDArray[Any], alt: str) -> str:
-    """Draw an image (rows, cols) small, as an `img` element that holds its PNG.
+    """Draw an image (rows, cols) small, as an `img` element that holds its PNG, with what
+    it is below.
 
     Args:
         image: every so many pixels of it are drawn, so that no side exceeds THUMBNAIL_PX.
@@ -56,4 +57,11 @@ def thumbnail(image: npt.NDArray[Any], alt: str) -> str:
     step = -(-max(image.shape) // THUMBNAIL_PX)
     small = np.ascontiguousarray(image[::step, ::step])
     data = base64.b64encode(png(small)).decode("ascii")
-    return f'<img alt="{escape(alt)}" src="data:image/png;base64,{data}">'
+    rows, cols = image.shape
+    said = f"{alt}: {rows} x {cols} pixels"
+    if step > 1:
+        said += f", every {step}. one is shown"
+    return (
+        f'<img alt="{escape(alt)}" width="{THUMBNAIL_PX}" style="image-rendering:pixelated" '
+        f'src="data:image/png;base64,{data}"><div>{escape(said)}</div>'
+    )

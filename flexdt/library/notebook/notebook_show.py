@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -27,14 +28,35 @@ WINDOW_REACH_WIDTHS: Final = 0.5
 """Reach of the window's slider beyond the window, on each side, as a share of its width."""
 
 
-def show_volume(volume: Volume, window: Sequence[float] | None = None) -> Any:
-    """Return widgets, in a notebook with ipywidgets, else a page of the volume; see
-    `Volume.show`.
+@dataclass(frozen=True)
+class LivePage(NotebookPage):
+    """A page that is shown as live widgets where there is a program behind them, and as
+    itself in a saved notebook, on a site and in print.
+
+    Attributes:
+        widgets: of ipywidgets.
     """
+
+    widgets: Any = None
+
+    def _repr_mimebundle_(self, **wanted: Any) -> dict[str, Any]:
+        """Give the widgets and the page in one output; its viewer takes what it can."""
+        live = self.widgets._repr_mimebundle_(**wanted)
+        views = live[0] if isinstance(live, tuple) else live
+        plain = {"text/html": self.html, "text/plain": repr(self)}
+        return {**(views or {}), **plain}
+
+
+def show_volume(volume: Volume, window: Sequence[float] | None = None) -> NotebookPage:
+    """Return a page of the volume, in a notebook with ipywidgets together with live
+    widgets; see `Volume.show`.
+    """
+    page = volume_page(volume, window)
     if in_notebook() and lacking("ipywidgets", "ipywidgets", "notebook") is None:
         widgets = package("ipywidgets", "a volume with live sliders", "notebook")
-        return volume_widgets(widgets, volume, window)
-    return volume_page(volume, window)
+        live = volume_widgets(widgets, volume, window)
+        return LivePage(page.html, page.title, live)
+    return page
 
 
 def show_geometry(cone_vec: ConeVec) -> NotebookPage:

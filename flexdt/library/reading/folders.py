@@ -105,7 +105,7 @@ from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.image_order import duplicate
 from flexdt.twin.plausibility.scan_geometry import azimuths
 from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
-from flexdt.twin.signatures import public, with_options_of
+from flexdt.twin.signatures import called, public, with_options_of
 
 DARK_PATTERN: Final = "di*"
 FLAT_PATTERN: Final = "io*"
@@ -117,6 +117,7 @@ MAX_SETTINGS_BYTES: Final = LIMITS["settings"].file_bytes
 
 
 @public
+@called("open")
 @with_options_of(ScanOptions)
 def load_dataset(
     folder: str | PathLike[str],

@@ -50,7 +50,7 @@ from flexdt.library.reconstruction.volume_files import (
 )
 from flexdt.runtime.files.directory import free_memory_bytes, memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes
-from flexdt.twin.algorithms import ALGORITHMS, DEFAULT, PLAIN, having
+from flexdt.twin.algorithms import ALGORITHMS, DEFAULT, PLAIN, having, misfit
 from flexdt.twin.caller_warnings import warn_caller
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import (
@@ -78,6 +78,7 @@ from flexdt.twin.reconstruction import (
     truncation_of,
     with_errors,
 )
+from flexdt.twin.reconstruction.acquisition.coverage import ends_not_seen_mm
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, distinct_angles
 from flexdt.twin.reconstruction.acquisition.truncation import SAMPLES as TRUNCATION_VIEWS
 from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of
@@ -113,7 +114,7 @@ class VolumeRequest:
         binning: pixels a side over which images are averaged first.
         every: use every n-th frame.
         iterations: of an iterative algorithm; None is its own default.
-        window: of FDK's ramp filter.
+        window: of FDK's ramp filter; None is `PLAIN`.
         center_mm: (x, y, z) of the grid; None is the middle of the field of view, or the origin
             where `shape` is given.
         rings: subtract the offsets that pixels add to all views, where they exceed object
@@ -136,7 +137,7 @@ class VolumeRequest:
     binning: int = 1
     every: int = 1
     iterations: int | None = None
-    window: str = PLAIN
+    window: str | None = None
     center_mm: tuple[float, float, float] | None = None
     rings: bool = False
     material: str | tuple[str, ...] | None = None
@@ -145,6 +146,11 @@ class VolumeRequest:
     weight: float | None = None
     scatter_correction: tuple[str, ...] | None = None
     tube: Tube | None = None
+
+    @property
+    def ramp_window(self) -> str:
+        """The window of FDK's ramp filter, `PLAIN` where none is asked for."""
+        return PLAIN if self.window is None else self.window
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +283,7 @@ def views_of(
 
 def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
     """Choose the grid of a requested volume; missing values are those of the field
-    of view.
+    of view, of a helix without the ends that FDK cannot fill.
 
     A requested shape without centre is centred at the origin.
 
@@ -295,6 +301,9 @@ def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
         settled(voxel_findings(request.voxel_mm, seen_mm), GeometryError)
     shape = whole.shape
     center = whole.center_mm
+    if ALGORITHMS[request.algorithm].direct:
+        left_out = math.floor(ends_not_seen_mm(views.cone_vec) / whole.voxel_mm)
+        shape = max(1, shape[0] - 2 * left_out), *shape[1:]
     if request.shape is not None:
         shape = request.shape
         center = (0.0, 0.0, 0.0)
@@ -585,7 +594,7 @@ def _fdk_slabs(
         work: gets the progress.
         errors: estimate `sigma`.
     """
-    window = task.request.window
+    window = task.request.ramp_window
     if plan.prepared:
         images = replace(task.standing, truncation=views.truncation)
         view = partial(views.view, again=False)
@@ -744,10 +753,7 @@ def _task(
     else:
         wanted = request
     name = wanted.algorithm
-    if name not in ALGORITHMS:
-        raise UnknownNameError.among(
-            f"unknown algorithm {name!r}; allowed", name, ALGORITHMS
-        )
+    require_effect(wanted)
     several = _names(wanted.material)
     if len(several) > 1 and "materials" not in ALGORITHMS[name].options:
         message = f"materials {', '.join(several)} with {name}"
@@ -771,6 +777,40 @@ def _task(
     doubts += [*bad, *image_doubts(mended, needed=True, counts=counts.looked_at)]
     views = replace(views, dataset=mended, doubts=tuple(doubts))
     return ReconstructionTask(wanted, views, grid, counts)
+
+
+def require_effect(request: VolumeRequest, errors: bool | None = None) -> None:
+    """Check that every option of a request has an effect (`twin.algorithms.OPTIONS`).
+
+    Args:
+        request: of a volume.
+        errors: whether the noise and the bound of the bias are asked for; None where
+            nothing was said.
+
+    Raises:
+        UnknownNameError: there is no such algorithm.
+        LimitError: an option has no effect; says with what it has one.
+    """
+    name = request.algorithm
+    if name not in ALGORITHMS:
+        raise UnknownNameError.among(
+            f"unknown algorithm {name!r}; allowed", name, ALGORITHMS
+        )
+    stated = {
+        "iterations": request.iterations,
+        "weight": request.weight,
+        "window": request.window,
+        "errors": errors or None,
+        "material": request.material,
+        "scatter_correction": request.scatter_correction,
+        "tube": request.tube,
+        "kv": request.kV,
+    }
+    given = {name for name, value in stated.items() if value is not None}
+    found = misfit(name, given)
+    if found is not None:
+        option, sentence = found
+        raise LimitError(sentence, {"asked": option, "algorithm": name})
 
 
 def preview(

@@ -217,14 +217,15 @@ class MiddleSlices:
         }
 
     def write(self, path: Path) -> list[Path]:
-        """Write PNG files next to `path`, named after all of its name (so those of
-        `v.tif` and `v.nrrd` differ); returns their paths.
+        """Write PNG files next to `path`, named as it is without its ending, with _xy, _xz
+        and _yz; returns their paths.
 
         All three share one grey scale: the 0.5th and 99.5th percentile of their values.
         """
         every = np.concatenate([image.ravel() for image in self.images.values()])
         written = []
         for name, image in self.images.items():
-            written.append(path.with_name(f"{path.name}_{name}.png"))
+            stem = path.name[: -len(ending(path))] if ending(path) else path.name
+            written.append(path.with_name(f"{stem}_{name}.png"))
             written[-1].write_bytes(png(image, like=every))
         return written

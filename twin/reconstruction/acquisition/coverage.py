@@ -18,11 +18,14 @@ from typing import Final
 
 import numpy as np
 
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.reconstruction.acquisition.trajectory import (
+    TURN,
     Circle,
+    circle_of,
     no_fdk,
     panel_reach,
 )
@@ -168,6 +171,24 @@ DEPTHS = 64
 """Number of depths at which shares are tabulated."""
 HELIX_TAPER_RAD = 0.2
 """Angle over which views count less towards the ends of the helix [rad]."""
+
+
+def ends_not_seen_mm(cone_vec: ConeVec) -> float:
+    """Compute how much of the field of view at either end of a helix FDK cannot fill.
+
+    A layer needs the views of a turn, and of the taper at both ends, which rise so far.
+
+    Args:
+        cone_vec: the scan.
+
+    Returns:
+        [mm] along z; 0 for scans that are no helix.
+    """
+    try:
+        circle = circle_of(cone_vec)
+    except GeometryError:
+        return 0.0
+    return abs(circle.rise) * (1.0 + 2.0 * HELIX_TAPER_RAD / TURN)
 
 
 @dataclass(frozen=True, eq=False)

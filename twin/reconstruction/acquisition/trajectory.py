@@ -440,8 +440,12 @@ def _check_covered(circle: Circle, widest: float) -> None:
     if _unseen(circle.gaps, widest) > 1e-6:
         covered = TURN - float(np.diff(circle.gaps).sum())
         span, need = np.rad2deg([covered, np.pi + 2 * widest])
+        # The source stands on -y at angle 0; a turn begins there.
+        begins = (np.rad2deg(circle.gaps[:3, 0]) + 90.0) % 360.0
+        wide = np.rad2deg(np.diff(circle.gaps[:3])[:, 0])
         listed = ", ".join(
-            f"{first:.4g} to {last:.4g}" for first, last in np.rad2deg(circle.gaps[:3])
+            f"{first:.4g} to {first + width:.4g}"
+            for first, width in zip(begins, wide, strict=True)
         )
         why = (
             f"the views span {span:.4g} deg of the circle, and with the gap at {listed} "
