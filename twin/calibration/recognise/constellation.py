@@ -94,16 +94,19 @@ class Likeness:
         """Angle between the phantom's z and the vertical [rad]."""
         return math.acos(min(max(float(self.rotation[2, 2]), -1.0), 1.0))
 
-    def turned_from(self, other: Likeness, within_mm: float) -> bool:
+    def turned_from(self, other: Likeness, within_mm: float, rise_mm: float = 0.0) -> bool:
         """Check whether the balls differ from others by a turn of the stage alone.
 
         Args:
             other: how the same beads are like the others.
             within_mm: shift that is none [mm].
+            rise_mm: of the stage as it turns, a radian [mm].
         """
         turn = self.rotation @ other.rotation.T
         upright = float(turn[2, 2]) > math.cos(math.radians(0.5))
         off = self.shift - turn @ other.shift
+        # Growing angles turn the balls clockwise.
+        off[2] += rise_mm * math.atan2(turn[1, 0], turn[0, 0])
         return upright and bool(np.linalg.norm(off) < within_mm)
 
     @property

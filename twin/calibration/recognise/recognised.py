@@ -314,6 +314,12 @@ class _Spots:
     name: str
     start: Offsets
 
+    @property
+    def _rise_mm(self) -> float:
+        """Rise of the stage as it turns, a radian [mm]."""
+        angle = self.poses.angle - self.poses.angle.mean()
+        return float(angle @ self.poses.axis[:, 2]) / max(float(angle @ angle), 1e-12)
+
     def leaning(self, like: Likeness) -> Recognised | None:
         """Identify the beads of a phantom that leans; None if that does not fit either."""
         turn = like.leaning
@@ -365,7 +371,7 @@ class _Spots:
         early, late = sorted(frames, key=lambda f: float(np.median(f)))
         share = len(np.intersect1d(early, late)) / max(min(len(early), len(late)), 1)
         if share < 0.2:
-            if other.turned_from(like, SAME_PLACE_MM):
+            if other.turned_from(like, SAME_PLACE_MM, self._rise_mm):
                 return Recognised(self.model)
             return self._remounted(int(early[early < np.median(late)].max()) + 1, turn)
         some = self._only(like, balls)
@@ -406,7 +412,7 @@ class _Spots:
         second = None if some is None else likeness(self.model.beads, some.places)
         if second is None or second.mirrored:
             return None
-        if second.turned_from(like, SAME_PLACE_MM):
+        if second.turned_from(like, SAME_PLACE_MM, self._rise_mm):
             return Recognised(self.model)
         return self._remounted(
             part.start if part.start > 0 else part.stop, _turn_between(like, second)

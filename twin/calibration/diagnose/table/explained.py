@@ -45,8 +45,6 @@ from flexdt.twin.geometry.panel import Border, PanelModel
 
 MOST_TABLES: Final = 10
 """Tables that are made one after another, at most."""
-FIRST_TABLES: Final = 3
-"""Of these, such whose outliers are told by the median of the residuals."""
 SETTLED_PART: Final = 0.1
 """Root mean square change of the predicted positions, in standard deviations of their noise, at
 which a table stays."""
@@ -227,7 +225,7 @@ def _state(
         elif not family.always:
             shift += table.shift_of(search.products.rows(f, g) @ weights)
     found = tuple(families[f].places[g] for f, g in groups)
-    return State(x, frames, shift, found)
+    return State(x, frames, shift, found, tiles.torn(table, found))
 
 
 def _made(
@@ -257,8 +255,11 @@ def _made(
                 rows = search.products.rows(f, g)
                 own_shift = table.shift_of(rows @ weights[f, g])
                 state = replace(state, shift=state.shift - own_shift)
-        problem, x = _with_groups(fit.problem, search, posterior, state)
-        use = table.problem.seen & (table.lengths <= 5.0 * max(own, known.floor))
+        whole = fit.problem
+        if state.torn is not None:
+            whole = replace(whole, seen=whole.seen & ~state.torn)
+        problem, x = _with_groups(whole, search, posterior, state)
+        use = problem.seen & (table.lengths <= 5.0 * max(own, known.floor))
         solution = replace(solution, x=x, use=use)
         certificate = certify(problem, x, use, max(own, 1e-4), known.sampling_px,
                               certificate.spectrum.bound)  # fmt: skip

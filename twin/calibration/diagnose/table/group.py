@@ -79,7 +79,7 @@ class Family:
         places: of each group, what it is about: columns of the fit for `Acts.COLUMNS`, the
             (parameter, factor) pairs for `Acts.FRAMES`, numbers for sentences for
             `Acts.IMAGE`.
-        chance: logarithm of the odds of each group before the scan is seen.
+        chance: logarithm of the odds of each group before the scan is seen, (g,) or of all.
         rows: (g, 2 n k, c) of the table; None with slopes.
         slopes: (p, s) numbers of slopes of the table; None with rows.
         courses: (m, s, n, c) of each slope over the frames: the g = m p groups are each course
@@ -94,13 +94,18 @@ class Family:
     names: tuple[str, ...]
     acts: Acts
     places: tuple[object, ...]
-    chance: float
+    chance: float | FloatArray
     rows: FloatArray | None = None
     slopes: npt.NDArray[np.intp] | None = None
     courses: FloatArray | None = None
     widest: float = math.inf
     always: float = 0.0
     root: FloatArray | None = None
+
+    @property
+    def chances(self) -> FloatArray:
+        """Logarithm of the odds of each group before the scan is seen, (g,)."""
+        return np.broadcast_to(np.asarray(self.chance), len(self.names))
 
     def at_places(self, weights: FloatArray) -> FloatArray:
         """Return what weights, (c, ...), do to the places of `Acts.COLUMNS`, (q, ...)."""

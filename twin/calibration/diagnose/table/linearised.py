@@ -47,12 +47,14 @@ class State:
         frames: parameter -> (n,) deviations of single frames, internal units.
         shift: (n, k, 2) shift of the positions by what is neither [px].
         found: what groups are about that are there, so far.
+        torn: (n, k) positions that are part of two places, so that they count for nothing.
     """
 
     x: FloatArray
     frames: Mapping[str, FloatArray]
     shift: FloatArray
     found: tuple[object, ...] = ()
+    torn: npt.NDArray[np.bool_] | None = None
 
 
 def image_shape(problem: FitProblem) -> tuple[int, int] | None:
@@ -154,6 +156,8 @@ class Linearised:
         seen = problem.seen
         self.spread = max(float(np.median(lengths[seen])) / RAYLEIGH_MEDIAN, floor)
         self.weight = weights(lengths, seen, self.spread)
+        if state.torn is not None:
+            self.weight[state.torn] = 0.0
         self.count = 2.0 * float((self.weight**2).sum())
         share = np.repeat(self.weight.ravel(), 2)
         jacobian = problem.jacobian(x) * share[:, None]

@@ -206,7 +206,7 @@ class Search:
         """Return the logarithm of the odds of a group before the scan, with the part of the
         grid that its width takes.
         """
-        return self.products.families[group[0]].chance + OCCAM
+        return float(self.products.families[group[0]].chances[group[1]]) + OCCAM
 
     def _between(self, one: int, other: int) -> FloatArray:
         """Return the products of two blocks, made once."""
@@ -416,7 +416,7 @@ class Search:
         """
         best = ((-1, -1), -math.inf, 0.0)
         for f, one in further.items():
-            total = one.total + self.products.families[f].chance
+            total = one.total + self.products.families[f].chances
             g = int(np.argmax(total))
             if total[g] > best[1]:
                 width2 = model.noise2 * GRID[int(np.argmax(one.gain[g]))] ** 2
@@ -519,7 +519,7 @@ class Search:
             mean = one.solved.mean[:count]
             covariance = one.solved.covariance[:count, :count]
             for f, more in some.items():
-                chance = self.products.families[f].chance - math.log(len(GRID))
+                chance = self.products.families[f].chances[:, None] - math.log(len(GRID))
                 weight = log_weight + more.gain + chance
                 for g, w in np.argwhere(weight > LEAST_LOG_WEIGHT).tolist():
                     width = more.values[g] + GRID[w] ** -2.0
@@ -545,7 +545,7 @@ class Search:
             beside = self._pinned(model, group)
             some = self.further(beside, pinned=True)
             f, g = group
-            own = float(some[f].total[g]) + self.products.families[f].chance
+            own = float(some[f].total[g] + self.products.families[f].chances[g])
             some[f].gain[g] = -np.inf
             take_further(beside, some, -own)
         for factor in range(len(FACTORS)):

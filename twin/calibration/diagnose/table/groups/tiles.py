@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.calibration.diagnose.table.group import (
     LOG_CHANCE,
@@ -30,27 +31,31 @@ NEAR: Final = 6
 """Gaps between spots, about a border of the last table, that are tried, too."""
 BORDERS: Final = 80
 """Places of a border along an axis that are tried, one in each gap between spots at most."""
+LOG_CHANCE_OF_MORE: Final = math.log(0.5)
+"""Logarithm of the probability that a panel with a border has one across it, too; assumed."""
 
 
 def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make tiles that begin at places along columns and rows, each shifted by two numbers;
-    places between which no spot lies are one.
+    places between which no spot lies are one, as likely as they are many.
     """
     shape = image_shape(table.problem)
     if shape is None:
         return
     counted = table.weight > 0
     known_borders = [one for one in table.state.found if isinstance(one, Border)]
-    borders: list[Border] = []
-    beyond: list[FloatArray] = []
     for axis in (0, 1):
         place = table.measured[..., axis]
         found = [b.at for b in known_borders if b.axis == axis]
-        for at in _borders(place[counted], shape[1 - axis], found):
-            borders.append(Border(axis, at))
-            beyond.append(np.where(place >= at, 1.0, 0.0))
-    if borders:
-        yield _family(table, borders, beyond, LOG_CHANCE - math.log(BORDERS))
+        across = any(b.axis != axis for b in known_borders)
+        places, shares = _borders(place[counted], shape[1 - axis], found)
+        if len(places):
+            yield _family(
+                table,
+                [Border(axis, at) for at in places.tolist()],
+                [np.where(place >= at, 1.0, 0.0) for at in places.tolist()],
+                (LOG_CHANCE_OF_MORE if across else LOG_CHANCE) + np.log(shares),
+            )
     # Four tiles are two borders, and a quarter that is neither.
     quarters: list[FloatArray] = [
         np.where((table.measured >= (one.at, other.at)).all(axis=2), 1.0, 0.0)
@@ -60,12 +65,32 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     ]
     quarters = [q for q in quarters if q[counted].sum() >= LEAST_SIDE]
     if quarters:
-        yield _family(
-            table, [f"quarter {i}" for i in range(len(quarters))], quarters, 0.0
-        )
+        names = [f"quarter {i}" for i in range(len(quarters))]
+        yield _family(table, names, quarters, np.zeros(len(quarters)))
 
 
-def _borders(places: FloatArray, size: int, found: Sequence[float]) -> list[float]:
+def torn(table: Linearised, found: Iterable[object]) -> npt.NDArray[np.bool_] | None:
+    """Find the positions of spots that lie across a border: half of such a spot is shifted.
+
+    Args:
+        table: of the fit.
+        found: what groups are about that are there.
+
+    Returns:
+        (n, k); None where there are none.
+    """
+    per_mm = np.broadcast_to(table.problem.poses.pixels_per_mm, table.n)
+    radii = np.outer(per_mm, np.asarray(table.problem.model.bead_radius_mm))
+    out = np.zeros(table.problem.seen.shape, dtype=bool)
+    for one in found:
+        if isinstance(one, Border):
+            out |= np.abs(table.measured[..., one.axis] - one.at) < radii
+    return out if out.any() else None
+
+
+def _borders(
+    places: FloatArray, size: int, found: Sequence[float]
+) -> tuple[FloatArray, FloatArray]:
     """Choose places of a border along an axis [px], each in the middle between two spots:
     `BORDERS` at most, and all near those that were found in the last table.
 
@@ -73,6 +98,9 @@ def _borders(places: FloatArray, size: int, found: Sequence[float]) -> list[floa
         places: (m,) of the spots that count.
         size: of the panel.
         found: borders.
+
+    Returns:
+        The places, and the part of all possible places that each stands for.
     """
     here = np.sort(places)
     own = slice(LEAST_SIDE - 1, len(here) - LEAST_SIDE)
@@ -81,7 +109,7 @@ def _borders(places: FloatArray, size: int, found: Sequence[float]) -> list[floa
     inside = (middles >= LEAST_TILE * size) & (middles <= (1 - LEAST_TILE) * size)
     middles, gaps = middles[inside & (gaps > 0)], gaps[inside & (gaps > 0)]
     if not len(middles):
-        return []
+        return middles, gaps
     # Evenly among the spots, and in the widest gaps: of beads that stay in their rows.
     chosen = np.linspace(0, len(middles) - 1, min(len(middles), BORDERS // 2)).round()
     some = {*chosen.astype(int).tolist(), *np.argsort(-gaps)[: BORDERS // 2].tolist()}
@@ -89,14 +117,18 @@ def _borders(places: FloatArray, size: int, found: Sequence[float]) -> list[floa
         nearest = int(np.searchsorted(middles, at))
         step = len(middles) // BORDERS + NEAR
         some |= set(range(max(nearest - step, 0), min(nearest + step + 1, len(middles))))
-    return [float(middles[i]) for i in sorted(some)]
+    at = np.array(sorted(some))
+    ends = (middles[at][1:] + middles[at][:-1]) / 2
+    nearest_chosen = np.searchsorted(ends, middles)
+    possible = (1 - 2 * LEAST_TILE) * size
+    return middles[at], np.bincount(nearest_chosen, gaps) / possible
 
 
 def _family(
     table: Linearised,
     places: Sequence[Border | str],
     beyond: Sequence[FloatArray],
-    chance: float,
+    chance: FloatArray,
 ) -> Family:
     """Make groups that shift the spots in a part of the panel, each by two numbers.
 
