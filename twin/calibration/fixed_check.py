@@ -101,7 +101,8 @@ def explain(
 
 def without_groups(state: Calibration, fit: FitResult) -> Calibration:
     """Return the state with what moves, and what else is no column of a fit, taken out of its
-    poses and positions: fits to it compare priors with images.
+    positions, and without the positions of single beads that are elsewhere: fits to it compare
+    priors with images.
 
     Args:
         state: the scans and their measurements.
@@ -109,23 +110,22 @@ def without_groups(state: Calibration, fit: FitResult) -> Calibration:
     """
     problem = fit.problem
     tracks = problem.pixels
+    if problem.layout.bead_column >= 0 and not fit.bead_prior_mm:
+        places = fit.solution.x[problem.layout.bead_columns].reshape(-1, 3)
+        tracks[:, (places != problem.model.beads).any(axis=1)] = np.nan
     ends = np.cumsum([0, *(len(scan.poses) for scan in state.scans)]).tolist()
     parts = [slice(*ends[i : i + 2]) for i in range(len(state.scans))]
-    scans = [
-        replace(scan, poses=problem.poses[own])
-        for scan, own in zip(state.scans, parts, strict=True)
-    ]
     if state.measured:
         measured = [
             replace(one, tracks=tracks[own])
             for one, own in zip(state.measured, parts, strict=True)
         ]
-        return replace(state, scans=tuple(scans), measured=tuple(measured))
+        return replace(state, measured=tuple(measured))
     found = [
         replace(one, tracks=tracks[own])
         for one, own in zip(state.identifications, parts, strict=True)
     ]
-    return replace(state, scans=tuple(scans), identifications=tuple(found))
+    return replace(state, identifications=tuple(found))
 
 
 def _limits(state: Calibration, request: CalibrationRequest) -> dict[str, float]:

@@ -96,7 +96,7 @@ def identify_scans(state: Calibration, request: CalibrationRequest) -> Calibrati
             out.append(told.found)
             continue
         numbers = None
-        if not told.right_angles or (found is not None and convincing(found)):
+        if not told.right_angles or (found is not None and _agreeing(found)):
             numbers = _numbers(found, detections, state.model, scan, request.start)
         if numbers is not None and (odd := numbers.judged(scan.name)) is not None:
             findings.append(odd)

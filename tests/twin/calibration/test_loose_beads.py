@@ -90,7 +90,6 @@ def test_slow_errors_and_motion_of_everything_are_no_beads_that_move(
 
 @pytest.mark.slow
 @pytest.mark.campaign(1)
-@pytest.mark.xfail(reason="open in issue 76: vague and withheld", strict=True)
 def test_four_tiles_are_no_beads_that_move() -> None:
     """A free course with steps beside it has an answer to any remainder."""
     found = scored("four_tiles", 99_000)

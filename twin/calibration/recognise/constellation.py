@@ -94,7 +94,9 @@ class Likeness:
         """Angle between the phantom's z and the vertical [rad]."""
         return math.acos(min(max(float(self.rotation[2, 2]), -1.0), 1.0))
 
-    def turned_from(self, other: Likeness, within_mm: float, rise_mm: float = 0.0) -> bool:
+    def turned_from(
+        self, other: Likeness, within_mm: float, rise_mm: float = 0.0
+    ) -> bool:
         """Check whether the balls differ from others by a turn of the stage alone.
 
         Args:

@@ -255,9 +255,7 @@ def _made(
                 rows = search.products.rows(f, g)
                 own_shift = table.shift_of(rows @ weights[f, g])
                 state = replace(state, shift=state.shift - own_shift)
-        whole = fit.problem
-        if state.torn is not None:
-            whole = replace(whole, seen=whole.seen & ~state.torn)
+        whole = replace(problem, seen=problem.seen & (table.weight > 0))
         problem, x = _with_groups(whole, search, posterior, state)
         use = problem.seen & (table.lengths <= 5.0 * max(own, known.floor))
         solution = replace(solution, x=x, use=use)
@@ -354,10 +352,15 @@ def _stated(
 def _with_groups(
     plain: FitProblem, search: Search, posterior: Posterior, state: State
 ) -> tuple[FitProblem, FloatArray]:
-    """Return the problem of a fit with those columns that groups of the best model have, the
-    other groups in its poses and positions, and the values of its columns.
+    """Return the problem of a fit with those columns that groups of the best model have, and
+    the values of its columns; what the other groups do is taken out of its positions, so that
+    its poses are those of the mean.
     """
     every, x = moved(plain, state)
+    if state.frames:
+        still = replace(every, poses=plain.poses)
+        motion = every.residuals(x)[0] - still.residuals(x)[0]
+        every = replace(still, measured=every.measured - motion)
     names = {posterior.name(g) for g in posterior.best.widths}
     old = plain.layout
     count = old.parameter_count

@@ -6,6 +6,7 @@ import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +20,13 @@ from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import Strain
 from flexdt.twin.geometry.conventions import FloatArray
 
+NEVER: Final = -1e6
+"""Logarithm of the odds of a group that is no answer by itself."""
+
 __all__ = [
     "LOG_CHANCE",
     "NAMED_LOG_ODDS",
+    "NEVER",
     "OPEN_LOG_ODDS",
     "Acts",
     "Family",

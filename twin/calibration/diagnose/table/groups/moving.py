@@ -25,6 +25,7 @@ from flexdt.twin.calibration.diagnose.named_motion import (
 )
 from flexdt.twin.calibration.diagnose.table.group import (
     LOG_CHANCE,
+    NEVER,
     Acts,
     Family,
     Found,
@@ -67,8 +68,6 @@ LEAST_SWINGING: Final = 12
 ONCE: Final = "swings once a turn"
 TURNING: Final = ("swings", "wanders", "ramps")
 """Ways of motion of which a swing once a turn may be a part; a jump is all that it is."""
-NEVER: Final = -1e6
-"""Logarithm of the odds of a group that is no answer by itself."""
 KINDS: Final = 4
 """Smooth kinds of motion, which share the odds."""
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.table.group import (
     LOG_CHANCE,
+    NEVER,
     Acts,
     Family,
     Found,
@@ -26,7 +27,7 @@ WORDS: Final = "beads that move against each other"
 LEAST_FRAMES: Final = 8
 LEAST_BEADS: Final = 4
 LEAST_SIDE: Final = 4
-"""Frames on either side of a slip."""
+"""Frames on either side of a slip that show the beads."""
 MOST_WAVES: Final = 12
 """Half waves in a scan, of an uneven course."""
 NEAR: Final = 2
@@ -81,6 +82,12 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         jumps = np.unique(np.clip([*jumps, *near], LEAST_SIDE, last))
         each = [(piece, int(frames[at])) for at in jumps for piece in pieces]
         steps = np.arange(count) >= jumps[:, None]
+        # Beads that are seen on one side alone are elsewhere, whenever that happened.
+        shown = np.stack(
+            [1.0 * table.weight[frames][:, p].any(axis=1) for p in pieces], axis=1
+        )
+        sides = np.minimum(steps @ shown, ~steps @ shown) >= LEAST_SIDE
+        chances = np.where(sides, chance - math.log(2 * len(jumps)), NEVER).ravel()
         # Only what is elsewhere weighs less: the rest is where the phantom's file has it.
         for after in (True, False):
             yield Family(
@@ -90,7 +97,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 ),
                 Acts.IMAGE,
                 tuple(Slips(piece, number, at) for piece, at in each),
-                chance - math.log(2 * len(jumps)),
+                chances,
                 slopes=slopes,
                 courses=_along_axes(table.n, frames, steps[:, :, None] == after),
             )

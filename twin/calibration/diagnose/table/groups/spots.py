@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.table.group import (
-    LOG_CHANCE,
     Acts,
     Family,
     Found,
@@ -22,6 +22,11 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 NAME: Final = "spots"
 WORDS: Final = "errors of single spots that change slowly"
+LOG_CHANCE_OF_ERRORS: Final = math.log(0.5)
+"""Logarithm of the probability that spots have such errors: by far more often than anything moves
+or distorts, however small they are (assumed)."""
+KINDS: Final = 3
+"""Kinds of errors, which share the odds."""
 HARMONICS: Final = 3
 LEAST_FRAMES: Final = 16
 MOST_WAVES: Final = 16
@@ -34,14 +39,16 @@ no finding."""
 
 
 def families(table: Linearised, known: Known) -> Iterator[Family]:
-    """Make errors that repeat with the turn, and errors that are slow, of each coordinate of
-    each bead's positions.
+    """Make errors that repeat with the turn, errors that follow a spot's column (its size,
+    its distance, a slope), and errors that are slow, of each coordinate of each bead's
+    positions.
     """
     if table.n < LEAST_FRAMES:
         return
     number = np.arange(HARMONICS + 1)
     turn = table.problem.poses.angle[:, None] * number
     size = 1.0 / np.maximum(number, 1)
+    size[0] = math.hypot(*size[1:])  # What stays is as large as all that changes.
     harmonics = np.concatenate(
         [size * np.cos(turn), size[1:] * np.sin(turn[:, 1:])], axis=1
     )
@@ -50,24 +57,36 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         min(MOST_WAVES, max(MOST_COLUMNS // (2 * table.k) - 1, HARMONICS)) + 1
     )
     slow = np.cos(math.pi * place[:, None] * waves) / np.sqrt(1.0 + (waves / 4.0) ** 2)
+    column = table.places[..., 0]
+    middle = (column.max(axis=0) + column.min(axis=0)) / 2.0
+    reach = np.maximum(np.ptp(column, axis=0) / 2.0, 1.0)
+    # Chebyshev's polynomials: of a circle these are the harmonics that are even about its ends.
+    along = chebvander((column - middle) / reach, HARMONICS) * size
+    along = np.repeat(along.transpose(1, 0, 2), 2, axis=0)
     slopes = table.spot_slopes[None]
-    for how, each in (("with the turn", harmonics), ("slowly", slow)):
+    count = slopes.shape[1]
+    for how, each in (
+        ("with the turn", np.broadcast_to(harmonics, (count, *harmonics.shape))),
+        ("along their way", along),
+        ("slowly", np.broadcast_to(slow, (count, *slow.shape))),
+    ):
         yield Family(
             NAME,
             (f"spots err {how}",),
             Acts.IMAGE,
             (how,),
-            LOG_CHANCE - math.log(2),
+            LOG_CHANCE_OF_ERRORS - math.log(KINDS),
             slopes=slopes,
-            courses=_each_by_itself(each, slopes.shape[1])[None],
+            courses=_each_by_itself(each)[None],
         )
 
 
-def _each_by_itself(course: FloatArray, count: int) -> FloatArray:
-    n, c = course.shape
-    out = np.zeros((count, n, count, c))
-    out[np.arange(count), :, np.arange(count)] = course
-    return out.reshape(count, n, count * c)
+def _each_by_itself(courses: FloatArray) -> FloatArray:
+    """Give each slope columns of its own for its courses, (s, n, c): (s, n, s c)."""
+    s, n, c = courses.shape
+    out = np.zeros((s, n, s, c))
+    out[np.arange(s), :, np.arange(s)] = courses
+    return out.reshape(s, n, s * c)
 
 
 def told(found: Found) -> list[Finding]:

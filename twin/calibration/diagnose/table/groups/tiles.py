@@ -43,7 +43,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     if shape is None:
         return
     counted = table.weight > 0
-    known_borders = [one for one in table.state.found if isinstance(one, Border)]
+    known_borders = sorted(_borders_of(table.state.found), key=lambda b: b.at)
     for axis in (0, 1):
         place = table.measured[..., axis]
         found = [b.at for b in known_borders if b.axis == axis]
@@ -57,16 +57,30 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 (LOG_CHANCE_OF_MORE if across else LOG_CHANCE) + np.log(shares),
             )
     # Four tiles are two borders, and a quarter that is neither.
-    quarters: list[FloatArray] = [
-        np.where((table.measured >= (one.at, other.at)).all(axis=2), 1.0, 0.0)
+    quarters = {
+        (one, other): np.where(
+            (table.measured >= (one.at, other.at)).all(axis=2), 1.0, 0.0
+        )
         for one in known_borders
         for other in known_borders
         if one.axis == 0 and other.axis == 1
-    ]
-    quarters = [q for q in quarters if q[counted].sum() >= LEAST_SIDE]
+    }
+    quarters = {b: q for b, q in quarters.items() if q[counted].sum() >= LEAST_SIDE}
     if quarters:
-        names = [f"quarter {i}" for i in range(len(quarters))]
-        yield _family(table, names, quarters, np.zeros(len(quarters)))
+        yield _family(
+            table, list(quarters), list(quarters.values()), np.zeros(len(quarters))
+        )
+
+
+def _borders_of(found: Iterable[object]) -> set[Border]:
+    """Collect the borders of tiles and of quarters."""
+    out: set[Border] = set()
+    for one in found:
+        if isinstance(one, Border):
+            out.add(one)
+        elif isinstance(one, tuple):
+            out |= {b for b in one if isinstance(b, Border)}
+    return out
 
 
 def torn(table: Linearised, found: Iterable[object]) -> npt.NDArray[np.bool_] | None:
@@ -82,9 +96,8 @@ def torn(table: Linearised, found: Iterable[object]) -> npt.NDArray[np.bool_] | 
     per_mm = np.broadcast_to(table.problem.poses.pixels_per_mm, table.n)
     radii = np.outer(per_mm, np.asarray(table.problem.model.bead_radius_mm))
     out = np.zeros(table.problem.seen.shape, dtype=bool)
-    for one in found:
-        if isinstance(one, Border):
-            out |= np.abs(table.measured[..., one.axis] - one.at) < radii
+    for one in _borders_of(found):
+        out |= np.abs(table.measured[..., one.axis] - one.at) < radii
     return out if out.any() else None
 
 
@@ -117,16 +130,15 @@ def _borders(
         nearest = int(np.searchsorted(middles, at))
         step = len(middles) // BORDERS + NEAR
         some |= set(range(max(nearest - step, 0), min(nearest + step + 1, len(middles))))
-    at = np.array(sorted(some))
-    ends = (middles[at][1:] + middles[at][:-1]) / 2
-    nearest_chosen = np.searchsorted(ends, middles)
+    chosen_middles = middles[np.array(sorted(some))]
+    ends = (chosen_middles[1:] + chosen_middles[:-1]) / 2
     possible = (1 - 2 * LEAST_TILE) * size
-    return middles[at], np.bincount(nearest_chosen, gaps) / possible
+    return chosen_middles, np.bincount(np.searchsorted(ends, middles), gaps) / possible
 
 
 def _family(
     table: Linearised,
-    places: Sequence[Border | str],
+    places: Sequence[Border | tuple[Border, ...]],
     beyond: Sequence[FloatArray],
     chance: FloatArray,
 ) -> Family:
@@ -134,7 +146,7 @@ def _family(
 
     Args:
         table: of the fit.
-        places: of the parts: borders, or names.
+        places: of the parts: borders, or the two of a quarter.
         beyond: of each part (n, k), 1 where a spot is in it.
         chance: of each.
     """
@@ -144,9 +156,11 @@ def _family(
         shift[..., 0, 0] = shift[..., 1, 1] = part
         rows.append(table.rows_of(shift))
     names = tuple(
-        f"tile from {('column', 'row')[p.axis]} {p.at:.2f}"
-        if isinstance(p, Border)
-        else p
+        "tile from "
+        + " and ".join(
+            f"{('column', 'row')[b.axis]} {b.at:.2f}"
+            for b in ((p,) if isinstance(p, Border) else p)
+        )
         for p in places
     )
     return Family(NAME, names, Acts.IMAGE, tuple(places), chance, np.array(rows))
