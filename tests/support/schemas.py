@@ -103,7 +103,9 @@ class Schemas:
                 }
             case "object":
                 inner = _members(s)
-                return {"x": self.draw(rng, inner if isinstance(inner, Mapping) else {})}
+                names = s.get("required", ("x",))
+                member = inner if isinstance(inner, Mapping) else {}
+                return {name: self.draw(rng, member) for name in names}
         return None
 
     def inner(self, schema: Schema, value: Any) -> Iterator[tuple[str | int, Schema]]:
