@@ -30,8 +30,8 @@ MAX_CORNERS: Final = 1 << 27
 """Vertices, or triangles, of a mesh."""
 MAX_MM: Final = 1e7
 """Farthest that anything is from the origin; also the longest u and v."""
-MAX_RAYS: Final = 16
-"""Largest number of rays along each side of a pixel."""
+MAX_MARK: Final = 31
+"""Largest mark of a pixel: 16 x 16 rays."""
 MAX_LISTED_NAMES: Final = 50
 """Number of volumes that an error lists, those used last."""
 UNKNOWN_VOLUME: Final = "unknown volume"
@@ -216,8 +216,8 @@ class Within(f.Params):
 
     pixels: Buffer
     """int64, little-endian: places in images (n, rows, cols), growing"""
-    sides: Buffer
-    """uint8, of each pixel: rays along a side, 1 to 16"""
+    marks: Buffer
+    """uint8, of each pixel, 1 to 31: 2 n - 1 for n x n rays, 2 n for n x (n + 1)"""
 
     @property
     def places(self) -> np.ndarray:
@@ -225,21 +225,21 @@ class Within(f.Params):
         return np.frombuffer(self.pixels, "<i8")
 
     @property
-    def rays(self) -> np.ndarray:
-        """Rays along a side of each, uint8."""
-        return np.frombuffer(self.sides, np.uint8)
+    def each(self) -> np.ndarray:
+        """Mark of each, uint8."""
+        return np.frombuffer(self.marks, np.uint8)
 
     @model_validator(mode="after")
     def _fitting(self) -> Within:
         """Check that each pixel is named once, in order, with its rays."""
-        if self.pixels.nbytes != 8 * self.sides.nbytes:
-            raise ValueError("pixels are eight bytes each, sides one")
-        places, rays = self.places, self.rays
+        if self.pixels.nbytes != 8 * self.marks.nbytes:
+            raise ValueError("pixels are eight bytes each, marks one")
+        places, marks = self.places, self.each
         if places.size and (places[0] < 0 or (np.diff(places) <= 0).any()):
             raise ValueError("pixels are not growing from 0 on")
-        if rays.size and not 1 <= rays.min() <= rays.max() <= MAX_RAYS:
+        if marks.size and not 1 <= marks.min() <= marks.max() <= MAX_MARK:
             raise ValueError(
-                f"a side has {rays.min()} to {rays.max()} rays; allowed: 1 to 16"
+                f"marks are {marks.min()} to {marks.max()}; allowed: 1 to {MAX_MARK}"
             )
         return self
 
@@ -257,7 +257,7 @@ class Project(f.Params):
 
 
 class RaysNeeded(f.Params):
-    """Rays along each side that the pixels of a view need, because edges are in their way."""
+    """Rays that the pixels of a view need, because edges are in their way."""
 
     volume: f.VolumeName
     cone_vec: ConeVecs
@@ -382,7 +382,7 @@ PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
             "rays",
             RaysNeeded,
             Array,
-            "rays along each side of a pixel that it needs, uint8",
+            "marks of the rays that each pixel needs, uint8, as of `within`",
         ),
         Method(
             "backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"

@@ -206,7 +206,7 @@ class DirectProjector:
         shape: tuple[int, int],
         need: tuple[Need, float],
     ) -> Marks:
-        """Find the rays along each side that pixels need, uint8 (n, rows, cols)."""
+        """Find the rays that pixels need: marks, uint8 (n, rows, cols)."""
         return rays_needed(self.known[name], cone_vec, shape, *need)
 
     async def paths_within(

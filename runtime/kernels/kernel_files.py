@@ -140,7 +140,7 @@ class KernelFiles:
         """Look into `places`; nothing is read or written yet."""
         self.places = places
         self._unsuitable: dict[Path, str] = {}
-        self._swept = False
+        self._tended = False
 
     def __repr__(self) -> str:
         """Name the places in use."""
@@ -172,11 +172,11 @@ class KernelFiles:
         """Keep data in the first place that can be written; a warning, once, if none can."""
         place = self._write(name, data)
         if place is None:
-            if not self._swept:
+            if not self._tended:
                 LOG.warning(UNKEPT_MESSAGE, self.told())
-        elif not self._swept:
+        elif not self._tended:
             delete_old(place.folder, time.time() - MAX_AGE_S)
-        self._swept = True
+        self._tended = True
 
     def writable(self) -> Place | None:
         """Return the place that would take an item now."""

@@ -198,7 +198,7 @@ class Projector(Protocol):
         shape: tuple[int, int],
         need: tuple[Need, float],
     ) -> Marks:
-        """Find the rays along each side that pixels need, uint8 (n, rows, cols)."""
+        """Find the rays that pixels need: marks, uint8 (n, rows, cols)."""
 
     async def paths_within(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within

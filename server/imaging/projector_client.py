@@ -127,7 +127,7 @@ class ProjectorClient:
         shape: tuple[int, int],
         need: tuple[Need, float],
     ) -> Marks:
-        """Find the rays along each side that every pixel needs, uint8 (n, rows, cols).
+        """Find the rays that every pixel needs: marks, uint8 (n, rows, cols).
 
         Args:
             name, body, cone_vec, shape: as of `project`.
@@ -162,8 +162,8 @@ class ProjectorClient:
         if not len(within.pixels):
             return np.zeros(0, np.float32)
         pixels = within.pixels.astype("<i8").view(np.uint8).data.toreadonly()
-        sides = within.sides.data.toreadonly()
-        params = {"within": {"pixels": pixels, "sides": sides}}
+        marks = within.marks.data.toreadonly()
+        params = {"within": {"pixels": pixels, "marks": marks}}
         sizes = (int(within.starts[-1]),)
         return await self._array("project", name, body, (cone_vec, shape), params, sizes)
 

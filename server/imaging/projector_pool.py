@@ -211,7 +211,7 @@ class ProjectorPool:
         shape: tuple[int, int],
         need: tuple[Need, float],
     ) -> Marks:
-        """Find the rays along each side that pixels need, as `ProjectorClient.rays_needed`."""
+        """Find the rays that pixels need, as `ProjectorClient.rays_needed`."""
         marks: Marks = await self._request(
             name,
             0,

@@ -197,7 +197,7 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
         steps = projection_steps(volume, rows, p.detector, block)
         shape: tuple[int, ...] = (len(rows), *p.detector)
     else:
-        pixels = Within(p.within.places, p.within.rays)
+        pixels = Within(p.within.places, p.within.each)
         if len(pixels.pixels) and pixels.pixels[-1] >= len(rows) * math.prod(p.detector):
             raise invalid_params("a pixel is beyond the last view")
         steps = within_steps(volume, rows, p.detector, block, pixels)
@@ -209,7 +209,7 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 
 
 async def rays(context: Context, client: JobClient, id: Id, p: wire.RaysNeeded) -> object:
-    """Find the rays along each side that pixels need, and send them as uint8 (n, rows, cols).
+    """Find the rays that pixels need, and send their marks as uint8 (n, rows, cols).
 
     Args:
         context: of the server.

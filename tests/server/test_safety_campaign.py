@@ -5,6 +5,7 @@ method is called in every legal spelling, and gives its result.
 from __future__ import annotations
 
 import pytest
+from kept_workers import kept_workers
 from safety_histories import all_are_called, episode
 
 from flexdt.twin.collision import guard, relative, retreat
@@ -13,11 +14,12 @@ from flexdt.twin.scanner import joining, safety, state
 
 def found(seeds: range, steps: int, *, dear: bool = False) -> list[str]:
     """What the histories of these seeds found, each with its seed."""
-    return [
-        f"{seed}: {what}"
-        for seed in seeds
-        for what in episode(seed, steps, dear=dear).found
-    ]
+    with kept_workers():
+        return [
+            f"{seed}: {what}"
+            for seed in seeds
+            for what in episode(seed, steps, dear=dear).found
+        ]
 
 
 def test_the_campaign_calls_every_safe_and_urgent_method() -> None:

@@ -4,14 +4,16 @@
 One client sends `safety.estop` every 20 ms and times the answers, another subscribes to the
 state, which changes with every E-stop, and a third is the load, in a process of its own with a
 low priority. After each load the twin's `/metrics` tell how long turns of its loop took
-meanwhile. A real-time process that oversleeps tells when the whole machine stood still (a
-virtual one does). Prints a table and exits with 1 where a figure is beyond its limit (times
+meanwhile. In turns with the E-stops it asks a bare echo server, whose answers tell what the
+machine itself takes. A real-time process that oversleeps tells when the whole machine stood still
+(a virtual one does). Prints a table and exits with 1 where a figure is beyond its limit (times
 `--slack`, for machines that are busy with other things).
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
 import json
 import math
@@ -269,6 +271,26 @@ class Ages:
         return worst
 
 
+class Echo:
+    """A bare asyncio server in a process of its own that sends lines back: what of a round trip is
+    the machine's."""
+
+    def __init__(self) -> None:
+        """Start it and connect."""
+        ours, theirs = multiprocessing.Pipe()
+        multiprocessing.Process(target=_echo, args=(theirs,), daemon=True).start()
+        self._sock = dial(ours.recv())
+        self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._file = self._sock.makefile("rb")
+
+    def ask(self) -> float:
+        """One round trip [ms]."""
+        begun = time.perf_counter()
+        self._sock.sendall(GET)
+        self._file.readline()
+        return 1000 * (time.perf_counter() - begun)
+
+
 class Stalls:
     """How long the machine itself stood still: a real-time process that oversleeps [ms]."""
 
@@ -285,6 +307,21 @@ class Stalls:
         self._pipe.send(None)
         worst: float = self._pipe.recv()
         return worst if self.known else math.nan
+
+
+def _echo(pipe: Any) -> None:
+    """Send each line of each connection back, for ever; the port goes through the pipe."""
+
+    async def back(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while line := await reader.readline():
+            writer.write(line)
+
+    async def serve() -> None:
+        server = await asyncio.start_server(back, "127.0.0.1", 0)
+        pipe.send(server.sockets[0].getsockname()[1])
+        await server.serve_forever()
+
+    asyncio.run(serve())
 
 
 def _oversleep(pipe: Any) -> None:
@@ -358,13 +395,17 @@ def p999(before: dict[float, int], after: dict[float, int]) -> float:
     return 1000 * next(bounds)
 
 
-def probes(wire: Wire, busy: Callable[[], bool]) -> Iterator[float]:
-    """E-stop round trips while a load works [ms]."""
+def probes(
+    wire: Wire, echo: Echo, busy: Callable[[], bool]
+) -> Iterator[tuple[float, float]]:
+    """Round trips of E-stops and of the echo in turns while a load works [ms]."""
     while busy():
         begun = time.perf_counter()
         wire.call("safety.estop")
-        yield 1000 * (time.perf_counter() - begun)
-        time.sleep(PROBE_S)
+        taken = 1000 * (time.perf_counter() - begun)
+        time.sleep(0.5 * PROBE_S)
+        yield taken, echo.ask()
+        time.sleep(0.5 * PROBE_S)
 
 
 def _load(work: Callable[[int, float], int], port: int, seconds: float) -> None:
@@ -400,20 +441,21 @@ def main() -> int:
         try:
             wire = Wire(server.port)
             wire.call("safety.estop")
-            ages, stalls = Ages(server.port), Stalls()
-            print("| beside | E-stops | p50 | p99 | worst | state age | loop p99.9 | worst | MB |"
-                  " machine stood still |")  # fmt: skip
-            print("|---|---|---|---|---|---|---|---|---|---|")
+            ages, stalls, echo = Ages(server.port), Stalls(), Echo()
+            print("| beside | E-stops | p50 | p99 | worst | echo p50 | p99 | worst | state age |"
+                  " loop p99.9 | worst | MB | machine stood still |")  # fmt: skip
+            print("|---" * 13 + "|")
             for name in options.loads or every:
                 before, _ = holds(http)
-                next(probes(wire, lambda: True))
+                next(probes(wire, echo, lambda: True))
                 ages.take()
                 stalls.take()
                 work = multiprocessing.Process(
                     target=_load, args=(every[name], server.port, options.seconds)
                 )
                 work.start()
-                ms = list(probes(wire, work.is_alive))
+                both = list(probes(wire, echo, work.is_alive))
+                ms, bare = [a for a, _ in both], [b for _, b in both]
                 after, held = holds(http)
                 work.join()
                 got = {
@@ -422,7 +464,9 @@ def main() -> int:
                 }  # fmt: skip
                 print(
                     f"| {name} | {len(ms)} | {percentile(ms, 0.5):.1f} | {got['p99']:.1f} | "
-                    f"{got['worst']:.1f} | {got['age']:.0f} | {got['hold p99.9']:.0f} | "
+                    f"{got['worst']:.1f} | {percentile(bare, 0.5):.1f} | "
+                    f"{percentile(bare, 0.99):.1f} | {max(bare):.1f} | "
+                    f"{got['age']:.0f} | {got['hold p99.9']:.0f} | "
                     f"{got['hold worst']:.0f} | {server.memory_mb():.0f} | "
                     f"{stalls.take():.0f} |", flush=True,
                 )  # fmt: skip

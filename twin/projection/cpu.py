@@ -64,24 +64,33 @@ def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, boo
             yield slice(at, min(at + step, end)), turned
 
 
-def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True) -> None:
-    """Fill out (n, rows, cols) with line integrals.
+def project(
+    box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True, side: int = 1
+) -> None:
+    """Fill out (n, rows, cols) with line integrals, or their means over pixels.
 
     Views on their side are walked with rows and columns exchanged; those that no fan
     fits, ray by ray.
 
     Args:
         box: the volume.
-        views: (n, 12) source, first pixel minus source, u, v in voxel units of the box.
+        views: (n, 12) source, first pixel minus source, u, v in voxel units of the box; of
+            `side` x `side` rays a pixel, those of the finer panel.
         out: C-ordered float32.
         fans: False to walk every ray on its own.
+        side: rays along each side of a pixel. Where fans are columns of rays they are averaged
+            where they are walked; other views have an image of all rays first.
     """
     from flexdt.twin.projection.kernels import fan_kernels
 
-    shape = (out.shape[1], out.shape[2])
+    shape = (out.shape[1] * side, out.shape[2] * side)
     counts = (box.nx, box.ny, box.nz)
     if not fans:
-        _project_alone(box, views, np.arange(len(views)), out)
+        every = np.arange(len(views))
+        if side == 1:
+            _project_alone(box, views, every, out)
+        else:
+            _project_averaged(box, views, every, out, side, fans=False)
         return
     for some, turned in runs(views, shape):
         rays = views[some]
@@ -90,8 +99,8 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
         if turned:
             rays = exchanged(rays)
             seen = shape[::-1]
-            images = np.empty((len(rays), *seen), np.float32)
-        plan = plan_fans(rays, counts, seen)
+            images = np.empty((len(rays), *images.shape[:0:-1]), np.float32)
+        plan = plan_fans(rays, counts, seen, side)
         workers = threads()
         if len(plan.jobs):
             shadows = box_shadows(box, rays, (0, box.nz), seen)
@@ -100,10 +109,32 @@ def project(box: Box, views: FloatArray, out: Float32Array, *, fans: bool = True
             )
             for first, last in portions(times, workers):
                 part = plan.fans(rays, slice(first, last))
-                fan_kernels.project_fans(box, part, shadows, workers, images)
-        _project_alone(box, rays, plan.alone, images)
+                fan_kernels.project_fans(box, part, shadows, workers, side, images)
+        if side == 1:
+            _project_alone(box, rays, plan.alone, images)
+        else:
+            _project_averaged(box, rays, plan.alone, images, side)
         if turned:
             out[some] = images.transpose(0, 2, 1)
+
+
+def _project_averaged(
+    box: Box,
+    views: FloatArray,
+    chosen: IntArray,
+    out: Float32Array,
+    side: int,
+    *,
+    fans: bool = True,
+) -> None:
+    """Fill the chosen views of `out` with means over pixels of `side` x `side` rays, from an
+    image of all rays of one view at a time. Arguments as of `project`."""
+    from flexdt.twin.projection.kernels import within_kernels
+
+    room = np.empty((1, out.shape[1] * side, out.shape[2] * side), np.float32)
+    for view in chosen.tolist():
+        project(box, views[view : view + 1], room, fans=fans)
+        within_kernels.average_parts(room, side, out[view : view + 1])
 
 
 def _project_alone(

@@ -104,7 +104,7 @@ class FanPlan:
 
 
 def plan_fans(
-    views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int]
+    views: FloatArray, counts: tuple[int, int, int], shape: tuple[int, int], side: int = 1
 ) -> FanPlan:
     """Cut views into fans.
 
@@ -117,7 +117,9 @@ def plan_fans(
         views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the
             box.
         counts: (nx, ny, nz) voxels of the box.
-        shape: detector (rows, cols).
+        shape: detector (rows, cols), of rays.
+        side: rays along each side of a pixel. With several a job has whole pixels, and views
+            whose fans are no columns have none.
     """
     rows, cols = shape
     first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
@@ -133,9 +135,9 @@ def plan_fans(
     )
     facing = ((along > 0) & (along**2 >= MIN_FACING_COSINE**2 * size)).all(axis=1)
     level = np.abs(v[:, :2]).max(axis=1) * rows < MAX_LEVEL_OFFSET_VOXELS
-    parts = [_plan_level(np.flatnonzero(facing & level), shape)]
+    parts = [_plan_level(np.flatnonzero(facing & level), shape, side)]
     tilted = np.flatnonzero(facing & ~level)
-    if len(tilted):
+    if len(tilted) and side == 1:
         parts.append(_plan_tilted(tilted, views[tilted], corners[tilted], counts, shape))
     shift = len(parts[0].lines) * np.array([0, 1, 1])
     done = np.concatenate([part.jobs[:, 0] for part in parts])
@@ -150,22 +152,24 @@ def plan_fans(
     )
 
 
-def _plan_level(chosen: IntArray, shape: tuple[int, int]) -> FanPlan:
+def _plan_level(chosen: IntArray, shape: tuple[int, int], side: int) -> FanPlan:
     """Plan views with detector columns parallel to z: each column is a fan, in all views.
 
     Args:
         chosen: (n,) numbers of these views.
-        shape: the detector's (rows, cols).
+        shape: the detector's (rows, cols), of rays.
+        side: rays along each side of a pixel.
     """
     rows, cols = shape
     edges = np.arange(cols + 1) - 0.5
-    starts = np.arange(0, cols, FANS_A_JOB)
+    fans = side * max(1, FANS_A_JOB // side)
+    starts = np.arange(0, cols, fans)
     jobs = np.empty((len(chosen), len(starts), 3), np.int64)
     jobs[:, :, 0] = chosen[:, None]
     jobs[:, :, 1] = starts
-    jobs[:, :, 2] = np.minimum(starts + FANS_A_JOB, cols)
+    jobs[:, :, 2] = np.minimum(starts + fans, cols)
     lines = np.column_stack([edges, np.zeros(cols + 1)])
-    return FanPlan(lines, jobs.reshape(-1, 3), rows, min(cols, FANS_A_JOB), chosen)
+    return FanPlan(lines, jobs.reshape(-1, 3), rows, min(cols, fans), chosen)
 
 
 def _plan_tilted(

@@ -267,16 +267,23 @@ def forward(
     result = check_out(out, (len(geometry), *shape))
     volume = as_volume(volume)
     geometry = run_through(geometry, corners_of(volume))
-    if _on_device(volume, geometry, shape, result):
-        return result
+    if not _on_device(volume, geometry, shape, result):
+        _on_processor(volume, geometry, shape, result)
+    return result
+
+
+def _on_processor(
+    volume: Volume, geometry: ConeVec, shape: Shape2, out: Float32Array, side: int = 1
+) -> None:
+    """Fill `out` (n, rows, cols) with line integrals of a panel of `shape`, or with means over
+    its `side` x `side` rays a pixel, `side` times fewer along each side."""
     for some, order, fans in by_level_axis(volume, geometry, shape):
         layout = volume.in_order(order).layout
         if layout.empty:
-            result[some] = 0.0
+            out[some] = 0.0
         else:
             views = voxel_rays(in_order(geometry[some], order), layout, shape)
-            cpu.project(box_of(layout), views, result[some], fans=fans)
-    return result
+            cpu.project(box_of(layout), views, out[some], fans=fans, side=side)
 
 
 def check_sampling(model: Model, rays: Rays) -> None:
@@ -332,12 +339,12 @@ def _of_areas(
     if model == "exact":
         if side == 1:
             return forward(volume, geometry, shape, result)
-        room: Float32Array | None = None
-        for some in batches(len(geometry), shape, side, FORWARD_BYTES):
-            fine = finer(geometry[some], shape, side)
-            if room is None or len(room) != len(fine):
-                room = np.empty((len(fine), shape[0] * side, shape[1] * side), np.float32)
-            averaged(forward(volume, fine, out=room), side, result[some])
+        fine = finer(run_through(geometry, corners_of(volume)), shape, side)
+        if gpu.availability().present:
+            for some in batches(len(geometry), shape, side, FORWARD_BYTES):
+                averaged(forward(volume, fine[some]), side, result[some])
+        else:
+            _on_processor(volume, fine, fine.of_shape(None), result, side)
         return result
     geometry = run_through(geometry, corners_of(volume))
     for some, order in _by_steepness(volume, geometry, shape):

@@ -1,7 +1,8 @@
 """A pixel is an area: how many rays each needs, and line integrals along several rays of some.
 
 One ray, to a pixel's centre, has the mean over the pixel of a line integral that changes evenly
-there. Where an edge of the object is in the way it has not, and n x n rays come nearer.
+there. Where an edge of the object is in the way it has not, and n x n or n x (n + 1) rays come
+nearer.
 `rays_needed` finds these pixels from the shapes alone, by closed forms: no part that lies
 between the rays is missed. `paths_within` projects them. Voxels have edges everywhere, so that
 all the pixels they darken get rays, at least two to a voxel's shadow along each side.
@@ -15,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Final
 
@@ -45,7 +47,9 @@ from flexdt.twin.rays_a_pixel import Rays
 
 BATCH_PIXELS: Final = 1 << 21
 """Pixels of the views that are looked at together."""
-TILE_PIXELS: Final = 24
+KEPT_SCENES: Final = 8
+"""Number of scenes whose shapes are kept encoded."""
+TILE_PIXELS: Final = 32
 """Pixels along a side of a tile, whose rays are projected together."""
 BAND_ROWS: Final = 32
 """Rows of a job."""
@@ -54,6 +58,8 @@ SHARE_OF_MAXIMUM: Final = 3e-3
 deviation)."""
 FEWEST_NEEDED: Final = 1e-4
 """The same from which a pixel gets the number of rays that is asked for."""
+RAYS: Final = np.array([(mark + 1) // 2 * (mark // 2 + 1) for mark in range(32)])
+"""Number of rays of each mark."""
 IntArray = npt.NDArray[np.int64]
 Marks = npt.NDArray[np.uint8]
 
@@ -74,10 +80,10 @@ class Need:
     rays: Rays = "auto"
 
     def given(self, marks: Marks) -> Marks:
-        """Replace the numbers of pixels that need several rays by the one asked for."""
+        """Replace the marks of pixels that need several rays by the one asked for."""
         if self.rays == "auto":
             return marks
-        return np.where(marks > 1, np.uint8(self.rays), np.uint8(1))
+        return np.where(marks > 1, np.uint8(2 * self.rays - 1), np.uint8(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +92,11 @@ class Within:
 
     Attributes:
         pixels: (k,) flat places in images (n, rows, cols), growing.
-        sides: uint8 (k,) rays along each side.
+        marks: uint8 (k,) of each, see `rays_of`.
     """
 
     pixels: IntArray
-    sides: Marks
+    marks: Marks
 
     @classmethod
     def of(cls, marks: Marks) -> Within:
@@ -99,18 +105,17 @@ class Within:
         pixels = np.flatnonzero(flat > 1)
         return cls(pixels, flat[pixels])
 
-    @property
+    @cached_property
     def starts(self) -> IntArray:
         """Place of each pixel's first ray among all, (k + 1,); the last is their number."""
-        counts = self.sides.astype(np.int64) ** 2
-        return np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+        return np.concatenate([np.zeros(1, np.int64), np.cumsum(rays_of(self.marks))])
 
     def of_range(self, first: int, last: int) -> tuple[Within, slice]:
         """Take the pixels from place `first` to before `last`, counted from `first`, and the
         range of their rays."""
         a, b = np.searchsorted(self.pixels, [first, last]).tolist()
         starts = self.starts
-        part = Within(self.pixels[a:b] - first, self.sides[a:b])
+        part = Within(self.pixels[a:b] - first, self.marks[a:b])
         return part, slice(int(starts[a]), int(starts[b]))
 
     def means(self, values: npt.NDArray[np.floating]) -> FloatArray:
@@ -118,7 +123,7 @@ class Within:
         if not len(self.pixels):
             return np.zeros((*values.shape[:-1], 0))
         sums = np.add.reduceat(values, self.starts[:-1], axis=-1, dtype=np.float64)
-        return np.asarray(sums / self.sides.astype(np.float64) ** 2)
+        return np.asarray(sums / rays_of(self.marks))
 
     def mean_signals(self, values: Float32Array) -> FloatArray:
         """Compute the line integral of the mean signal of each pixel, -log of the mean of
@@ -126,8 +131,7 @@ class Within:
         if not len(self.pixels):
             return np.zeros(0)
         least = np.minimum.reduceat(values, self.starts[:-1])
-        counts = self.sides.astype(np.int64) ** 2
-        beyond = values - np.repeat(least, counts)
+        beyond = values - np.repeat(least, rays_of(self.marks))
         return np.asarray(least - np.log(self.means(np.exp(-beyond))))
 
 
@@ -138,7 +142,7 @@ def rays_needed(
     need: Need,
     weight: float = 1.0,
 ) -> Marks:
-    """Find the rays along each side that every pixel needs.
+    """Find the rays that every pixel needs.
 
     Args:
         body: solids, a mesh or voxels.
@@ -149,7 +153,7 @@ def rays_needed(
             1/mm for a mesh.
 
     Returns:
-        uint8 (n, rows, cols), 1 where one ray has the mean.
+        Marks, uint8 (n, rows, cols), see `rays_of`; 1 where one ray has the mean.
     """
     geometry = as_cone_vec(cone_vec)
     marks = np.ones((len(geometry), *shape), np.uint8)
@@ -245,15 +249,20 @@ def needed(
     return Within.of(marks)
 
 
-def _shapes(scene: Scene) -> tuple[list[Convex], FloatArray, FloatArray, IntArray]:
-    """Encode solids for the kernels: shapes, quadrics, slabs, and each solid's slabs."""
+@lru_cache(maxsize=KEPT_SCENES)
+def _shapes(
+    scene: Scene,
+) -> tuple[list[Convex], FloatArray, FloatArray, IntArray, FloatArray]:
+    """Encode solids for the kernels: shapes, quadrics, slabs, each solid's slabs, and the points
+    about all of them."""
     shapes = [as_convex(solid.shape) for solid in scene.solids]
     quadric = np.array(
         [[one.curved, *one.matrix.ravel(), *one.center] for one in shapes], float
     )
     ends = np.cumsum([0, *(len(one.slabs) for one in shapes)])
     slabs = np.concatenate([one.slabs for one in shapes])
-    return shapes, quadric, slabs, np.column_stack([ends[:-1], ends[1:]])
+    hull = np.concatenate([hull_points(one) for one in shapes])
+    return shapes, quadric, slabs, np.column_stack([ends[:-1], ends[1:]]), hull
 
 
 def _wide_shadows(shapes: list[Convex], rays: FloatArray, shape: Shape2) -> IntArray:
@@ -287,9 +296,8 @@ def _mark_scene(
     if not scene.solids or not marks.size:
         return
     shape = (marks.shape[1], marks.shape[2])
-    shapes, quadric, slabs, ranges = _shapes(scene)
-    geometry = run_through(geometry, np.concatenate([hull_points(s) for s in shapes]))
-    rays = geometry.rays(shape)
+    shapes, quadric, slabs, ranges, hull = _shapes(scene)
+    rays = run_through(geometry, hull).rays(shape)
     weights = np.array([abs(solid.mu_per_mm) * weight for solid in scene.solids])
     within_kernels.mark_convex(
         quadric,
@@ -313,15 +321,8 @@ def _within_scene(
 
     if not scene.solids:
         return
-    shapes, quadric, slabs, ranges = _shapes(scene)
-    geometry = run_through(geometry, np.concatenate([hull_points(s) for s in shapes]))
-    rays = geometry.rays(shape)
-    pixels = np.stack(np.unravel_index(within.pixels, (len(rays), *shape)), axis=1)
-    tile = pixels // [1, TILE_PIXELS, TILE_PIXELS]
-    across = -(-shape[1] // TILE_PIXELS)
-    key = (tile[:, 0] * -(-shape[0] // TILE_PIXELS) + tile[:, 1]) * across + tile[:, 2]
-    order = np.argsort(key, kind="stable")
-    edges = np.flatnonzero(np.diff(key[order])) + 1
+    shapes, quadric, slabs, ranges, hull = _shapes(scene)
+    rays = run_through(geometry, hull).rays(shape)
     within_kernels.chords_within(
         quadric,
         slabs,
@@ -329,10 +330,11 @@ def _within_scene(
         _wide_shadows(shapes, rays, shape),
         rays,
         np.array([solid.mu_per_mm for solid in scene.solids], np.float64),
-        np.ascontiguousarray(pixels[order], dtype=np.int64),
-        within.sides[order].astype(np.int64),
-        within.starts[:-1][order],
-        np.concatenate([[0], edges, [len(order)]]),
+        within.pixels,
+        within.marks,
+        within.starts,
+        shape,
+        TILE_PIXELS,
         out,
     )
 
@@ -396,13 +398,13 @@ def _within_mesh(
     from flexdt.twin.projection.kernels import within_kernels
 
     rays, inverses = _mesh_rays(mesh, geometry, shape)
-    sides = np.zeros((len(rays), *shape), np.uint8)
+    marks = np.zeros((len(rays), *shape), np.uint8)
     starts = np.zeros((len(rays), *shape), np.int64)
-    sides.reshape(-1)[within.pixels] = within.sides
+    marks.reshape(-1)[within.pixels] = within.marks
     starts.reshape(-1)[within.pixels] = within.starts[:-1]
     sums = np.zeros(len(out))
     within_kernels.triangles_within(
-        mesh.vertices, mesh.faces, rays, inverses, sides, starts, sums, BAND_ROWS
+        mesh.vertices, mesh.faces, rays, inverses, marks, starts, sums, BAND_ROWS
     )
     out[:] = sums
 
@@ -419,7 +421,7 @@ def _mark_voxels(volume: Volume, geometry: ConeVec, marks: Marks) -> None:
     corners = np.array(list(product(*zip(low, high, strict=True))))
     rays = run_through(geometry, corners).rays(shape)
     for view, (r0, r1, c0, c1) in enumerate(corner_shadows(corners, rays, shape)):
-        marks[view, max(r0 - 1, 0) : r1 + 1, max(c0 - 1, 0) : c1 + 1] = side
+        marks[view, max(r0 - 1, 0) : r1 + 1, max(c0 - 1, 0) : c1 + 1] = 2 * side - 1
 
 
 def _within_voxels(
@@ -427,7 +429,7 @@ def _within_voxels(
 ) -> None:
     """Fill `out` with line integrals of voxels, as `paths_within`: each ray is that of the
     nearest of a voxel's, as exact lengths on a finer panel."""
-    n = min(voxel_rays_a_side(volume, geometry), int(within.sides.max()))
+    n = min(voxel_rays_a_side(volume, geometry), int(within.marks.max()) // 2 + 1)
     images = np.empty((1, shape[0] * n, shape[1] * n), np.float32)
     starts = within.starts
     edges = np.searchsorted(
@@ -440,21 +442,24 @@ def _within_voxels(
         one = finer(geometry[view : view + 1], shape, n)
         forward(volume, one, out=images)
         r, c = np.divmod(within.pixels[chosen] - view * shape[0] * shape[1], shape[1])
-        sides = within.sides[chosen]
+        marks = within.marks[chosen]
         first = starts[:-1][chosen]
-        for side in np.unique(sides).tolist():
-            some = sides == side
-            across, down = offsets(side)
+        for mark in np.unique(marks).tolist():
+            some = marks == mark
+            across, down = offsets(mark)
             rows = n * r[some, None] + np.floor((down + 0.5) * n).astype(np.int64)
             cols = n * c[some, None] + np.floor((across + 0.5) * n).astype(np.int64)
-            out[first[some, None] + np.arange(side**2)] = images[0][rows, cols]
+            out[first[some, None] + np.arange(len(across))] = images[0][rows, cols]
 
 
-def offsets(side: int) -> tuple[FloatArray, FloatArray]:
-    """Compute the places of a pixel's side x side rays, (columns, rows) from its centre,
-    (side^2,) each: no two in one row or column, so that edges along them come out in side^2
-    steps."""
-    j, i = np.divmod(np.arange(side**2), side)
-    across = (i + (j + 0.5) / side) / side - 0.5
-    down = (j + (side - i - 0.5) / side) / side - 0.5
-    return across, down
+def rays_of(marks: Marks) -> IntArray:
+    """Compute the number of rays of marks: of 2 n - 1 there are n x n, of 2 n n x (n + 1)."""
+    return RAYS[marks]
+
+
+def offsets(mark: int) -> tuple[FloatArray, FloatArray]:
+    """Compute the places of a pixel's rays, (columns, rows) from its centre, (rays,) each: no two
+    in one row or column, so that edges along them come out in as many steps."""
+    a, b = (mark + 1) // 2, mark // 2 + 1
+    j, i = np.divmod(np.arange(a * b), a)
+    return (i + (j + 0.5) / b) / a - 0.5, (j + (a - i - 0.5) / a) / b - 0.5

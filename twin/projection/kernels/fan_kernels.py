@@ -48,7 +48,7 @@ SOURCES = sources(fan_rays_kernels, fan_types, fan_walk_kernels, siddon_kernels)
 
 @inline
 def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
-    """Sum the integrals of a fan of collected rays into the job's buffer; transposed, add
+    """Add the integrals of a fan of collected rays to the job's buffer; transposed, add
     the buffer's values to the voxels.
 
     A fan that cannot be walked together is walked ray by ray; rays that miss the box
@@ -74,7 +74,7 @@ def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
             r = np.int64(collected.row[q])
             c = np.int64(collected.column[q])
             if not transposed:
-                buffer[at] = walk_ray(box, g, r, c, ZERO, False)
+                buffer[at] += walk_ray(box, g, r, c, ZERO, False)
             # Single rays are dear, and a pixel of 0 adds nothing.
             elif buffer[at] != ZERO:
                 walk_ray(box, g, r, c, buffer[at], True)
@@ -94,12 +94,12 @@ def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
     walk(box.flat, box.spans, grid, fan, rays, work, count, transposed)
     if not transposed:
         for q in range(count):
-            buffer[slot[q]] = acc[q] * length[q]
+            buffer[slot[q]] += acc[q] * length[q]
 
 
 @kernel
-def put(image, buffer, starts, ends, width, top, bottom):
-    """Copy a job's buffer into its columns of an image; zeros outside its rows.
+def put(image, buffer, starts, ends, width, top, bottom, share):
+    """Copy a job's buffer, times `share`, into its columns of an image; zeros outside its rows.
 
     Args:
         image: (rows, cols) changed in place.
@@ -115,7 +115,7 @@ def put(image, buffer, starts, ends, width, top, bottom):
         if top <= r < bottom:
             at = (r - top) * width
             for c in range(row.size):
-                row[c] = buffer[at + c]
+                row[c] = buffer[at + c] * share
         else:
             for c in range(row.size):
                 row[c] = ZERO
@@ -147,6 +147,7 @@ def work_on(
     rays,
     work,
     buffer,
+    side,
     transposed,
 ):
     """Do one job: fill the columns of an image between two lines; transposed, add them to
@@ -168,13 +169,20 @@ def work_on(
         rays: room for sorted rays.
         work: room for the walk.
         buffer: room for the job's pixels.
+        side: rays along each side of a pixel of the image, whose lines and shadow are those of
+            a panel that many times as fine; more than one only of a job of whole columns, and
+            not transposed.
         transposed: see above.
     """
-    rows, cols = image.shape
+    rows, cols = image.shape[0] * side, image.shape[1] * side
     # The job's pixels lie between two slanted lines: each row has a start and an end of its
     # own, and the buffer holds the rows one behind the other, all `width` long.
     width = columns_of(lines, first, last, cols, starts, ends)
-    top, bottom = shadow[0], shadow[1]
+    if side > 1:
+        for r in range(rows):
+            starts[r], ends[r] = starts[r] // side, ends[r] // side
+        width = width // side
+    top, bottom = shadow[0] // side, (shadow[1] + side - 1) // side
     if transposed:
         take(image, buffer, starts, ends, width, top, bottom)
     else:
@@ -182,11 +190,21 @@ def work_on(
             buffer[i] = ZERO
     for line in range(first, last):
         grid = oriented(box, g, lines, line, rows)
-        n = collect(collected, grid, g, lines, line, starts, width, shadow)
+        n = collect(collected, grid, g, lines, line, starts, width, shadow, side)
         if n > 0:
             carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed)
     if not transposed:
-        put(image, buffer, starts, ends, width, top, bottom)
+        share = np.float32(1.0 / (side * side))
+        put(
+            image,
+            buffer,
+            starts[: image.shape[0]],
+            ends[: image.shape[0]],
+            width,
+            top,
+            bottom,
+            share,
+        )
 
 
 def _entry_points(key: int):  # type: ignore[no-untyped-def]
@@ -199,7 +217,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
     """
 
     @parallel
-    def project_fans(box, fans, shadows, workers, out):
+    def project_fans(box, fans, shadows, workers, side, out):
         """Fill out with line integrals, but for views without a job.
 
         Rows and columns that the box cannot reach get zero.
@@ -209,11 +227,12 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             fans: of the plan, see `FanPlan.fans`.
             shadows: (n, 4) rows and columns of each view that the box can reach.
             workers: number of threads.
+            side: as of `work_on`.
             out: (n, rows, cols).
         """
         _ = key
         views, lines, jobs, room, widest = fans
-        rows = out.shape[1]
+        rows = out.shape[1] * side
         counter = np.zeros(1, np.int64)
         # Each worker keeps its memory and takes the next job when it is free: jobs differ in
         # cost.
@@ -241,6 +260,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                     rays,
                     work,
                     buffer,
+                    side,
                     False,
                 )
                 job = fetch_next(counter)
@@ -321,6 +341,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         rays,
                         work,
                         buffer,
+                        1,
                         True,
                     )
                 count_one(done, turn)

@@ -141,7 +141,7 @@ def columns_of(lines, first, last, cols, starts, ends):
 
 
 @kernel
-def collect(collected, grid, g, lines, line, starts, width, shadow):
+def collect(collected, grid, g, lines, line, starts, width, shadow, side):
     """Collect the pixels of a fan, with slope, rise and span of their rays; returns their
     number.
 
@@ -157,6 +157,8 @@ def collect(collected, grid, g, lines, line, starts, width, shadow):
         width: its columns.
         shadow: rows and columns that the box can reach, the first of them the buffer's
             first.
+        side: rays along each side of a pixel, for the place in the buffer; more than one only
+            of whole columns.
     """
     row = collected.row
     column = collected.column
@@ -171,11 +173,11 @@ def collect(collected, grid, g, lines, line, starts, width, shadow):
         c0 = max(math.ceil(low[0]), shadow[2])
         c1 = min(math.ceil(high[0]), shadow[3])
         for c in range(c0, c1):
-            at = c - starts[top]
+            at = c // side - starts[top] - top // side * width
             for i in range(bottom - top):
                 row[n + i] = top + i
                 column[n + i] = c
-                slot[n + i] = i * width + at
+                slot[n + i] = (top + i) // side * width + at
             n += bottom - top
     else:
         for r in range(top, bottom):
@@ -283,9 +285,24 @@ def sort_by_slope(grid, fan, collected, rays, bins, n):
     part = collected.bin
     reach0 = fan.begin - grid.st
     reach1 = fan.j1 - grid.st
+    to_slope = rays.slope
+    to_rise = rays.rise
+    to_slot = rays.slot
+    if not fan.spread:
+        # All in one bin.
+        at = np.uint64(0)
+        for q in range(n):
+            z0 = grid.sz + rise[q] * reach0
+            z1 = grid.sz + rise[q] * reach1
+            to_slope[at], to_rise[at], to_slot[at] = slope[q], rise[q], slot[q]
+            met = (max(z0, z1) >= 0.0) & (min(z0, z1) <= grid.nz)
+            at += np.uint64(met)
+        bins[0] = 0
+        bins[1:] = at
+        return bins[SLOPE_BINS]
     # A counting sort: count the rays of each bin, turn counts into first places, deal out.
     bins[:] = 0
-    scale = SLOPE_BINS / fan.width if fan.spread else 0.0
+    scale = SLOPE_BINS / fan.width
     top = SLOPE_BINS - 1.0
     for q in range(n):
         z0 = grid.sz + rise[q] * reach0
@@ -299,9 +316,6 @@ def sort_by_slope(grid, fan, collected, rays, bins, n):
             bins[np.uint64(part[q]) + np.uint64(1)] += 1
     for b in range(SLOPE_BINS):
         bins[b + 1] += bins[b]
-    to_slope = rays.slope
-    to_rise = rays.rise
-    to_slot = rays.slot
     for q in range(n):
         if part[q] >= 0.0:
             b = np.uint64(part[q])

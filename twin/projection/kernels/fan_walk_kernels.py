@@ -575,8 +575,9 @@ def open_slab(flat, marks, grid, j, i0, i1):
 
 
 @inline
-def settle(rays, work, n):
-    """Add the integral of its level to each ray, and start all levels again from zero.
+def settle(rays, work, n, spread):
+    """Add the integral of its level to each ray, and start all levels again from zero; rays
+    that do not spread have no moments.
 
     Integrals of levels grow along the whole line, a ray takes a difference of two:
     without this, a ray with a short path through a long volume would lose digits.
@@ -586,11 +587,15 @@ def settle(rays, work, n):
     level = rays.level
     total = work.total
     moment = work.moment
-    for q in range(n):
-        k = level[q]
-        acc[q] += total[k] + ratio[q] * moment[k]
+    if spread:
+        for q in range(n):
+            k = level[q]
+            acc[q] += total[k] + ratio[q] * moment[k]
+        moment[:] = ZERO
+    else:
+        for q in range(n):
+            acc[q] += total[level[q]]
     total[:] = ZERO
-    moment[:] = ZERO
 
 
 @inline
@@ -643,7 +648,7 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
             if transposed:
                 share_out(rays, work, n)
             else:
-                settle(rays, work, n)
+                settle(rays, work, n, fan.spread)
         # Not x + m0: rounding would add up along the line.
         after = grid.sl + fan.m0 * (j + 1 - grid.st)
         r0, r1 = math.floor(x), max(math.floor(x + fan.m0), math.floor(after))
@@ -665,4 +670,4 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
         pass_slab(flat, spans, grid, fan, work, j, r0, r1, share, transposed)
         x = after
     if not transposed:
-        settle(rays, work, n)
+        settle(rays, work, n, fan.spread)

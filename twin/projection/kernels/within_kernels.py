@@ -8,7 +8,9 @@ sample can miss a part between rays. Of a mesh the kinks lie on its edges, which
 the pixels they touch.
 
 How many rays: with k of them a step of height C comes out in k steps, so its error is C / (sqrt(12)
-k) as a standard deviation. The rays of a pixel are `rays_aside`: no two in one row or column.
+k) as a standard deviation. The rays of a pixel are `rays_aside`: n x n, or n x (n + 1), no two in
+one row or column. Marks have both sides together, less one: 1 for one ray, 2 for two, 3 for 2 x 2,
+4 for 2 x 3.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from flexdt.twin.projection.kernels.analytic_kernels import edge_form, locate, m
 from flexdt.twin.projection.kernels.compiling import inline, kernel, parallel, sources
 
 SOURCES = sources(analytic_kernels)
-MAX_RAYS = 16
-"""Largest number of rays along each side of a pixel."""
+MAX_MARK = 31
+"""Largest mark: 16 x 16 rays."""
 STEP_SPREAD = math.sqrt(12.0)
 """Height of a step over the standard deviation of where it falls between two of its steps."""
 CURVED_SPREAD = 24.0
@@ -33,13 +35,41 @@ RIM_REACHES = 2.0
 """Half pixels from the outline of a curved solid within which its chord counts as bent."""
 BLOCK, CELL = 16, 4
 """Pixels along a side of the squares that are looked at first, of which quarters follow, and of
-those from which on only the nearest surfaces are."""
+those whose pixels are looked at together, at their nearest surfaces."""
+PIXELS = CELL * CELL
+LEAST_IN, MOST_IN, LEAST_OUT, MOST_OUT = 0, PIXELS, 2 * PIXELS, 3 * PIXELS
+"""Where, of a cell's pixels, the ranges of the distances lie at which rays enter and leave."""
+QUADRIC_IN, QUADRIC_OUT, RIM = 4 * PIXELS, 5 * PIXELS, 6 * PIXELS
+"""The quadric's largest entry and least exit, and 1 where its outline is near."""
+FIRSTS, LASTS, COLUMN, ROW = 7 * PIXELS, 8 * PIXELS, 9 * PIXELS, 10 * PIXELS
+"""How many surfaces may be the first and the last; column and row."""
+CHANGE, SURE, SEVERAL = 11 * PIXELS, 12 * PIXELS, 13 * PIXELS
+"""Change of the line integral, its least value, and whether the pixel needs several rays: 1
+because the chord changes evenly and fast, 2 because it bends."""
+SPARE = 14 * PIXELS
+"""From where on each slab has two rows: largest entry, least exit."""
 
 
 @inline
-def rays_for_step(change, error, counts, least=0.0):
-    """Compute the rays along each side of a pixel within which the line integral bends or
-    jumps by at most `change`.
+def mark_of(rays):
+    """Compute the mark of a pixel that needs at least so many rays."""
+    most = ((MAX_MARK + 1) // 2) ** 2
+    rays = min(max(rays, 1.0), most)
+    whole = math.ceil(2.0 * math.sqrt(rays))
+    return whole - 1 if (whole // 2) * ((whole + 1) // 2) >= rays else whole
+
+
+@inline
+def rays_of(mark):
+    """Compute the number of rays of a mark."""
+    mark = np.int64(mark)
+    return ((mark + 1) // 2) * (mark // 2 + 1)
+
+
+@inline
+def mark_for_step(change, error, counts, least=0.0):
+    """Compute the mark of a pixel within which the line integral bends or jumps by at most
+    `change`.
 
     Args:
         change: largest difference of line integrals within the pixel.
@@ -52,31 +82,27 @@ def rays_for_step(change, error, counts, least=0.0):
         height = 1.0 - math.exp(-change)
         if least > 0.0:
             height *= math.exp(-least)
-    return min(math.ceil(math.sqrt(height / (STEP_SPREAD * error))), MAX_RAYS)
+    return mark_of(height / (STEP_SPREAD * error))
 
 
 @inline
-def rays_for_slope(change, error, counts, least=0.0):
-    """Compute the rays along each side of a pixel across which the line integral changes
-    evenly by `change`: its mean is that of the middle, that of signals is not. Arguments as of
-    `rays_for_step`.
+def mark_for_slope(change, error, counts, least=0.0):
+    """Compute the mark of a pixel across which the line integral changes evenly by `change`:
+    its mean is that of the middle, that of signals is not. Arguments as of `mark_for_step`.
     """
     if not counts:
         return 1
-    return math.ceil(
-        min(change * math.sqrt(math.exp(-least) / (CURVED_SPREAD * error)), MAX_RAYS)
-    )
+    return mark_of(change * change * math.exp(-least) / (CURVED_SPREAD * error))
 
 
 @inline
-def rays_aside(k, side):
-    """Compute the place of ray k of side^2 in its pixel, (columns, rows) from the centre."""
-    j = k // side
-    i = k - j * side
-    return (
-        (i + (j + 0.5) / side) / side - 0.5,
-        (j + (side - i - 0.5) / side) / side - 0.5,
-    )
+def rays_aside(k, mark):
+    """Compute the place of ray k of a mark's in its pixel, (columns, rows) from the centre."""
+    a = (np.int64(mark) + 1) // 2
+    b = np.int64(mark) // 2 + 1
+    j = k // a
+    i = k - j * a
+    return (i + (j + 0.5) / b) / a - 0.5, (j + (a - i - 0.5) / a) / b - 0.5
 
 
 @inline
@@ -153,9 +179,8 @@ def quadric_ranges(q, d, u, v, size_px, side):
 
 
 @inline
-def side_needed(c, r, size, curved, forms, slabs, room, g, weight, filled, error, counts):
-    """Compute the rays along each side that a pixel needs for one convex solid, 0 where none of
-    its rays meets the solid; of a larger square, 2 where one of its pixels may need several.
+def bends(c, r, size, curved, forms, slabs, room, g, weight, error):
+    """Whether, of a square of pixels, one may need several rays for one convex solid.
 
     Args:
         c, r: column and row of the square's middle.
@@ -166,7 +191,7 @@ def side_needed(c, r, size, curved, forms, slabs, room, g, weight, filled, error
         room: of `solid_forms`; room[4] is spare, room[5, 1:] filled with the least entry into
             the solid and the largest exit.
         g: (12,) the view's rays [mm].
-        weight, filled, error, counts: as of `mark_convex`.
+        weight, error: as of `mark_convex`.
     """
     # The solid is entered at the largest of its surfaces' entries and left at the least of the
     # exits; chords end at the source and at the panel. Ranges over the square.
@@ -182,26 +207,24 @@ def side_needed(c, r, size, curved, forms, slabs, room, g, weight, filled, error
         e0, e1 = max(e0, a0), max(e1, qa)
         l0, l1 = min(l0, qb), min(l1, b1)
         if l1 <= e0:
-            return 0
+            return False
     for j in range(slabs):
         a0, a1, b0, b1 = ranges_of(forms[j], c, r, size)
         forms[j, 6], forms[j, 7] = a1, b0
         e0, e1 = max(e0, a0), max(e1, a1)
         l0, l1 = min(l0, b0), min(l1, b1)
         if l1 <= e0:
-            return 0
+            return False
     room[5, 1], room[5, 2] = e0, l1
     x = g[3] + c * g[6] + r * g[9]
     y = g[4] + c * g[7] + r * g[10]
     z = g[5] + c * g[8] + r * g[11]
-    scale = math.sqrt(x * x + y * y + z * z) * weight
     sure = max(l0 - e1, 0.0)
-    change = ((l1 - e0) - sure) * scale
+    change = ((l1 - e0) - sure) * (math.sqrt(x * x + y * y + z * z) * weight)
     if change <= STEP_SPREAD * error:  # signals differ by less still
-        return 1
-    least = sure * scale if filled else 0.0
-    if rim or l0 <= e1:
-        return 2 if size > 1 else rays_for_step(change, error, counts, least)
+        return False
+    if rim or l0 <= e1 or change * change > CURVED_SPREAD * error:
+        return True
     # All rays meet it. Bent where more than one surface may be the first, or the last.
     entries = exits = 0
     entries += e0 <= 0.0
@@ -211,16 +234,166 @@ def side_needed(c, r, size, curved, forms, slabs, room, g, weight, filled, error
     for j in range(slabs):
         entries += forms[j, 6] >= e0
         exits += forms[j, 7] <= l1
-    if entries > 1 or exits > 1:
-        return 2 if size > 1 else rays_for_step(change, error, counts, least)
-    if change * change <= CURVED_SPREAD * error:
-        return 1
-    if size > 1:
-        return 2
-    return min(
-        rays_for_step(change, error, counts, least),
-        rays_for_slope(change, error, counts, least),
-    )
+    return entries > 1 or exits > 1
+
+
+@kernel
+def cell_ranges(curved, forms, slabs, room, g, top, left, weight, error, lane):
+    """Fill `lane` with what `mark_cell` asks of each pixel of a cell, in loops without branches,
+    so that they vectorise.
+
+    Args:
+        curved, forms, slabs, room, g, weight, error: as of `bends`.
+        top, left: the cell's first pixel.
+        lane: (SPARE + 2 k PIXELS,) filled, in rows of PIXELS. One array: of several the compiler
+            would have to ask whether they are the same memory, and gives up.
+    """
+    for k in range(PIXELS):
+        lane[COLUMN + k], lane[ROW + k] = left + k % CELL, top + k // CELL
+        lane[LEAST_IN + k] = lane[MOST_IN + k] = lane[RIM + k] = 0.0
+        lane[LEAST_OUT + k] = lane[MOST_OUT + k] = 1.0
+        lane[QUADRIC_IN + k], lane[QUADRIC_OUT + k] = -math.inf, math.inf
+    if curved:
+        # Read before the loop: what it writes might else be the same memory.
+        q0, q1, q2 = room[0, 0], room[0, 1], room[0, 2]
+        f0, f1, f2 = room[1, 0], room[1, 1], room[1, 2]
+        u0, u1, u2 = room[2, 0], room[2, 1], room[2, 2]
+        v0, v1, v2 = room[3, 0], room[3, 1], room[3, 2]
+        half = 0.5 * room[5, 0]
+        for k in range(PIXELS):
+            # As of `quadric_ranges`.
+            c, r = lane[COLUMN + k], lane[ROW + k]
+            d0 = f0 + c * u0 + r * v0
+            d1 = f1 + c * u1 + r * v1
+            d2 = f2 + c * u2 + r * v2
+            a = d0 * d0 + d1 * d1 + d2 * d2
+            size = math.sqrt(a)
+            along = size <= 2.0 * half
+            middle = -(q0 * d0 + q1 * d1 + q2 * d2) / a
+            x, y, z = q0 + middle * d0, q1 + middle * d1, q2 + middle * d2
+            away = math.sqrt(x * x + y * y + z * z)
+            reach = abs(middle) * half
+            du = d0 * u0 + d1 * u1 + d2 * u2
+            dv = d0 * v0 + d1 * v1 + d2 * v2
+            xu = x * u0 + y * u1 + z * u2
+            xv = x * v0 + y * v1 + z * v2
+            moved = 0.5 * (abs(middle * du + xu) + abs(middle * dv + xv)) / a
+            bent = 0.5 * (abs(du) + abs(dv)) / a
+            inner, outer = max(away - reach, 0.0), away + reach
+            largest = math.sqrt(max(1.0 - inner * inner, 0.0)) / size * (1.0 + bent)
+            least = math.sqrt(max(1.0 - outer * outer, 0.0)) / size * (1.0 - bent)
+            missed = away - reach >= 1.0
+            lane[LEAST_IN + k] = max(
+                0.0, 0.0 if along else (1.0 if missed else middle - moved - largest)
+            )
+            lane[QUADRIC_IN + k] = 1.0 if along else middle + moved - least
+            lane[QUADRIC_OUT + k] = 0.0 if along else middle - moved + least
+            lane[MOST_OUT + k] = min(
+                1.0, 1.0 if along else (0.0 if missed else middle + moved + largest)
+            )
+            lane[RIM + k] = 1.0 if along | (away + RIM_REACHES * reach >= 1.0) else 0.0
+            lane[MOST_IN + k] = max(0.0, lane[QUADRIC_IN + k])
+            lane[LEAST_OUT + k] = min(1.0, lane[QUADRIC_OUT + k])
+    for j in range(slabs):
+        low, high, at = forms[j, 0], forms[j, 1], forms[j, 2]
+        first_in = SPARE + 2 * PIXELS * j
+        last_out = first_in + PIXELS
+        s0, s1, s2 = forms[j, 3], forms[j, 4], forms[j, 5]
+        reach = 0.5 * (abs(s1) + abs(s2))
+        outside = at < low or at > high
+        gap = min(at - low, high - at)
+        if outside:
+            gap = low - at if at < low else at - high
+        for k in range(PIXELS):
+            # As of `slab_ranges`.
+            speed = s0 + lane[COLUMN + k] * s1 + lane[ROW + k] * s2
+            size = abs(speed)
+            level = size <= reach  # some rays may be along the slab
+            inverse = 1.0 / (1.0 if level else (size - reach) * (size + reach))
+            slow, fast = (size + reach) * inverse, (size - reach) * inverse
+            near = low - at if speed > 0.0 else at - high
+            far = high - at if speed > 0.0 else at - low
+            least = gap / max(size + reach, 1e-300)
+            a0 = near * fast if near >= 0.0 else near * slow
+            a1 = near * slow if near >= 0.0 else near * fast
+            b0 = far * fast if far >= 0.0 else far * slow
+            b1 = far * slow if far >= 0.0 else far * fast
+            a0 = (least if outside else -math.inf) if level else a0
+            a1 = (math.inf if outside else -least) if level else a1
+            b0 = (0.0 if outside else least) if level else b0
+            b1 = math.inf if level else b1
+            lane[first_in + k], lane[last_out + k] = a1, b0
+            lane[LEAST_IN + k], lane[MOST_IN + k] = (
+                max(lane[LEAST_IN + k], a0),
+                max(lane[MOST_IN + k], a1),
+            )
+            lane[LEAST_OUT + k], lane[MOST_OUT + k] = (
+                min(lane[LEAST_OUT + k], b0),
+                min(lane[MOST_OUT + k], b1),
+            )
+    for k in range(PIXELS):
+        lane[FIRSTS + k] = (1.0 if lane[LEAST_IN + k] <= 0.0 else 0.0) + (
+            1.0 if lane[QUADRIC_IN + k] >= lane[LEAST_IN + k] else 0.0
+        )
+        lane[LASTS + k] = (1.0 if lane[MOST_OUT + k] >= 1.0 else 0.0) + (
+            1.0 if lane[QUADRIC_OUT + k] <= lane[MOST_OUT + k] else 0.0
+        )
+    for j in range(slabs):
+        first_in = SPARE + 2 * PIXELS * j
+        last_out = first_in + PIXELS
+        for k in range(PIXELS):
+            lane[FIRSTS + k] += 1.0 if lane[first_in + k] >= lane[LEAST_IN + k] else 0.0
+            lane[LASTS + k] += 1.0 if lane[last_out + k] <= lane[MOST_OUT + k] else 0.0
+    g3, g4, g5, g6, g7, g8 = g[3], g[4], g[5], g[6], g[7], g[8]
+    g9, g10, g11 = g[9], g[10], g[11]
+    for k in range(PIXELS):
+        c, r = lane[COLUMN + k], lane[ROW + k]
+        x = g3 + c * g6 + r * g9
+        y = g4 + c * g7 + r * g10
+        z = g5 + c * g8 + r * g11
+        scale = math.sqrt(x * x + y * y + z * z) * weight
+        e0, l1 = lane[LEAST_IN + k], lane[MOST_OUT + k]
+        all_rays = lane[LEAST_OUT + k] > lane[MOST_IN + k]
+        sure = max(lane[LEAST_OUT + k] - lane[MOST_IN + k], 0.0)
+        change = ((l1 - e0) - sure) * scale
+        bent = (
+            (lane[RIM + k] > 0.0)
+            | (not all_rays)
+            | (lane[FIRSTS + k] > 1.0)
+            | (lane[LASTS + k] > 1.0)
+        )
+        # Below, signals differ by less still.
+        seen = (l1 > e0) & (change > STEP_SPREAD * error)
+        several = seen & (bent | (change * change > CURVED_SPREAD * error))
+        lane[CHANGE + k] = change
+        lane[SURE + k] = sure * scale
+        lane[SEVERAL + k] = (2.0 if bent else 1.0) if several else 0.0
+
+
+@kernel
+def mark_cell(top, left, r0, r1, c0, c1, lane, filled, error, counts, marks):
+    """Raise the marks of a cell of CELL x CELL pixels.
+
+    Args:
+        top, left: its first pixel.
+        r0, r1, c0, c1: pixels that count.
+        lane: filled by `cell_ranges`.
+        filled, error, counts: as of `mark_convex`.
+        marks: (rows, cols) changed in place.
+    """
+    for k in range(PIXELS):
+        several = lane[SEVERAL + k]
+        if several == 0.0:
+            continue
+        r, c = top + k // CELL, left + k % CELL
+        if r < r0 or r >= r1 or c < c0 or c >= c1:
+            continue
+        change = lane[CHANGE + k]
+        least = lane[SURE + k] if filled else 0.0
+        need = mark_for_step(change, error, counts, least)
+        if several < 2.0:
+            need = min(need, mark_for_slope(change, error, counts, least))
+        marks[r, c] = max(marks[r, c], need)
 
 
 @kernel
@@ -229,7 +402,7 @@ def nearest_forms(forms, slabs, room, near):
     within all of its pixels, and count them.
 
     Args:
-        forms, slabs, room: as `side_needed` has left them.
+        forms, slabs, room: as `bends` has left them.
         near: (k, 8) filled.
     """
     count = 0
@@ -243,7 +416,7 @@ def nearest_forms(forms, slabs, room, near):
 
 @inline
 def ranges_of(form, c, r, size):
-    """Compute `slab_ranges` of a slab's form for a square of pixels, as of `side_needed`."""
+    """Compute `slab_ranges` of a slab's form for a square of pixels, as of `bends`."""
     speed = form[3] + c * form[4] + r * form[5]
     reach = 0.5 * size * (abs(form[4]) + abs(form[5]))
     return slab_ranges(form[0], form[1], form[2], speed, reach)
@@ -292,6 +465,7 @@ def mark_block(
     forms,
     slabs,
     near,
+    lane,
     room,
     g,
     top,
@@ -310,43 +484,34 @@ def mark_block(
     chord bends, because a square without a bend has none in any of its pixels.
 
     Args:
-        curved, forms, slabs, room, g, weight, filled, error, counts: as of `side_needed`.
-        near: room for as many forms.
+        curved, forms, slabs, room: as of `bends`.
+        near, lane: room for as many forms, and for `cell_ranges`.
+        g, weight, filled, error, counts: as of `mark_convex`.
         top, left: the block's first pixel.
         r0, r1, c0, c1: pixels that count.
         marks: (rows, cols) changed in place.
     """
     # Along a curve on which each square's quarters follow one another: a square that needs no
-    # rays is passed over, of others the quarters are next. Squares before them are done.
-    k, size, few = 0, BLOCK, 0
+    # rays is passed over, of others the quarters are next, and of cells the pixels. Squares
+    # before them are done.
+    k, size = 0, BLOCK
     while k < BLOCK * BLOCK:
         i, j = top + odd_bits(k >> 1), left + odd_bits(k)
         half = 0.5 * (size - 1)
-        need = 0
+        several = False
         if i < r1 and j < c1 and i + size > r0 and j + size > c0:
-            need = side_needed(
-                j + half,
-                i + half,
-                size,
-                curved,
-                forms if size >= CELL else near,
-                slabs if size >= CELL else few,
-                room,
-                g,
-                weight,
-                filled,
-                error,
-                counts,
+            several = bends(
+                j + half, i + half, size, curved, forms, slabs, room, g, weight, error
             )
-        if need > 1 and size > 1:
-            if size == CELL:
-                few = nearest_forms(forms, slabs, room, near)
+        if several and size > CELL:
             size //= 2
             continue
-        if need > 1:
-            marks[i, j] = max(marks[i, j], need)
+        if several:
+            few = nearest_forms(forms, slabs, room, near)
+            cell_ranges(curved, near, few, room, g, i, j, weight, error, lane)
+            mark_cell(i, j, r0, r1, c0, c1, lane, filled, error, counts, marks)
         k += size * size
-        size = 1
+        size = CELL
         while k % (4 * size * size) == 0 and size < BLOCK:
             size *= 2
 
@@ -398,9 +563,52 @@ def cut_rays(quadric, slabs, first, last, g, dx, dy, dz, t0, t1):
             t1[k] = min(t1[k], max(near, far))
 
 
+@kernel
+def by_tiles(places, rows, cols, side, order, ends):
+    """Sort pixels by tiles of `side` x `side`, those of a tile in their order.
+
+    Args:
+        places: (m,) flat, in images (n, rows, cols), growing.
+        rows, cols, side: see above.
+        order: (m,) filled with numbers of pixels.
+        ends: (tiles + 1,) zeros, filled with the place in `order` of each tile's first pixel,
+            and m.
+    """
+    down, across = (rows + side - 1) // side, (cols + side - 1) // side
+    for i in range(places.size):
+        line = places[i] // cols
+        view = line // rows
+        tile = (view * down + (line - view * rows) // side) * across
+        ends[tile + (places[i] - line * cols) // side + 1] += 1
+    for tile in range(ends.size - 1):
+        ends[tile + 1] += ends[tile]
+    for i in range(places.size):
+        line = places[i] // cols
+        view = line // rows
+        tile = (view * down + (line - view * rows) // side) * across
+        tile += (places[i] - line * cols) // side
+        order[ends[tile]] = i
+        ends[tile] += 1
+    # Dealing out has moved each tile's first place to the next tile's: shift them back.
+    for tile in range(ends.size - 2, 0, -1):
+        ends[tile] = ends[tile - 1]
+    ends[0] = 0
+
+
 @parallel
 def chords_within(
-    quadric, slabs, slab_range, shadow, rays, weight, pixels, sides, starts, tiles, out
+    quadric,
+    slabs,
+    slab_range,
+    shadow,
+    rays,
+    weight,
+    places,
+    marks,
+    starts,
+    shape,
+    side,
+    out,
 ):
     """Fill `out` with line integrals of convex solids along several rays of some pixels.
 
@@ -410,30 +618,49 @@ def chords_within(
         quadric, slabs, slab_range, rays: as of `mark_convex`.
         shadow: (n, k, 4), a pixel wider.
         weight: (k,) factors on the chords.
-        pixels: (m, 3) view, row, column, those of a tile in a row.
-        sides: (m,) rays along a side of each.
-        starts: (m,) place of its first ray.
-        tiles: (t + 1,) first pixel of each tile, and m.
+        places: (m,) flat, in images (n, *shape), growing.
+        marks: (m,) of each.
+        starts: (m + 1,) place of its first ray.
+        shape: (rows, cols).
+        side: pixels along a side of a tile.
         out: float32, filled.
     """
-    for tile in prange(len(tiles) - 1):
-        first, last = tiles[tile], tiles[tile + 1]
-        view = pixels[first, 0]
+    rows, cols = shape
+    tiles = len(rays) * ((rows + side - 1) // side) * ((cols + side - 1) // side)
+    order = np.empty(places.size, np.int64)
+    ends = np.zeros(tiles + 1, np.int64)
+    by_tiles(places, rows, cols, side, order, ends)
+    for tile in prange(tiles):
+        chosen = order[ends[tile] : ends[tile + 1]]
+        if chosen.size == 0:
+            continue
+        view = places[chosen[0]] // (rows * cols)
         g = rays[view]
+        row, column = np.empty(chosen.size, np.int64), np.empty(chosen.size, np.int64)
         count = 0
-        top, bottom, left, right = pixels[first, 1], 0, pixels[first, 2], 0
-        for i in range(first, last):
-            count += sides[i] * sides[i]
-            top, bottom = min(top, pixels[i, 1]), max(bottom, pixels[i, 1])
-            left, right = min(left, pixels[i, 2]), max(right, pixels[i, 2])
+        left, right = cols, 0
+        for i in range(chosen.size):
+            line = places[chosen[i]] // cols
+            row[i], column[i] = line - view * rows, places[chosen[i]] - line * cols
+            count += starts[chosen[i] + 1] - starts[chosen[i]]
+            left, right = min(left, column[i]), max(right, column[i])
+        top, bottom = row[0], row[-1]
         dx, dy, dz = np.empty(count), np.empty(count), np.empty(count)
         t0, t1, total = np.empty(count), np.empty(count), np.zeros(count)
+        # Pixels are in the order of their rows: those from one row on are the rays from a place on.
+        height = bottom - top + 1
+        of_row = np.full(height + 1, count)
         n = 0
-        for i in range(first, last):
-            for k in range(sides[i] * sides[i]):
-                x, y = rays_aside(k, sides[i])
-                x += pixels[i, 2]
-                y += pixels[i, 1]
+        begun = -1
+        for i in range(chosen.size):
+            while begun < row[i] - top:
+                begun += 1
+                of_row[begun] = n
+            mark = marks[chosen[i]]
+            for k in range(rays_of(mark)):
+                x, y = rays_aside(k, mark)
+                x += column[i]
+                y += row[i]
                 dx[n] = g[3] + x * g[6] + y * g[9]
                 dy[n] = g[4] + x * g[7] + y * g[10]
                 dz[n] = g[5] + x * g[8] + y * g[11]
@@ -443,15 +670,29 @@ def chords_within(
             if near[0] > bottom or near[1] <= top or near[2] > right or near[3] <= left:
                 continue
             a, b = slab_range[s, 0], slab_range[s, 1]
-            cut_rays(quadric[s], slabs, a, b, g, dx, dy, dz, t0, t1)
+            p, q = of_row[max(near[0] - top, 0)], of_row[min(near[1] - top, height)]
+            if q > p:
+                cut_rays(
+                    quadric[s],
+                    slabs,
+                    a,
+                    b,
+                    g,
+                    dx[p:q],
+                    dy[p:q],
+                    dz[p:q],
+                    t0[p:q],
+                    t1[p:q],
+                )
             factor = weight[s]
-            for k in range(count):
+            for k in range(p, q):
                 total[k] += factor * max(t1[k] - t0[k], 0.0)
+        for k in range(count):
+            total[k] *= math.sqrt(dx[k] * dx[k] + dy[k] * dy[k] + dz[k] * dz[k])
         n = 0
-        for i in range(first, last):
-            for k in range(sides[i] * sides[i]):
-                length = math.sqrt(dx[n] * dx[n] + dy[n] * dy[n] + dz[n] * dz[n])
-                out[starts[i] + k] = np.float32(total[n] * length)
+        for i in range(chosen.size):
+            for k in range(starts[chosen[i]], starts[chosen[i] + 1]):
+                out[k] = np.float32(total[n])
                 n += 1
 
 
@@ -490,7 +731,7 @@ def raise_marks(marks, x, y, need):
     Args:
         marks: (rows, cols) changed in place.
         x, y: (3,) columns and rows of its corners.
-        need: rays along a side.
+        need: a mark.
     """
     rows, cols = marks.shape
     low = min(y[0], min(y[1], y[2]))
@@ -563,7 +804,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
     def mark_convex(
         quadric, slabs, slab_range, shadow, rays, weight, filled, error, counts, marks
     ):
-        """Raise `marks` to the rays along a side that each pixel needs for convex solids.
+        """Raise `marks` to what each pixel needs for convex solids.
 
         Args:
             quadric, slabs, slab_range: as of `analytic_kernels.project_convex`.
@@ -571,7 +812,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             rays: (n, 12) [mm]: source, first pixel minus source, u, v.
             weight: (k,) attenuation along the chords [1/mm], not negative.
             filled: whether no solid takes away from another.
-            error, counts: as of `rays_for_step`.
+            error, counts: as of `mark_for_step`.
             marks: uint8 (n, rows, cols), changed in place.
         """
         _ = key
@@ -587,6 +828,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             g = rays[view]
             room = np.empty((6, 3))
             forms, near = np.empty((most, 8)), np.empty((most, 8))
+            lane = np.empty(SPARE + 2 * most * PIXELS)
             for s in range(shadow.shape[1]):
                 c0, c1 = shadow[view, s, 2], shadow[view, s, 3]
                 r0, r1 = max(row0, shadow[view, s, 0]), min(row1, shadow[view, s, 1])
@@ -600,6 +842,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         forms,
                         last - first,
                         near,
+                        lane,
                         room,
                         g,
                         row0,
@@ -619,8 +862,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
     def mark_mesh(
         vertices, faces, edges, rays, inverses, weight, largest, error, counts, marks
     ):
-        """Raise `marks` to the rays along a side that each pixel needs for a closed mesh: along
-        edges where the path bends, and on faces that are seen steeply.
+        """Raise `marks` to what each pixel needs for a closed mesh: along edges where the path
+        bends, and on faces that are seen steeply.
 
         Args:
             vertices: (k, 3) [mm].
@@ -629,7 +872,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             rays, inverses: as of `analytic_kernels.project_triangles`.
             weight: attenuation [1/mm].
             largest: no path is longer [mm].
-            error, counts: as of `rays_for_step`.
+            error, counts: as of `mark_for_step`.
             marks: uint8 (n, rows, cols), changed in place.
         """
         _ = key
@@ -643,7 +886,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
             locate(vertices, g, inverses[view], p, pixels)
             if pixels[:, 2].min() == 0.0:
                 # The mesh reaches behind the source: every pixel may have an edge.
-                need = max(rays_for_step(largest * weight, error, counts), 1)
+                need = max(mark_for_step(largest * weight, error, counts), 1)
                 for r in range(marks.shape[1]):
                     for c in range(marks.shape[2]):
                         marks[view, r, c] = max(marks[view, r, c], need)
@@ -661,7 +904,7 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                     + math.sqrt(p[j, 0] ** 2 + p[j, 1] ** 2 + p[j, 2] ** 2)
                 )
                 bend = 0.5 * away * math.sqrt((ax - bx) ** 2 + (ay - by) ** 2)
-                need = rays_for_step(min(bend, largest) * weight, error, counts)
+                need = mark_for_step(min(bend, largest) * weight, error, counts)
                 if need > 1:
                     x[0], x[1], x[2] = pixels[i, 0], pixels[j, 0], pixels[j, 0]
                     y[0], y[1], y[2] = pixels[i, 1], pixels[j, 1], pixels[j, 1]
@@ -679,31 +922,31 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 ax, ay = slope_at(planes[f], c, r)
                 steep = min(away * math.sqrt(ax * ax + ay * ay), largest) * weight
                 need = min(
-                    rays_for_slope(steep, error, counts),
-                    rays_for_step(steep, error, counts),
+                    mark_for_slope(steep, error, counts),
+                    mark_for_step(steep, error, counts),
                 )
                 if need > 1:
                     raise_marks(marks[view], x, y, need)
 
     @parallel
-    def triangles_within(vertices, faces, rays, inverses, sides, starts, out, band):
+    def triangles_within(vertices, faces, rays, inverses, marks, starts, out, band):
         """Add up path lengths through a closed mesh along several rays of some pixels.
 
         Args:
             vertices, faces, rays, inverses: as of `analytic_kernels.project_triangles`.
-            sides: uint8 (n, rows, cols) rays along a side, 0 in pixels that are left out.
+            marks: uint8 (n, rows, cols), 0 in pixels that are left out.
             starts: int64 (n, rows, cols) place of a pixel's first ray.
             out: float64, changed in place: lengths of the rays, then mm.
             band: rows of a job.
         """
         _ = key
-        _, rows, cols = sides.shape
+        _, rows, cols = marks.shape
         bands = (rows + band - 1) // band
         for job in prange(len(rays) * bands):
             view = job // bands
             row0 = (job - view * bands) * band
             row1 = min(rows, row0 + band)
-            if sides[view, row0:row1].max() == 0:
+            if marks[view, row0:row1].max() == 0:
                 continue
             g = rays[view]
             p = np.empty((len(vertices), 3))
@@ -743,8 +986,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 )
                 for r in range(first, last):
                     for c in range(c0, c1):
-                        side = np.int64(sides[view, r, c])
-                        if side == 0:
+                        mark = marks[view, r, c]
+                        if mark == 0:
                             continue
                         known = 0
                         for q in range(3):
@@ -756,8 +999,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                         if known == 3:  # left of one edge and right of another: outside
                             continue
                         at = starts[view, r, c]
-                        for s in range(side * side):
-                            x, y = rays_aside(s, side)
+                        for s in range(rays_of(mark)):
+                            x, y = rays_aside(s, mark)
                             x += c
                             y += r
                             # As `analytic_kernels.draw_row`: the sides of an edge are computed from
@@ -778,9 +1021,9 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                                 out[at + s] += t if a else -t
             for r in range(row0, row1):
                 for c in range(cols):
-                    side = np.int64(sides[view, r, c])
-                    for s in range(side * side):
-                        x, y = rays_aside(s, side)
+                    mark = marks[view, r, c]
+                    for s in range(rays_of(mark)):
+                        x, y = rays_aside(s, mark)
                         dx = g[3] + (c + x) * g[6] + (r + y) * g[9]
                         dy = g[4] + (c + x) * g[7] + (r + y) * g[10]
                         dz = g[5] + (c + x) * g[8] + (r + y) * g[11]
