@@ -112,7 +112,7 @@ def image_doubts(
         held = min(shares.saturated.values()) <= 1.0 - WARNING_SHARE
         doubts = [*_sentences(shares, unlit)]
         if held:
-            told = scan.references or looked_at(scan).references or ()
+            told = looked_at(scan).references or ()
             doubts += settled(told or beam_findings(shares.beam), DatasetFormatError)
     if needed and not held:
         raise DatasetFormatError(

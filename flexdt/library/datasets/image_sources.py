@@ -17,10 +17,12 @@ import numpy.typing as npt
 
 from flexdt.library.datasets.scan_options import Said
 from flexdt.library.extras import package
+from flexdt.library.hdf5_files import hdf5_file
 from flexdt.runtime.files.dataset_folder import list_folder, read_values
 from flexdt.runtime.files.image_files import ImageHead, image_head
 from flexdt.runtime.files.image_meaning import MAX_IMAGE_BYTES
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
+from flexdt.twin.errors import TwinError
 from flexdt.twin.length_units import UNITS_RAD, angle_rad
 
 HDF5_MARK: Final = b"\x89HDF"
@@ -254,11 +256,10 @@ def hdf5_numbers(path: Path, inside: str) -> tuple[npt.NDArray[Any], str]:
         DatasetFormatError: there is no such data set, or it holds no numbers.
         TwinError: h5py is not installed.
     """
-    h5py = package("h5py", f"{path.name}:{inside}")
     try:
-        with h5py.File(path) as file:
+        with hdf5_file(path, f"{path.name}:{inside}") as file:
             found = file.get(inside)
-            if not isinstance(found, h5py.Dataset):
+            if not hasattr(found, "dtype"):
                 allowed = ", ".join(_numbers_in(file)) or "none, it holds no numbers"
                 raise DatasetFormatError(
                     f"{path} has no data set {inside}; there are: {allowed}",
@@ -273,7 +274,7 @@ def hdf5_numbers(path: Path, inside: str) -> tuple[npt.NDArray[Any], str]:
                     f"{path}:{inside} claims {found.size} numbers", found.size, "fewer"
                 )
             return np.asarray(found[()]), _unit(found)
-    except DatasetFormatError:
+    except TwinError:
         raise
     except Exception:  # a damaged file: anything may come
         raise DatasetFormatError(
@@ -309,9 +310,9 @@ def _numbers_in(file: Any, least: int = 1) -> list[str]:
 
 def hdf5_images(path: Path) -> list[str]:
     """List up to eight data sets of an HDF5 file that may be images; [] of a damaged file."""
-    h5py = package("h5py", f"the HDF5 file {path.name}")
+    package("h5py", f"the HDF5 file {path.name}")
     try:
-        with h5py.File(path) as file:
+        with hdf5_file(path, f"the HDF5 file {path.name}") as file:
             return _numbers_in(file, 2)
     except Exception:  # a damaged file: anything may come
         return []

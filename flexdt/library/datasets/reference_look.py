@@ -34,7 +34,7 @@ Some = npt.NDArray[Any]
 
 def looked_at(data: Images) -> Images:
     """Return the data set with what its dark and flat images contradict, in `references` and in
-    its warnings; itself without any, or where something was told before.
+    its warnings; itself where they were looked at before.
 
     Each is compared with the others of its kind, and three projections with their means, in
     `ROWS` rows. An image that cannot be read is left out: reading it later is an error.
@@ -42,8 +42,6 @@ def looked_at(data: Images) -> Images:
     if data.references is not None:
         return data
     found = _findings(data)
-    if not found:
-        return data
     told = settled(found)
     new = tuple(one for one in told if not any(one in known for known in data.warnings))
     return replace(data, references=found, warnings=(*data.warnings, *new))

@@ -165,7 +165,11 @@ def with_references(data: Images, options: ScanOptions) -> Images:
             values = values.replaced((part,), f"{name}=")
     # The document lists the scan's own reference images.
     return replace(
-        placed(data, dark, flat), warnings=kept, document=None, provenance=values
+        placed(data, dark, flat),
+        warnings=kept,
+        document=None,
+        provenance=values,
+        references=None,
     )
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.extras import extension, package
+from flexdt.library.hdf5_files import hdf5_file
 from flexdt.twin.projection import Grid
 from flexdt.twin.projection.volume import edges_xyz
 
@@ -475,7 +476,7 @@ def _read_hdf5(path: Path) -> Stored:
     """Read voxels, edge [mm], centre [mm] and False (it is the centre, not the first
     voxel's place) from an .h5 file.
     """
-    with _h5py().File(path) as file:
+    with hdf5_file(path, "a volume in .h5") as file:
         values = file["volume"]
         about = values.attrs
         return values[:], about["voxel_mm"], about["center_mm"], False

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, PROJECTION
-from flexdt.library.extras import package
+from flexdt.library.hdf5_files import hdf5_file
 from flexdt.library.reading.foreign_parsing import require_memory
 from flexdt.library.reading.hdf5_formats.dxchange_table import DATA_EXCHANGE, INSTRUMENT
 from flexdt.library.reading.hdf5_formats.hdf5_values import (
@@ -47,8 +47,7 @@ FLATS: Final = "process/acquisition/flat_fields"
 def is_data_exchange(path: Path) -> bool:
     """Return whether an HDF5 file has images at `exchange/data`; False without h5py."""
     try:
-        h5py = package("h5py", "Data Exchange")
-        with h5py.File(path) as file:
+        with hdf5_file(path, "Data Exchange") as file:
             return "exchange/data" in file
     except (OSError, ValueError):  # TwinError is a ValueError
         return False
@@ -72,8 +71,7 @@ def read_data_exchange(
         DatasetFormatError: no images, or no geometry that is possible.
         TwinError: the package h5py is not installed.
     """
-    h5py = package("h5py", "Data Exchange")
-    with h5py.File(path) as file:
+    with hdf5_file(path, "Data Exchange") as file:
         said = Ledger(DATA_EXCHANGE, str(path))
         members: dict[str, Any] = {}
         for place, item in members_of(file):

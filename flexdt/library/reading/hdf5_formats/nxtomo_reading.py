@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, INVALID, PROJECTION
-from flexdt.library.extras import package
+from flexdt.library.hdf5_files import hdf5_file
 from flexdt.library.reading.foreign_parsing import require_memory
 from flexdt.library.reading.hdf5_formats.nxtomo_geometry import (
     file_geometry,
@@ -55,9 +55,8 @@ def read_nxtomo(
             the file's own figures contradict.
         TwinError: the package h5py is not installed.
     """
-    h5py = package("h5py", "NXtomo")
     try:
-        with h5py.File(path) as file:
+        with hdf5_file(path, "NXtomo") as file:
             return _read(file, path, geometry, distances, angles)
     except FileNotFoundError:
         raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
@@ -105,7 +104,7 @@ def _read(
         )
     scan = scan_of(file, name, path, keys)
     images = data[:]
-    kinds = {key: images[keys == key] for key in (PROJECTION, DARK, FLAT)}
+    kinds = {key: _some(images, keys == key) for key in (PROJECTION, DARK, FLAT)}
     if not len(kinds[FLAT]) and images.dtype.kind in "ui":
         doubts.append(
             f"{path.name}: no image has the key of a flat image, {FLAT}; counts have no line "
@@ -140,6 +139,14 @@ def _read(
     values = scan.ledger.finish()
     all_told = (*made.warnings, *doubts, *scan.ledger.warnings)
     return replace(made, warnings=all_told, provenance=values)
+
+
+def _some(images: npt.NDArray[Any], chosen: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+    """Return the chosen images; those that follow each other are not copied."""
+    at = np.flatnonzero(chosen)
+    if len(at) and at[-1] - at[0] + 1 == len(at):
+        return images[at[0] : at[-1] + 1]
+    return images[chosen]
 
 
 def _one_exposure(
