@@ -6,7 +6,7 @@ values with row 0 on top and column 0 at the left, or not at all, with the cause
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar
@@ -134,12 +134,20 @@ OTHER_FORMATS: Final = {
 RAW_ENDINGS: Final = (".raw", ".bin", ".dat", ".img", ".vol")
 """Usual endings of files of numbers without a header."""
 RAW_ADVICE: Final = (
-    "is not known by its first bytes: for raw numbers write a text beside it, scan.mhd: "
+    "has {size} bytes and is not known by the first of them: for raw numbers write a text beside "
+    "it, scan.mhd: "
     "'NDims = 3', 'DimSize = COLUMNS ROWS IMAGES', 'ElementType = MET_USHORT', "
     "'ElementDataFile = {name}', and open that; or fx.DataSet.from_arrays("
     "np.fromfile('{name}', np.uint16).reshape(IMAGES, ROWS, COLUMNS), GEOMETRY)"
 )
 """How to read a file of numbers without a header."""
+RAW_FOLDER_ADVICE: Final = (
+    "{many} files of numbers without a header, of {size} bytes each (ROWS x COLUMNS x 2 of "
+    "uint16): fx.DataSet.from_arrays(np.stack([np.fromfile(path, np.uint16)"
+    ".reshape(ROWS, COLUMNS) for path in sorted(Path({folder!r}).glob({pattern!r}), "
+    "key=lambda path: (len(path.name), path))]), GEOMETRY)"
+)
+"""How to read a folder of such files, of an image each."""
 MOST_BEGIN: Final = 16
 """First bytes that are looked at."""
 
@@ -235,7 +243,32 @@ def raw_advice(path: Path) -> str:
     """Say how raw numbers are read; "" for a file whose ending does not mean them."""
     if path.suffix.lower() not in RAW_ENDINGS:
         return ""
-    return RAW_ADVICE.format(name=path.name)
+    size = path.stat().st_size if path.is_file() else 0
+    return RAW_ADVICE.format(name=path.name, size=size)
+
+
+def raw_folder_advice(paths: Sequence[Path]) -> str:
+    """Say how the raw files of a folder are read; "" unless there are several of one size,
+    an image each.
+
+    Args:
+        paths: of the files of a folder, sorted.
+    """
+    raw = [path for path in paths if path.suffix.lower() in RAW_ENDINGS]
+    sizes = [path.stat().st_size for path in raw]
+    usual = max(set(sizes), key=sizes.count, default=0)
+    if sizes.count(usual) < 2:
+        return raw_advice(raw[0]) and f"{raw[0].name} {raw_advice(raw[0])}" if raw else ""
+    some = [path for path, size in zip(raw, sizes, strict=True) if size == usual]
+    first, last = min(p.name for p in some), max(p.name for p in some)
+    alike = next((i for i, (a, b) in enumerate(zip(first, last)) if a != b), 0)  # noqa: B905
+    begin = first[:alike].rstrip("0123456789")
+    return RAW_FOLDER_ADVICE.format(
+        many=len(some),
+        size=usual,
+        folder=str(some[0].parent),
+        pattern=f"{begin}*{some[0].suffix}",
+    )
 
 
 def _no_image(begin: bytes, known: str | None) -> str:

@@ -41,3 +41,32 @@ def test_the_way_that_the_error_says_gives_the_numbers(
     call = said[said.index("fx.DataSet") :].replace("GEOMETRY)", "scan)")
     made = eval(call[: call.index("scan)") + 5], {"fx": fx, "np": np, "scan": SCAN})
     np.testing.assert_array_equal(made.counts(), COUNTS)
+
+
+FOLDERS: dict[str, Callable[[Path], object]] = {
+    "open": fx.open,
+    "open with a geometry": lambda path: fx.open(path, geometry=SCAN),
+    "images": lambda path: fx.read_tiffs(path, SCAN),
+}
+
+
+@pytest.mark.parametrize("names", ["p_{:03d}.raw", "{:d}.bin", "shot{:02d}.RAW"])
+@pytest.mark.parametrize("door", FOLDERS)
+def test_a_folder_of_raw_files_is_read_by_the_call_that_the_error_says(
+    door: str, names: str, tmp_path: Path
+) -> None:
+    """As cameras write them: an image a file, a text in words, a dark image of its own."""
+    for i, image in zip((2, 9, 10), COUNTS, strict=True):
+        (tmp_path / names.format(i)).write_bytes(image.tobytes())
+    (tmp_path / "readme.txt").write_text("5 wide, 4 high, uint16, source at 100 mm")
+    (tmp_path / "thumbnail.dat").write_bytes(b"123")
+    with pytest.raises(DatasetError) as refused:
+        FOLDERS[door](tmp_path)
+    said = str(refused.value)
+    assert "3 files" in said
+    assert "40 bytes each" in said
+    call = said[said.index("fx.DataSet") :].replace("GEOMETRY)", "scan)")
+    call = call.replace("ROWS", "4").replace("COLUMNS", "5")
+    known = {"fx": fx, "np": np, "scan": SCAN, "Path": Path}
+    made = eval(call[: call.index("scan)") + 5], known)
+    np.testing.assert_array_equal(made.counts(), COUNTS)

@@ -66,7 +66,7 @@ from flexdt.runtime.files.image_files import (
     ImageHead,
     image_head,
     is_image_name,
-    raw_advice,
+    raw_folder_advice,
 )
 from flexdt.twin.dataset.dataset_errors import (
     DatasetError,
@@ -415,8 +415,8 @@ def _no_projections(
         )
     else:
         why = f"there are {', '.join(names[:3])} ..."
-        raw = [(n, said) for n in names if (said := raw_advice(folder / n))]
-        why += f"; {raw[0][0]} {raw[0][1]}" if raw else ""
+        raw = raw_folder_advice([folder / name for name in names])
+        why += f"; {raw}" if raw else ""
     wanted = (
         f"match {frames!r}"
         if frames is not None
@@ -608,7 +608,8 @@ def _other_scan(content: Folder) -> str:
             f", but {len(images)} other TIFFs, which fx.read_tiffs(FOLDER, geometry) reads, "
             "and commands read with --geometry FILE"
         )
-    return ""
+    raw = raw_folder_advice([content.path / name for name in content.in_order])
+    return f", but {raw}" if raw else ""
 
 
 def _exposure_doubts(doc: DatasetDocument) -> list[str]:
