@@ -22,6 +22,9 @@ from flexdt.twin.errors import TwinError
 
 DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 """A number as programs of some countries write it."""
+GROUPED: Final = re.compile(r"[-+]?\d{1,3}(,\d{3})+")
+"""A number of thousands with commas, or of thousandths with a decimal comma."""
+POINT: Final = re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 SPACES: Final = re.compile(r"\s+")
 SLASH: Final = re.compile(r" ?/ ?")
 OFF: Final = ("", "0", "off", "no", "false", "none")
@@ -306,13 +309,26 @@ class Ledger:
         value = as_number(text)
         if not math.isfinite(value):
             self._refuse(name, text[:60], "a number")
+        if GROUPED.fullmatch(text) and self._has_points:
+            self._refuse(
+                name, text[:60], "a number without a comma, as the others have a point"
+            )
         return value
 
-    def whole(self, name: str, default: int | None = None) -> int:
-        """Take a whole number; arguments as for `text`, errors as of `number`."""
+    @property
+    def _has_points(self) -> bool:
+        """Whether a number of the file has a decimal point, so that a comma is none."""
+        return any(POINT.fullmatch(one.value.strip()) for one in self._entries)
+
+    def whole(
+        self, name: str, default: int | None = None, least: int | None = None
+    ) -> int:
+        """Take a whole number, from `least` on; others as for `number`."""
         value = self.number(name, default)
         if not value.is_integer():
             self._refuse(name, f"{value:g}", "a whole number")
+        if least is not None and value < least:
+            self._refuse(name, f"{value:g}", f"{least} or more")
         return int(value)
 
     def switch(self, name: str, default: bool = False) -> bool:

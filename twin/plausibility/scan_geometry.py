@@ -52,7 +52,11 @@ FDK_TOO: Final = "an iterative method (sirt, cgls, tv) takes any trajectory"
 
 
 def distance_findings(
-    sod: float, sdd: float, pixel: npt.ArrayLike, names: tuple[str, str] = ("SOD", "SDD")
+    sod: float,
+    sdd: float,
+    pixel: npt.ArrayLike,
+    names: tuple[str, str] = ("SOD", "SDD"),
+    of_pixel: str = "the pixel",
 ) -> Iterator[Finding]:
     """Find distances and pixels that no scanner has.
 
@@ -64,6 +68,7 @@ def distance_findings(
         sod, sdd: source to axis and to panel [mm].
         pixel: one pitch or several [mm].
         names: of the distances in the file or dictionary.
+        of_pixel: name of the pixel there.
     """
     pitches = np.atleast_1d(np.asarray(pixel, dtype=np.float64))
     if not (math.isfinite(sod) and math.isfinite(sdd) and 0.0 < sod <= sdd):
@@ -72,7 +77,7 @@ def distance_findings(
         yield error(PlausibilityCode.IMPOSSIBLE_DISTANCES, cause, allowed, figure=sod)
         return
     if not (np.isfinite(pitches).all() and (pitches > 0.0).all()):
-        cause = f"the pixel is {' x '.join(f'{p:g}' for p in pitches)} mm"
+        cause = f"{of_pixel} is {' x '.join(f'{p:g}' for p in pitches)} mm"
         yield error(
             PlausibilityCode.IMPOSSIBLE_DISTANCES,
             cause,

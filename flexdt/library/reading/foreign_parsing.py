@@ -16,6 +16,10 @@ from flexdt.twin.input_limits import InputLimitError
 
 UTF_16_MARKS: Final = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks of UTF-16, as programs of Windows begin a text."""
+ENDS: Final = "\x1a\0 \t\r\n"
+"""What DOS and memory of a fixed size leave behind a text, and blanks."""
+BEGIN_BYTES: Final = 1 << 16
+"""Bytes by which the format of a text is told."""
 
 
 @contextmanager
@@ -60,8 +64,19 @@ def head_text(path: Path) -> str:
         raw = limited_bytes(path, "settings")
     except InputLimitError as error:
         raise DatasetFormatError(error.message, error.data) from None
+    return "\n".join(_decoded(raw).rstrip(ENDS).splitlines())
+
+
+def begin_of(path: Path) -> str:
+    """Return the first `BEGIN_BYTES` of a text, as `head_text` reads it."""
+    with path.open("rb") as file:
+        return _decoded(file.read(BEGIN_BYTES))
+
+
+def _decoded(raw: bytes) -> str:
+    """Return bytes as text: UTF-16 with a mark, or else UTF-8 with or without one."""
     encoding = "utf-16" if raw[:2] in UTF_16_MARKS else "utf-8-sig"
-    return "\n".join(raw.decode(encoding, "replace").splitlines())
+    return raw.decode(encoding, "replace")
 
 
 def require_memory(path: Path, what: str, size: int) -> None:

@@ -23,6 +23,8 @@ from flexdt.library.reading.text_formats.text_scans import (
     compared,
     folder_name,
     ini_values,
+    require_turn,
+    stated_size,
     stated_views,
     under_a_level,
 )
@@ -62,7 +64,7 @@ def read_nikon(path: Path, geometry: ConeVec | None) -> DataSet:
     values = ini_values(head_text(path))
     said.state_all((key, value) for _, key, value in values)
     views = stated_views(said, "Projections")
-    size = said.whole("DetectorPixelsY"), said.whole("DetectorPixelsX")
+    size = stated_size(said, "DetectorPixelsY", "DetectorPixelsX")
     beside = list_folder(path.parent)
     cone, more = _geometry(said, path, beside, views, size, geometry)
     place = said.text("InputFolderName", ".").replace("\\", "/")
@@ -109,7 +111,7 @@ def _geometry(
     sod, sdd = (unit * said.number(key) for key in ("SrcToObject", "SrcToDetector"))
     across, down = (unit * said.number(f"DetectorPixelSize{axis}") for axis in "XY")
     impossible = distance_findings(
-        sod, sdd, (across, down), ("SrcToObject", "SrcToDetector")
+        sod, sdd, (across, down), ("SrcToObject", "SrcToDetector"), "DetectorPixelSize"
     )
     if given is None:
         settled(impossible, DatasetFormatError, str(path))
@@ -121,6 +123,7 @@ def _geometry(
     if given is not None:
         compared(said, given, across, angles)
         return given, values
+    require_turn(said, "AngularStep", angles)
     place = np.array(
         [[aside, -sod, 0.0], [aside, sdd - sod, 0.0], [-across, 0, 0], [0, 0, -down]]
     )

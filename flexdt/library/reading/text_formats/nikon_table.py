@@ -142,7 +142,9 @@ NIKON: Final = FormatTable(
             "CutOffFrequency Exponent Normalisation InterpolationType "
             "MedianFilterKernelSize ConvolutionKernelSize AutoScalingType "
             "ScalingMinimum ScalingMaximum LowPercentile HighPercentile "
-            "ImportConversion TIFFScaling TimeStampFolder OutputSeparator",
+            "ImportConversion TIFFScaling TimeStampFolder OutputSeparator "
+            "OutputFolderName AutomaticCentreOfRotationOffsetZ1 "
+            "AutomaticCentreOfRotationOffsetZ2",
             "a setting of CT Pro's own reconstruction",
         ),
         noted("InputSeparator", "in the images' names", "they are sorted by numbers"),

@@ -17,6 +17,8 @@ from flexdt.library.reading.text_formats.text_scans import (
     assume_sense,
     compared,
     ini_values,
+    require_turn,
+    stated_size,
     stated_views,
     under_a_level,
 )
@@ -42,7 +44,7 @@ def read_phoenix(path: Path, geometry: ConeVec | None) -> DataSet:
     said = Ledger(PHOENIX, str(path))
     said.state_all((f"{s}/{key}", value) for s, key, value in ini_values(head_text(path)))
     views = stated_views(said, "CT/NumberImages")
-    size = said.whole("Image/DimY"), said.whole("Image/DimX")
+    size = stated_size(said, "Image/DimY", "Image/DimX")
     cone = _geometry(said, path, views, size, geometry)
     return under_a_level(
         said,
@@ -93,12 +95,15 @@ def _geometry(
         if pitch is None:
             pitch = said.number(f"Geometry/VoxelSize{axis}")
         pitches.append(pitch)
-    impossible = distance_findings(sod, sdd, pitches, ("FOD", "FDD"))
+    impossible = distance_findings(
+        sod, sdd, pitches, ("FOD", "FDD"), "VoxelSize at the panel"
+    )
     if given is None:
         settled(impossible, DatasetFormatError, str(path))
     span = said.number("CT/RotationSector", 360.0)
     angles = span / views * np.arange(views, dtype=np.float64)
     if given is None:
+        require_turn(said, "CT/RotationSector", angles)
         assume_sense(said, "clockwise seen from above; the file does not say")
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
     column, row = (

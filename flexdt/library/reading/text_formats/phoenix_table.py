@@ -10,6 +10,7 @@ from flexdt.twin.dataset.format_table import (
     GEOMETRY,
     FormatTable,
     dropped,
+    noted,
     noted_all,
     refused,
     used,
@@ -174,6 +175,10 @@ PHOENIX: Final = FormatTable(
             "EnableKeyboardJoy KeyJoyVelocityFactor",
             "of the motors",
             under="Cnc/",
+        ),
+        *(
+            noted(f"CNC_?/{name}", "where a motor stood", "FDD, FOD, cx and cy have it")
+            for name in ("LoadPos", "AcqPos")
         ),
         *noted_all(
             "XSample YSample ZSample RSample TSample YTube ZTube XDetector YDetector "

@@ -15,13 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
-from flexdt.library.reading.foreign_parsing import head_text
+from flexdt.library.reading.foreign_parsing import begin_of, head_text
 from flexdt.library.reading.text_formats.skyscan_table import SKYSCAN
 from flexdt.library.reading.text_formats.text_scans import (
     TIFFS,
     assume_sense,
     compared,
     ini_values,
+    require_turn,
+    stated_size,
     stated_views,
     under_a_level,
 )
@@ -42,9 +44,8 @@ SHIFT_HEAD_LINES: Final = 5
 
 def is_skyscan(path: Path) -> bool:
     """Return whether a text begins as SkyScan's: sections System and Acquisition."""
-    with path.open("rb") as file:
-        begin = file.read(1 << 16)
-    return b"[Acquisition]" in begin or b"[System]" in begin
+    begin = begin_of(path)
+    return "[Acquisition]" in begin or "[System]" in begin
 
 
 def read_skyscan(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -63,7 +64,7 @@ def read_skyscan(path: Path, geometry: ConeVec | None) -> DataSet:
         name = key if section in OWN_SECTIONS else f"{section}/{key}"
         said.state(name, value)
     views = stated_views(said, "Number of Files")
-    size = said.whole("Number of Rows"), said.whole("Number of Columns")
+    size = stated_size(said, "Number of Rows", "Number of Columns")
     folder = list_folder(path.parent)
     cone = _geometry(said, path, folder, views, size, geometry)
     return under_a_level(
@@ -122,7 +123,11 @@ def _geometry(
     sod, sdd = (said.number(f"{one} to Source (mm)") for one in ("Object", "Camera"))
     pitch = _pitch(said, sod, sdd, size[1])
     impossible = distance_findings(
-        sod, sdd, pitch, ("Object to Source (mm)", "Camera to Source (mm)")
+        sod,
+        sdd,
+        pitch,
+        ("Object to Source (mm)", "Camera to Source (mm)"),
+        "Image Pixel Size (um) at the panel",
     )
     if given is None:
         settled(impossible, DatasetFormatError, str(path))
@@ -132,6 +137,7 @@ def _geometry(
     if given is not None:
         compared(said, given, pitch, angles)
         return given
+    require_turn(said, "Rotation Step (deg)", angles)
     cone = ConeVec.circular(sod=sod, sdd=sdd, angles=angles, pixel=pitch, shape=size)
     rows = np.array(cone.rows)
     source, detector, u, v = np.split(rows, 4, axis=1)

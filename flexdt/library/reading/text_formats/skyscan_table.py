@@ -138,6 +138,12 @@ SKYSCAN: Final = FormatTable(
             of=GEOMETRY,
         ),
         dropped(
+            "Table Feed (micron)",
+            "rise of the sample from view to view",
+            "a circle is taken; give geometry= for a helix",
+            of=GEOMETRY,
+        ),
+        dropped(
             "List mode",
             "views in an order of their own",
             "even steps are taken",
@@ -155,6 +161,11 @@ SKYSCAN: Final = FormatTable(
             "the same of parts [pixels]",
             "the axis is taken in the middle column; `align` finds it",
             of=GEOMETRY,
+        ),
+        *noted_all(
+            f"{RECONSTRUCTION}/Pseudo-parallel projection calculated",
+            "a setting of NRecon",
+            divider="; ",
         ),
         *noted_all(
             "Flat Field Correction; Geometrical Correction; Median Filtering; "

@@ -20,6 +20,7 @@ from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import ANGLES, GEOMETRY, Ledger, as_number
 from flexdt.twin.dataset.scan_settings import ScanSettings
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility import PlausibilityCode, settled
 from flexdt.twin.plausibility.image_order import ordered
 from flexdt.twin.plausibility.stated_figures import angle_findings, pixel_findings
@@ -149,6 +150,34 @@ def stated_views(said: Ledger, field: str) -> int:
         problem = f"{said.path}: {field} is {views}"
         raise DatasetFormatError.instead(problem, views, f"1 to {MOST_VIEWS}")
     return views
+
+
+def stated_size(said: Ledger, rows: str, columns: str) -> tuple[int, int]:
+    """Take the numbers of rows and of columns that two fields state.
+
+    Raises:
+        DatasetFormatError: one is no whole number above 0.
+    """
+    return said.whole(rows, least=1), said.whole(columns, least=1)
+
+
+def require_turn(said: Ledger, field: str, angles: FloatArray) -> None:
+    """Require that the views turn.
+
+    Args:
+        said: what the file states.
+        field: from which the turn follows.
+        angles: of the views.
+
+    Raises:
+        DatasetFormatError: all of several views are at one angle.
+    """
+    if len(angles) > 1 and not np.ptp(angles):
+        problem = (
+            f"{said.path}: {field} is {said.stated(field)}, and all views at one angle"
+        )
+        allowed = "a turn from view to view, or geometry="
+        raise DatasetFormatError.instead(problem, said.stated(field), allowed)
 
 
 def assume_sense(said: Ledger, why: str) -> None:

@@ -12,9 +12,11 @@ from typing import Final
 import numpy as np
 
 from flexdt.library.data_set import DataSet
-from flexdt.library.reading.foreign_parsing import xml_values
+from flexdt.library.reading.foreign_parsing import begin_of, xml_values
 from flexdt.library.reading.text_formats.text_scans import (
     compared,
+    require_turn,
+    stated_size,
     stated_views,
     under_a_level,
 )
@@ -33,8 +35,7 @@ FOLDERS: Final = ("Projections", "Projektionen")
 
 def is_yxlon(path: Path) -> bool:
     """Return whether a file has YXLON's element of a cone beam."""
-    with path.open("rb") as file:
-        return PARAMETERS.encode() in file.read(1 << 16)
+    return PARAMETERS in begin_of(path)
 
 
 def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -51,7 +52,7 @@ def read_yxlon(path: Path, geometry: ConeVec | None) -> DataSet:
     said = Ledger(YXLON, str(path))
     said.state_all(xml_values(path, PARAMETERS))
     views = stated_views(said, "ScanTrajectory/NumberOfProjections")
-    size = said.whole("ProjectionSize/Height"), said.whole("ProjectionSize/Width")
+    size = stated_size(said, "ProjectionSize/Height", "ProjectionSize/Width")
     cone = _geometry(said, path, views, geometry)
     there = [path.parent / name for name in FOLDERS if (path.parent / name).is_dir()]
     return under_a_level(
@@ -76,7 +77,7 @@ def _geometry(said: Ledger, path: Path, views: int, given: ConeVec | None) -> Co
     unit = said.number("ScanTrajectory/PixelPitch", 1.0)
     sdd, sod = (unit * said.number(f"ScanTrajectory/{name}") for name in ("Fdd", "Fod"))
     pixel = [said.number(f"PixelSize/{name}") for name in ("Width", "Height")]
-    impossible = distance_findings(sod, sdd, pixel, ("Fod", "Fdd"))
+    impossible = distance_findings(sod, sdd, pixel, ("Fod", "Fdd"), "PixelSize")
     if given is None:
         settled(impossible, DatasetFormatError, str(path))
     start = said.number("ScanTrajectory/StartAngle", 0.0)
@@ -85,4 +86,5 @@ def _geometry(said: Ledger, path: Path, views: int, given: ConeVec | None) -> Co
     if given is not None:
         compared(said, given, pixel[0], angles)
         return given
+    require_turn(said, "ScanTrajectory/Rotation", angles)
     return ConeVec.circular(sod=sod, sdd=sdd, angles=angles, pixel=pixel)

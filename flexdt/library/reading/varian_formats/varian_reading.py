@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
-from flexdt.library.reading.foreign_parsing import require_memory, xml_values
-from flexdt.library.reading.text_formats.text_scans import stated_voltage
+from flexdt.library.reading.foreign_parsing import begin_of, require_memory, xml_values
+from flexdt.library.reading.text_formats.text_scans import stated_size, stated_voltage
 from flexdt.library.reading.varian_formats.varian_table import VARIAN
 from flexdt.library.reading.varian_formats.xim_images import XimImage, read_xim
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
@@ -37,9 +37,8 @@ LEAST_OPEN: Final = 1e-6
 
 def is_varian(path: Path) -> bool:
     """Return whether a file has the elements of Varian's scans."""
-    with path.open("rb") as file:
-        begin = file.read(1 << 16)
-    return all(word in begin for word in (b"Acquisitions", b"ImagerRes"))
+    begin = begin_of(path)
+    return all(word in begin for word in ("Acquisitions", "ImagerRes"))
 
 
 def read_varian(path: Path, geometry: ConeVec | None) -> DataSet:
@@ -55,7 +54,7 @@ def read_varian(path: Path, geometry: ConeVec | None) -> DataSet:
     """
     said = Ledger(VARIAN, str(path))
     said.state_all(xml_values(path, "Acquisitions"))
-    shape = said.whole("ImagerSizeY"), said.whole("ImagerSizeX")
+    shape = stated_size(said, "ImagerSizeY", "ImagerSizeX")
     images = _Images(said, "xim", shape)
     shares = images.read(_projections(said, path), path)
     said.warnings.insert(
@@ -276,7 +275,9 @@ def _geometry(
             pitch[0],
         )
     settled(
-        distance_findings(sod, sdd, pitch, ("SAD", "SID")), DatasetFormatError, str(path)
+        distance_findings(sod, sdd, pitch, ("SAD", "SID"), "ImagerRes"),
+        DatasetFormatError,
+        str(path),
     )
     o = np.zeros(len(angles))
     near, far, right, down = o + sod, o + sdd - sod, o + pitch[0], o + pitch[1]
