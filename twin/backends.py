@@ -17,6 +17,7 @@ BACKENDS: Final = {
     "notebook": "flexdt.library.notebook.notebook_show",
     "plots": "flexdt.library.plots",
     "scripts": "flexdt.library.scripts",
+    "sharpness": "flexdt.twin.reconstruction.resolution",
     "volume files": "flexdt.library.reconstruction.volume_files",
     "xarray": "flexdt.library.xarray_forms",
 }

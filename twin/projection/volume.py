@@ -44,6 +44,10 @@ NOT_BOUNDED: Final = (
     "accuracy: not bounded, because the object extends beyond the panel's sides: "
     "a denser shell out there makes every value too low, and no image shows it"
 )
+MIN_DOUBLED_SIGMAS: Final = 2.0
+"""Standard errors from which on edges are said to be doubled."""
+MIN_DOUBLED_VOXELS: Final = 0.2
+"""Least distance of doubled edges that is told [voxels]: less widens no edge."""
 Vector3 = tuple[float, float, float]
 IntArray = npt.NDArray[np.int32]
 LANE_FLOATS = 16
@@ -92,6 +96,80 @@ class Accuracy:
         else empty.
         """
         return [f"values may be off; {self}"] * (self.most > WARNING_BOUND)
+
+
+@public
+@dataclass(frozen=True)
+class Width:
+    """Width of edges between 10 and 90 % of the step [mm].
+
+    Attributes:
+        mm: of the sharpest quarter of edges, as far as edges differ by more than noise.
+        error_mm: its standard error.
+        edges: number of them.
+    """
+
+    mm: float
+    error_mm: float
+    edges: int
+
+
+@public
+@dataclass(frozen=True)
+class Sharpness:
+    """How sharp a volume is.
+
+    Attributes:
+        across: width of edges whose normals lie in the layers; None without enough edges.
+        along: width of edges whose normals lie along the axis; None likewise.
+        detail_mm: size of the finest details that two half scans have in common (Fourier
+            ring correlation on planes, half-bit criterion); None where it was not
+            measured.
+        doubled_mm: distance at which opposite views show the same edge, on that plane
+            where it is largest; None where it was not measured.
+        doubled_error_mm: its standard error.
+        voxel_mm: edge of a voxel; details are at least two, edges about one.
+
+    Example:
+        >>> Sharpness(None, None, 0.21, 0.0, 0.01, 0.1).doubled
+        False
+    """
+
+    across: Width | None
+    along: Width | None
+    detail_mm: float | None
+    doubled_mm: float | None
+    doubled_error_mm: float | None
+    voxel_mm: float
+
+    @property
+    def doubled(self) -> bool:
+        """True if edges are doubled, by `MIN_DOUBLED_SIGMAS` standard errors and by
+        `MIN_DOUBLED_VOXELS`.
+        """
+        if self.doubled_mm is None or self.doubled_error_mm is None:
+            return False
+        least = max(
+            MIN_DOUBLED_SIGMAS * self.doubled_error_mm, MIN_DOUBLED_VOXELS * self.voxel_mm
+        )
+        return self.doubled_mm > least
+
+    def __str__(self) -> str:
+        """Say in one sentence how wide edges are, what details are told, and whether
+        edges are doubled.
+        """
+        said = [
+            f"edges {width.mm:.2g} mm wide {where}"
+            for width, where in ((self.across, "across"), (self.along, "along the axis"))
+            if width is not None
+        ]
+        if self.detail_mm is not None:
+            said.append(f"details from {self.detail_mm:.2g} mm")
+        if self.doubled:
+            said.append(f"edges doubled by {self.doubled_mm:.2g} mm")
+        if not said:
+            return "sharpness: not known, no edges"
+        return f"sharpness: {', '.join(said)} (voxels of {self.voxel_mm:.2g} mm)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,12 +367,15 @@ class Volume:
 
     def _repr_html_(self) -> str:
         """Return an HTML table for a notebook: shape, size [mm], least and largest finite
-        value [1/mm], the share of voxels that no data determine, and the accuracy if known.
+        value [1/mm], the share of voxels that no data determine, and of one of `reconstruct` the
+        accuracy and the sharpness.
         """
         size = " x ".join(f"{side:g}" for side in self.size_mm)
         rows = {"size (x, y, z)": f"{size} mm", "values": self._range_words()}
         if self.accuracy is not None:
             rows["accuracy"] = str(self.accuracy).removeprefix("accuracy: ")
+        if getattr(self, "_bias", None) is not None:
+            rows["sharpness"] = str(self.sharpness).removeprefix("sharpness: ")
         body = "".join(
             f"<tr><th>{escape(name)}</th><td>{escape(said)}</td></tr>"
             for name, said in rows.items()
@@ -497,6 +578,19 @@ class Volume:
         else:
             summary = bias.accuracy(self)
         return summary
+
+    @cached_property
+    def sharpness(self) -> Sharpness:
+        """Widths of the volume's edges; by `reconstruct("fdk")` also the finest details
+        that two half scans share, and whether opposite views show edges twice. Computed
+        at the first access.
+
+        Example:
+            >>> print(Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).sharpness)
+            sharpness: not known, no edges
+        """
+        found: Sharpness = backend("sharpness").sharpness_of(self)
+        return found
 
     @property
     def voxel_xyz(self) -> Vector3:

@@ -259,7 +259,8 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
 
     At the end it gets accuracy or doubts, the part of voxels that no view sees, the
     surface, and then the volumes of errors, if any. Warnings of the reconstruction become
-    `doubts`, followed by the accuracy if it has no warnings. The surface is printed with
+    `doubts`, followed by the accuracy if it has no warnings, and the
+    sharpness if there are edges. The surface is printed with
     `FINISHED_CELLS` cells and not stored. `sigma` and `bias_bound` are stored if they
     were computed.
 
@@ -285,6 +286,8 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         accuracy is not None and not accuracy.warnings
     ):  # the accuracy has the same warnings
         said.append(str(accuracy))
+    if volume.sharpness.across is not None:
+        said.append(str(volume.sharpness))
     held.hold(volume.data, volume)
     held.keep(
         done=1.0,

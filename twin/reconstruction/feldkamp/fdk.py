@@ -97,6 +97,7 @@ class Task:
         if meter is None:
             return data.transpose(2, 0, 1), None
         plan.cover(meter.data, meter.grid, outside=self.outside)
+        plan.cover(meter.halves.factors, meter.halves.grid, outside=self.outside)
         return data.transpose(2, 0, 1), meter.found()
 
 

@@ -22,6 +22,7 @@ from flexdt.twin.projection.volume import Volume
 from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
 from flexdt.twin.reconstruction.acquisition.trajectory import Circle
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
+from flexdt.twin.reconstruction.feldkamp.half_scans import HalfScanMeter, HalfScans
 from flexdt.twin.reconstruction.feldkamp.slabs import layers
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
@@ -93,6 +94,11 @@ class NoiseOfViews:
         """Compute the standard deviation at each voxel of a grid; see `Noise`."""
         return self.noise.sigma(grid)
 
+    @cached_property
+    def half_scans(self) -> HalfScans | None:
+        """Planes from parts of the scan; None where a device made the volume."""
+        return self.meter.halves.found()
+
 
 @dataclass(frozen=True, eq=False)
 class NoiseOfSlabs:
@@ -110,6 +116,13 @@ class NoiseOfSlabs:
         """Compute the standard deviation on the complete grid; see `Noise`."""
         parts = zip(self.slabs, self.noises, strict=True)
         return np.concatenate([noise.sigma(layers(grid, *slab)) for slab, noise in parts])
+
+    @cached_property
+    def half_scans(self) -> HalfScans | None:
+        """Planes from parts of the scan, as `NoiseOfViews`."""
+        parts = [noise.half_scans for noise in self.noises]
+        found = [part for part in parts if part is not None]
+        return HalfScans.stacked(found) if len(found) == len(parts) else None
 
 
 class NoiseMeter:
@@ -159,6 +172,7 @@ class NoiseMeter:
         self._means: Float32Array | None = None
         self._done = 0
         self._response: FloatArray = np.zeros(0)
+        self.halves = HalfScanMeter(like, circle, self._signs)
 
     def note(self, views: Views) -> Float32Array:
         """Record the next views, in the order of the scan: adds their images to plain and
@@ -194,6 +208,7 @@ class NoiseMeter:
         """
         from flexdt.twin.reconstruction.kernels import fdk_kernels
 
+        self.halves.add(views, columns, self._done)
         signs = self.note(views)
         rows = views.sizes[3]
         for column, sign in zip(columns, signs, strict=False):
