@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from told_lengths_drawn import drawn_told
 
 from flexdt.twin.calibration.bead_model import BeadModel, Tolerance
 from flexdt.twin.calibration.diagnose.table.group import Acts, Family, Known
-from flexdt.twin.calibration.diagnose.table.groups import _limited, tiles
+from flexdt.twin.calibration.diagnose.table.groups import _limited, moving, tiles
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.priors import known_scale, known_strain
 from flexdt.twin.calibration.fit.told_ways import told_motions
@@ -187,3 +188,29 @@ def test_causes_are_excluded_by_users_and_scanners() -> None:
     assert narrow is not None
     assert narrow.widest == 0.5
     assert limited(rows=0.0) == limited() == tile
+
+
+@pytest.mark.parametrize(
+    ("cause", "unit"), [("angles", math.radians(1.0)), ("motion", 1.0)]
+)
+def test_courses_are_as_wide_as_an_encoder_or_a_stage_is_stated_to_be(
+    cause: str, unit: float
+) -> None:
+    """Courses that are drawn with the widths that a limit leaves err by it."""
+    rng = np.random.default_rng(5)
+    courses = rng.normal(size=(3, 1, 40, 6)) * [[[[1.0]]], [[[7.0]]], [[[0.2]]]]
+    courses[1, :, 20:] = 0.0  # of another scan
+    name = "alpha" if cause == "angles" else "dO_x"
+    family = Family(
+        moving.NAME, (f"{name} wanders",) * 3, Acts.FRAMES, (None,) * 3, 0.0,
+        slopes=np.array([[0]]), courses=courses,
+    )  # fmt: skip
+    known = Known((0.0, 0.0), None, 1.0, limits={cause: 0.25})
+    narrow = _limited(family, known)
+    assert narrow is not None
+    weights = np.reshape(narrow.widest, (3, 1, 1)) * rng.normal(size=(3, 6, 4000))
+    drawn_ = np.einsum("gnc,gcd->gnd", courses[:, 0], weights)
+    drawn_ = np.where(courses[:, 0, :, :1] != 0.0, drawn_, np.nan)
+    assert np.sqrt(np.nanmean(drawn_**2, axis=(1, 2))) == pytest.approx(
+        0.25 * unit, rel=0.05
+    )

@@ -89,7 +89,7 @@ class Family:
         slopes: (p, s) numbers of slopes of the table; None with rows.
         courses: (m, s, n, c) of each slope over the frames: the g = m p groups are each course
             with each of the slopes, in this order.
-        widest: largest width of a weight [its own unit].
+        widest: largest width of a weight [its own unit], (g,) or of all.
         always: width that always holds, so that the group is no question; 0: it is one.
         root: (q, c) what each weight does to the q places of `Acts.COLUMNS`, where these do not
             change by themselves; None: each is one.
@@ -103,7 +103,7 @@ class Family:
     rows: FloatArray | None = None
     slopes: npt.NDArray[np.intp] | None = None
     courses: FloatArray | None = None
-    widest: float = math.inf
+    widest: float | FloatArray = math.inf
     always: float = 0.0
     root: FloatArray | None = None
 
@@ -111,6 +111,18 @@ class Family:
     def chances(self) -> FloatArray:
         """Logarithm of the odds of each group before the scan is seen, (g,)."""
         return np.broadcast_to(np.asarray(self.chance), len(self.names))
+
+    @property
+    def reach(self) -> FloatArray:
+        """Root mean square over its frames of each group's course, of weights that are normal
+        with a width of 1, (g,); 1e-150 at least.
+        """
+        assert self.courses is not None
+        assert self.slopes is not None
+        square = (self.courses[:, 0] ** 2).sum(axis=2)
+        frames = np.maximum((square > 0).sum(axis=1), 1)
+        size = np.sqrt(square.sum(axis=1) / frames) + 1e-150
+        return np.repeat(size, len(self.slopes))
 
     def at_places(self, weights: FloatArray) -> FloatArray:
         """Return what weights, (c, ...), do to the places of `Acts.COLUMNS`, (q, ...)."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Final, NamedTuple
+
+import numpy as np
 
 from flexdt.twin.calibration.diagnose.table.group import Family, Found, Known
 from flexdt.twin.calibration.diagnose.table.groups import (
@@ -72,6 +75,9 @@ STATED: Final = (
 the first counts."""
 SAME_UNIT: Final = ("gap", "distortion", "shape", "beads")
 """Stated causes of which a group's weights have the stated unit."""
+OF_FRAMES: Final = {"angles": math.radians(1.0), "motion": 1.0}
+"""Stated causes of which a group's weights make courses over the frames -> the stated unit in that
+of the courses."""
 
 
 def every_family(table: Linearised, known: Known) -> list[Family]:
@@ -86,7 +92,8 @@ def every_family(table: Linearised, known: Known) -> list[Family]:
 
 def _limited(family: Family, known: Known) -> Family | None:
     """Return a family that is no wider than stated; None for one that is excluded. Of a size
-    that is stated in another unit than its weights', only 0 is one.
+    that is stated in another unit than its weights', only 0 is one; a course over the frames
+    has the root mean square that is stated.
     """
     name = next(
         (
@@ -101,6 +108,10 @@ def _limited(family: Family, known: Known) -> Family | None:
         return family
     if limit == 0.0:
         return None
-    if name not in SAME_UNIT:
+    if name in OF_FRAMES and family.cause != growth.NAME:
+        widest = limit * OF_FRAMES[name] / family.reach
+    elif name in SAME_UNIT:
+        widest = np.full(len(family.names), limit)
+    else:
         return family
-    return replace(family, widest=min(family.widest, limit))
+    return replace(family, widest=np.minimum(family.widest, widest))
