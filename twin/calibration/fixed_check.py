@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose import CalibrationCode, listed
-from flexdt.twin.calibration.diagnose.fitted import (
+from flexdt.twin.calibration.diagnose import (
     OF_MOTION,
     OF_RESIDUALS,
+    CalibrationCode,
+    listed,
 )
 from flexdt.twin.calibration.diagnose.fixed_parameters import (
     DOUBT_SIGMAS,

@@ -13,7 +13,7 @@ import numpy as np
 
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.diagnose import CalibrationCode, listed
+from flexdt.twin.calibration.diagnose import OF_MOTION, CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.data import (
     GOOD_RMS_PX,
     GOOD_SHARE,
@@ -21,7 +21,6 @@ from flexdt.twin.calibration.diagnose.data import (
     convincing,
     explain_identification,
 )
-from flexdt.twin.calibration.diagnose.fitted import OF_MOTION
 from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers, frame_numbers
 from flexdt.twin.calibration.diagnose.measured_spots import shadows_drawn_out
 from flexdt.twin.calibration.fit.priors import known

@@ -16,25 +16,37 @@ from flexdt.twin.calibration.bead_model import (
     bead_model,
     with_contrast,
 )
-from flexdt.twin.calibration.bead_sizes import judge_first_sizes, judge_sizes
 from flexdt.twin.calibration.detect.bead_contrast import detector_for
 from flexdt.twin.calibration.detect.detection import SpotFinder
-from flexdt.twin.calibration.diagnose import CalibrationCode, listed
+from flexdt.twin.calibration.diagnose import (
+    OF_MOTION,
+    OF_RESIDUALS,
+    CalibrationCode,
+    listed,
+)
 from flexdt.twin.calibration.diagnose.data import judge_frames
-from flexdt.twin.calibration.diagnose.fitted import OF_MOTION, OF_RESIDUALS, judge_offsets
+from flexdt.twin.calibration.diagnose.fixed_parameters import judge_offsets
 from flexdt.twin.calibration.diagnose.frame_places import judge_places
 from flexdt.twin.calibration.diagnose.measured_spots import (
     beside_missing_light,
     judge_body,
+    judge_first_sizes,
     judge_lag,
     judge_missing_light,
+    judge_sizes,
     judge_smear,
 )
 from flexdt.twin.calibration.fit.fit import FitResult, with_start
 from flexdt.twin.calibration.fit.problem import SIX, usual_step
 from flexdt.twin.calibration.fits_of_scans import fit_scans
 from flexdt.twin.calibration.fixed_check import check_fixed, explain
-from flexdt.twin.calibration.frame_source import FrameState, Scan, without_repeats
+from flexdt.twin.calibration.frame_source import (
+    FrameState,
+    Scan,
+    require_different,
+    require_scans,
+    without_repeats,
+)
 from flexdt.twin.calibration.identified_scans import identify_scans
 from flexdt.twin.calibration.motion_of_scans import (
     explained_with_motion,
@@ -49,7 +61,6 @@ from flexdt.twin.calibration.request import (
     with_free,
     with_stated,
 )
-from flexdt.twin.calibration.scans_to_calibrate import require_different, require_scans
 from flexdt.twin.calibration.second_measurement import measure_again
 from flexdt.twin.findings import Finding, Findings
 from flexdt.twin.projection.analytic_solids import Scene

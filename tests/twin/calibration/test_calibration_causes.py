@@ -3,16 +3,17 @@ own."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from causes_named import calibrated, scored
+from causes_named import calibrated, scored, worst_error
 from faults_drawn import KINDS, drawn
 from prior_coverage import PIXEL, SDD, SHAPE, SOD, pixels
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
 from flexdt.twin.calibration.detect.detection import Detections
-from flexdt.twin.calibration.diagnose import fitted
 from flexdt.twin.calibration.diagnose.data import explain_identification
 from flexdt.twin.calibration.identify import identify
 from flexdt.twin.geometry.poses import Poses
@@ -186,17 +187,19 @@ def test_what_once_had_another_name_beside_or_instead(kind: str, seed: int) -> N
 @pytest.mark.parametrize("kind", ["wobble", "runout"])
 @pytest.mark.campaign(1)
 def test_an_axis_that_wobbles_is_named_and_one_that_runs_out_is_another(
-    kind: str, monkeypatch: pytest.MonkeyPatch
+    kind: str,
 ) -> None:
     """A runout is no wobble even where no motion is looked for. The geometry beside a wobble
     is that of the mean axis, and holds; nothing explains the runout then."""
+    scan = drawn(kind, 71500)
     if kind == "runout":
-        monkeypatch.setattr(fitted, "moving", lambda *_: None)
-    found = scored(kind, 71500)
-    codes = [said.split(":")[0] for said in found.said]
-    assert codes == ["wobble" if kind == "wobble" else "misfit"], found.said
-    assert found.offered == (kind == "wobble")
-    assert found.worst < 4.0, found.where
+        none = dict(scan.believed.priors) | {"motion": 0.0, "angles": 0.0}
+        scan = replace(scan, believed=replace(scan.believed, priors=none))
+    result = calibrated(scan)
+    codes = [f.code for f in result.findings]
+    assert codes == ["wobble" if kind == "wobble" else "misfit"], result.findings
+    assert result.identifiable == (kind == "wobble")
+    assert not result.identifiable or worst_error(result, scan)[0] < 4.0
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from causes_named import calibrated, worst_error
 from faults_drawn import RANGE, UNSEEN, Believed, Faulty, World, in_images, shadows
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.residual_limit import largest_residual
+from flexdt.twin.calibration.diagnose.table.verdict import largest_residual
 from flexdt.twin.calibration.fit.certificate import spread_of_residuals
 from flexdt.twin.calibration.fit.fit import Solver, estimate_geometry
 from flexdt.twin.calibration.fit.priors import ASSUMED

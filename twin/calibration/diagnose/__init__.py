@@ -139,6 +139,28 @@ class CalibrationCode(FindingCode):
     )  # fmt: skip
 
 
+OF_RESIDUALS = frozenset(
+    (
+        CalibrationCode.DRIFT,
+        CalibrationCode.VIBRATION,
+        CalibrationCode.BEAD_ERRORS,
+        CalibrationCode.BEAD_DISPLACED,
+        CalibrationCode.TOO_MANY_OUTLIERS,
+        CalibrationCode.BEAD_TOLERANCE,
+    )
+)
+"""Codes of findings about residuals: they hold for that fit alone."""
+OF_MOTION = frozenset(
+    (
+        CalibrationCode.DRIFT,
+        CalibrationCode.VIBRATION,
+        CalibrationCode.ANGLES_WRONG,
+        CalibrationCode.WOBBLE,
+    )
+)
+"""Codes of findings on what is elsewhere from frame to frame."""
+
+
 def listed(finding: Finding | None) -> list[Finding]:
     """Make a list of one finding; empty for `None`."""
     return [] if finding is None else [finding]

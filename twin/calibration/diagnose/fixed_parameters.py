@@ -41,6 +41,10 @@ sigmas off.)"""
 MIN_GROWTH: Final = 3.0
 """Growth of a sigma from which values stated as exact are named, if they cannot be
 checked, or if images narrow their usual prior by less."""
+PLAUSIBLE_SHARE: Final = 0.12
+"""Largest offset along the beam, as a share of SOD, that a mount may cause. A phantom that is
+scaled together with its beads looks like the right one at another distance, so that this offset
+is its only sign."""
 NARROW_CHANCE: Final = 0.01
 """Probability of such a contradiction with right priors below which priors are widened."""
 
@@ -520,3 +524,20 @@ def _chance(square: float, count: int, freedom: float) -> float:
         freedom: degrees of freedom with which the sigmas are known (Fisher).
     """
     return float(fdtrc(count, freedom, max(square, 0.0) / count))
+
+
+def judge_offsets(fit: FitResult) -> Finding | None:
+    """Judge whether the fitted place is within the possible errors of mount and motors.
+
+    Returns:
+        An error if dO_z of some scan exceeds `PLAUSIBLE_SHARE` of the SOD; else None.
+    """
+    sod = float(np.median(fit.problem.poses.sod))
+    for parameters in fit.group_parameters:
+        if abs(parameters.dO_z) > PLAUSIBLE_SHARE * sod:
+            return error(
+                CalibrationCode.IMPLAUSIBLE_OFFSET,
+                f"dO_z comes out as {parameters.dO_z:.1f} mm at SOD {sod:.0f} mm: a phantom of "
+                "another scale, or wrong nominal distances",
+            )
+    return None

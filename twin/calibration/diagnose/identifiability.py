@@ -1,7 +1,8 @@
 """Forecast of the parameters that a planned scan determines, and changes to improve it.
 
-The prediction is that of the fit (`fit.forecast`) to scans that are drawn (`foreseen`), with
-what the causes that a calibration looks for leave open of each. The suggestions are planned
+The prediction is that of the fit (`fit.forecast`) to scans that are drawn, with what the
+causes that a calibration looks for leave open of each: what it states depends on the noise, as a
+cause that the noise looks like stays open. The suggestions are planned
 scans too and are evaluated in the same way.
 """
 
@@ -9,15 +10,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.bead_model import BeadModel, BeadPhantom, bead_model
-from flexdt.twin.calibration.diagnose.foreseen import foreseen
 from flexdt.twin.calibration.diagnose.table.group import Known
+from flexdt.twin.calibration.diagnose.table.groups import every_family, strain
+from flexdt.twin.calibration.diagnose.table.linearised import (
+    Linearised,
+    State,
+    with_every_column,
+)
+from flexdt.twin.calibration.diagnose.table.posterior import Search
 from flexdt.twin.calibration.fit.certificate import beyond_bound
-from flexdt.twin.calibration.fit.forecast import Forecast, forecast, visible_beads
+from flexdt.twin.calibration.fit.fit import image_slopes
+from flexdt.twin.calibration.fit.forecast import Forecast, Stated, forecast, visible_beads
 from flexdt.twin.calibration.fit.priors import (
     NOISE_PX,
     Given,
@@ -28,9 +37,11 @@ from flexdt.twin.calibration.fit.priors import (
 )
 from flexdt.twin.calibration.fit.problem import (
     SIX,
+    FitProblem,
     Shape,
     as_poses,
     build_problem,
+    edge_factors,
     frame_shapes,
     require_tolerance,
 )
@@ -41,6 +52,9 @@ from flexdt.twin.geometry.offsets import NOMINAL, Offsets
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.geometry.told_lengths import PHANTOM
 
+DRAWS: Final = 39
+"""Number of scans that are drawn."""
+SEED: Final = 39
 _Plan = tuple[BeadModel, Poses, FloatArray]
 
 
@@ -200,7 +214,7 @@ def identifiability(
         )
         fitted = forecast(problem, bound)
         if rivals and not fitted.spectrum.null and visible.any():
-            stated = foreseen(problem, Known(strain, bead_tolerance_mm, 1.0))
+            stated = _foreseen(problem, Known(strain, bead_tolerance_mm, 1.0))
             return forecast(problem, bound, stated), visible
         return fitted, visible
 
@@ -278,3 +292,77 @@ def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Pl
         "take twice as many frames": with_more(angle=float(half)),
         "use a phantom with two beads more": (beads, poses, sizes),
     }
+
+
+def _foreseen(problem: FitProblem, known: Known) -> Stated:
+    """Draw what scans of a plan state; the same in every call.
+
+    The fit is linearised where a scanner and a phantom are (small offsets turn the image of
+    the axis by more than it is known), what causes add at the plan.
+
+    Args:
+        problem: planned, with its positions as predicted at the start; their whitened errors
+            have spread 1.
+        known: statements on the phantom and the positions.
+
+    Returns:
+        `DRAWS` scans.
+    """
+    rng = np.random.default_rng(SEED)
+    _, x = with_every_column(problem, problem.start)
+    still = State(x, {}, np.zeros((*problem.seen.shape, 2)))
+    table = Linearised(problem, still, known.floor)
+    families = every_family(table, known)
+    bases = [table.geometry]
+    widths = [np.where(table.precision > 0, table.precision, np.inf) ** -0.5]
+    shape: list[int] = []
+    for family in families:
+        if family.always and family.rows is not None:
+            bases.append(family.rows[0])
+            widths.append(np.full(family.rows.shape[2], family.always))
+            if family.cause == strain.NAME:
+                first = sum(map(len, widths[:-1]))
+                shape += range(first, first + family.rows.shape[2])
+    base = np.concatenate(bases, axis=1)
+    spread = np.concatenate(widths)
+    drawn = spread[:, None] * rng.normal(size=(len(spread), DRAWS))
+    noise = (
+        rng.normal(size=(len(base), DRAWS)) * np.repeat(table.weight.ravel(), 2)[:, None]
+    )
+    search = Search(table, families, 0.0, base @ drawn + noise)
+    search.keep_shapes()
+    count = table.parameters
+    factor = edge_factors(problem.layout.names)
+    unit = np.outer(factor[:count], factor[:count])
+    precision = np.diag(1.0 / (problem.prior_sigma * factor) ** 2)
+    keep = np.repeat(problem.seen.ravel(), 2)
+    columns = [
+        *range(count),
+        *range(len(problem.layout.names))[problem.layout.strain_columns],
+    ]
+    sources = [*range(count), *shape[: len(columns) - count]]
+    slopes = image_slopes(problem, problem.start, 0)[1]
+    covariances = []
+    images = []
+    for number in range(DRAWS):
+        search.draw(number)
+        model = search.model({}, 1.0)
+        posterior = search.mixture(model, search.further(model))
+        mean = model.solved.mean[:count]
+        wide = sum(
+            p.weight * (p.covariance + np.outer(p.mean - mean, p.mean - mean))
+            for p in posterior.parts
+        )
+        more = (np.asarray(wide) - model.solved.covariance[:count, :count]) * unit
+        there = problem.start
+        there[columns] += drawn[sources, number]
+        rows: FloatArray = problem.jacobian(there)[keep] / factor
+        told = rows.T @ rows / model.noise2
+        here = np.linalg.inv(told + precision)[:count, :count]
+        turned = image_slopes(problem, there, 0)[1]
+        covariances.append(here + more)
+        images.append(
+            np.einsum("qi,ij,qj->q", turned, here, turned)
+            + np.einsum("qi,ij,qj->q", slopes, more, slopes)
+        )
+    return Stated(np.array(covariances), np.array(images))

@@ -8,17 +8,25 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flexdt.twin.calibration.bead_model import spot_radii
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.detect.smear import Smear
-from flexdt.twin.calibration.diagnose import CalibrationCode
+from flexdt.twin.calibration.diagnose import CalibrationCode, listed
 from flexdt.twin.calibration.diagnose.usual_factors import OF_RADII, usual_reason
+from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.frame_source import FrameSpots
 from flexdt.twin.calibration.identify import Identification
+from flexdt.twin.calibration.outcome import Calibration
+from flexdt.twin.calibration.request import CalibrationRequest
 from flexdt.twin.findings import Finding, error, warning
 from flexdt.twin.geometry.conventions import FloatArray
 
+OTHER_BEADS = 1.0 / 6.0
+"""Deviation of the first radii from which beads are others."""
+BLURRED_FIRST = 0.4
+"""The same before blur is measured: blurred spots are wider."""
 MAX_SIZE_ERROR = 0.04
 """Deviation of the spots' radii from the expected ones that indicates a wrong scale."""
 BLUR_TOLERANCE = 0.6
@@ -28,6 +36,55 @@ MAX_BODY_LOG = 0.5
 beam hardening alone stays below."""
 MAX_BODY_MM = 0.3
 """Shift of the body from its description from which it is reported [mm]."""
+
+
+def judge_first_sizes(
+    state: Calibration, request: CalibrationRequest, fit: FitResult
+) -> list[Finding]:
+    """Judge the sizes of spots in the first measurement against those predicted by the
+    fit.
+
+    Args:
+        state: scans, identified, with their spots.
+        request: whether a second measurement follows; then a deviation of `BLURRED_FIRST`
+            is allowed now, as blur makes spots wider, else `OTHER_BEADS`.
+        fit: gives the geometry of each scan.
+
+    Returns:
+        At most one finding for each scan; empty if all fit.
+    """
+    out = []
+    if request.second_look:
+        allowed = BLURRED_FIRST
+    else:
+        allowed = OTHER_BEADS
+    sized = zip(state.scans, state.identifications, state.looks, strict=True)
+    for g, (scan, found, looks) in enumerate(sized):
+        radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
+        out += listed(judge_first_size(found, looks, radii, allowed))
+    return out
+
+
+def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
+    """Judge in each scan the bead sizes of the second measurement, or of the first (with
+    `OTHER_BEADS`) where the second measured no size and the spots are not smeared.
+
+    Args:
+        state: scans, spots, identifications and the second measurements.
+        fit: of the geometry, which predicts the spots' radii.
+
+    Returns:
+        Findings on sizes that do not fit, at most one a scan; empty if all fit.
+    """
+    out = []
+    for g, scan in enumerate(state.scans):
+        radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
+        if np.isfinite(state.measured[g].size):
+            out += listed(judge_size(state.measured[g], float(np.median(radii))))
+        elif not state.measured[g].smear.told:
+            first = state.identifications[g], state.looks[g], radii
+            out += listed(judge_first_size(*first, OTHER_BEADS))
+    return out
 
 
 def judge_first_size(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,14 +81,6 @@ class Table:
         self._push = np.einsum("mq,m->q", rows, values) / alike
         self._total = float(values @ values) / alike
         self._floor = floor
-
-    def of_values(self, rows: FloatArray, values: FloatArray, floor: float) -> Table:
-        """Return the table of other values of the same rows, none of them correlated."""
-        other = copy(self)
-        other._push = np.einsum("mq,m->q", rows, values)
-        other._total = float(values @ values)
-        other._floor = floor
-        return other
 
     def judged(
         self, columns: Sequence[int], widths: FloatArray, noise: float, means: FloatArray

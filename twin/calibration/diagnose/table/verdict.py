@@ -7,15 +7,16 @@ warning. What no group explains, or only errors of the spots themselves, counts 
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from scipy.special import chdtri
 
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.frame_places import MOST_LEFT_OUT
-from flexdt.twin.calibration.diagnose.residual_limit import largest_residual
 from flexdt.twin.calibration.diagnose.table.explained import Explained, explained
 from flexdt.twin.calibration.diagnose.table.group import (
     NAMED_LOG_ODDS,
@@ -31,12 +32,15 @@ from flexdt.twin.calibration.diagnose.table.groups import (
     positions,
     spots,
 )
+from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.findings import ERROR, WARNING, Finding, error, warning
 
 MISFIT_CHANCE: Final = 0.01
 """Probability of positions that scatter so much, below which a fit is not to be used unless
 its residuals are explained."""
+NOISE_SIGMAS: Final = 1.5
+"""Stated sigmas up to which residuals are noise, however large."""
 LEAST_BEADS: Final = 3
 MOST_LOST: Final = 0.35
 """Part of the positions that may be left out."""
@@ -182,6 +186,31 @@ def _misfits(what: Explained, sigmas_known: bool, misfit_px: float) -> bool:
     spread = fit.certificate.rms_px
     limit = max(misfit_px, largest_residual(fit, MISFIT_CHANCE, sigmas_known))
     return bool(spread >= limit) or _share_left_out(fit) > MOST_LEFT_OUT
+
+
+def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) -> float:
+    """Compute the root mean square residual that a right fit exceeds by chance.
+
+    Positions scatter by their stated sigmas and, from image to image, by
+    `certificate.POSITION_SPREAD_PX` with SPREAD_FREEDOM degrees of freedom.
+
+    Args:
+        fit: whose residuals are judged.
+        chance: probability of more.
+        sigmas_known: the positions' sigmas were measured, and are no more than compared;
+            else the stated ones are ignored.
+
+    Returns:
+        [px].
+    """
+    usual = SPREAD_FREEDOM / float(chdtri(SPREAD_FREEDOM, 1.0 - chance))
+    certificate = fit.certificate
+    measured = sigmas_known and certificate.noise > 0.0
+    if measured:
+        stated = certificate.rms_px / certificate.noise
+    else:
+        stated = 0.0
+    return math.hypot(POSITION_SPREAD_PX * math.sqrt(usual), NOISE_SIGMAS * stated)
 
 
 def _misfit(fit: FitResult) -> Finding:
