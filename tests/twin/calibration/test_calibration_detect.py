@@ -159,7 +159,7 @@ def test_two_sizes_of_beads_when_asked() -> None:
 
 
 def test_bad_images_are_refused() -> None:
-    with pytest.raises(TwinError, match="rows, cols"):
+    with pytest.raises(TwinError, match="rows x cols"):
         detect_beads(np.zeros((3, 4, 5)))
     assert len(detect_beads(np.full((50, 50), np.nan))) == 0
     assert len(detect_beads(np.zeros((2, 2)))) == 0
