@@ -331,7 +331,7 @@ class Removed(f.Result):
 class Array(f.Result):
     """An image value, or (with `parts`) the description of one sent in parts."""
 
-    dtype: Literal["float32", "uint8"]
+    dtype: Literal["float32", "uint32"]
     shape: list[int]
     parts: int | None = None
     data: Buffer | None = None
@@ -382,7 +382,7 @@ PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {
             "rays",
             RaysNeeded,
             Array,
-            "marks of the rays that each pixel needs, uint8, as of `within`",
+            "pixels that need several rays, uint32 (k,): of each view 32 x place + mark, then 0",
         ),
         Method(
             "backproject", Backproject, Array, "the adjoint of project, float32 (z, y, x)"

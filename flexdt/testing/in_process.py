@@ -41,7 +41,6 @@ from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.machine.description import Machine
 from flexdt.twin.projection import Body, project_body
 from flexdt.twin.projection.pixel_areas import (
-    Marks,
     Need,
     Within,
     paths_within,
@@ -205,9 +204,9 @@ class DirectProjector:
         cone_vec: ConeVec,
         shape: tuple[int, int],
         need: tuple[Need, float],
-    ) -> Marks:
-        """Find the rays that pixels need: marks, uint8 (n, rows, cols)."""
-        return rays_needed(self.known[name], cone_vec, shape, *need)
+    ) -> Within:
+        """Find the pixels that need several rays."""
+        return Within.of(rays_needed(self.known[name], cone_vec, shape, *need))
 
     async def paths_within(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within

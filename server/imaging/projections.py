@@ -51,7 +51,7 @@ from flexdt.twin.physics.sampled_views import spot_views
 from flexdt.twin.physics.scatter import Object
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
-from flexdt.twin.projection.pixel_areas import Marks, Need, Within
+from flexdt.twin.projection.pixel_areas import Need, Within
 from flexdt.twin.scanner.state import Sample, StagePlacement, require_before_source
 
 MAX_TRUTH_VALUE = 1e6
@@ -197,8 +197,8 @@ class Projector(Protocol):
         cone_vec: ConeVec,
         shape: tuple[int, int],
         need: tuple[Need, float],
-    ) -> Marks:
-        """Find the rays that pixels need: marks, uint8 (n, rows, cols)."""
+    ) -> Within:
+        """Find the pixels that need several rays."""
 
     async def paths_within(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within
@@ -340,13 +340,12 @@ class Imaging:
         Returns:
             The pixels, and float32 (pieces, rays).
         """
-        marks: Any = None
-        for name, weight in zip(divided.names, weights, strict=True):
-            more = await self.projector.rays_needed(name, cone, shape, (need, weight))
-            marks = more if marks is None else np.maximum(marks, more)
-        if marks is None:
-            marks = np.ones((len(cone), *shape), np.uint8)
-        within = await asyncio.to_thread(Within.of, marks)
+        within = Within.joined(
+            [
+                await self.projector.rays_needed(name, cone, shape, (need, weight))
+                for name, weight in zip(divided.names, weights, strict=True)
+            ]
+        )
         paths = np.empty((len(divided.names), int(within.starts[-1])), np.float32)
         for i, name in enumerate(divided.names):
             paths[i] = await self.projector.paths_within(name, cone, shape, within)

@@ -7,6 +7,7 @@ again to a server that has restarted or has dropped it for others.
 from __future__ import annotations
 
 import asyncio
+import math
 import ssl as tls
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
@@ -16,14 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.phantoms.checked_reading import scene_to_dict
-from flexdt.protocol import RpcError, hello_params, image, parse_result
+from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, volumes_there
 from flexdt.runtime.wire_errors import ProjectorUnavailable
 from flexdt.server.projector.wire import LinkLost, ProjectorLink
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Body, TriangleMesh
 from flexdt.twin.projection.analytic_solids import Scene
-from flexdt.twin.projection.pixel_areas import Marks, Need, Within
+from flexdt.twin.projection.pixel_areas import Need, Within
 
 _T = TypeVar("_T")
 
@@ -126,8 +127,8 @@ class ProjectorClient:
         cone_vec: ConeVec,
         shape: tuple[int, int],
         need: tuple[Need, float],
-    ) -> Marks:
-        """Find the rays that every pixel needs: marks, uint8 (n, rows, cols).
+    ) -> Within:
+        """Find the pixels that need several rays.
 
         Args:
             name, body, cone_vec, shape: as of `project`.
@@ -139,11 +140,18 @@ class ProjectorClient:
             "counts": wanted.counts,
             "weight": abs(float(weight)),
         }
-        sizes = (len(cone_vec), *shape)
-        marks = await self._array(
-            "rays", name, body, (cone_vec, shape), params, sizes, np.uint8
+        pixels = math.prod(shape)
+        sizes = (len(cone_vec) * (pixels + 1),)
+        values = await self._array(
+            "rays", name, body, (cone_vec, shape), params, sizes, np.uint32, most=True
         )
-        return wanted.given(marks)
+        try:
+            found = Within.unpacked(values, len(cone_vec), pixels)
+        except ValueError as error:
+            raise RpcError(
+                Code.INTERNAL, f"the projector's answer to rays: {error}"
+            ) from None
+        return Within(found.pixels, wanted.given(found.marks))
 
     async def paths_within(
         self,
@@ -176,6 +184,8 @@ class ProjectorClient:
         more: Mapping[str, object],
         sizes: tuple[int, ...],
         dtype: npt.DTypeLike = np.float32,
+        *,
+        most: bool = False,
     ) -> npt.NDArray[Any]:
         """Request an array about a body; send the body again if the server has dropped it.
 
@@ -188,7 +198,7 @@ class ProjectorClient:
             name, body: the body; None if it is there already.
             views: object frame, and detector (rows, cols).
             more: the method's further parameters.
-            sizes, dtype: of the array.
+            sizes, dtype, most: of the array, as of `ProjectorLink.ask_array`.
 
         Returns:
             The array, read-only.
@@ -210,7 +220,7 @@ class ProjectorClient:
                 await self.give(name, body)
             try:
                 return await self._ask(
-                    method, lambda c: c.ask_array(method, params, sizes, dtype)
+                    method, lambda c: c.ask_array(method, params, sizes, dtype, most=most)
                 )
             except RpcError as error:
                 there = volumes_there(error, name)

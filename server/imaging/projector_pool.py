@@ -24,7 +24,7 @@ from flexdt.server.imaging.projector_client import ProjectorClient
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Body
-from flexdt.twin.projection.pixel_areas import Marks, Need, Within
+from flexdt.twin.projection.pixel_areas import Need, Within
 
 MAX_OPEN_REQUESTS: Final = 2
 """Largest number of requests that a projector has: one is computed while the other travels."""
@@ -210,14 +210,14 @@ class ProjectorPool:
         cone_vec: ConeVec,
         shape: tuple[int, int],
         need: tuple[Need, float],
-    ) -> Marks:
-        """Find the rays that pixels need, as `ProjectorClient.rays_needed`."""
-        marks: Marks = await self._request(
+    ) -> Within:
+        """Find the pixels that need several rays, as `ProjectorClient.rays_needed`."""
+        within: Within = await self._request(
             name,
             0,
             lambda client, body: client.rays_needed(name, body, cone_vec, shape, need),
         )
-        return marks
+        return within
 
     async def paths_within(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within

@@ -34,7 +34,13 @@ from flexdt.runtime.kernels import compile_ahead
 from flexdt.twin.projection import Body, gpu, project_body
 from flexdt.twin.projection.analytic import warm_up_forward
 from flexdt.twin.projection.kernels.compiling import LOG
-from flexdt.twin.projection.pixel_areas import Need, Within, paths_within, rays_needed
+from flexdt.twin.projection.pixel_areas import (
+    Need,
+    Within,
+    packed,
+    paths_within,
+    rays_needed,
+)
 
 COMPILE_BACK_AFTER_S: Final = 60.0
 """Delay before back projection is compiled [s], so that a first scan has all cores."""
@@ -213,12 +219,12 @@ def marking_steps(
         need: and the body's weight, as of `rays_needed`.
 
     Yields:
-        Steps whose values are uint8 (views, rows, cols).
+        Steps whose values are uint32, see `pixel_areas.packed`.
     """
 
     def step(part: npt.NDArray[np.float64]) -> Step:
         """Make the step of some rows."""
-        return lambda: rays_needed(body, part, shape, *need)
+        return lambda: packed(rays_needed(body, part, shape, *need))
 
     for start in range(0, len(rows), block):
         yield step(rows[start : start + block])

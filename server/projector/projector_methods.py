@@ -209,7 +209,7 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 
 
 async def rays(context: Context, client: JobClient, id: Id, p: wire.RaysNeeded) -> object:
-    """Find the rays that pixels need, and send their marks as uint8 (n, rows, cols).
+    """Find the rays that pixels need, and send their marks (`pixel_areas.packed`).
 
     Args:
         context: of the server.
@@ -232,8 +232,7 @@ async def rays(context: Context, client: JobClient, id: Id, p: wire.RaysNeeded) 
         (Need(p.error, p.counts), p.weight),
     )
     job = client.begin(id, None)
-    shape = (len(rows), *p.detector)
-    return {**await _sent(context, client, id, job, steps, shape), **warnings}
+    return {**await _sent(context, client, id, job, steps, None), **warnings}
 
 
 def _looked_at(
@@ -263,10 +262,10 @@ async def _sent(
     id: Id,
     job: ComputeJob,
     steps: Iterator[Step],
-    shape: tuple[int, ...],
+    shape: tuple[int, ...] | None,
 ) -> dict[str, Any]:
-    """Compute steps one after the other and send their values: the image value if all are
-    one step's and fit into a frame; else dtype, shape and the number of parts, sent before.
+    """Compute steps one after the other and send their values: the image value if there is one
+    step and it fits into a frame; else dtype, shape and the number of parts, sent before.
 
     Args:
         context: of the server.
@@ -274,21 +273,22 @@ async def _sent(
         id: of its request.
         job: of the request.
         steps: of the array's first axis, in order.
-        shape: of the array.
+        shape: of the array; None for as many values as there are.
     """
     parts = done = 0
     dtype = np.dtype(np.float32)
-    for step in steps:
+    every = list(steps)
+    for step in every:
         values = await job.run(context.compute, step)
         assert isinstance(values, np.ndarray)
         if values.dtype == np.float32 and values.ndim == 3:
             context.views += len(values)
-        if len(values) == shape[0] and values.nbytes + SPARE_BYTES <= MAX_FRAME:
+        if len(every) == 1 and values.nbytes + SPARE_BYTES <= MAX_FRAME:
             return dict(image.encode(values))
         parts += await context.send_parts(client, id, values, done)
         done += values.size
         dtype = values.dtype
-    return {"dtype": str(dtype), "shape": list(shape), "parts": parts}
+    return {"dtype": str(dtype), "shape": list(shape or (done,)), "parts": parts}
 
 
 async def backproject(

@@ -350,6 +350,8 @@ class ProjectorLink:
         params: Mapping[str, object],
         shape: tuple[int, ...],
         dtype: npt.DTypeLike = np.float32,
+        *,
+        most: bool = False,
     ) -> npt.NDArray[Any]:
         """Request an array, which comes in one piece or in parts.
 
@@ -358,6 +360,7 @@ class ProjectorLink:
             params: its parameters.
             shape: of the array.
             dtype: of its values.
+            most: whether it is flat, and `shape` is the largest that it may have.
 
         Returns:
             The array, read-only.
@@ -369,11 +372,15 @@ class ProjectorLink:
         answer, parts = await self._request(method, params, shape, dtype)
         if isinstance(answer, Mapping) and answer.get("data") is not None:
             array = np.asarray(image.decode(answer))
-            if array.shape == shape and array.dtype == dtype:
+            fits = array.ndim == 1 and array.size <= math.prod(shape)
+            if (fits if most else array.shape == shape) and array.dtype == dtype:
                 return array
-        elif parts is not None and tuple(parse_result(Array, answer).shape) == shape:
-            parts.setflags(write=False)
-            return np.asarray(parts.reshape(shape))
+        elif parts is not None:
+            told = tuple(parse_result(Array, answer).shape)
+            fits = len(told) == 1 and math.prod(told) <= parts.size
+            if fits if most else told == shape:
+                parts.setflags(write=False)
+                return np.asarray(parts[: math.prod(told)].reshape(told))
         raise RpcError(
             Code.INTERNAL, f"the projector's answer to {method} is no {shape} array"
         )

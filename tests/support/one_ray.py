@@ -8,7 +8,7 @@ import numpy as np
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
-from flexdt.twin.projection.pixel_areas import Marks, Within
+from flexdt.twin.projection.pixel_areas import Within
 
 
 class OneRay:
@@ -16,9 +16,9 @@ class OneRay:
 
     async def rays_needed(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], need: Any
-    ) -> Marks:
-        """Return 1 for every pixel."""
-        return np.ones((len(cone_vec), *shape), np.uint8)
+    ) -> Within:
+        """Return no pixel."""
+        return Within.joined([])
 
     async def paths_within(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within

@@ -56,12 +56,18 @@ BAND_ROWS: Final = 32
 SHARE_OF_MAXIMUM: Final = 3e-3
 """Error of a pixel on an edge by "auto", as a part of the largest line integral (standard
 deviation)."""
+PLAIN_INTEGRAL: Final = 60.0
+"""Line integral below which no signal leaves the range of single precision: others are taken from
+the least of their pixel."""
 FEWEST_NEEDED: Final = 1e-4
 """The same from which a pixel gets the number of rays that is asked for."""
-RAYS: Final = np.array([(mark + 1) // 2 * (mark // 2 + 1) for mark in range(32)])
+MARKS: Final = 32
+"""Number of marks, 0 included."""
+RAYS: Final = np.array([(mark + 1) // 2 * (mark // 2 + 1) for mark in range(MARKS)])
 """Number of rays of each mark."""
 IntArray = npt.NDArray[np.int64]
 Marks = npt.NDArray[np.uint8]
+Packed = npt.NDArray[np.uint32]
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,34 @@ class Within:
         pixels = np.flatnonzero(flat > 1)
         return cls(pixels, flat[pixels])
 
+    @classmethod
+    def joined(cls, several: Sequence[Within]) -> Within:
+        """Take the pixels that any of several names, each with the most rays."""
+        if len(several) == 1:
+            return several[0]
+        pixels = np.concatenate([np.zeros(0, np.int64), *(one.pixels for one in several)])
+        marks = np.concatenate([np.zeros(0, np.uint8), *(one.marks for one in several)])
+        order = np.argsort(pixels, kind="stable")
+        pixels, first = np.unique(pixels[order], return_index=True)
+        if not len(pixels):
+            return cls(pixels, marks)
+        return cls(pixels, np.maximum.reduceat(marks[order], first))
+
+    @classmethod
+    def unpacked(cls, values: Packed, views: int, pixels: int) -> Within:
+        """Read what `packed` has made of views of `pixels` each.
+
+        Raises:
+            ValueError: it is of other views.
+        """
+        ends = values == 0
+        places, marks = np.divmod(values[~ends].astype(np.int64), MARKS)
+        places += np.cumsum(ends)[~ends] * pixels
+        sound = np.count_nonzero(ends) == views and (not len(ends) or ends[-1])
+        if not sound or (np.diff(places) <= 0).any() or (places >= views * pixels).any():
+            raise ValueError(f"no marks of {views} views of {pixels} pixels")
+        return cls(places, marks.astype(np.uint8))
+
     @cached_property
     def starts(self) -> IntArray:
         """Place of each pixel's first ray among all, (k + 1,); the last is their number."""
@@ -130,6 +164,8 @@ class Within:
         exp(-values): what a panel that counts photons shows. (rays,) to float64 (k,)."""
         if not len(self.pixels):
             return np.zeros(0)
+        if values.min() > -PLAIN_INTEGRAL and values.max() < PLAIN_INTEGRAL:
+            return np.asarray(-np.log(self.means(np.exp(-values))))
         least = np.minimum.reduceat(values, self.starts[:-1])
         beyond = values - np.repeat(least, rays_of(self.marks))
         return np.asarray(least - np.log(self.means(np.exp(-beyond))))
@@ -164,6 +200,16 @@ def rays_needed(
     else:
         _mark_voxels(body, geometry, marks)
     return need.given(marks)
+
+
+def packed(marks: Marks) -> Packed:
+    """Pack marks (n, rows, cols), of which few are more than 1: for each view, of each such
+    pixel, `MARKS` times its place plus its mark, in their order, and a 0."""
+    out = [np.zeros(0, np.uint32)]
+    for view in map(np.ravel, marks):
+        places = np.flatnonzero(view > 1)
+        out += [(places * MARKS + view[places]).astype(np.uint32), np.zeros(1, np.uint32)]
+    return np.concatenate(out)
 
 
 def paths_within(
@@ -243,10 +289,12 @@ def needed(
 ) -> Within:
     """Find the pixels that need several rays for any of the bodies (with their weights, as of
     `rays_needed`)."""
-    marks = np.ones((len(cone_vec), *shape), np.uint8)
-    for body, weight in parts:
-        np.maximum(marks, rays_needed(body, cone_vec, shape, need, weight), out=marks)
-    return Within.of(marks)
+    return Within.joined(
+        [
+            Within.of(rays_needed(body, cone_vec, shape, need, weight))
+            for body, weight in parts
+        ]
+    )
 
 
 @lru_cache(maxsize=KEPT_SCENES)

@@ -10,7 +10,7 @@ from drawn_bodies import parts_of
 from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid, Operator, Volume, back, forward, pixel_areas
-from flexdt.twin.projection.pixel_areas import Need, Within
+from flexdt.twin.projection.pixel_areas import Need, Within, packed
 from flexdt.twin.rays_a_pixel import check_rays
 
 SHAPE = (40, 40)
@@ -162,3 +162,30 @@ def test_what_is_not_there_is_refused_with_what_is() -> None:
     with pytest.raises(LimitError, match="allowed: 'exact' or 'linear'"):
         Operator(SCAN, volume, model="cubic")  # type: ignore[arg-type]
     assert Within.of(np.ones((1, 3, 3), np.uint8)).means(np.zeros(0)).size == 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_packed_marks_are_read_as_they_were(seed: int) -> None:
+    """Of any number of views, some of them without a pixel that needs several rays."""
+    rng = np.random.default_rng(seed)
+    views, pixels = int(rng.integers(0, 4)), (int(rng.integers(1, 9)), 7)
+    marks = rng.integers(1, 32, (views, *pixels)).astype(np.uint8)
+    marks[rng.random(marks.shape) < rng.choice([0.1, 0.9, 1.0])] = 1
+    values = packed(marks)
+    back = Within.unpacked(values, views, pixels[0] * pixels[1])
+    np.testing.assert_array_equal(back.pixels, np.flatnonzero(marks > 1))
+    np.testing.assert_array_equal(back.marks, marks[marks > 1])
+    for wrong in (values[:-1], np.append(values, np.uint32(0)), values + np.uint32(32)):
+        if len(values) > 0 or len(wrong) > 0:
+            with pytest.raises(ValueError, match="no marks of"):
+                Within.unpacked(wrong, views, pixels[0] * pixels[1])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_pixels_of_several_bodies_have_the_most_rays_of_any(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    marks = rng.integers(1, 6, (int(rng.integers(0, 4)), 2, 5, 4)).astype(np.uint8)
+    whole = Within.joined([Within.of(one) for one in marks])
+    most = marks.max(axis=0, initial=1)
+    np.testing.assert_array_equal(whole.pixels, np.flatnonzero(most > 1))
+    np.testing.assert_array_equal(whole.marks, most[most > 1])
