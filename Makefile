@@ -1,5 +1,5 @@
 # make install | demo | quick | test | lint | test-extensions | slow (studies, page, campaigns) | failed | docs |
-# web | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
+# dist | web | typecheck | lowest | newest. Everything lives in .venv; PYTHON picks another interpreter.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -29,7 +29,7 @@ QUICK := tests/protocol tests/twin/script $(TWIN:%=tests/twin/test_%.py) \
 # As tests/support/suite.py does for the tests: without kept bytecode each process compiles all it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo ready quick quick-tests test test-extensions slow studies page campaigns failed docs web lint typecheck lowest newest clean
+.PHONY: install demo ready quick quick-tests test test-extensions slow studies page campaigns failed docs dist web lint typecheck lowest newest clean
 
 install: $(COMPILED)
 
@@ -159,6 +159,10 @@ web: install $(WEB_STAMP)
 docs: $(DOCS_STAMP) $(COMPILED)
 	$(BIN)/python -m sphinx -b html -n -W --keep-going -q --jobs 2 docs docs/_build/html
 	$(BIN)/python docs/tools/site_checks.py docs/_build/html
+
+# Wheels and source archives of both distributions, tried in clean environments. Result: dist/
+dist: $(STAMP)
+	$(BIN)/python .ci/distributions.py --out dist
 
 # The oldest and the newest dependencies that pyproject.toml allows, in an environment of their own.
 lowest newest:

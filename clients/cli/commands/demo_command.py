@@ -53,6 +53,8 @@ PICTURE_ROWS: Final = 380
 PICTURE_VOXEL_MM: Final = 0.1
 PICTURE_MARGIN: Final = 30
 """Voxels of air beside the phantom in the picture."""
+PICTURE_EVERY: Final = 1
+"""Of the frames that its volumes take."""
 PICTURE_GAP: Final = 8
 """Distance of the images in the picture [pixels]."""
 STAY_S: Final = 3600.0
@@ -363,10 +365,9 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
 
     from flexdt.library.datasets.labelled_pictures import labelled
     from flexdt.library.datasets.pictures import png_of, windowed
-    from flexdt.library.reconstruction.reconstruct import (
-        VolumeRequest,
-        reconstruct_volume,
-    )
+    from flexdt.twin.projection import Grid
+    from flexdt.twin.reconstruction import fdk
+    from flexdt.twin.reconstruction.acquisition.rectify import rows_needed, window
 
     fit = outcome.calibration.fit
     assert fit is not None
@@ -374,20 +375,30 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
     rows, cols = (n + 2 * PICTURE_MARGIN for n in truth.shape[1:])
     layer = int(np.argmin(np.abs(truth.centers()[2] - outcome.phantom.beads[0, 2])))
     z = float(truth.centers()[2][layer])
-    request = VolumeRequest(
-        voxel_mm=PICTURE_VOXEL_MM,
-        shape=(1, rows, cols),
-        center_mm=(0.0, 0.0, z),
-    )
+    grid = Grid((1, rows, cols), PICTURE_VOXEL_MM, (0.0, 0.0, z)).blank()
+    frames = dataset.present[::PICTURE_EVERY]
+    geometries = [
+        dataset.corrected(parameters)[np.array(frames)]
+        for parameters in (None, fit.parameters)
+    ]
+    parts = [rows_needed(geometry, dataset.shape, grid) for geometry in geometries]
+    first = max(0, min(part[0] for part in parts))
+    last = min(dataset.shape[0], max(part[1] for part in parts))
     with long_work.during("drawing the picture"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the picture shows what they say
+        images = np.stack([dataset.line_integrals(i)[first:last] for i in frames])
         believed, calibrated = (
-            reconstruct_volume(dataset, request, parameters=parameters).data[0]
-            for parameters in (None, fit.parameters)
+            fdk(
+                images,
+                window(geometry, dataset.shape, (first, last), (0, dataset.shape[1])),
+                grid,
+                errors=False,
+            ).data[0]
+            for geometry in geometries
         )
     known = np.pad(truth.data[layer], PICTURE_MARGIN)
     plastic = float(np.median(known[known > 0.0]))
-    window = np.array([-plastic, 3.0 * plastic])  # beads are far beyond
+    ends = np.array([-0.3 * plastic, 3.0 * plastic])  # beads are far beyond
     gap = np.full((1, PICTURE_GAP), 255, np.uint8)
     drawn: list[npt.NDArray[np.uint8]] = []
     for image, title in (
@@ -395,7 +406,7 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
         (calibrated, "as calibrated from its own images"),
         (known, "the truth"),
     ):
-        picture = windowed(_scaled_to(image[::-1]), like=window)
+        picture = windowed(_scaled_to(image[::-1]), like=ends)
         named = labelled(picture, title, PICTURE_VOXEL_MM * rows / PICTURE_ROWS)
         drawn += [named, np.repeat(gap, len(named), axis=0)]
     out.write_bytes(png_of(np.hstack(drawn[:-1])))

@@ -28,7 +28,7 @@ WINDOW_REACH_WIDTHS: Final = 0.5
 """Reach of the window's slider beyond the window, on each side, as a share of its width."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class LivePage(NotebookPage):
     """A page that is shown as live widgets where there is a program behind them, and as
     itself in a saved notebook, on a site and in print.
