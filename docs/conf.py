@@ -56,6 +56,8 @@ myst_heading_anchors = 4
 suppress_warnings = ["misc.highlighting_failure", "toc.not_included", "ref.python"]
 
 nb_execution_mode = "force"
+# The story is kept with its outputs: a weekly job executes it, from the wheel.
+nb_execution_excludepatterns = ["story/*"]
 nb_execution_raise_on_error = True
 nb_execution_timeout = 180
 nb_execution_show_tb = True

@@ -423,6 +423,7 @@ def test_one_version_everywhere() -> None:
 
 
 CONDA = {
+    "matplotlib": "matplotlib-base",
     "msgpack": "msgpack-python",
     "opencv-python-headless": "py-opencv",
     "prometheus-client": "prometheus_client",

@@ -67,7 +67,7 @@ def test_without_the_distribution_one_line_says_what_to_install(
     assert (code, out) == (1, "")
     assert err == (
         f"flexdt: `flexdt {name}` needs flexdt-extensions, which is not installed: "
-        "pip install flexdt-extensions\n"
+        "pip install ./extensions in a clone of flexdt\n"
     )
 
 

@@ -40,7 +40,12 @@ def html_report(report: CheckReport, name: str = "script") -> str:
         name: of the script.
     """
     title = f"Dry run of {name}"
-    if report.ok:
+    doubts = len(report.problems)
+    if report.ok and doubts:
+        verdict = marked(
+            f"can run, {doubts} warning{'s' if doubts > 1 else ''}", "warning"
+        )
+    elif report.ok:
         verdict = marked("ok", "good")
     else:
         verdict = marked("not ok", "bad")

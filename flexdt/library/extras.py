@@ -70,7 +70,8 @@ def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
     loaded = offered(name, group)
     if loaded is None:
         raise TwinError(
-            f"{what} needs {DISTRIBUTION}, which is not installed: pip install {DISTRIBUTION}",
+            f"{what} needs {DISTRIBUTION}, which is not installed: "
+            "pip install ./extensions in a clone of flexdt",
             {"missing": DISTRIBUTION},
         )
     return loaded
