@@ -390,3 +390,52 @@ def test_materials_of_samples_hold_for_filters_of_tubes_too(name: str) -> None:
         fx.TwinError, match=r"unknown material 'aluminum'; there are: .*aluminium"
     ):
         fx.Tube(filters=[("aluminum", 0.3)])
+
+
+def test_the_accuracy_is_told_once(tmp_path: Path) -> None:
+    from flexdt.clients.cli.commands.data_commands import _lines_of
+    from flexdt.twin.projection.volume import Accuracy
+
+    accuracy = Accuracy(0.02, 0.04, "angles")
+    document = {
+        "shape": [1, 2, 3], "voxel_mm": 1.0, "frames": 4, "seconds": 1.0, "slices": [],
+        "accuracy": asdict(accuracy), "warnings": [],
+    }  # fmt: skip
+    out = tmp_path / "v.tif"
+    out.write_bytes(b"")
+    assert sum(str(accuracy) in line for line in _lines_of(document, out)) == 1
+    document["warnings"] = [f"doubtful: {accuracy}"]
+    assert not any(str(accuracy) in line for line in _lines_of(document, out))
+
+
+@pytest.mark.filterwarnings("ignore:.*layers of the grid")
+def test_a_helix_is_given_the_layers_that_it_fills() -> None:
+    from flexdt.library.reconstruction.reconstruct import grid_of, views_of
+
+    helix = fx.ConeVec.helical(
+        sod=100, sdd=200, angles=60, turns=3, rise=4.0, shape=(16, 12), pixel=1.0
+    )
+    flat, counts = np.full((16, 12), 1000), np.full((60, 16, 12), 500)
+    data = fx.DataSet.from_arrays(counts, helix, flat=flat)
+    views = views_of(data)
+    tall, cut = (
+        grid_of(views, VolumeRequest(algorithm, voxel_mm=0.5))
+        for algorithm in ("sirt", "fdk")
+    )
+    missing = (tall.shape[0] - cut.shape[0]) * 0.5 / 2
+    assert 4.0 <= missing + 0.5 <= 5.5  # a turn's rise, and the taper
+    volume = data.reconstruct("fdk", voxel=0.5, errors=False)
+    unknown = ~np.isfinite(volume.data).any(axis=(1, 2))
+    assert unknown.mean() < 0.25
+
+
+def test_a_contrast_has_its_time() -> None:
+    ball = {"kind": "sphere", "center": [0, 0, 0], "radius": 8, "material": "aluminium"}
+    asked = fx.expose(ball, kV=90, images=10, contrast=3.0)
+    assert asked.contrast_ms is not None
+    assert "contrast of 3 after" in repr(asked)
+    there = fx.expose(ball, kV=90, images=10, exposure_ms=min(asked.contrast_ms, 2000.0))
+    if asked.contrast_ms < 2000.0 and there.asked.cnr is not None:
+        assert there.asked.cnr == pytest.approx(3.0, rel=0.01)
+    with pytest.raises(fx.TwinError, match="contrast is -1; allowed"):
+        fx.expose(ball, contrast=-1.0)
