@@ -94,7 +94,7 @@ OPTIONS: Final[dict[str, Option]] = {
         Option("weight", "the strength of the total variation"),
         Option("window", "the window of the ramp filter"),
         Option("materials", "several materials, each followed through the volume"),
-        Option("errors", "the noise and the bound of the bias"),
+        Option("errors", "whether images fit, and the bound of the bias", general=True),
         Option("scheduler", "workers that share the slabs"),
         Option("slurm", "workers that share the slabs"),
         Option("tube", "the spectrum of a correction", general=True, needs=_CORRECTIONS),

@@ -175,9 +175,10 @@ def reconstruct(
         parameters: correction; default: the one in force during the scan, if any.
         progress: a bar after two seconds; False for no bar, or a function of the fraction
             done.
-        errors: of FDK (default: True), estimate errors, `volume.bias_bound` and
-            `volume.accuracy`, and warn of them; and find the noise, `volume.sigma` (of a
-            circle, of five rows or more).
+        errors: compare the volume with its images (default: True), and warn of
+            contradictions and large errors; `volume.accuracy`, `bias_bound` and
+            `residuals` tell more, of FDK also `volume.sigma`, the noise (of a circle, of
+            five rows or more).
 
     Returns:
         Volume of attenuation [1/mm].

@@ -17,7 +17,7 @@ from flexdt.library.notebook.notebook_slices import window_of
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.panel_corners import panel_corners
-from flexdt.twin.projection.volume import Volume
+from flexdt.twin.projection.volume import Residuals, Volume
 from flexdt.twin.script import CheckReport, ScanPlan
 
 PATH_SAMPLES = 2000
@@ -33,6 +33,9 @@ DOT_PT = 6.0
 GEOMETRY_INCH = (7.0, 5.5)
 BAR_WIDTH = 0.05
 """Of a colour bar, as a share of its picture's width."""
+RESIDUALS_INCH = (12.0, 3.6)
+MOVIE_MS = 400
+"""Time of a view in a movie of residuals."""
 MAX_TICKS = 6
 """Of the longest axis of a geometry."""
 MAX_PANELS = 12
@@ -147,6 +150,59 @@ def plot_volume(
     _colour_bar(axes, shown, f"{LAYER_LABELS[what]} [1/mm]")
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"z = {z[middle]:g} mm")
     return axes
+
+
+def plot_residuals(residuals: Residuals) -> Any:
+    """Plot residuals by view and by pixel, and those of the worst view.
+
+    Args:
+        residuals: of a volume.
+
+    Returns:
+        The three axes.
+    """
+    require_plots()
+    import matplotlib.pyplot as plt
+
+    _, axes = plt.subplots(1, 3, figsize=RESIDUALS_INCH, layout="constrained")
+    axes[0].plot(residuals.views, residuals.by_view, ".")
+    axes[0].set(xlabel="view", ylabel="residual [line integral]", ylim=(0.0, None))
+    shown = axes[1].imshow(residuals.by_pixel, cmap="viridis", vmin=0.0)
+    axes[1].set(xlabel="column", ylabel="row", title="by pixel")
+    _colour_bar(axes[1], shown, "")
+    view = int(residuals.worst(1)[0])
+    rest = residuals.images[residuals.views.tolist().index(view)]
+    most = float(np.abs(rest).max()) or 1.0
+    shown = axes[2].imshow(rest, cmap="RdBu_r", vmin=-most, vmax=most)
+    axes[2].set(xlabel="column", title=f"view {view}")
+    _colour_bar(axes[2], shown, "")
+    return axes
+
+
+def movie_of_residuals(residuals: Residuals, count: int) -> Any:
+    """Make an animation of the views with the largest residuals, in the order of the scan.
+
+    Args:
+        residuals: of a volume.
+        count: of views.
+    """
+    require_plots()
+    import matplotlib.pyplot as plt
+    from matplotlib.animation import FuncAnimation
+
+    views = np.sort(residuals.worst(count))
+    rest = residuals.images[np.isin(residuals.views, views)]
+    most = float(np.abs(rest).max()) or 1.0
+    figure, axes = plt.subplots(layout="constrained")
+    shown = axes.imshow(rest[0], cmap="RdBu_r", vmin=-most, vmax=most)
+    _colour_bar(axes, shown, "residual [line integral]")
+
+    def show(number: int) -> list[Any]:
+        """Draw one view."""
+        shown.set_data(rest[number])
+        return [shown, axes.set_title(f"view {views[number]}")]
+
+    return FuncAnimation(figure, show, frames=len(views), interval=MOVIE_MS)
 
 
 def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:

@@ -35,6 +35,8 @@ CAUSES: Final = {
     "rows": "truncation above or below the panel's rows",
     "beyond": "truncation at the panel's sides",
     "drift": "an open beam beside the object that is not the flat field's",
+    "stopping": "iterations that ended early",
+    "penalty": "the penalty of the total variation",
 }
 GRANTED: Final = (
     "taken for granted: the geometry, as far as images do not contradict it, and line "
@@ -170,6 +172,78 @@ class Sharpness:
         if not said:
             return "sharpness: not known, no edges"
         return f"sharpness: {', '.join(said)} (voxels of {self.voxel_mm:.2g} mm)"
+
+
+@public
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What a volume, projected again, leaves of its images.
+
+    Attributes:
+        images: measured less projected line integrals, (n, rows, cols), of a copy of the
+            scan with fewer pixels.
+        views: numbers of these n views among the scan's.
+        binned: rows and columns of the panel over which a pixel is the mean.
+        own: the volume itself was projected; else a coarse one of the field of view,
+            because the volume is a part of it.
+
+    Example:
+        >>> rest = np.zeros((3, 2, 2), np.float32)
+        >>> rest[1] = 0.1
+        >>> found = Residuals(rest, np.array([0, 4, 8]), (6, 6), True)
+        >>> found.worst(1).tolist()
+        [4]
+    """
+
+    images: Float32Array
+    views: npt.NDArray[np.intp]
+    binned: tuple[int, int]
+    own: bool
+
+    @property
+    def by_view(self) -> FloatArray:
+        """Root mean square of each view, (n,)."""
+        squares = np.square(self.images, dtype=np.float64)
+        return np.asarray(np.sqrt(squares.mean(axis=(1, 2))))
+
+    @property
+    def by_pixel(self) -> FloatArray:
+        """Root mean square of each pixel over the views, (rows, cols)."""
+        squares = np.square(self.images, dtype=np.float64)
+        return np.asarray(np.sqrt(squares.mean(axis=0)))
+
+    def worst(self, count: int = 12) -> npt.NDArray[np.intp]:
+        """Return the numbers of the views with the largest residuals, worst first."""
+        return self.views[np.argsort(-self.by_view, kind="stable")[:count]]
+
+    def plot(self) -> Any:
+        """Draw the residual by view and by pixel, and the worst view; needs matplotlib
+        (the extra `plots`).
+
+        Returns:
+            The three axes.
+        """
+        return backend("plots").plot_residuals(self)
+
+    def movie(self, count: int = 12) -> Any:
+        """Make an animation of the worst views, in the order of the scan; needs
+        matplotlib (the extra `plots`). A notebook shows `.to_jshtml()` of it.
+
+        Args:
+            count: of views.
+
+        Returns:
+            Matplotlib's animation, with `save("file.gif")`.
+        """
+        return backend("plots").movie_of_residuals(self, count)
+
+    def __repr__(self) -> str:
+        """Name the worst view beside the usual one."""
+        by_view = self.by_view
+        return (
+            f"<Residuals of {len(self.views)} views: {np.median(by_view):.3g} (median), "
+            f"{by_view.max():.3g} in view {self.worst(1)[0]}>"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -590,6 +664,16 @@ class Volume:
             sharpness: not known, no edges
         """
         found: Sharpness = backend("sharpness").sharpness_of(self)
+        return found
+
+    @cached_property
+    def residuals(self) -> Residuals | None:
+        """What the volume, projected again, leaves of the images (`reconstruct`): by
+        view, by pixel, and the worst views; at most 180 views, of pixels binned to at most
+        80 a side. None if no copy of the images was made. Computed at the first access.
+        """
+        bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
+        found: Residuals | None = None if bias is None else bias.residuals(self)
         return found
 
     @property

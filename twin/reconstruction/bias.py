@@ -24,7 +24,7 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
-from flexdt.twin.projection.volume import Accuracy
+from flexdt.twin.projection.volume import Accuracy, Residuals
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import (
     FINE_NODES,
@@ -46,6 +46,7 @@ from flexdt.twin.reconstruction.consistency.agreement import (
 )
 from flexdt.twin.reconstruction.uniform_nodes import MIN_EVENNESS, UniformNodes
 from flexdt.twin.reconstruction.volume_errors import interpolated
+from flexdt.twin.reconstruction.volume_residuals import residuals_of
 
 SAFETY_FACTOR: Final = 1.0 / SMOOTH_CHANGE_SHARE
 """Factor of the bound, which makes up for what the smooth coarse volume does not show."""
@@ -61,6 +62,8 @@ USUAL_SHARE: Final = {
     "rows": 1.0,
     "beyond": 1.0,
     "drift": 1.3,
+    "stopping": 1.0,
+    "penalty": 1.0,
 }
 """Cause -> share of its bound that half of a scan's uniform regions stay below. Causes
 that reach their bound in narrow places have small ones
@@ -291,6 +294,15 @@ class BiasOnDemand:
             return _bounded(thin, {"angles"}).warnings(grid)
         return []
 
+    def residuals(self, volume: Volume) -> Residuals | None:
+        """Compare the finer copy's images with the projections of a volume of the scan;
+        None where neither that nor a coarse one can be projected.
+        """
+        try:
+            return residuals_of(volume, self._copied(FINE_NODES))
+        except GeometryError:
+            return None
+
     @cached_property
     def _bounded(self) -> Bias:
         """The errors, but for what the comparison adds."""
@@ -336,6 +348,48 @@ class BiasOnDemand:
                 closer = comparison.finer(undecided, fine)
                 undecided = closer.undecided(accuracy.most, sides_known=sides_known)
         return undecided
+
+
+class BiasOfIterations(BiasOnDemand):
+    """Possible errors of an iterative volume: of what iterations that end early, or a
+    penalty, leave out of the smooth coarse volume's projections.
+
+    Args:
+        copied, sides_known: as of `BiasOnDemand`.
+        run: reconstructs images (n, rows, cols) of n views on a grid, by the algorithm
+            and with the options of the volume.
+        cause: stopping or penalty.
+    """
+
+    def __init__(
+        self,
+        copied: Callable[[int], CoarseScan],
+        run: Callable[[Float32Array, ConeVec, Volume], Volume],
+        cause: str,
+        *,
+        sides_known: bool = False,
+    ) -> None:
+        """Look at the scan once; see the class."""
+        self._run = run
+        self._cause = cause
+        super().__init__(copied, sides_known=sides_known)
+
+    def warnings(self, grid: Grid | Volume) -> list[str]:
+        """List what is wrong at first sight: a contradiction."""
+        return [] if self.contradiction is None else [str(self.contradiction)]
+
+    @cached_property
+    def _bounded(self) -> Bias:
+        """The errors, but for what the comparison adds."""
+        scan = self._copied(NODES)
+        values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
+        nodes = UniformNodes.of(values, scan.rim)
+        shape = (scan.images.shape[1], scan.images.shape[2])
+        images = scan.projected(nodes.found, scan.cone_vec, shape)
+        again = self._run(images, scan.cone_vec, scan.grid).data
+        change = np.nan_to_num(again) - nodes.found
+        causes = {self._cause: SAFETY_FACTOR * _about(change, nodes.even)}
+        return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
 
 
 def bias_of(

@@ -81,7 +81,7 @@ from flexdt.twin.reconstruction import (
 from flexdt.twin.reconstruction.acquisition.coverage import ends_not_seen_mm
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, distinct_angles
 from flexdt.twin.reconstruction.acquisition.truncation import SAMPLES as TRUNCATION_VIEWS
-from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of
+from flexdt.twin.reconstruction.bias import BiasOfIterations, BiasOnDemand, copies_of
 from flexdt.twin.reconstruction.coarse_scan import ScanCopies
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
@@ -664,7 +664,8 @@ def reconstruct_volume(
 
     Args:
         dataset, request, parameters, progress: as for `reconstruct_dataset`.
-        errors: estimate FDK's errors: `bias_bound`, `accuracy` and `sigma`.
+        errors: compare the volume with its images: `bias_bound`, `accuracy`, `residuals`,
+            and of FDK `sigma`.
 
     Returns:
         The volume, attenuation [1/mm].
@@ -690,6 +691,9 @@ def reconstruct_volume(
         for doubt in views.doubts:
             warn_caller(doubt)
         if not fdk:
+            if errors:
+                copies = copies_of(views.cone_vec, views.shape)
+                views = replace(views, copies=copies)
             return _iterative(views, grid, task.request, tell)
         if errors:
             views = _copied(views)
@@ -1072,23 +1076,37 @@ def _iterative(
         grids = grids + 3
     need = stacks * 4 * len(views.indices) * math.prod(views.shape) + grids * grid.bytes
     _require(f"of memory for {request.algorithm}", need, int(0.8 * memory_bytes()), grid)
-    options = {
-        "iterations": request.iterations,
-        "weight": request.weight,
-        "hardening": views.mixture,
-    }
-    with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", PlausibilityWarning
-        )  # it is among the views' doubts
-        made: Volume = algorithm.load()(
-            _stack_integrals(views),
-            views.cone_vec,
-            grid.blank(),
-            watch=lambda step: tell(step.iteration, step.of),
-            **{name: value for name, value in options.items() if value is not None},
-        )
-    return made
+    options = {"iterations": request.iterations, "weight": request.weight}
+    given = {name: value for name, value in options.items() if value is not None}
+    mixture = {} if views.mixture is None else {"hardening": views.mixture}
+
+    def run(images: Float32Array, cone_vec: ConeVec, like: Volume, **more: Any) -> Volume:
+        """Reconstruct; what is implausible is among the views' doubts."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PlausibilityWarning)
+            made: Volume = algorithm.load()(images, cone_vec, like, **given, **more)
+        return made
+
+    stack = _stack_integrals(views)
+
+    def watch(step: Any) -> None:
+        """Report the iterations done."""
+        tell(step.iteration, step.of)
+
+    made = run(stack, views.cone_vec, grid.blank(), watch=watch, **mixture)
+    copies = views.copies
+    if copies is None or views.mixture is not None:
+        return made
+    cause = "penalty" if "weight" in algorithm.options else "stopping"
+    try:
+        copies.truncation = truncation_of(stack.__getitem__, views.cone_vec, views.shape)
+        quiet = partial(run, progress=False)
+        bias = BiasOfIterations(copies, quiet, cause, sides_known=views.sides_known)
+    except GeometryError:  # a trajectory that is not looked at
+        return made
+    for doubt in bias.warnings(made):
+        warn_caller(doubt)
+    return with_errors(made, bias=bias)
 
 
 def _stack_integrals(views: ScanFrames) -> Float32Array:
