@@ -26,6 +26,8 @@ MODULE_LISTS = {"reference/python": "python", "extensions/reference": "python-ex
 MODULE_OPTIONS = {
     "flexdt.twin.reconstruction": "   :exclude-members: Grid\n",
     "flexdt.library.datasets.exchange": "   :exclude-members: ExchangeError, ScanGeometry\n",
+    "flexdt.twin.exchange": "   :exclude-members: Ledger\n\n"
+    ".. autoclass:: flexdt.twin.exchange.Ledger\n   :no-members:\n",
     "flexdt.twin.physics": "   :exclude-members: Detector\n\n"
     ".. autoclass:: flexdt.twin.physics.Detector\n   :no-members:\n",
 }
