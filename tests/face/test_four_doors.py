@@ -8,10 +8,12 @@ words.
 
 from __future__ import annotations
 
+import inspect
 import json
 import random
 import re
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -123,9 +125,7 @@ def in_python(draw: random.Random) -> Iterator[Mistake]:
             wrong = misspelt(name, draw)
             named = {wrong if n == name else n: v for n, v in right.items()}
             never = tuple(n for n in right if n != name)
-            yield Mistake(
-                where, kind, lambda c=call, k=named: c(**k), (repr(wrong),), never
-            )
+            yield Mistake(where, kind, partial(call, **named), (repr(wrong),), never)
         elif kind == "missing":
             given = draw.sample([*right], draw.randrange(len(right)))
             line = next((one for one in SURFACE if one.startswith(f"fx.{where}(")), "")
@@ -134,7 +134,7 @@ def in_python(draw: random.Random) -> Iterator[Mistake]:
             if needed:
                 named = {n: right[n] for n in given}
                 cause = tuple(repr(n) for n in needed)
-                yield Mistake(where, kind, lambda c=call, k=named: c(**k), cause)
+                yield Mistake(where, kind, partial(call, **named), cause)
         elif kind == "pair":
             by_name = solvers()
             algorithm = draw.choice([*by_name])
@@ -143,22 +143,22 @@ def in_python(draw: random.Random) -> Iterator[Mistake]:
                 value = {"iterations": 2, "weight": 0.1, "window": "hann"}[option]
                 yield Mistake(
                     f"reconstruct {algorithm}", kind,
-                    lambda a=algorithm, o=option, v=value: data.reconstruct(a, **{o: v}),
+                    partial(data.reconstruct, algorithm, **{option: value}),
                     (f"{option}: {algorithm}",),
                 )  # fmt: skip
         elif kind == "file":
             word = f"gone-{draw.randrange(1000)}"
             ways: Mapping[str, Callable[[], object]] = {
-                "open": lambda w=word: fx.open(w),
-                "Volume.load": lambda w=word: fx.Volume.load(f"{w}.tif"),
-                "ConeVec.load": lambda w=word: fx.ConeVec.load(f"{w}.json"),
-                "plan": lambda w=word: fx.plan(f"{w}.txt"),
-                "machine": lambda w=word: fx.machine(f"{w}.toml"),
-                "calibrate": lambda w=word: fx.calibrate(data, f"{w}.toml"),
-                "read_tiffs": lambda w=word: fx.read_tiffs(w, data.geometry),
-                "simulate": lambda w=word: fx.simulate(f"{w}.stl", data.geometry),
-                "expose": lambda w=word: fx.expose(f"{w}.stl"),
-                "reconstruct": lambda w=word: fx.reconstruct(w),
+                "open": partial(fx.open, word),
+                "Volume.load": partial(fx.Volume.load, f"{word}.tif"),
+                "ConeVec.load": partial(fx.ConeVec.load, f"{word}.json"),
+                "plan": partial(fx.plan, f"{word}.txt"),
+                "machine": partial(fx.machine, f"{word}.toml"),
+                "calibrate": partial(fx.calibrate, data, f"{word}.toml"),
+                "read_tiffs": partial(fx.read_tiffs, word, data.geometry),
+                "simulate": partial(fx.simulate, f"{word}.stl", data.geometry),
+                "expose": partial(fx.expose, f"{word}.stl"),
+                "reconstruct": partial(fx.reconstruct, word),
             }
             door = draw.choice([*ways])
             yield Mistake(door, kind, ways[door], (word,))
@@ -168,16 +168,14 @@ def in_python(draw: random.Random) -> Iterator[Mistake]:
                 theirs = draw.choice(STRANGERS[ours])
                 named = {theirs if n == ours else n: v for n, v in right.items()}
                 cause = (f"did you mean {ours!r}",)
-                yield Mistake(where, kind, lambda c=call, k=named: c(**k), cause)
+                yield Mistake(where, kind, partial(call, **named), cause)
         else:
             named = {**right, name: object()}
             others = test_mistakes._others(  # whether the annotation allows anything
-                str(test_mistakes.inspect.signature(call).parameters[name].annotation), 0
+                str(inspect.signature(call).parameters[name].annotation), 0
             )
             if others:
-                yield Mistake(
-                    where, kind, lambda c=call, k=named: c(**k), (f"{name} is",)
-                )
+                yield Mistake(where, kind, partial(call, **named), (f"{name} is",))
 
 
 def some(mistakes: Iterator[Mistake]) -> list[Mistake]:
@@ -234,14 +232,14 @@ def on_the_command_line(draw: random.Random) -> Iterator[Mistake]:
             wrong = "--" + misspelt(draw.choice(options)[2:], draw)
             if not any(option.startswith(wrong) for option in options):
                 given = [*words, *("gone" for _ in arguments), f"{wrong}=1"]
-                yield Mistake(path, kind, lambda g=given: run(g), (wrong,))
+                yield Mistake(path, kind, partial(run, given), (wrong,))
         elif kind == "stranger":
             ours = draw.choice([n for n in STRANGERS if f"--{n}" in options] or [""])
             if ours:
                 theirs = draw.choice(STRANGERS[ours])
                 given = [*words, *("gone" for _ in arguments), f"--{theirs}=1"]
                 yield Mistake(
-                    path, kind, lambda g=given: run(g), (f"did you mean --{ours}",)
+                    path, kind, partial(run, given), (f"did you mean --{ours}",)
                 )
         elif kind == "pair":
             by_name = solvers()
@@ -251,7 +249,7 @@ def on_the_command_line(draw: random.Random) -> Iterator[Mistake]:
                 given = ["reconstruct", "gone", "--out=v.tif", f"--algorithm={algorithm}",
                          f"--{option}=2"]  # fmt: skip
                 cause = (f"--{option}: {algorithm}",)
-                yield Mistake("reconstruct", kind, lambda g=given: run(g), cause)
+                yield Mistake("reconstruct", kind, partial(run, given), cause)
         elif kind == "file":
             word = f"gone-{draw.randrange(1000)}"
             given = draw.choice([
@@ -261,14 +259,14 @@ def on_the_command_line(draw: random.Random) -> Iterator[Mistake]:
                 ["import", f"{word}.json", "--format=rtk", "--out=g.json"],
                 ["export", word, "--format=rtk", "--out=g.xml"],
             ])  # fmt: skip
-            yield Mistake(" ".join(given[:1]), kind, lambda g=given: run(g), (word,))
+            yield Mistake(" ".join(given[:1]), kind, partial(run, given), (word,))
         else:
             option = draw.choice(
                 ["--binning", "--every", "--iterations", "--voxel", "--kv"]
             )
             value = draw.choice(["many", "1,5", "--", "ten"])
             given = ["reconstruct", "gone", "--out=v.tif", f"{option}={value}"]
-            yield Mistake("reconstruct", kind, lambda g=given: run(g), (option,))
+            yield Mistake("reconstruct", kind, partial(run, given), (option,))
 
 
 @pytest.mark.slow
@@ -306,8 +304,8 @@ def of_schemas(
         if kind == "misspelt":
             wrong = misspelt(name, draw)
             if wrong not in fields:
-                given = {wrong: 1}
-                yield Mistake(method, kind, lambda m=method, g=given: ask(m, g), (wrong,))
+                given: dict[str, object] = {wrong: 1}
+                yield Mistake(method, kind, partial(ask, method, given), (wrong,))
         elif kind == "type":
             given = {name: {"what": [None]}}
             if fields[name].get("type") in (
@@ -317,16 +315,16 @@ def of_schemas(
                 "boolean",
                 "array",
             ):
-                yield Mistake(method, kind, lambda m=method, g=given: ask(m, g), (name,))
+                yield Mistake(method, kind, partial(ask, method, given), (name,))
         elif kind == "missing":
             needed = [n for n, schema in fields.items() if schema.get("needed")]
             if needed:
-                yield Mistake(method, kind, lambda m=method: ask(m, {}), tuple(needed))
+                yield Mistake(method, kind, partial(ask, method, {}), tuple(needed))
         else:
             low, high = fields[name].get("minimum"), fields[name].get("maximum")
             if low is not None or high is not None:
                 given = {name: low - 1 if low is not None else high + 1}
-                yield Mistake(method, kind, lambda m=method, g=given: ask(m, g), (name,))
+                yield Mistake(method, kind, partial(ask, method, given), (name,))
 
 
 def refusal(mistake: Mistake) -> str | None:
