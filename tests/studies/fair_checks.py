@@ -42,6 +42,8 @@ def check(port: int, text: str, name: str, done: list[tuple[float, str]]) -> Non
         wire.call("script.check", text=text)
     except Refused as error:
         name += f" ({error.code})"
+    except OSError:  # the study has left
+        return
     done.append((time.monotonic(), name))
 
 
