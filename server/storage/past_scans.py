@@ -564,7 +564,7 @@ def _list_row(path: Path, modified: float) -> p.DatasetInfo | str:
         The summary; "" for a folder that holds no data set.
     """
     folder = files.list_folder(path)
-    if folder.document is None and not folder.projections:
+    if folder.document is None and folder.geometry is None and not folder.projections:
         return ""
     try:
         scan = _scan(folder, MAX_LISTED_DOCUMENT_BYTES)
@@ -603,6 +603,8 @@ def _with_thumbnail(
         """
         folder = files.list_folder(path)
         images = list(folder.projections.values())
+        if not images and folder.geometry is not None and (saved := _texts(folder)):
+            images = [frame.file for frame in saved.frames if frame.present]
         if not images:
             return ""
         try:

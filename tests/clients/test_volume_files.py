@@ -112,7 +112,7 @@ def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
 def test_what_cannot_be_written_or_read_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(fx.TwinError, match=r"one of .*\.mha, \.nii\.gz"):
+    with pytest.raises(fx.TwinError, match=r"one of .*\.mhd, \.nii\.gz"):
         VOLUME.save(tmp_path / "v.vtk")
     np.save(tmp_path / "v.npy", DATA)
     for use in (VOLUME.save, fx.Volume.load):
@@ -286,3 +286,22 @@ def test_volumes_of_version_0_4_keep_their_place(tmp_path: Path) -> None:
             )
         file.write_bytes(raw)
         assert_allclose(fx.Volume.load(file).center_mm, VOLUME.center_mm, atol=1e-6)
+
+
+def test_a_header_with_its_values_beside_it_is_read(tmp_path: Path) -> None:
+    """Gate#623, xcist#96: .mhd with .raw, as RTK and elastix write volumes."""
+    values = np.random.default_rng(3).normal(size=(3, 4, 5)).astype(np.float32)
+    volume = fx.Volume(values, (0.5, 0.25, 2.0), (1.0, -2.0, 3.0))
+    volume.save(tmp_path / "v.mha")
+    raw = (tmp_path / "v.mha").read_bytes()
+    head, _, data = raw.partition(b"ElementDataFile = LOCAL\n")
+    (tmp_path / "w.raw").write_bytes(data)
+    (tmp_path / "w.mhd").write_bytes(head + b"ElementDataFile = w.raw\n")
+    read = fx.Volume.load(tmp_path / "w.mhd")
+    np.testing.assert_array_equal(read.data, values)
+    assert read.voxel_xyz == pytest.approx(volume.voxel_xyz)
+    assert read.center_mm == pytest.approx(volume.center_mm)
+    for name in ("../w.raw", "gone.raw"):
+        (tmp_path / "w.mhd").write_bytes(head + f"ElementDataFile = {name}\n".encode())
+        with pytest.raises((fx.TwinError, OSError), match=r"w\.mhd|gone\.raw"):
+            fx.Volume.load(tmp_path / "w.mhd")

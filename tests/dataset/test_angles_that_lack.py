@@ -60,7 +60,7 @@ def test_what_lacks_is_named_with_the_argument_that_gives_it(
         DatasetError, match="give angles=DEGREES, one for each projection"
     ):
         fx.open(path, **needed)
-    for count in (1, 7, 10):  # the last are all images of NXtomo's, dark and flat too
+    for count in (1, 7, 9, 11):  # NXtomo has 8 projections of 10 images
         with pytest.raises(DatasetError, match=rf"{count} angles for 8 projections"):
             fx.open(path, angles=np.arange(count), **needed)
     if form == "Data Exchange":
@@ -84,3 +84,22 @@ def test_angles_that_are_there_are_turned_as_before(form: str, tmp_path: Path) -
 
 def data_file(form: str) -> str:
     return "scan.nxs" if form == "NXtomo" else "scan.h5"
+
+
+def test_angles_of_all_images_and_of_another_place_of_the_file(tmp_path: Path) -> None:
+    """Diamond's layouts: images in one entry, angles in another, one for each image."""
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "d.nxs"
+    with h5py.File(path, "w") as file:
+        file["entry1/instrument/detector/data"] = np.full((8, 10, 12), 500, "u2")
+        file["entry1/instrument/detector/image_key"] = np.array([2, 1] + [0] * 6)
+        file["entry1/instrument/detector/x_pixel_size"] = 1e-4
+        file["entry2/gts_cs_theta"] = np.r_[0.0, 0.0, np.arange(6) * 45.0]
+    with pytest.raises(DatasetError) as refused:
+        fx.open(path, distances=(100, 300))
+    place = str(refused.value).split('angles="')[1].split('"')[0]
+    assert place == "d.nxs:/entry2/gts_cs_theta"
+    data = fx.open(path, distances=(100, 300), angles=place)
+    assert np.allclose(np.diff(data.angles_deg), 45.0)
+    with pytest.raises(DatasetError, match="6, or 8 of all images"):
+        fx.open(path, distances=(100, 300), angles=np.arange(7.0))

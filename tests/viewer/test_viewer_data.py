@@ -9,12 +9,14 @@ import shutil
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import as_others_write as others
 import numpy as np
 import pytest
 import tifffile
 from lab import fly_script
 from looking import USUAL, seen, until
 
+import flexdt as fx
 from flexdt.clients.client.client import TwinClient
 
 pytestmark = pytest.mark.browser
@@ -123,6 +125,53 @@ def test_frames_are_gone_through_with_the_machine(page: Any, scans: Any) -> None
     page.click("#record-close")
     page.wait_for_function("flexdt.store.image && !flexdt.store.image.recorded")
     assert not page.locator("#film-recorded").is_visible()
+
+
+def test_values_of_another_maker_s_file_are_shown_with_their_uses(
+    page: Any, scans: Any, tmp_path: Any
+) -> None:
+    """A scan of Nikon's that was opened with angles of its own and saved; the scanner's texts
+    alone; and a scan of flexdt's own, which has no such values."""
+    layout = others.NIKON
+    text = others.planted(layout, layout.text).replace("CoefX2=0.0", "CoefX2=0.25")
+    path = others.scene(tmp_path, layout, text.encode())
+    data = fx.open(path, angles=np.linspace(0.0, 200.0, others.VIEWS))
+    data.save(scans / "from nikon")
+    try:
+        find(page, "from nikon")
+        page.locator(".data-set[data-name='from nikon']").click()
+        shows(page, 2)
+        box = page.locator("#record-values")
+        unused = sum(one.use != "used" for one in data.provenance)
+        words = f"{len(data.provenance)} values of its file, {unused} not used"
+        assert box.locator("summary").text_content() == words
+        box.locator("summary").click()
+        rows = box.locator("tr")
+        assert rows.count() == 1 + len(data.provenance)
+        shown = [row.split("\t") for row in rows.all_inner_texts()]
+        assert shown[0] == ["field", "value", "use", "consequence"]
+        uses = {row[0]: row[2] for row in shown[1:]}
+        assert uses["SrcToObject"] == "used"
+        assert uses["AngularStep"] == "contradicted"
+        assert uses[others.PLANTED] == "ignored"
+        told = {row[0]: row[3] for row in shown[1:]}
+        assert told["AngularStep"] == "angles= takes its place"
+        assert told[others.PLANTED] == "not known to flexdt"
+        assert "not applied" in told["CoefX2"]
+        assert rows.first.is_visible()
+        find(page, "own texts")
+        page.locator(".data-set[data-name='own texts']").click()
+        page.locator("#record-name", has_text="own texts").wait_for()
+        page.wait_for_function(
+            "[...document.querySelectorAll('#record-values td')]"
+            ".some((e) => e.textContent === 'SOD')"
+        )
+        find(page, "whole")
+        page.locator(".data-set[data-name='whole scan']").click()
+        page.locator("#record-name", has_text="whole scan").wait_for()
+        box.wait_for(state="hidden")
+    finally:
+        shutil.rmtree(scans / "from nikon")
 
 
 def test_the_geometry_that_is_read_is_that_of_the_image_shown(

@@ -47,6 +47,7 @@ from flexdt.library.reading.foreign_files import (
     open_file,
     refuse_distances,
 )
+from flexdt.library.reading.hdf5_formats.hdf5_values import SAID_ANGLES
 from flexdt.library.reading.listed_images import (
     in_memory,
     in_order,
@@ -177,8 +178,10 @@ def load_dataset(
         kept = options if given is None else _without_angles(options)
         said = kept.get("angles")
         angles = None if said is None else angles_deg(said, source.parent)
-        kept = cast(ScanOptions, {**kept, "angles": angles})
         made = open_file(source, given, distances, angles)
+        if made.provenance.field(SAID_ANGLES):
+            angles = None  # the reader has taken them
+        kept = cast(ScanOptions, {**kept, "angles": angles})
         if stated is not None:
             made = with_statements(made, stated)
         return looked_at(with_options(made, kept))

@@ -428,11 +428,21 @@ def _read_tiff(path: Path) -> Stored:
 
 def _read_mha(path: Path) -> Stored:
     """Read voxels (memory-mapped), edges [mm], the first voxel's place [mm] and True (it
-    is the first voxel's, not the centre) from an .mha file."""
-    fields, begin = _header(path, "=", b"ElementDataFile = LOCAL\n")
+    is the first voxel's, not the centre) from an .mha file, or from an .mhd with its values
+    in a file beside it."""
+    fields, begin = _header(path, "=", b"ElementDataFile =")
+    with path.open("rb") as file:
+        file.seek(begin)
+        line = file.readline(HEADER_BYTES)
+    name = line.decode("ascii").strip()
     _require_own(fields, MHA_FIELDS)
-    values = _map_values(path, begin, fields["DimSize"])
-    x, y, z = (float(v) for v in fields["Offset"].split())
+    if name == "LOCAL":
+        values = _map_values(path, begin + len(line), fields["DimSize"])
+    elif Path(name).name == name:
+        values = _map_values(path.parent / name, 0, fields["DimSize"])
+    else:
+        raise OtherFormError(f"its values are in {name}; allowed: a file beside it")
+    x, y, z = (float(v) for v in fields.get("Offset", "0 0 0").split())
     older = fields.get("TransformMatrix") == OLDER_FIELDS["TransformMatrix"]
     low = [-x, -y, z] if older else [x, y, z]
     return values, [float(edge) for edge in fields["ElementSpacing"].split()], low, True
@@ -507,7 +517,7 @@ def _read_zarr(path: Path) -> Stored:
 VOLUME_FORMATS: Final = (
     VolumeFormat((".tif", ".tiff"), _write_and_rename(_write_tiff), _read_tiff),
     VolumeFormat((".nrrd",), _write_headed(_nrrd_header), _read_nrrd),
-    VolumeFormat((".mha",), _write_headed(_mha_header), _read_mha),
+    VolumeFormat((".mha", ".mhd"), _write_headed(_mha_header), _read_mha),
     VolumeFormat(
         (".nii.gz",),
         _write_headed(_nifti_header, compress=True),

@@ -227,7 +227,7 @@ def _geometry(
     detector = f"{INSTRUMENT}/detector"
     angles = _angles(said, members, path, shape[0])
     if angles is None and given is None:
-        angles = said_angles(degrees, shape[0], path)
+        angles = said_angles(degrees, np.ones(shape[0], bool), said)
     pitches = []
     for what, names in PIXELS.items():
         stated = [

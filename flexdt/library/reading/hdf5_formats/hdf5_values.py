@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
+from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.length_units import UNITS_RAD, angle_rad, length_mm
 
@@ -23,6 +23,8 @@ STRUCTURE: Final = (
     "reference_list name "
 )
 """Attributes, in lower case, that say how a file is built, or describe a value in words."""
+SAID_ANGLES: Final = "angles="
+"""Field under which angles of the caller stand that a reader took."""
 ANGLES: Final = ("rotation_angle", "theta")
 """Names of the angles of projections."""
 SHOWN_VALUES: Final = 100_000
@@ -150,23 +152,30 @@ def angles_rad(dataset: Any, usual: str = "deg") -> npt.NDArray[np.float64]:
 
 
 def said_angles(
-    degrees: FloatArray | None, projections: int, path: Path
+    degrees: FloatArray | None, projections: npt.NDArray[np.bool_], ledger: Ledger
 ) -> FloatArray | None:
     """Return the angles [rad] that the caller says in place of those that a file lacks.
 
     Args:
-        degrees: of each projection [deg]; None: none are said.
-        projections: number of them in the file.
-        path: for messages.
+        degrees: of each projection, or of each image of the file [deg]; None: none are
+            said.
+        projections: which images of the file are some, (n,).
+        ledger: of the file, in which they are entered as used.
 
     Raises:
-        DatasetFormatError: another number of angles than projections.
+        DatasetFormatError: another number of angles.
     """
     if degrees is None:
         return None
-    if len(degrees) != projections:
-        said = f"{path}: {len(degrees)} angles for {projections} projections"
-        raise DatasetFormatError.instead(said, len(degrees), projections)
+    many = int(np.count_nonzero(projections))
+    if len(degrees) == len(projections):
+        degrees = degrees[projections]
+    if len(degrees) != many:
+        said = f"{ledger.path}: {len(degrees)} angles for {many} projections"
+        allowed = f"{many}, or {len(projections)} of all images"
+        raise DatasetFormatError.instead(said, len(degrees), allowed)
+    ledger.state(SAID_ANGLES, f"{many} angles")
+    ledger.use(SAID_ANGLES, "the views, of which the file has no angles")
     return np.deg2rad(degrees)
 
 

@@ -6,6 +6,7 @@ sample's height, flips mirror the images that are stored.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -40,6 +41,8 @@ LENGTHS: Final = {
     "detector distance": f"{DETECTOR}/distance",
 }
 """Length of NXtomo, distances from the sample -> its canonical place."""
+ANGLE_NAME: Final = re.compile(r"(angle|theta|rotation)[^/]*$", re.IGNORECASE)
+"""Names of angles in places where nobody looks for them."""
 NEEDED_LENGTHS: Final = ("x_pixel_size", "source distance", "detector distance")
 """Lengths without which a geometry is undetermined."""
 TRANSLATIONS: Final = ("sample/x_translation", "sample/y_translation")
@@ -86,7 +89,7 @@ def file_geometry(
         return ConeVec(rows), []
     angles = _angles(scan.file, scan.name, scan.projections, scan.ledger)
     if angles is None:
-        angles = said_angles(degrees, int(np.count_nonzero(scan.projections)), path)
+        angles = said_angles(degrees, scan.projections, scan.ledger)
     lengths = {
         what: scan.length(place)
         for what, place in LENGTHS.items()
@@ -104,7 +107,7 @@ def file_geometry(
         missing.insert(0, "rotation_angle")
     pixel = lengths["x_pixel_size"]
     if missing or angles is None or pixel is None:
-        raise _too_little(path, missing)
+        raise _too_little(path, missing, _angles_elsewhere(scan.file))
     sod, beyond = (
         abs(lengths[what] or 0.0) for what in ("source distance", "detector distance")
     )
@@ -310,15 +313,33 @@ def replaced_by(
             scan.ledger.set_aside(place, words)
 
 
-def _too_little(path: Path, missing: Sequence[str]) -> DatasetFormatError:
+def _too_little(path: Path, missing: Sequence[str], elsewhere: str) -> DatasetFormatError:
     """Make the error for quantities that a geometry needs and the file lacks; it names the
-    argument that gives them.
+    argument that gives them, and a place of the file that has angles.
     """
     listed = ", ".join(missing)
+    there = ""
+    if elsewhere and "rotation_angle" in missing:
+        there = (
+            f'; angles="{path.name}:{elsewhere}" takes those of another place of the file'
+        )
     return DatasetFormatError(
-        f"{path}: the file has no cone_vec and no {listed}; give {what_gives(missing)}",
+        f"{path}: the file has no cone_vec and no {listed}; give {what_gives(missing)}{there}",
         {"missing": missing},
     )
+
+
+def _angles_elsewhere(file: Any) -> str:
+    """Return the first place of a file that is named as angles are; "" without one."""
+    found: list[str] = []
+
+    def look(name: str, item: Any) -> bool | None:
+        if ANGLE_NAME.search(name) and getattr(item, "ndim", 0) == 1:
+            found.append(f"/{name}")
+        return True if found else None
+
+    file.visititems(look)
+    return found[0] if found else ""
 
 
 def _angles(
