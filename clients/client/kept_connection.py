@@ -10,6 +10,7 @@ again.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import ssl as tls
 from collections.abc import Callable, Mapping
@@ -108,6 +109,17 @@ class KeptConnection:
         if subscription is not None:
             self.topics = tuple(cast(list[str], subscription["topics"]))
             self._client.core.follow(self, subscription)
+
+    async def subscribe(self, subscription: Mapping[str, object]) -> None:
+        """Change rate and view of the subscription, now and after each later connection; its
+        topics stay.
+
+        Without a connection the next one begins with it; a refusal is ignored.
+        """
+        self._client.core.follow(self, subscription)
+        if self.connected:
+            with contextlib.suppress(ConnectionLost, RpcError):
+                await self.request("state.subscribe", subscription)
 
     @property
     def connected(self) -> bool:

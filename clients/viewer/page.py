@@ -28,7 +28,9 @@ from websockets.exceptions import ConnectionClosed
 
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, Unsendable
 from flexdt.clients.client.transport import ConnectionLost
+from flexdt.clients.viewer.page_words import for_reader
 from flexdt.clients.viewer.scenes.layers import Shown
+from flexdt.clients.viewer.scenes.stage_volume import StageVolume
 from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
 from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
@@ -97,7 +99,13 @@ class Page:
         """
         self.id = id
         self.kind = "line_integral"
-        self.dark = self.live = False
+        self.dark = False
+        self.live: tuple[str, bool] | None = None
+        """Data set whose volume the page follows, and whether that scan is over."""
+        self.volume: StageVolume | None = None
+        """Newest surface of that volume, for this page's own scenes."""
+        self.ghost = False
+        """Whether the surface is shown as a ghost where it does not fit the stage."""
         self.fine = True
         """Whether the page has reported that a graphics processor draws; True before."""
         self.shown = Shown()
@@ -394,15 +402,14 @@ def _words(error: RpcError | ConnectionLost) -> str:
     """Format an error's message for people: with the page's button instead of the
     wire's method.
 
-    Only the refusal because another is the controller is reworded; others keep their
-    text. A lost connection gives its own text.
+    Others are put into words of the page (`for_reader`), a lost connection's too.
     """
     if not isinstance(error, RpcError):
-        return str(error)
+        return for_reader(str(error))
     match error.data:
         case {"controller": holder, "allowed": "session.control force"}:
             return f"{holder} is the controller; “Take over” takes control"
-    return error.message
+    return for_reader(error.message)
 
 
 def _read(text: str) -> tuple[str | int | None, dict[str, Any]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -26,6 +27,9 @@ from flexdt.twin.geometry.conventions import FloatArray
 FAR_RATIO = 1.3
 """Distance of the camera, over the distance at which the ball in view fills the
 picture."""
+RESTS_S = 0.5
+"""Time without motion of the stage after which a close camera belongs to its person again: its
+browser has told where that has put it."""
 MOVED_SHARE = 0.005
 """Displacement of a camera, as a part of its distance, from which it counts as moved
 by a person."""
@@ -37,6 +41,24 @@ class Who:
 
     page: str
     view: str
+
+
+@dataclass
+class Aim:
+    """What a close camera is aimed at: the sample, wherever it stands.
+
+    Attributes:
+        middle: (3,) of the sample when the camera was put last [m].
+        radius_mm: of the ball around it.
+        arm: place and target of the camera from there [m], while the stage moves; None at
+            rest, when a person may move the camera.
+        moved_at: when the stage moved last [s].
+    """
+
+    middle: FloatArray
+    radius_mm: float
+    arm: tuple[FloatArray, FloatArray] | None = None
+    moved_at: float = 0.0
 
 
 class SceneClients:
@@ -64,6 +86,8 @@ class SceneClients:
         """Page -> whether its frames are dark, and finely lit."""
         self._shown: dict[int, tuple[int, Nodes]] = {}
         """Client -> number of messages when built, and the state of its nodes."""
+        self._aims: dict[int, Aim] = {}
+        """Client -> what its close camera is aimed at."""
         self._beam: Standpoint | None = None
         self.cameras: dict[str, Fitted] = {}
         """View -> its points and directions; the beam's eye, which follows the
@@ -161,42 +185,66 @@ class SceneClients:
         """
         preset = self.cameras.get(view)
         for client in self.of(page, view):
+            self._aims.pop(client.client_id, None)
             if preset is not None:
                 self._put(client, preset.at(client.camera.aspect))
 
     def look(self, page: str, view: str, at: FloatArray, radius_mm: float) -> None:
-        """Turn a page's view towards a ball, in its preset's direction.
+        """Aim a page's view at the sample: it is seen from its preset's direction, and
+        followed (`ride`) until `reset`.
 
-        The distance is `FAR_RATIO` times that at which the ball fills the view, more in a
-        narrow pane. The camera then counts as moved by a person. A view that is not open
-        is left alone.
+        A view that is not open is left alone.
 
         Args:
             page: its id.
             view: name of the view.
             at: (3,) centre [mm].
-            radius_mm: of the ball.
+            radius_mm: of the ball around it.
 
         Raises:
             KeyError: the view is open and has no preset.
         """
         for client in self.of(page, view):
-            aspect = client.camera.aspect
-            preset = self.cameras[view].at(aspect)
-            far = (
-                FAR_RATIO
-                * radius_mm
-                * MM
-                / math.sin(preset.fov / 2)
-                / min(1.0, max(aspect, 0.3))
-            )
-            way = np.subtract(preset.position, preset.look_at)
-            middle = at * MM
-            x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
-            set_camera(
-                client,
-                replace(preset, position=(x, y, z), look_at=tuple(middle.tolist())),
-            )
+            self._aim(client, view, at * MM, radius_mm)
+
+    def _aim(
+        self, client: viser.ClientHandle, view: str, middle: FloatArray, radius_mm: float
+    ) -> None:
+        """Put a camera before a ball, in its view's direction.
+
+        The distance is `FAR_RATIO` times that at which the ball fills the view, more in a
+        narrow pane. The camera then counts as moved by a person.
+        """
+        aspect = client.camera.aspect
+        preset = self.cameras[view].at(aspect)
+        half = math.sin(preset.fov / 2) * min(1.0, max(aspect, 0.3))
+        far = FAR_RATIO * radius_mm * MM / half
+        way = np.subtract(preset.position, preset.look_at)
+        x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
+        target = tuple(middle.tolist())
+        set_camera(client, replace(preset, position=(x, y, z), look_at=target))
+        self._aims[client.client_id] = Aim(middle, radius_mm)
+
+    def ride(self, at: FloatArray | None, radius_mm: float) -> None:
+        """Move all close cameras along with the sample, as they stand to it.
+
+        They go home to their presets where there is no sample, and look at another one anew.
+
+        Args:
+            at: (3,) the sample's place [mm]; None: the stage is empty.
+            radius_mm: of the ball around it.
+        """
+        clients = self._server.get_clients()
+        for id, aim in list(self._aims.items()):
+            client, who = clients.get(id), self._who.get(id)
+            if client is None or who is None:
+                del self._aims[id]
+            elif at is None:
+                self.reset(who.page, who.view)
+            elif radius_mm != aim.radius_mm:
+                self._aim(client, who.view, at * MM, radius_mm)
+            else:
+                _carry(client, aim, at * MM)
 
     def theme(self, page: str, dark: bool, fine: bool) -> None:
         """Set light or dark, plain or fine light, for all frames of a page."""
@@ -278,6 +326,23 @@ class SceneClients:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
             self._shown.pop(client.client_id, None)
+
+
+def _carry(client: viser.ClientHandle, aim: Aim, middle: FloatArray) -> None:
+    """Move a close camera by as much as the sample has moved since it was put."""
+    now = time.monotonic()
+    if np.allclose(middle, aim.middle, atol=1e-6):
+        if now > aim.moved_at + RESTS_S:
+            aim.arm = None
+        return
+    seen = _now(client)
+    if aim.arm is None:
+        place, target = np.array(seen.position), np.array(seen.look_at)
+        aim.arm = place - aim.middle, target - aim.middle
+    place, target = (middle + part for part in aim.arm)
+    aim.middle, aim.moved_at = middle, now
+    (px, py, pz), (tx, ty, tz) = place.tolist(), target.tolist()
+    set_camera(client, replace(seen, position=(px, py, pz), look_at=(tx, ty, tz)))
 
 
 def _now(client: viser.ClientHandle) -> Standpoint:

@@ -36,7 +36,7 @@ from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import LAYERS
 from flexdt.clients.viewer.scenes.views import FREE
 from flexdt.clients.viewer.scenes.world import motors
-from flexdt.clients.viewer.shown_images import ShownImage, packed
+from flexdt.clients.viewer.shown_images import ShownImage, grey, packed, window_of
 from flexdt.clients.viewer.viewer import PageMethod, Viewer
 from flexdt.clients.viewer.volumes.reconstruction_process import wish
 from flexdt.protocol import Code, Method, RpcError, parse_params
@@ -183,6 +183,14 @@ class RecordedImage(Params):
     virtual: bool = False
 
 
+class Thumbnail(Params):
+    """A saved image of a data set, and its size as a thumbnail [px]."""
+
+    name: FileName
+    index: Annotated[int, Ge(0), Le(10**7)]
+    side: Annotated[int, Ge(16), Le(256)] = 124
+
+
 class Live(Params):
     """A data set to reconstruct while it is scanned, and voxels a side; none: no longer."""
 
@@ -190,6 +198,12 @@ class Live(Params):
     side: Literal[128, 192, 256, 512] = 128
     past: bool = False
     """Request the complete volume of a finished scan, not a growing one."""
+
+
+class Ghost(Params):
+    """Whether a volume that does not fit the stage is shown there as a ghost."""
+
+    shown: bool
 
 
 class Block(Live):
@@ -574,6 +588,30 @@ async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
     return wire_image.decode(answer), answer.get("origin")
 
 
+async def thumbnail(viewer: Viewer, page: Page, params: Thumbnail) -> object:
+    """Read a saved image of a data set, also of a running scan, as a small picture.
+
+    Returns:
+        `name`, `index` and `file` of the image, and `image`: its shape, at most about
+        `side` columns, and its counts as 8-bit grey between their percentiles, in base64.
+
+    Raises:
+        RpcError: the twin refuses, such as an image that is not there yet.
+    """
+    columns = 1024 if viewer.state is None else viewer.state.camera.shape[1]
+    asked = {
+        "name": params.name,
+        "index": params.index,
+        "binning": min(64, max(1, -(-columns // params.side))),
+    }
+    told: Any = await page.link.request("dataset.frame", asked)
+    small = ShownImage(wire_image.decode(told), "counts", (), 0.0, params.index)
+    pixels = await asyncio.to_thread(lambda: grey(small, window_of(small))[:, :, 0])
+    data = base64.b64encode(pixels.tobytes()).decode("ascii")
+    image = {"shape": list(pixels.shape), "data": data}
+    return {"image": image, **{key: told[key] for key in ("name", "index", "file")}}
+
+
 async def live(viewer: Viewer, page: Page, params: Live) -> object:
     """Start to grow a volume of a data set from its images so far, for all pages that
     want one; without a name, end that for this page. Returns {}.
@@ -589,14 +627,27 @@ async def live(viewer: Viewer, page: Page, params: Live) -> object:
         RpcError: there is no such data set (links do not count), or the viewer has no
             --data.
     """
-    page.live = params.name is not None
+    page.live = page.volume = None
+    page.ghost = False
     if params.name is None:
+        viewer.show_volumes()
         viewer.ungrow()
         return {}
     folder = _data(viewer) / plain_name(params.name, "data set")
     if folder.is_symlink() or not folder.is_dir():
         raise RpcError(Code.INVALID_PARAMS, f"no data set {params.name!r}")
+    page.live = (folder.name, params.past)
+    viewer.show_volumes()
     viewer.grower.grow(folder, params.side, params.past)
+    return {}
+
+
+async def ghost(viewer: Viewer, page: Page, params: Ghost) -> object:
+    """Show this page's volume as a ghost where it is not of what stands on the stage, or
+    no longer; returns {}.
+    """
+    page.ghost = params.shown
+    viewer.show_volumes()
     return {}
 
 
@@ -967,7 +1018,9 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.plan": (Plan, plan),
     "viewer.recorded": (Recorded, recorded),
     "viewer.recorded_image": (RecordedImage, recorded_image),
+    "viewer.thumbnail": (Thumbnail, thumbnail),
     "viewer.live": (Live, live),
+    "viewer.ghost": (Ghost, ghost),
     "viewer.block": (Block, volume_block),
     "viewer.voxel": (Voxel, voxel),
     "viewer.compare": (Live, volume_compare),

@@ -90,6 +90,12 @@ class ImageOrigin(f.Result):
     roi: f.Roi
     correction: str | None = None
     """name of the one that its geometry has"""
+    dataset: str | None = None
+    """of a running scan's image: its data set"""
+    index: int | None = None
+    """and its number there, as in dataset.frame"""
+    file: str | None = None
+    """and its file there"""
 
 
 class Projection(f.ImageValue):

@@ -134,6 +134,7 @@ class ScanRunner:
         plan = self.plan
         done = frozenset(self.done)
         self._frames = [e for e in plan.exposures if e.file is not None]
+        self._numbers = {e.index: number for number, e in enumerate(self._frames)}
         self._events = _events(
             plan.steps, [e for e in self._frames if e.file not in done]
         )
@@ -323,6 +324,17 @@ class ScanRunner:
         await self.produce(batch)
         made = sum(e.kind == "projection" for e in batch)
         self._set_progress(frames_done=self.progress.frames_done + made)
+
+    def moment_of(self, frame: Exposure) -> float:
+        """Return the twin time of a frame's pose [s], now at the latest.
+
+        After a pause it is that of the plan as it goes on, for frames from before the pause, too.
+        """
+        return min(self.origin + frame.start_s, self.clock.now())
+
+    def number_of(self, frame: Exposure) -> int:
+        """Return a saved frame's number among all images of the data set."""
+        return self._numbers[frame.index]
 
     def recount(self, present: Collection[str]) -> None:
         """Set the number of finished projections to those that the data set has.

@@ -18,6 +18,7 @@ from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 from flexdt.protocol import state_model as w
@@ -48,7 +49,7 @@ from flexdt.server.storage.stored_samples import (
 )
 from flexdt.server.twin import state_views
 from flexdt.server.twin.hub import Hub
-from flexdt.server.twin.live import LiveView, StateFeed
+from flexdt.server.twin.live import LiveView, SavedImage, StateFeed
 from flexdt.twin.collision.first_contact import NearestPair, clearance
 from flexdt.twin.collision.guard import SceneGuard
 from flexdt.twin.dataset.dataset_errors import DatasetWriteError
@@ -843,7 +844,7 @@ class TwinServer:
 
         Only a projection is judged, also without subscribers. An image of any kind is
         published if there are subscribers. It has the sample of the running job and the
-        frame's positions, camera and tube.
+        frame's positions, camera, tube, moment and file.
 
         Args:
             frame: of the scan.
@@ -858,8 +859,15 @@ class TwinServer:
             shown = now.sample
         else:
             shown = job.sample
+        runner = saved = None
+        if job is not None and job.runner is not None and frame.file is not None:
+            runner = job.runner
+            folder = Path(job.folder).name
+            saved = SavedImage(folder, runner.number_of(frame), frame.file)
         shot = replace(
             now,
+            time=now.time if runner is None else runner.moment_of(frame),
+            saved=saved,
             sample=shown,
             revision=self.stage.revision(shown),
             positions=tuple(sorted(frame.positions.items())),

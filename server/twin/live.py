@@ -41,6 +41,15 @@ RETRY_S = 1.0
 
 
 @dataclass(frozen=True)
+class SavedImage:
+    """An image of a running scan: its data set, its number there, and its file."""
+
+    dataset: str
+    index: int
+    file: str
+
+
+@dataclass(frozen=True)
 class Shot:
     """The state on which a live image depends."""
 
@@ -52,6 +61,8 @@ class Shot:
     correction: NamedCorrection | None
     revision: str | None = None
     """Identifies the content of an uploaded sample."""
+    saved: SavedImage | None = None
+    """The file that it is saved as; None of a live image."""
 
     @classmethod
     def of(cls, scanner: ScannerTwin, now: float, revision: str | None = None) -> Shot:
@@ -96,6 +107,7 @@ class Shot:
             averages=camera.averages,
             roi=camera.roi.edges,
             correction=None if self.correction is None else self.correction.name,
+            **({} if self.saved is None else asdict(self.saved)),
         )
 
     @property

@@ -412,6 +412,7 @@ def test_what_a_document_leaves_out_is_what_older_ones_meant(record: Make) -> No
     )
     assert vars(SampleRecord()) == {
         "name": "", "owner": "", "project": "", "comment": "", "diameter_mm": 0.0, "height_mm": 0.0,
+        "material": None, "revision": None, "offset": None,
     }  # fmt: skip
     assert doc.cone_vec(None).rows.shape == (8, 12)
     assert doc.files("flat") == ("io000000.tif", "io000001.tif")

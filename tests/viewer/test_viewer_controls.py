@@ -307,7 +307,7 @@ def test_emergency_stop_and_reset(page: Any, twin: TwinClient, wait: Wait) -> No
     assert page.locator("#estop").is_visible()
     page.click("#estop")
     wait(lambda: twin.state().safety.estop)
-    page.locator(".warning.bad", has_text="Emergency stop by you").wait_for()
+    page.locator("#emergency", has_text="Emergency stop by you").wait_for()
     released(page)
     wait(lambda: not twin.state().safety.estop)
     page.keyboard.press("Shift+Space")

@@ -88,7 +88,7 @@ def test_axe_finds_nothing_after_a_run_and_with_a_data_set_open(
     assert findings(page) == []
     assert page.inner_text("#volume-note") == ""
     page.click("#job-data")
-    page.locator("#record-at", has_text="image ").wait_for()
+    page.locator("#record-at", has_text="scan_").wait_for()
     wait(lambda: "measuring" not in page.inner_text("#record-note"), "all lanes")
     assert str(name).endswith(page.inner_text("#record-name"))
     assert findings(page) == []

@@ -203,9 +203,9 @@ def go_through_a_scan(v: Visitor) -> None:
     """the next image, with its place in the scan"""
     v.tab("Data")
     v.click(v.page.get_by_role("button", name=re.compile("^past scan")))
-    first = int(v.sees(re.compile(r"^image \d+ of \d+ · scan_000000.tif")).split()[1])
+    v.sees(re.compile(r"^scan_000000 · "))
     v.button("›")
-    v.sees(re.compile(rf"^image {first + 1} of \d+ · scan_000001.tif"))
+    v.sees(re.compile(r"^scan_000001 · "))
 
 
 def calibrate(v: Visitor) -> None:

@@ -364,15 +364,12 @@ def test_figures_of_a_body_whose_size_is_known() -> None:
 def test_the_truth_stands_where_the_sample_stood(
     scan: tuple[Path, list[Path]], turn: float
 ) -> None:
-    """A cuboid of PMMA, moved and turned on the stage as the record of its job says."""
+    """A cuboid of PMMA, moved and turned on the stage as the data set's document says."""
     home, _ = scan
     document = json.loads((home / "flexdt.json").read_text())
-    document["sample"]["name"] = "normal"
-    (home / "flexdt.json").write_text(json.dumps(document))
-    (home.parent / "jobs").mkdir()
     offset = {"x": 2.0, "y": -1.0, "z": 3.0, "rx": 0.0, "ry": 0.0, "rz": turn}
-    record = {"sample": {"name": "normal", "offset": offset}}
-    (home.parent / "jobs" / "ball.json").write_text(json.dumps(record))
+    document["sample"] |= {"name": "normal", "offset": offset}
+    (home / "flexdt.json").write_text(json.dumps(document))
     like = Volume(np.zeros((200, 191, 192), np.float32), 0.4, (0.0, 0.0, 1.0))
     truth = truth_of(load_dataset(home), like)
     phantom = load_phantom("normal")

@@ -143,7 +143,7 @@ def test_half_a_frame_is_refused(page: Any) -> None:
         "flexdt.call('viewer.compose', {kind: 'fly', frames: 10.5}).catch((e) => e.message)"
     )
     assert "frames" in told
-    assert "integer" in told
+    assert "whole number" in told
 
 
 def test_the_script_box_can_be_left_with_the_keyboard(page: Any) -> None:
@@ -216,7 +216,7 @@ def test_pause_step_resume_abort(page: Any, twin: TwinClient, wait: Wait) -> Non
     page.click("#job-pause")
     wait(lambda: twin.job_status().state == "paused")
     page.locator("#job-state", has_text="paused").wait_for()
-    assert page.locator("#job-left").inner_text() != ""
+    assert page.inner_text("#job-left") == ""  # nobody knows for how long
     before = twin.job_status()
     page.locator("#job-step:not([disabled])").click()
     wait(

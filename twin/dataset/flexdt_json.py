@@ -41,7 +41,7 @@ from flexdt.twin.machine.camera import CameraSettings, Roi
 from flexdt.twin.machine.description import Machine, Profile
 from flexdt.twin.machine.kinematics import motor_poses
 from flexdt.twin.physics.predicted_beam import PredictedExposure
-from flexdt.twin.scanner.state import NamedCorrection
+from flexdt.twin.scanner.state import NamedCorrection, StagePlacement
 from flexdt.twin.script import SampleSize, ScanPlan
 from flexdt.twin.script.planning.plan import saved_images
 from flexdt.twin.values import ArrayValue
@@ -70,6 +70,12 @@ class SampleRecord:
     comment: str = ""
     diameter_mm: float = 0.0
     height_mm: float = 0.0
+    material: str | None = None
+    """Of a mesh; None for a sample that states its own."""
+    revision: str | None = None
+    """Content of an upload; None for a shipped phantom."""
+    offset: StagePlacement | None = None
+    """Place on the stage during the scan; None where it is not known."""
 
 
 @dataclass(frozen=True)

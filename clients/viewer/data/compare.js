@@ -3,6 +3,7 @@
 import { $, $input, el, fixed, setText } from "./dom.js";
 import { emit, on, store } from "./link.js";
 import * as marks from "./marks.js";
+import { nameOf } from "./moment.js";
 /** @import { Pair, Shown, TrackedFrame, TrackedScan } from "../web/viewer.d.ts" */
 
 const AMBER = "#ffb454";
@@ -165,7 +166,7 @@ export function beside(i, virtual) {
  */
 export function words(i) {
   const way = i?.virtual ? mode.value : "recorded";
-  const file = i?.recorded ? i.recorded.file : "no image to be shown";
+  const file = i?.recorded ? nameOf(i.recorded.file) : "no image to be shown";
   return `${WAYS[way].replace("curtain: ", "")} · ${file}`;
 }
 // Dragging the curtain in the picture; `pixel` is a CSS pixel in its coordinates.

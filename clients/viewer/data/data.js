@@ -17,9 +17,10 @@ import {
   within,
   words,
 } from "./dom.js";
-import { allJobs, call, command, emit, on, store } from "./link.js";
+import { allJobs, call, command, emit, enter, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import { differences, ofImage, only, sampleOf } from "./fingerprint.js";
+import { indexOf, nameOf, NOW } from "./moment.js";
 import { draw as drawTimeline } from "./timeline.js";
 import { offer } from "./share.js";
 import * as compare from "./compare.js";
@@ -60,6 +61,8 @@ let index = 0;
 /** @type {number | null} */
 let next = null;
 let asking = false;
+// Of the image that is shown; "" for none.
+let imageName = "";
 let playing = false;
 let number = 0;
 
@@ -299,9 +302,9 @@ on("job", (job) => {
 });
 
 /**
- * Opens a data set at an image, or closes the one that is open (null).
+ * Opens a data set at an image, by its number or name, or closes the one that is open (null).
  * @param {string | null} name
- * @param {number | null} [at]
+ * @param {number | string | null} [at]
  */
 export async function open(name, at = null, step = false) {
   void play(false);
@@ -314,17 +317,13 @@ export async function open(name, at = null, step = false) {
   if (mine !== opening || (name !== null && !answer)) return;
   told = name === null ? null : answer;
   plan = null;
-  store.recorded = name;
-  store.hidden = false;
-  store.image = null;
-  emit("image");
   panel.hidden = told === null;
   $("#stage").classList.toggle("recorded", told !== null);
   for (const node of $$("#data-list > *"))
     node.setAttribute("aria-current", String(node.dataset.name === name));
   clearTimeout(kept);
-  remember({ data: name, frame: at }, step);
-  emit("recorded", name);
+  remember({ data: name, frame: typeof at === "string" ? at : null }, step);
+  enter(name === null ? NOW : { kind: "image", dataset: name, index: null, missing: false });
   if (name === null || !told) return;
   const i = told.info;
   const bare = !told.times_s;
@@ -349,10 +348,13 @@ export async function open(name, at = null, step = false) {
   setText($("#record-note"), note());
   showValues(told.provenance);
   lanes();
-  await show(Math.min(Math.max(0, at ?? told.kinds.indexOf("projection")), told.images - 1));
-  const measured = await call("dataset.get", { name, points: 400, measure: true }).catch(
-    () => null,
-  );
+  const asked = typeof at === "string" ? indexOf(at, told) : at;
+  await show(Math.min(Math.max(0, asked ?? told.kinds.indexOf("projection")), told.images - 1));
+  const measured = await call("dataset.get", {
+    name,
+    points: 400,
+    measure: true,
+  }).catch(() => null);
   if (mine !== opening || !measured) return;
   told = { ...measured, whole: told };
   setText($("#record-note"), note());
@@ -519,24 +521,18 @@ async function show(wanted) {
     }
     if (!still(name)) break;
     moment = about ? (about.time_s ?? at) : told.times_s ? null : at;
-    store.hidden = !about;
-    if (!about) {
-      store.image = null;
-      emit("image");
-    }
+    enter({ kind: "image", dataset: name, index: at, missing: !about });
+    imageName = about ? nameOf(about.file) : "";
     panel.dataset.index = String(at);
     panel.dataset.shown = String(Boolean(about));
     const facts = about && [
-      about.file,
+      nameOf(about.file),
       about.time_s === null ? "" : `${fixed(about.time_s, 2)} s`,
       about.image === "projection" ? "" : about.image,
       why && `counts: ${why}`,
       about.problem && `no virtual image: ${about.problem}`,
     ];
-    setText(
-      $("#record-at"),
-      [`image ${at + 1} of ${told.images}`, ...(facts ?? [why])].filter(Boolean).join(" · "),
-    );
+    setText($("#record-at"), (facts ?? [why]).filter(Boolean).join(" · "));
     $("#record-at").title = $("#record-at").textContent;
     redraw();
   }
@@ -547,7 +543,7 @@ async function show(wanted) {
   }
   clearTimeout(kept);
   kept = window.setTimeout(() => {
-    if (told) remember({ frame: index });
+    if (told && imageName) remember({ frame: imageName });
   }, SEARCH_MS);
 }
 
@@ -653,7 +649,7 @@ on("layers", () => {
 on("session", ready);
 export function restore() {
   const name = asked("data");
-  const at = asked("frame") === null ? null : Number(asked("frame")) || 0;
+  const at = asked("frame");
   if (name !== (told?.info.name ?? null)) void open(name, at);
-  else if (told && at !== null) void show(at);
+  else if (told && at !== null) void show(indexOf(at, told) ?? index);
 }

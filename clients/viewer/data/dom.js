@@ -204,7 +204,7 @@ export function context2d(canvas) {
  * @param {readonly number[]} shape
  * @param {(k: number) => number} grey
  */
-export function putGrey(canvas, [rows, cols], grey) {
+function putGrey(canvas, [rows, cols], grey) {
   canvas.width = cols;
   canvas.height = rows;
   const x = context2d(canvas);

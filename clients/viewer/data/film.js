@@ -16,6 +16,7 @@ import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
+import { nameOf } from "./moment.js";
 import { signed } from "./slices.js";
 /** @import { Four, Kind, Pair, Shown } from "../web/viewer.d.ts" */
 
@@ -253,9 +254,8 @@ export function draw() {
   }
   chooseWindow(i);
   develop(i);
-  film.style.aspectRatio = String(
-    Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0])),
-  );
+  const aspect = Math.min(FLATTEST, Math.max(SLIMMEST, i.full[1] / i.full[0]));
+  film.style.setProperty("--aspect", String(aspect));
   const dpr = Math.min(devicePixelRatio, 2);
   const w = Math.round(film.clientWidth * dpr);
   const h = Math.round(film.clientHeight * dpr);
@@ -290,6 +290,11 @@ export function draw() {
   clearTimeout(quiet);
   quiet = window.setTimeout(() => setText($("#film-rate"), ""), 2000);
   tell();
+  const { moment } = store;
+  const which = [
+    i.recorded || !i.origin?.file ? "" : nameOf(i.origin.file),
+    moment.kind === "plan" ? `live: the ghost is at ${fixed(moment.time_s, 1)} s` : "",
+  ].map((words) => words && `${words}  ·  `);
   const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2));
   const zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
   const alone =
@@ -298,7 +303,7 @@ export function draw() {
       : "";
   setText(
     $("#film-note"),
-    `${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`,
+    `${which.join("")}${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`,
   );
 }
 
@@ -645,6 +650,7 @@ $select("#kind").addEventListener("change", () => {
   call("viewer.feed", { kind: /** @type {Kind} */ ($select("#kind").value) }).catch(() => {});
 });
 on("image", ask);
+on("moment", ask);
 on("open", () => {
   if ($select("#kind").value !== "line_integral")
     call("viewer.feed", { kind: /** @type {Kind} */ ($select("#kind").value) }).catch(() => {});

@@ -1,6 +1,6 @@
 // What an image, a report or a prediction was made of, and whether that is still so. Nothing else
 // decides what is "now", "old" or "of a data set": headings, marks and notes ask here.
-/** @import { HelloResult, ImageOrigin, State, Value } from "../web/viewer.d.ts" */
+/** @import { HelloResult, ImageOrigin, State, Value, VolumeMessage } from "../web/viewer.d.ts" */
 
 /**
  * Quantities by name; a thing has those that it depends on.
@@ -9,6 +9,7 @@
  * @property {Value} machine
  * @property {Value} dataset
  * @property {Value} frame
+ * @property {Value} file
  * @property {Value} sample
  * @property {Value} placement
  * @property {Value} pose
@@ -30,6 +31,7 @@ export const WORDS = {
   machine: "machine",
   dataset: "data set",
   frame: "image",
+  file: "file",
   sample: "sample",
   placement: "placement of the sample",
   pose: "pose",
@@ -82,6 +84,7 @@ export function ofNow(state, coneVec, hello) {
     machine: hello ? [hello.machine, hello.profile] : null,
     dataset: null,
     frame: null,
+    file: null,
     sample: content(sample.name, sample.revision, sample.material),
     placement: placed(sample.offset),
     pose: coneVec,
@@ -120,14 +123,27 @@ export function ofImage(origin, coneVec, twin) {
 }
 
 /**
- * What is of a data set: an image of it, or all of it.
- * @param {string} dataset
- * @param {number | null} [frame]
+ * A volume, by what its data set says.
+ * @param {NonNullable<VolumeMessage["made"]>} told
  * @returns {Fingerprint}
  */
-export const ofData = (dataset, frame = null) => ({
+export const ofVolume = ({ sample, revision, material, offset, correction }) => ({
+  sample: content(sample, revision, material),
+  ...(offset ? { placement: placed(offset) } : {}),
+  correction,
+});
+
+/**
+ * What is of a data set: an image of it by number and name, or all of it.
+ * @param {string} dataset
+ * @param {number | null} [frame]
+ * @param {string} [file]
+ * @returns {Fingerprint}
+ */
+export const ofData = (dataset, frame = null, file = "") => ({
   dataset,
   frame,
+  file,
 });
 
 /**
@@ -197,7 +213,7 @@ function same(quantity, a, b) {
 /**
  * @typedef {{ kind: "now" }
  *   | { kind: "old"; differ: Quantity[] }
- *   | { kind: "data set"; dataset: string; frame: number | null }} About
+ *   | { kind: "data set"; dataset: string; file: string }} About
  */
 
 /**
@@ -208,15 +224,15 @@ function same(quantity, a, b) {
  */
 export function about(made, now) {
   if (typeof made.dataset === "string") {
-    const frame = typeof made.frame === "number" ? made.frame : null;
-    return { kind: "data set", dataset: made.dataset, frame };
+    const file = typeof made.file === "string" ? made.file : "";
+    return { kind: "data set", dataset: made.dataset, file };
   }
   const differ = differences(made, now);
   return differ.length ? { kind: "old", differ } : { kind: "now" };
 }
 
 /**
- * A heading in words: "Geometry now", "Geometry of scan-3, image 5".
+ * A heading in words: "Geometry now", "Geometry of scan-3, scan_000004".
  * @param {string} title
  * @param {About} a
  * @returns {string}
@@ -224,7 +240,7 @@ export function about(made, now) {
 export function heading(title, a) {
   if (a.kind === "now") return `${title} now`;
   if (a.kind === "old") return `${title} of another ${listed(a.differ)}`;
-  return `${title} of ${a.dataset}${a.frame === null ? "" : `, image ${a.frame + 1}`}`;
+  return `${title} of ${a.dataset}${a.file ? `, ${a.file}` : ""}`;
 }
 
 /**

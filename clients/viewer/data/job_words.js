@@ -1,6 +1,6 @@
 // What is said of a scan: its state, who ended it, how long it takes, and what stands elsewhere
 // than where it began.
-import { fixed, isNumber, seconds } from "./figures.js";
+import { fixed, seconds } from "./figures.js";
 /** @import { AxisState, JobStatus, State } from "../web/viewer.d.ts" */
 
 /** @type {Array<JobStatus["state"]>} */
@@ -53,14 +53,14 @@ export function progress(job) {
 }
 
 /**
+ * What a scan took, or how long it still takes, where that is known.
  * @param {JobStatus} job
+ * @param {number | null} left_s
  * @returns {string}
  */
-export function timeLeft(job) {
+export function timeLeft(job, left_s) {
   if (isOver(job)) return seconds(job.elapsed_s);
-  if (!isNumber(job.remaining_s)) return "";
-  const factor = job.real_time_factor || (job.speed_up === "max" ? null : job.speed_up);
-  return `${seconds(factor ? job.remaining_s / factor : job.remaining_s)} left`;
+  return left_s === null ? "" : `${seconds(left_s)} left`;
 }
 
 /** @typedef {Record<string, Pick<AxisState, "position" | "moving" | "unit">>} Axes */

@@ -52,6 +52,12 @@ export function large(on) {
 $button("#film-large").addEventListener("click", () =>
   large(!document.body.classList.contains("large")),
 );
+// Tools of the radiograph stay as they were left in this browser.
+const TOOLS = "flexdt-tools";
+/** @type {HTMLDetailsElement} */
+const tools = $("#film-tools");
+tools.open = localStorage.getItem(TOOLS) !== "closed";
+tools.addEventListener("toggle", () => keep(TOOLS, tools.open ? "open" : "closed"));
 on("tab", () => large(false));
 // An image of a data set is in view, though a volume was looked at before.
 on("recorded", (name) => {

@@ -1,9 +1,11 @@
 // The page's connection to its viewer: requests with answers, newest states and images, how old
 // they are, reconnection.
 import { keep, words } from "./dom.js";
-import { differences, ofData, ofImage, ofNow } from "./fingerprint.js";
+import { ofData, ofImage, ofNow } from "./fingerprint.js";
+import { aging, belongs, clockNow, nameOf, NOW, OLD_S } from "./moment.js";
 /**
  * @import { Fingerprint, Quantities, Quantity } from "./fingerprint.js"
+ * @import { Moment } from "./moment.js"
  * @import { Answers, Events, Framing, HelloResult, ImageHead, JobStatus, Messages, Near, Pair,
  *   Requests, Shown, State } from "../web/viewer.d.ts"
  */
@@ -23,8 +25,11 @@ export const store = {
   /** @type {Record<string, boolean>} */ layers: {},
   opacity: 1,
   /** @type {Shown | null} */ image: null,
-  /** @type {string | null} */ recorded: null,
-  hidden: false,
+  /** @type {Moment} */ moment: NOW,
+  /** The data set that is open. */
+  get recorded() {
+    return this.moment.kind === "image" ? this.moment.dataset : null;
+  },
   received: { state: 0, image: 0 },
   age: 0,
   /** @type {number | null} */ fresh: null,
@@ -37,9 +42,7 @@ export const store = {
   /** @type {number[] | null} */ coneVec: null,
   drawn: false,
 };
-// Older than OLD_S, what is shown is said to be old; after SILENT_S nobody waits for answers any
-// more.
-export const OLD_S = 1;
+// After SILENT_S nobody waits for answers any more.
 const SILENT_S = Number(new URLSearchParams(location.search).get("patience") ?? 5);
 const LOOK_MS = 200;
 const REST_MS = 500;
@@ -245,7 +248,8 @@ export function connect() {
   socket.onopen = () => {
     store.viewer = true;
     parts = [];
-    heard = least = null;
+    heard = least = told = null;
+    quickest = Infinity;
     emit("connection");
     emit("open");
   };
@@ -271,10 +275,26 @@ export function connect() {
   };
 }
 
+/**
+ * The page is about another moment: what does not belong to it is gone.
+ * @param {Moment} moment
+ */
+export function enter(moment) {
+  const before = store.recorded;
+  store.moment = moment;
+  if (store.image && !belongs(made, moment)) {
+    store.image = null;
+    emit("image");
+  }
+  if (store.recorded !== before) emit("recorded", store.recorded);
+  emit("moment", moment);
+}
+
 /** @type {{ [T in keyof Messages]: (m: Messages[T]) => void }} */
 const handlers = {
   answer(m) {
     const w = waiting.get(m.id);
+    if (w?.sent) quickest = Math.min(quickest, (performance.now() - w.since) / 1000);
     if (w?.urgent && m.error?.code === LINK_DOWN) {
       w.sent = false; // the next session with the twin takes it along, or this one
       setTimeout(() => store.session && sendUrgent(), RETRY_MS);
@@ -295,6 +315,8 @@ const handlers = {
     });
     store.received.state++;
     store.now = ofNow(m.state, m.cone_vec, store.hello);
+    told = { at: performance.now(), late: late(m.at) };
+    look();
     if (!store.twin) {
       store.twin = true;
       emit("connection");
@@ -368,8 +390,14 @@ function late(sent) {
   return now - sent - least.lag;
 }
 
-/** @type {number | null} */
-let differs = null;
+// When the newest state came, how late, and the quickest answer so far: half of that, and at most
+// all, is what any news takes.
+/** @type {{ at: number; late: number } | null} */
+let told = null;
+let quickest = Infinity;
+/** Of the image that is shown. @type {Fingerprint} */
+let made = {};
+const age = aging();
 
 /**
  * What an image that the page has was made of.
@@ -378,22 +406,39 @@ let differs = null;
  */
 export function imageMade(image) {
   const { recorded } = image;
-  if (recorded) return ofData(recorded.name, recorded.index);
+  if (recorded) return ofData(recorded.name, recorded.index, nameOf(recorded.file));
   return ofImage(image.origin, image.cone_vec, image.twin);
+}
+
+/** What the twin's clock shows now; null before a state has come. */
+export function twinNow() {
+  if (!store.state || !told) return null;
+  const now = performance.now();
+  const trip = Number.isFinite(quickest) ? quickest : 0;
+  const since = (now - told.at - delay(now)) / 1000 + told.late + trip;
+  return clockNow(store.state.clock, since);
 }
 function look() {
   const now = performance.now();
   const own = delay(now) / 1000;
-  const age = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
-  store.age = Math.max(0, age - own);
+  const silent = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
+  // A state may wait behind other things where a heartbeat does not; at rest one comes every .5 s.
+  const trip = Number.isFinite(quickest) ? quickest / 2 : 0;
+  const behind = told === null ? 0 : (now - told.at) / 1000 + told.late + trip;
+  store.age = Math.max(0, Math.max(silent, behind) - own);
   store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
-  // An image of other things than the state's is old, once none has come for a while.
   const image = store.image;
-  store.imageDiffers = image && store.now ? differences(imageMade(image), store.now) : [];
-  const apart = image && store.imageDiffers.length && !image.recorded ? image : null;
-  differs = apart ? (differs ?? now) : null;
-  const waited = apart && differs !== null ? (now - Math.max(differs, apart.at_ms)) / 1000 : 0;
-  store.imageAge = Math.max(0, waited - own);
+  const time_s = twinNow();
+  store.imageAge = 0;
+  store.imageDiffers = [];
+  if (image && !image.recorded && store.now && store.state && time_s !== null) {
+    const present = { made: store.now, told_s: store.state.time, time_s };
+    const { age_s, differ } = age({ made, time_s: image.time }, present);
+    // As old as when the page looks next: until then it is not marked.
+    const next_s = clockNow(store.state.clock, LOOK_MS / 1000) - store.state.clock.time_s;
+    store.imageAge = differ.length ? age_s + next_s : 0;
+    store.imageDiffers = differ;
+  }
   emit("age");
 }
 // A page that itself stood still (much to draw, a laptop asleep) first reads what has come
@@ -496,9 +541,11 @@ async function image(whole) {
     : { ...head, at_ms, pixels: all };
   if (number < unpacked) return; // a newer one was quicker
   unpacked = number;
-  // Neither a live image while a data set is open, nor the other way round.
-  if ((head.recorded?.name ?? null) !== store.recorded || store.hidden) return;
+  const of = imageMade(got);
+  if (!belongs(of, store.moment)) return;
+  made = of;
   store.image = got;
   store.received.image++;
+  look();
   emit("image", got);
 }

@@ -17,15 +17,17 @@ import {
   slid,
   words,
 } from "./dom.js";
-import { call, command, emit, Failure, on, store } from "./link.js";
+import { call, command, emit, enter, Failure, on, store } from "./link.js";
 import { rememberedScript, rememberScript } from "./address.js";
 import { folder, open as openData } from "./data.js";
 import { differences, listed, only } from "./fingerprint.js";
 import { draw as drawTimeline } from "./timeline.js";
 import * as designer from "./designer.js";
 import { isOver } from "./job_words.js";
+import { NOW } from "./moment.js";
 import { effect } from "./signals.js";
 import { exposure_ms, frames, kind, sameWish, wished, wishWords } from "./scan_wish.js";
+import { isDown } from "./warnings.js";
 /**
  * @import { CheckResult, CheckStep, Pair, PlanDocument, Problem, ScriptInput }
  *   from "../web/viewer.d.ts"
@@ -49,6 +51,7 @@ let plan = null;
 let planned = "";
 let lost = false;
 let sent = "";
+let starting = false;
 
 designer.place($("#tab-scan .card"));
 clicks({
@@ -64,7 +67,8 @@ clicks({
 function marks() {
   written = text.value.split("\n");
   worst = new Map();
-  for (const id of ["#check", "#run", "#plan"]) $button(id).disabled = !text.value.trim();
+  for (const id of ["#check", "#plan"]) $button(id).disabled = !text.value.trim();
+  allow();
   $("#empty-note").hidden = text.value.trim() !== "";
   for (const p of problems) {
     if (p.line)
@@ -79,6 +83,16 @@ function marks() {
   }
   paint();
 }
+
+/** Nothing runs before a stop is released, nor another script than the fields ask for. */
+function allow() {
+  const down = store.state !== null && isDown(store.state);
+  const why = down ? "A stop is in force: RESET first" : otherScript();
+  const run = $button("#run");
+  run.disabled = starting || !text.value.trim() || why !== "";
+  run.title = why;
+}
+on("state", allow);
 
 /** @param {number} line */
 const said = (line) =>
@@ -148,7 +162,7 @@ function forget() {
   $("#timeline-card").hidden = true;
   if (plan) dismiss();
   plan = null;
-  at = null;
+  if (store.moment.kind === "plan") enter(NOW);
   next = null;
   lost = false;
 }
@@ -202,7 +216,7 @@ async function compose(keep = []) {
   const answer = await call("viewer.compose", params).catch(words);
   if (typeof answer === "string") {
     emit("note", "error", none, answer);
-    refused = { wish, why: answer };
+    refused = { wish, why: answer, beside: text.value };
     tellWish();
     return;
   }
@@ -218,15 +232,27 @@ async function compose(keep = []) {
 // one stands in the fields, the script beside them is not of it.
 /** @type {Wish | null} */
 let writtenFor = null;
-/** @type {{ wish: Wish; why: string } | null} */
+/** @type {{ wish: Wish; why: string; beside: string } | null} */
 let refused = null;
+/**
+ * Why the script is not what the fields ask for: Write was refused for them. A script of
+ * somebody's own, or an edit of one, is meant.
+ * @returns {string}
+ */
+function otherScript() {
+  const wish = wished();
+  if (!refused || typeof wish === "string" || text.value !== refused.beside) return "";
+  if (!sameWish(refused.wish, wish)) return "";
+  return "Write was refused: this is the script of before. Change it, or the fields";
+}
 function tellWish() {
   const wish = wished();
   const note = $("#wish-note");
+  allow();
   if (typeof wish === "string") {
     setText(note, wish);
   } else if (refused && sameWish(refused.wish, wish)) {
-    const old = text.value ? " The script above is another one." : "";
+    const old = otherScript() ? " The script above is the one of before: it does not run." : "";
     setText(note, `Not written: ${refused.why}.${old}`);
   } else if (writtenFor && text.value === made && !sameWish(writtenFor, wish)) {
     setText(note, `The script above is of ${wishWords(writtenFor)}: press Write for these.`);
@@ -508,7 +534,7 @@ on("open", () => {
 on("layers", () => {
   if (lost) {
     lost = false;
-    void makePlan(planned, at);
+    void makePlan(planned, at());
   }
 });
 
@@ -540,11 +566,11 @@ on("script", bring);
 let asking = false;
 /** @type {[number | null] | null} */
 let next = null;
-/** @type {number | null} */
-let at = null;
+const at = () => (store.moment.kind === "plan" ? store.moment.time_s : null);
 /** @param {number | null} time */
 export async function scrub(time) {
-  at = time;
+  if (time !== null) enter({ kind: "plan", time_s: time });
+  else if (store.moment.kind === "plan") enter(NOW);
   next = [time];
   redraw();
   if (asking) return;
@@ -559,22 +585,22 @@ export async function scrub(time) {
 }
 function redraw() {
   if (!plan) return;
+  const now = at();
   drawTimeline(
     $canvas("#timeline"),
     plan,
-    at,
+    now,
     store.job && !isOver(store.job) ? store.job.elapsed_s : null,
   );
-  const now = at;
   const step = now === null ? null : plan.steps.findLast((s) => s.start_s <= now + 1e-9);
   $("#scrub-at").textContent =
-    at === null
+    now === null
       ? `${seconds(plan.duration_s)} in all`
-      : `${fixed(at, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
+      : `${fixed(now, 1)} s · line ${step?.line ?? "–"} · ${step?.what ?? ""}`;
   $("#scrub-at").title = $("#scrub-at").textContent;
   const told = {
     "aria-valuemax": plan.duration_s,
-    "aria-valuenow": at ?? 0,
+    "aria-valuenow": now ?? 0,
     "aria-valuetext": $("#scrub-at").textContent,
   };
   for (const [name, value] of Object.entries(told)) canvas.setAttribute(name, String(value));
@@ -596,18 +622,22 @@ canvas.addEventListener("keydown", (e) => {
   if (step && plan) {
     e.preventDefault();
     e.stopPropagation();
-    void scrub(Math.min(1, Math.max(0, (at ?? 0) / plan.duration_s + step)) * plan.duration_s);
+    void scrub(
+      Math.min(1, Math.max(0, (at() ?? 0) / plan.duration_s + step)) * plan.duration_s,
+    );
   }
 });
 new ResizeObserver(redraw).observe(canvas);
 
 async function run() {
   const button = $button("#run");
-  button.disabled = true;
+  starting = true;
+  allow();
   setText(button, "Starting …");
   try {
     await submit();
   } finally {
+    starting = false;
     setText(button, "Run");
     marks();
   }
@@ -630,7 +660,7 @@ async function submit() {
   emit("note", "good", "Scan", `${answer.job} has begun`);
   for (const warning of answer.warnings.slice(0, 3))
     emit("note", "warning-note", "Scan", warning);
-  if (at !== null) void scrub(null);
+  if (at() !== null) void scrub(null);
 }
 
 on("scan", (fresh) => {

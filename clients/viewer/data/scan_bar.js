@@ -11,11 +11,14 @@ import {
   timeLeft,
   whatWords,
 } from "./job_words.js";
+import { estimates } from "./estimate.js";
 import { forgetJob } from "./scan_job.js";
 import { folder, open as openData } from "./data.js";
+import { isDown } from "./warnings.js";
 /** @import { JobStatus } from "../web/viewer.d.ts" */
 
 const bar = $("#scan-bar");
+const left = estimates();
 let dismissed = ""; // the ended scan that a person has put away
 
 for (const action of /** @type {const} */ (["pause", "resume", "step", "abort"])) {
@@ -49,7 +52,7 @@ function draw() {
   setText($("#job-name"), job.name || job.job);
   setText($("#job-state"), stateWords(job, store.session));
   setText($("#job-frames"), `${job.frames_done} / ${job.frames_total} frames`);
-  setText($("#job-left"), timeLeft(job));
+  setText($("#job-left"), timeLeft(job, left(job, performance.now() / 1000)));
   const what = whatWords(job, store.twin ? store.state : null);
   setText($("#job-what"), what);
   $("#job-what").title = what;
@@ -88,8 +91,9 @@ function offer(job) {
   for (const [name, visible] of Object.entries(shown))
     $button(`#job-${name}`).hidden = !visible;
   $button("#job-pause").disabled = job.state !== "running";
-  $button("#job-step").disabled = job.state !== "paused";
-  $button("#job-resume").disabled = job.state !== "paused" && !isUnfinished(job);
+  const down = store.state !== null && isDown(store.state);
+  $button("#job-step").disabled = down || job.state !== "paused";
+  $button("#job-resume").disabled = down || (job.state !== "paused" && !isUnfinished(job));
   $button("#job-back").disabled = Boolean(store.state?.job);
 }
 on("scan", draw);

@@ -1,71 +1,66 @@
-// Thumbnails of the running scan's images.
-import { $, el, putGrey } from "./dom.js";
+// Thumbnails of the running scan: images as they were saved, each by the name of its file.
+import { $, $$, el, pressed, putImage } from "./dom.js";
+import { folder, open as openData } from "./data.js";
 import { isOver } from "./job_words.js";
-import { on, store } from "./link.js";
-/** @import { JobStatus, Shown } from "../web/viewer.d.ts" */
+import { call, on, store } from "./link.js";
+import { nameOf } from "./moment.js";
+/** @import { Answers } from "../web/viewer.d.ts" */
 
 const MAX_THUMBS = 40;
+// Of a scan that was over before its images came here.
+const LEAST_THUMBS = 5;
 const WIDTH_PX = 124;
-// The last image may come a little after the scan's end, by our clock, or be of a little after
-// it, by the twin's.
-const LATE_S = 1.5;
-let lastThumb = -1;
-let lastImage = 0;
-/** @type {{ time_s: number; at_ms: number } | null} */
-let ended = null;
+let dataset = "";
+let asking = false;
+/** @type {Set<number>} */
+let steps = new Set();
 
 on("scan", (fresh) => {
+  const job = store.job;
   if (fresh) {
     $("#thumbs").textContent = "";
-    lastThumb = -1;
-    lastImage = store.received.image;
-    ended = null;
+    steps = new Set();
+    dataset = job ? folder(job) : "";
   }
-  const job = store.job;
-  if (!job || !isOver(job) || ended) return;
-  ended = { time_s: job.time + LATE_S, at_ms: fresh ? -Infinity : performance.now() };
-  thumb();
+  if (job?.state === "done" && steps.size < LEAST_THUMBS) void fill(job.frames_total);
 });
-on("image", thumb);
-
-function thumb() {
+// A live image of the scan says which file it was saved as: of every n-th that file is shown.
+on("image", (image) => {
   const job = store.job;
-  const image = store.image;
-  if (!job?.frames_done || !image || image.recorded) return;
-  if (store.received.image === lastImage || isLate(image)) return;
-  const every = Math.max(1, Math.floor(job.frames_total / MAX_THUMBS));
-  const number = Math.floor(job.frames_done / every);
-  if (number === lastThumb) return;
-  lastThumb = number;
-  lastImage = store.received.image;
-  add(image, job);
+  const index = image?.origin?.index ?? null;
+  if (!job || isOver(job) || index === null) return;
+  if (!asking && image?.origin?.dataset === dataset) void show(index, job.frames_total);
+});
+
+/** @param {number} total */
+async function fill(total) {
+  for (let k = 0; k < LEAST_THUMBS; k++)
+    await show(Math.floor(((k + 0.5) * total) / LEAST_THUMBS), total);
 }
 
 /**
- * @param {Shown} image
- * @returns {boolean}
+ * @param {number} index
+ * @param {number} total
  */
-function isLate(image) {
-  if (!ended) return false;
-  return image.time > ended.time_s && performance.now() > ended.at_ms + 1000 * LATE_S;
+async function show(index, total) {
+  const step = Math.floor(index / Math.max(1, Math.floor(total / MAX_THUMBS)));
+  if (steps.has(step)) return;
+  steps.add(step);
+  asking = true;
+  const asked = { name: dataset, index, side: WIDTH_PX };
+  const small = await call("viewer.thumbnail", asked).catch(() => null);
+  asking = false;
+  if (small?.name === dataset) add(small);
 }
 
-/**
- * @param {Shown} image
- * @param {JobStatus} job
- */
-function add(image, job) {
-  const [rows, cols] = image.shape;
-  const height = Math.max(1, Math.round((WIDTH_PX * rows) / cols));
-  const [low, high] = image.window;
-  const canvas = el("canvas");
-  putGrey(canvas, [height, WIDTH_PX], (k) => {
-    const row = Math.floor(((k / WIDTH_PX) | 0) * (rows / height));
-    const column = Math.floor(((k % WIDTH_PX) * cols) / WIDTH_PX);
-    const value = image.low + image.scale * image.pixels[row * cols + column];
-    return Math.min(255, Math.max(0, (255 * (value - low)) / (high - low))) | 0;
-  });
+/** @param {Answers["viewer.thumbnail"]} small */
+function add({ name, file, index, image }) {
   $("#thumb-card").hidden = false;
-  $("#thumbs").append(el("figure", {}, canvas, el("figcaption", {}, String(job.frames_done))));
-  $("#thumbs").scrollLeft = $("#thumbs").scrollWidth;
+  const open = pressed(() => openData(name, index, true));
+  const told = { ...open, "data-index": index, "data-file": file, title: `${file} of ${name}` };
+  const picture = putImage(el("canvas"), image);
+  const made = el("figure", told, picture, el("figcaption", {}, nameOf(file)));
+  const later = $$("#thumbs figure").find((one) => Number(one.dataset.index) > index);
+  $("#thumbs").insertBefore(made, later ?? null);
+  if (!later) $("#thumbs").scrollLeft = $("#thumbs").scrollWidth;
 }

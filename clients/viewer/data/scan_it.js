@@ -7,6 +7,7 @@ import { folder } from "./data.js";
 import { isUnfinished } from "./job_words.js";
 import { across } from "./sample_outline.js";
 import { nearSample } from "./views.js";
+import { isDown } from "./warnings.js";
 import { reconstruct, watch } from "./volume.js";
 /** @import { Answers, State } from "../web/viewer.d.ts" */
 
@@ -184,9 +185,21 @@ export async function scanIt(named = sample.value) {
   }
 }
 
-/** Nothing is scanned of an empty stage. */
+/**
+ * Takes up a scan that this page began before it was loaded again: its volume grows and then stands
+ * beside its truth.
+ * @param {string} job
+ */
+export function takeUp(job) {
+  mine = job;
+  busy = true;
+  watch();
+}
+
+/** Nothing is scanned of an empty stage, nor before a stop is released. */
 function allow() {
-  go.disabled = pressed || !store.state?.sample.name;
+  const state = store.state;
+  go.disabled = pressed || !state?.sample.name || isDown(state);
 }
 
 on("state", (state) => {

@@ -16,6 +16,7 @@ import {
 } from "./dom.js";
 import { differences, listed, only } from "./fingerprint.js";
 import { allSamples, call, command, emit, on, store } from "./link.js";
+import { isDown } from "./warnings.js";
 import { curve } from "./plots.js";
 /**
  * @import { ExposurePrediction, Placement, PredictedSetting, Requests, State }
@@ -320,6 +321,7 @@ function show(state) {
   xrays.textContent = on ? (ready ? "X-rays are ON" : "X-rays warm up") : "Switch X-rays on";
   xrays.classList.toggle("beam-on", on);
   xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";
+  xrays.disabled = !on && isDown(state);
   const c = state.camera;
   put("exposure", c.exposure_ms, 3);
   put("averages", c.averages);

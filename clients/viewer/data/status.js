@@ -3,7 +3,8 @@
 import { $, $$, $button, $dialog, $input, el, fixed, setText } from "./dom.js";
 import { listed, sampleOf } from "./fingerprint.js";
 import { toYou } from "./names.js";
-import { command, imageMade, OLD_S, on, person, rename, store, unanswered } from "./link.js";
+import { command, imageMade, on, person, rename, store, unanswered } from "./link.js";
+import { OLD_S } from "./moment.js";
 import { isDown, stopped } from "./warnings.js";
 import "./readouts.js";
 /** @import { ClockState, State } from "../web/viewer.d.ts" */
@@ -114,7 +115,9 @@ function release(s) {
   const stop = isDown(s) ? s.safety.stop : null;
   const reset = $button("#reset");
   const ask = $dialog("#reset-dialog");
-  reset.hidden = stop === null;
+  reset.hidden = $("#emergency").hidden = stop === null;
+  if (stop !== null) setText($("#emergency-what"), stopped(s));
+  document.body.dataset.down = String(stop !== null);
   $button("#xrays-off").hidden = stop === null || !s.tube.on;
   if (stop === shown) return;
   shown = stop;
@@ -240,7 +243,9 @@ on("age", () => {
   connection();
   const tag = $("#film-old");
   tag.hidden = store.imageAge <= OLD_S;
-  if (!tag.hidden) setText(tag, `of another ${old()}: ${fixed(store.imageAge, 0)} s old`);
+  if (tag.hidden) return;
+  const age = Number.isFinite(store.imageAge) ? `: ${fixed(store.imageAge, 0)} s old` : "";
+  setText(tag, `of another ${old()}${age}`);
 });
 
 /**

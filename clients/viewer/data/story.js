@@ -3,12 +3,15 @@
 // right one, and a second scan of the gear is sharp again. Images are the same with a part that
 // is displaced and with a reconstruction that believes it displaced: so nothing is bent.
 import { $, clicks, el, fixed, setText, words } from "./dom.js";
-import { call, command, emit, on, store } from "./link.js";
+import { call, command, emit, Failure, on, store } from "./link.js";
 import { beliefWords } from "./belief.js";
+import { BY_HAND } from "./by_hand.js";
 import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
 import { isUnfinished } from "./job_words.js";
-import { scanIt, turnOf } from "./scan_it.js";
+import { scanIt, takeUp, turnOf } from "./scan_it.js";
+import { reconstruct } from "./volume.js";
+import { isDown } from "./warnings.js";
 /**
  * @import { Found } from "./belief.js"
  * @import { JobStatus } from "../web/viewer.d.ts"
@@ -23,7 +26,6 @@ const NOT_BEGUN = "The scan did not begin: the note says why.";
 // What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt
 // from their height.
 const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll"];
-const COMMENT = "misaligned by hand";
 
 /**
  * Offset -> what it is, its unit, the largest and the first value of its slider, what it
@@ -60,20 +62,40 @@ const STEPS = [
     "The same turn, the right geometry. Share it from the volume.",
   ],
 ];
-let step = 0;
-/** @type {string | null} */
-let job = null;
-/** @type {string | null} */
-let dataset = null;
-/** @type {string | null} */
-let phantomJob = null;
-/** @type {{ correction: Record<string, number>; source: string } | null} */
-let found = null;
-let waiting = false;
-/** @type {Record<string, number>} */
-let believed = {};
-/** @type {number[]} */
-const rms = [];
+/**
+ * Where the story is: kept in this tab, so that it goes on after a reload. While it waits, one of
+ * `job`, `dataset`, `phantomJob` and `looking` says for what.
+ * @typedef {object} Told
+ * @property {number} step
+ * @property {string | null} job
+ * @property {string | null} dataset
+ * @property {string | null} phantomJob
+ * @property {string | null} looking
+ * @property {{ correction: Record<string, number>; source: string } | null} found
+ * @property {boolean} waiting
+ * @property {string} says
+ * @property {Record<string, number>} believed
+ * @property {Record<string, unknown>} parameters
+ * @property {number[]} rms
+ */
+
+const KEY = "flexdt-story";
+/** @returns {Told} */
+const fresh = () => ({
+  step: 0,
+  job: null,
+  dataset: null,
+  phantomJob: null,
+  looking: null,
+  found: null,
+  waiting: false,
+  says: "",
+  believed: {},
+  parameters: {},
+  rms: [],
+});
+const kept = sessionStorage.getItem(KEY);
+let told = kept ? { ...fresh(), .../** @type {Told} */ (JSON.parse(kept)) } : fresh();
 
 /** @param {string} name */
 const slider = (name) => /** @type {HTMLInputElement} */ ($(`#story-${name}`));
@@ -122,66 +144,82 @@ function says() {
     setText($(`#story-${name}-is`), fixed(value, 2));
   }
 }
-function show(says = STEPS[step]?.[2] ?? "") {
+function show(says = STEPS[told.step]?.[2] ?? "") {
+  told.says = says;
+  setText($("#story-says"), says);
+  allow();
+  if (told.step || told.waiting) sessionStorage.setItem(KEY, JSON.stringify(told));
+}
+function allow() {
+  const down = store.state !== null && isDown(store.state);
   STEPS.forEach(([id], k) => {
     /** @type {HTMLButtonElement} */
     const button = $(`#${id}`);
-    button.disabled = waiting || (k !== step && k !== 0);
-    button.classList.toggle("primary", k === step);
+    button.disabled = down || told.waiting || (k !== told.step && k !== 0);
+    button.classList.toggle("primary", k === told.step);
   });
-  setText($("#story-says"), says);
 }
+on("state", allow);
 function next() {
-  waiting = false;
-  step += 1;
-  show(step < STEPS.length ? undefined : `Sharp again. ${compared()}`);
+  told.waiting = false;
+  told.step += 1;
+  show(told.step < STEPS.length ? undefined : `Sharp again. ${compared()}`);
 }
 
 /** @returns {string} */
 function compared() {
-  const values = rms.map((one) => `${fixed(one, 5)} /mm`).join(", then ");
+  const values = told.rms.map((one) => `${fixed(one, 5)} /mm`).join(", then ");
   return `Rms difference from the truth: ${values}.`;
 }
 
 /** @param {string} why */
 function failed(why) {
-  waiting = false;
+  Object.assign(told, {
+    waiting: false,
+    job: null,
+    dataset: null,
+    phantomJob: null,
+    looking: null,
+  });
   show(why);
 }
 
 async function bend() {
-  step = 0;
-  rms.length = 0;
+  told = { ...fresh(), believed: chosen() };
   setText($("#story-found"), "");
-  believed = chosen();
-  const wrong = { parameters: believed, source: null, comment: COMMENT };
+  const wrong = { parameters: told.believed, source: null, comment: BY_HAND };
   if (!(await command("sample.set", { name: OBJECT }, "The sample stays"))) return;
   if (!(await command("calibration.apply", wrong, "Not applied"))) return;
   next();
 }
 async function scan() {
-  waiting = true;
+  told.waiting = true;
+  told.dataset = null;
   show("Scanning; the volume grows in the scene.");
-  dataset = null;
-  job = await scanIt(OBJECT);
-  if (!job) failed(NOT_BEGUN);
+  told.job = await scanIt(OBJECT);
+  if (told.job) show(told.says);
+  else failed(NOT_BEGUN);
 }
 
 /** Scans the phantom; its beads are looked for once its images are there. */
 async function fit() {
-  waiting = true;
+  told.waiting = true;
   show("The bead phantom is on the stage, and turns once.");
-  phantomJob = await turnOf(PHANTOM, PHANTOM_VIEWS);
-  if (!phantomJob) failed(NOT_BEGUN);
+  told.phantomJob = await turnOf(PHANTOM, PHANTOM_VIEWS);
+  if (told.phantomJob) show(told.says);
+  else failed(NOT_BEGUN);
 }
 
 /** @param {string} scanned */
 async function look(scanned) {
+  told.looking = scanned;
   show("Finding beads in all images …");
   const asked = { datasets: [scanned], phantom: PHANTOM, free: FREE };
   const report = await call("calibration.fit", asked).catch((/** @type {unknown} */ error) =>
-    words(error),
+    error instanceof Failure && error.code === 0 ? null : words(error),
   );
+  if (report === null) return; // the next connection looks again
+  told.looking = null;
   if (typeof report === "string") {
     failed(report);
     return;
@@ -195,54 +233,69 @@ async function look(scanned) {
     failed("The phantom is still on the stage.");
     return;
   }
-  found = { correction, source: scanned };
-  tell(report.parameters);
+  told.found = { correction, source: scanned };
+  told.parameters = report.parameters;
+  tell();
   next();
 }
 
-/**
- * What the beads say beside what the sliders said when the geometry was bent.
- * @param {Record<string, unknown>} parameters
- */
-function tell(parameters) {
+/** What the beads say beside what the sliders said when the geometry was bent. */
+function tell() {
+  if (!told.found) return;
   const rows = Object.entries(BELIEFS).map(([name, [what, unit]]) => {
-    const found = /** @type {Found | undefined} */ (parameters[name]);
-    return el("div", {}, beliefWords(what, unit, believed[name], found));
+    const found = /** @type {Found | undefined} */ (told.parameters[name]);
+    return el("div", {}, beliefWords(what, unit, told.believed[name], found));
   });
   $("#story-found").replaceChildren(...rows);
 }
 async function use() {
-  if (!found) return;
-  if (await apply(found.correction, found.source, "after a story", true)) next();
+  const { found } = told;
+  if (found && (await apply(found.correction, found.source, "after a story", true))) next();
 }
-on("job", (/** @type {JobStatus} */ told) => {
-  if (!waiting || (told.job !== job && told.job !== phantomJob)) return;
-  if (isUnfinished(told)) failed(`The scan is ${told.state}.`);
-  if (told.state !== "done") return;
-  if (told.job === phantomJob) {
-    phantomJob = null;
-    void look(folder(told));
+on("job", (/** @type {JobStatus} */ status) => {
+  if (!told.waiting || ![told.job, told.phantomJob].includes(status.job)) return;
+  if (isUnfinished(status)) failed(`The scan is ${status.state}.`);
+  if (status.state !== "done") return;
+  if (status.job === told.phantomJob) {
+    told.phantomJob = null;
+    void look(folder(status));
   } else {
-    job = null;
-    dataset = folder(told);
+    told.job = null;
+    told.dataset = folder(status);
     show("Reconstructing, and comparing with the truth …");
   }
 });
 on("volume", (volume) => {
-  if (!waiting || !volume.past || volume.name !== dataset) return;
+  if (!told.waiting || !volume.past || volume.name !== told.dataset) return;
   const problem = volume.problem ?? volume.not_compared;
   if (problem) {
     failed(problem);
     return;
   }
   if (!volume.compared) return;
-  dataset = null;
-  rms.push(Object.values(volume.compared)[0].rms);
+  told.dataset = null;
+  told.rms.push(Object.values(volume.compared)[0].rms);
   next();
-  if (step === 2) show(`${compared()} ${STEPS[2][2]}`);
+  if (told.step === 2) show(`${compared()} ${STEPS[2][2]}`);
 });
-on("connection", () => {
-  if (!store.twin && waiting) failed("The connection was lost meanwhile.");
+
+// A page that was loaded again, or connected again, takes up what it waited for.
+let loaded = true;
+on("session", async () => {
+  if (!told.waiting) return;
+  const { job, dataset, phantomJob, looking } = told;
+  if (loaded && job) takeUp(job);
+  if (loaded && dataset) reconstruct(dataset, true);
+  loaded = false;
+  if (looking) void look(looking);
+  const asked = job ?? phantomJob;
+  if (!asked) {
+    if (!dataset && !looking) failed(NOT_BEGUN);
+    return;
+  }
+  const status = await call("job.status", { job: asked }).catch(() => null);
+  if (status) emit("job", status);
+  else failed("The twin knows nothing of that scan any more.");
 });
 clicks({
   "story-bend": bend,
@@ -251,8 +304,11 @@ clicks({
   "story-apply": use,
   "story-again": scan,
 });
+for (const [name, value] of Object.entries(told.believed)) slider(name).value = String(value);
 says();
-show();
+tell();
+show(told.says || undefined);
+card.open = kept !== null;
 export function open() {
   emit("show-tab", "calibrate");
   card.open = true;

@@ -23,7 +23,7 @@ for (const name of ["move", "setup", "scan", "data", "calibrate", "share"]) {
     el("section", { class: "tab", id: `tab-${name}`, hidden: true });
   panel.setAttribute("role", "tabpanel");
   panel.setAttribute("aria-labelledby", `tab-of-${name}`);
-  $("#left").append(panel);
+  $("#facts").before(panel);
 }
 
 /** @param {string} name */

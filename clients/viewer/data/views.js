@@ -138,7 +138,7 @@ export function nearSample() {
 // large, beside it.
 /** @type {HTMLImageElement} */
 const still = $("#still");
-const CLOSE_UP_MS = 700;
+const CLOSE_UP_MS = 1000;
 const STILL_AGAIN_MS = 1000;
 let live = false;
 /** A busy server answers late with no picture: ask again until a frame has drawn the scene. */
@@ -161,6 +161,10 @@ window.addEventListener("message", (e) => {
     still.hidden = true;
   }
 });
+// The close cameras have gone home: there is nothing to look at.
+on("state", (s) => {
+  if (!s.sample.name) for (const { box } of open.values()) box.classList.remove("near");
+});
 let posed = "";
 let seenAt = -Infinity;
 on("state", (s) => {
@@ -173,6 +177,8 @@ on("state", (s) => {
     document.documentElement.dataset.theme,
   ]);
   if (now === posed || performance.now() < seenAt + CLOSE_UP_MS) return;
+  // The viewer computes each picture: one that is on its way is waited for.
+  for (const { sample } of open.values()) if (sample && !sample.complete) return;
   posed = now;
   seenAt = performance.now();
   closeUps();

@@ -24,12 +24,14 @@ import { raycast, ROOM } from "./raycast.js";
 import { shared } from "./shared.js";
 import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
+import { follow } from "./volume_stage.js";
 /**
  * @import { Block, Figures, Live, Name, Pair, Vector, VolumeMessage } from "../web/viewer.d.ts"
  */
 
 const KEY = "flexdt-volume";
 const STARTING = "starting; dark, flat and a first image are needed";
+const BEGINS = "the reconstruction begins";
 const EXACT_MS = 60;
 // Largest first zoom of a volume in three dimensions, and the room about its object.
 const NEAREST = 4;
@@ -93,6 +95,7 @@ function ask() {
   const before = asked;
   asked = wish;
   told = null;
+  follow(null);
   comparing = false;
   // The folder comes a moment after the job: what is refused is asked again.
   of = { name, side: /** @type {128} */ (Number(size.value)), past: past !== null };
@@ -113,7 +116,21 @@ function ask() {
   $button("#volume-cancel").hidden = past === null;
   setText($button("#volume-cancel"), "Cancel");
   setText($("#volume-title"), past ? `Volume of ${past}` : wish ? "Volume so far" : "Volume");
-  setText(note, !wish ? "" : past ? "reading the images …" : STARTING);
+  setText(note, !wish ? "" : past ? BEGINS : STARTING);
+  wait(past ? BEGINS : "");
+}
+// What has no share yet moves at least with the clock.
+/** @type {number | undefined} */
+let waits;
+/** @param {string} what */
+function wait(what) {
+  clearInterval(waits);
+  if (!what) return;
+  const since = performance.now();
+  waits = window.setInterval(
+    () => setText(note, `${what} … ${fixed((performance.now() - since) / 1000, 0)} s`),
+    1000,
+  );
 }
 function forget() {
   blocks.clear();
@@ -181,24 +198,27 @@ on("open", () => {
 
 on("volume", (m) => {
   if (!asked?.startsWith(`${m.name} `) || m.past !== (past !== null)) return;
+  wait("");
   if (m.problem) {
     setText(note, m.problem);
     progress.hidden = true;
     return;
   }
   told = m;
+  follow(m);
   const other =
     m.side === Number(size.value) ? "" : `${m.side} voxels a side, as another page chose · `;
   const working = m.comparing !== undefined && m.comparing < 1 && !m.not_compared;
   progress.hidden = m.past ? m.done === 1 && !working : true;
   progress.value = working ? (m.comparing ?? 0) : (m.done ?? 0);
   if (!m.size) {
-    setText(note, `${other}reconstructing: ${fixed(100 * (m.done ?? 0), 0)} %`);
+    if (m.done === undefined) wait(m.phase ?? BEGINS);
+    else setText(note, `${other}reading and reconstructing: ${fixed(100 * m.done, 0)} %`);
     return;
   }
   if (m.past) setText($button("#volume-cancel"), "Close");
   const facts = [
-    `${m.views ?? "–"} of ${m.of ?? "–"} views`,
+    `${m.views ?? "–"} of ${m.of ?? "–"} views${behind(m)}`,
     `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`,
     m.geometry,
     m.uncovered && m.uncovered > 5e-4
@@ -218,6 +238,17 @@ on("volume", (m) => {
   if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing)
     compare();
 });
+/**
+ * How far a volume that grows is behind its scan.
+ * @param {VolumeMessage} m
+ * @returns {string}
+ */
+function behind({ past: over, views, of: all }) {
+  const job = store.job;
+  if (over || !job?.frames_total || isOver(job) || !views || !all) return "";
+  const taken = Math.floor((all * job.frames_done) / job.frames_total);
+  return taken - views > all / 20 ? ` (behind: ${taken} are taken)` : "";
+}
 // The truth beside the scan, under one slider.
 const splitter = $input("#volume-split");
 async function beside() {

@@ -1,6 +1,8 @@
-// What is wrong with the machine, the sample's place and the image, over the scene.
+// What is wrong with the machine, the sample's place and the image, over the scene. A stop has a
+// row of its own above it.
 import { $, el, fixed } from "./dom.js";
-import { OLD_S, on, store } from "./link.js";
+import { on, store } from "./link.js";
+import { OLD_S } from "./moment.js";
 import { outline } from "./sample_outline.js";
 /** @import { State } from "../web/viewer.d.ts" */
 
@@ -54,7 +56,6 @@ function atEnds(s) {
 function ofMachine(s) {
   /** @type {Warning[]} */
   const list = [];
-  if (isDown(s)) list.push(["bad", stopped(s)]);
   const lost = "A server that is killed now comes back without the last change";
   if (s.unsaved) list.push(["bad", `Not saved: ${s.unsaved}. ${lost}`]);
   if (s.projector) list.push(["bad", `No new images: ${s.projector}`]);

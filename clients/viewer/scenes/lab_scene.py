@@ -50,7 +50,6 @@ LAMP_M: Final = 0.045
 CONE_OPACITY: Final = 0.2
 """Opacity of the full beam in a picture that needs no browser."""
 BEAM_OFF: Final = (120, 140, 165)
-SURFACE: Final = (70, 190, 255)
 FADED_OPACITY: Final = 0.12
 """Largest opacity of a sample whose volume is drawn within it."""
 FLOOR: Final = (140, 150, 165)
@@ -105,7 +104,6 @@ class LabScene:
         self._solids: dict[str, list[Shape]] = {}
         self._lit = False
         self._look: SampleLook | None = None
-        self._surface: Any = None
         self._hulls: dict[str, Any] = {}
         self._margins: dict[str, Any] = {}
         self.plan = PlanDrawing(machine, self._collision)
@@ -117,7 +115,7 @@ class LabScene:
             for node, visible in self._visible(Shown()).items():
                 handle: Any = server.scene.get_handle_by_name(node)
                 handle.visible = visible
-        self.plain = self.nodes(Shown(), faded=False)
+        self.plain = self.nodes(Shown())
         """Properties of all nodes as built; each frame gets the differences of its
         page."""
 
@@ -458,42 +456,6 @@ class LabScene:
                 world, lines, 0.0 if self._look is None else self._look.radius_mm
             )
 
-    def show_surface(
-        self, vertices_mm: FloatArray | None, faces: npt.NDArray[np.int32] | None = None
-    ) -> None:
-        """Show the volume's surface that a scan has reconstructed so far, on the stage;
-        None removes it.
-
-        No faces remove it, too. A surface that is there already is replaced.
-
-        The sample itself fades meanwhile, so that its volume is seen within it.
-
-        Args:
-            vertices_mm: (v, 3) [mm, object frame].
-            faces: (f, 3), outward.
-        """
-        with self._server.atomic():
-            if vertices_mm is None or faces is None or not len(faces):
-                if self._surface is not None:
-                    self._surface.remove()
-                self._surface = None
-                return
-            vertices = (vertices_mm * MM).astype(np.float32)
-            triangles = np.asarray(faces, dtype=np.uint32)
-            if self._surface is not None:
-                self._surface.vertices = vertices
-                self._surface.faces = triangles
-                return
-            self._surface = self._server.scene.add_mesh_simple(
-                "/object/surface",
-                vertices,
-                triangles,
-                color=SURFACE,
-                side="double",
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-
     def wear(self, look: SampleLook) -> None:
         """Put a sample on the stage.
 
@@ -523,7 +485,7 @@ class LabScene:
                 for skin in look.skins
             ]
             self._stand(look)
-        self.plain = self.nodes(Shown(), faded=False)
+        self.plain = self.nodes(Shown())
 
     def _stand(self, look: SampleLook) -> None:
         """Draw a thin rod from the mount to the sample; X-rays do not see it.
@@ -553,7 +515,7 @@ class LabScene:
             self._server.scene.add_glb(name, glb([rod]), receive_shadow=False)
 
     def nodes(
-        self, shown: Shown, near: Collection[str] = (), faded: bool = True
+        self, shown: Shown, near: Collection[str] = (), within: bool = False
     ) -> Nodes:
         """Collect the nodes of all layers, for frames of a page that shows `shown`.
 
@@ -563,13 +525,12 @@ class LabScene:
 
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
-            faded: whether the sample fades where its volume is drawn within it.
+            within: whether the page's volume is drawn within the sample, which then fades.
         """
         out = {
             n: {"visible": visible} for n, visible in self._visible(shown, near).items()
         }
         skins = () if self._look is None else self._look.skins
-        within = faded and self._surface is not None
         if within:
             opacity = min(shown.opacity, FADED_OPACITY)
         else:

@@ -32,7 +32,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -213,6 +213,7 @@ def grow(
     told = 0.0
     drawn = 0.0
     held.hold(target.volume().transpose(2, 0, 1), like)
+    held.about["made"] = made_of(data)
 
     def parts() -> Iterator[Float32Array]:
         """Yield line integrals (1, rows, cols), binned, each as soon as its file is
@@ -272,8 +273,10 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     Raises:
         TwinError: as `reconstruct_volume`.
     """
+    held.say(phase="opening the scan")
     data = load_dataset(folder)
     held.dataset = data
+    held.about["made"] = made_of(data)
     held.request = VolumeRequest(binning=max(1, round(data.shape[1] / side)))
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
@@ -331,6 +334,25 @@ def _named(correction: NamedCorrection | None) -> str:
     if correction is None:
         return "no correction"
     return f"correction “{correction.name}”"
+
+
+def made_of(data: DataSet) -> dict[str, Any]:
+    """Collect what a data set's volume is compared with the stage by: `sample`, `revision`,
+    `material`, `offset` (None where it does not say) and `correction`, a name.
+    """
+    document = data.document
+    correction = None if data.correction is None else data.correction.name
+    if document is None:
+        known: dict[str, Any] = {"sample": "", "revision": None, "material": None}
+        return known | {"offset": None, "correction": correction}
+    sample = document.sample
+    return {
+        "sample": sample.name,
+        "revision": sample.revision,
+        "material": sample.material,
+        "offset": None if sample.offset is None else asdict(sample.offset),
+        "correction": correction,
+    }
 
 
 def _facts(data: DataSet) -> dict[str, Any]:

@@ -7,9 +7,7 @@ and is not read.
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +17,6 @@ from scipy import ndimage
 from flexdt.library.data_set import DataSet
 from flexdt.phantoms import load_phantom
 from flexdt.phantoms.samples import is_shipped
-from flexdt.runtime.files.own_documents import file_stem
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.projection import Volume
@@ -39,9 +36,9 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
     """Compute the sample's attenuation [1/mm] on the grid of a volume.
 
     Known are the phantoms that ship. Solids are averaged over two half voxels a side; the
-    sample's place on the stage is that of the data set's folder. Values are interpolated
+    sample's place on the stage is that of the data set's document. Values are interpolated
     linearly, 0 outside the phantom, negative rounding errors clipped to 0. A voxel
-    phantom is used as it is. Without a folder the sample is not shifted or turned.
+    phantom is used as it is. Without a place in the document it is not shifted or turned.
 
     Args:
         dataset: its sample, and its place on the stage.
@@ -76,10 +73,7 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
         half = 0.5
         for axis in range(3):
             data = _means_of_pairs(data, axis)
-    if dataset.folder is None:
-        stands = StagePlacement()
-    else:
-        stands = placement(dataset.folder)
+    stands = (document.sample.offset if document else None) or StagePlacement()
     back = stands.rotation.T
     shift = np.array([stands.x, stands.y, stands.z])
     nz, ny, nx = like.shape
@@ -113,21 +107,6 @@ def _means_of_pairs(data: Float32Array, axis: int) -> Float32Array:
     means = along[:-1] + along[1:]
     means *= np.float32(0.5)
     return np.moveaxis(means, 0, axis)
-
-
-def placement(folder: Path) -> StagePlacement:
-    """Read the place of a data set's sample from its job's record; without one: no
-    offset.
-
-    An offset is missing also where the record is damaged. The record is `jobs/NAME.json`
-    beside the data set's folder. Any error of reading or content gives no offset; nothing
-    is raised.
-    """
-    try:
-        file = folder.parent / "jobs" / f"{file_stem(folder.name)}.json"
-        return StagePlacement(**json.loads(file.read_text("utf-8"))["sample"]["offset"])
-    except (OSError, ValueError, LookupError, TypeError, TwinError):
-        return StagePlacement()
 
 
 def figures(values: Float32Array, truth: Float32Array, voxel_mm: float) -> dict[str, Any]:

@@ -16,6 +16,8 @@ import type {
   State,
 } from "./wire.js";
 
+import type { Moment } from "../data/moment.js";
+
 export type * from "./wire.js";
 
 export type Pair = [number, number];
@@ -121,6 +123,14 @@ export interface VolumeMessage {
   name: string;
   side: number;
   past: boolean;
+  // What it is compared with the stage by; no offset where its data set does not say.
+  made?: {
+    sample: string;
+    revision: string | null;
+    material: string | null;
+    offset: State["sample"]["offset"] | null;
+    correction: string | null;
+  };
   problem?: string;
   views?: number;
   of?: number;
@@ -128,6 +138,7 @@ export interface VolumeMessage {
   voxel_mm?: number;
   // Of a finished one: how much of the work is done, and then what it was made of.
   done?: number;
+  phase?: string;
   binning?: number;
   geometry?: string;
   doubts?: string[];
@@ -230,6 +241,12 @@ export interface Answers extends WireAnswers {
   "viewer.plan": PlanDocument;
   "viewer.recorded": DatasetResult;
   "viewer.recorded_image": AboutImage;
+  "viewer.thumbnail": {
+    name: string;
+    index: number;
+    file: string;
+    image: { shape: Pair; data: string };
+  };
   "viewer.block": Partial<BlockHead & Offer>;
   "viewer.voxel": Record<string, number | null>;
   "viewer.compose": { text: string; moved: Record<string, Pair> };
@@ -258,6 +275,7 @@ export interface Events {
   log: [entry: { level: string; message: string }];
   tab: [name: string];
   "show-tab": [name: string];
+  moment: [moment: Moment];
   recorded: [name: string | null];
   frame: [target: Window];
   calibrate: [dataset: string, sample: string, markers?: Mark[]];

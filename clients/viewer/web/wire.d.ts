@@ -117,6 +117,7 @@ export type GeometryState = {
   piercing_point_px: [number, number]; field_of_view_mm: [number, number];
   cone_angle_deg: number | null; axis_column_px: number | null
 };
+export type Ghost = { shown: boolean };
 export type HelloResult = {
   protocol: string; server: string; machine: string; profile: string | null; session: string | null;
   physics: string | null; rays: number | "auto" | null; instance: string | null
@@ -129,7 +130,8 @@ export type ImageFlags = {
 export type ImageOrigin = {
   sample: string | null; revision: string | null; material: string | null; offset: SamplePlacement;
   lit: boolean; kV: number; power_W: number; mode: string; exposure_ms: number; averages: number;
-  roi: [number, number, number, number]; correction: string | null
+  roi: [number, number, number, number]; correction: string | null; dataset: string | null;
+  index: number | null; file: string | null
 };
 export type ImageValue = { shape: Array<number>; data: string };
 export type JobAbort = { job?: string | null; reason?: string | null };
@@ -266,6 +268,7 @@ export type SubmitResult = {
   job: string; dataset: string | null; warnings: Array<string>
 };
 export type Theme = { dark?: boolean; fine?: boolean };
+export type Thumbnail = { name: string; index: number; side?: number };
 export type TransmissionShares = {
   least: number; p1: number; edges: Array<number>; shares: Array<number>
 };
@@ -331,7 +334,9 @@ export interface Methods {
   "viewer.plan": [Plan, object];
   "viewer.recorded": [Recorded, object];
   "viewer.recorded_image": [RecordedImage, object];
+  "viewer.thumbnail": [Thumbnail, object];
   "viewer.live": [Live, object];
+  "viewer.ghost": [Ghost, object];
   "viewer.block": [Block, object];
   "viewer.voxel": [Voxel, object];
   "viewer.compare": [Live, object];

@@ -3,10 +3,12 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { beliefWords } from "../../data/belief.js";
 import { decades } from "../../data/decades.js";
+import { estimates } from "../../data/estimate.js";
 import * as figures from "../../data/figures.js";
 import * as fp from "../../data/fingerprint.js";
 import * as job from "../../data/job_words.js";
 import * as meshes from "../../data/mesh_extent.js";
+import * as moments from "../../data/moment.js";
 import * as names from "../../data/names.js";
 import { across, outline } from "../../data/sample_outline.js";
 import * as signals from "../../data/signals.js";
@@ -84,8 +86,8 @@ test("a thing is compared in what it was made of alone", () => {
 test("what is of a data set is never of now", () => {
   const { state, cone } = drawn();
   const now = fp.ofNow(state, cone, HELLO);
-  const about = fp.about(fp.ofData("scan-3", 4), now);
-  assert.equal(fp.heading("Geometry", about), "Geometry of scan-3, image 5");
+  const about = fp.about(fp.ofData("scan-3", 4, "scan_000002"), now);
+  assert.equal(fp.heading("Geometry", about), "Geometry of scan-3, scan_000002");
   assert.equal(fp.heading("Geometry", fp.about(fp.ofData("scan-3"), now)), "Geometry of scan-3");
   assert.equal(fp.heading("Geometry", fp.about({}, now)), "Geometry now");
   assert.deepEqual(fp.differences(fp.ofData("scan-3", 4), now), ["dataset"]);
@@ -214,9 +216,10 @@ test("a scan's end names who asked and what stands elsewhere", () => {
   assert.equal(job.stateWords(ended, "Anna #3"), "aborted by you");
   assert.equal(job.whatWords(ended, state), "X-rays are off · rot_obj at 123.46°, began at 0.00°");
   assert.deepEqual(job.moved(ended, axes), [{ motor: "rot_obj", now: 123.456, start: 0 }]);
-  assert.equal(job.timeLeft(ended), "1 min 01 s");
+  assert.equal(job.timeLeft(ended, null), "1 min 01 s");
   const runs = { ...ended, state: "running", ended_by: null, remaining_s: 30, real_time_factor: 10 };
-  assert.equal(job.timeLeft(runs), "3 s left");
+  assert.equal(job.timeLeft(runs, 3), "3 s left");
+  assert.equal(job.timeLeft(runs, null), "");
   assert.equal(job.whatWords(runs, { ...state, projector: "no projector" }), "waits: no projector");
   assert.equal(job.isUnfinished({ state: "done" }), false);
   for (const end of ["failed", "aborted", "incomplete"]) assert.ok(job.isUnfinished({ state: end }));
@@ -332,4 +335,113 @@ test("the reader's own session is called you, and nobody else's", () => {
   assert.equal(names.toYou("E-stop by a visitor #81", "a visitor #8"), "E-stop by a visitor #81");
   assert.equal(names.toYou("E-stop by A+B. #3", "A+B. #3"), "E-stop by you");
   assert.equal(names.toYou("E-stop by Anna #2", null), "E-stop by Anna #2");
+});
+
+// A machine that turns, stands and is changed, whose images come late: an image is called old if
+// and only if it has not been true for longer than a second of the twin's clock, by a record of
+// the drawn history that the page does not see.
+test("an image's age is how long it has not been true, by the twin's clock", () => {
+  for (let history = 0; history < 300; history++) {
+    const told = [];
+    let pose = 0;
+    let time = 10 * random();
+    const age = moments.aging();
+    let image = null;
+    let waiting = [];
+    for (let k = 0; k < 60; k++) {
+      time += 2 * random();
+      if (random() < 0.5) pose += 1;
+      told.push({ time, pose });
+      waiting.push({ time_s: time, made: { pose: [pose] }, due: k + Math.floor(4 * random()) });
+      for (const one of waiting.filter((each) => each.due <= k)) {
+        if (!image || one.time_s > image.time_s) image = one;
+      }
+      waiting = waiting.filter((each) => each.due > k);
+      if (!image) continue;
+      const now = time + random();
+      const present = { made: { pose: [pose] }, told_s: time, time_s: now };
+      const { age_s, differ } = age(image, present);
+      const true_s = Math.max(
+        image.time_s,
+        ...told.filter((t) => t.pose === image.made.pose[0]).map((t) => t.time),
+      );
+      const fits = image.made.pose[0] === pose;
+      assert.equal(differ.length, fits ? 0 : 1);
+      // Seen only while it was shown: never younger than it is, and old only where it is.
+      assert.ok(fits ? age_s === 0 : age_s >= now - true_s - 1e-9);
+      assert.ok(fits || age_s <= now - image.time_s + 1e-9);
+    }
+  }
+});
+
+test("another run of the twin has no age, and what belongs nowhere is not shown", () => {
+  const present = { made: { twin: "b" }, told_s: 1, time_s: 1 };
+  assert.equal(moments.aging()({ made: { twin: "a" }, time_s: 900 }, present).age_s, Infinity);
+  const live = { dataset: null };
+  const five = { dataset: "x", frame: 5 };
+  const open = { kind: "image", dataset: "x", index: 5, missing: false };
+  const cases = [
+    [live, moments.NOW, true], [live, { kind: "plan", time_s: 3 }, true], [live, open, false],
+    [five, moments.NOW, false], [five, open, true], [five, { ...open, dataset: "y" }, false],
+    [five, { ...open, index: 6 }, true], [five, { ...open, index: 6, missing: true }, false],
+  ];
+  for (const [made, moment, wanted] of cases) assert.equal(moments.belongs(made, moment), wanted);
+  assert.equal(moments.clockNow({ time_s: 5, speed_up: 8, real_time_factor: null }, 0.5), 9);
+  assert.equal(moments.clockNow({ time_s: 5, speed_up: "max", real_time_factor: 20 }, 0.5), 15);
+});
+
+test("an image is found by the name of its file, also between those that were told", () => {
+  const all = [
+    ...Array.from({ length: 3 }, (_, k) => `di00000${k}.tif`),
+    ...Array.from({ length: 90 }, (_, k) => `scan_${String(k).padStart(6, "0")}.tif`),
+    ...Array.from({ length: 3 }, (_, k) => `io00000${k}.tif`),
+  ];
+  for (const every of [1, 4, 13]) {
+    const indices = all.map((_, k) => k).filter((k) => k % every === 0 || k === all.length - 1);
+    const told = { files: indices.map((k) => all[k]), indices, images: all.length };
+    all.forEach((file, k) => {
+      const found = moments.indexOf(moments.nameOf(file), told);
+      const known = indices.some((i) => i <= k && all[i].slice(0, 4) === file.slice(0, 4));
+      assert.equal(found, known ? k : null);
+    });
+    if (every === 1) assert.equal(moments.indexOf("scan_000090", told), null);
+    assert.equal(moments.indexOf("20", told), null);
+  }
+});
+
+// Scans whose images take as long as drawn here: evenly, with slow parts, with a pause.
+test("how long a scan takes is said only where it is nearly right", () => {
+  const even = { said: 0, off: 0 };
+  const uneven = { said: 0, off: 0 };
+  const always = { said: 0, off: 0 }; // of uneven ones, by the mean so far
+  for (let scan = 0; scan < 300; scan++) {
+    const left = estimates();
+    const total = 40 + Math.floor(200 * random());
+    const slow = random() < 0.5 ? 1 + 9 * random() : 1;
+    const from = random();
+    const kind = slow > 1 ? uneven : even;
+    const times = Array.from({ length: total }, (_, k) => {
+      const share = k / total;
+      return (0.8 + 0.4 * random()) * (share > from && share < from + 0.3 ? slow : 1);
+    });
+    const ends = times.reduce((all, t) => [...all, (all.at(-1) ?? 0) + t], []);
+    ends.forEach((now, k) => {
+      const status = { job: "a", state: "running", frames_done: k + 1, frames_total: total,
+        elapsed_s: 0, remaining_s: 1, speed_up: "max" };
+      const true_s = ends.at(-1) - now;
+      const wrong = (told) => Math.abs(told - true_s) > 2 + 0.5 * true_s;
+      if (slow > 1) {
+        always.said += 1;
+        always.off += wrong((now / (k + 1)) * (total - k - 1));
+      }
+      const told = left(status, now);
+      if (told === null) return;
+      kind.said += 1;
+      kind.off += wrong(told);
+    });
+  }
+  const share = ({ said, off }) => off / said;
+  assert.ok(even.said > 150 * 60 && share(even) === 0, JSON.stringify(even));
+  const told = JSON.stringify([uneven, always]);
+  assert.ok(uneven.said > 150 * 20 && uneven.off < 0.6 * always.off, told);
 });
