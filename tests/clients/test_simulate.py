@@ -567,9 +567,11 @@ def test_scatter_is_subtracted_from_a_scan_of_two_materials() -> None:
         for scatter in ("off", fine)
     ]
     assert not any(data.warnings for data in made)
-    given = {"voxel": 0.8, "shape": (3, 60, 60), "tube": tube}
+    given = {"voxel": 0.8, "shape": (3, 60, 60)}
     plain, scattered = (data.reconstruct(**given) for data in made)
-    corrected = made[1].reconstruct(scatter_correction=["pmma", "aluminium"], **given)
+    corrected = made[1].reconstruct(
+        scatter_correction=["pmma", "aluminium"], tube=tube, **given
+    )
     at = (np.arange(60) - 29.5) * 0.8
     y, x = np.meshgrid(at, at, indexing="ij")
     places = {

@@ -494,7 +494,7 @@ def test_the_machine_file_gives_a_measured_response(tmp_path: Path) -> None:
         ("[[20, 21], [300, 9]]", "at most the photon's energy, 20 keV"),
         ("[[20, 1], [20, 9]]", "at a higher energy than the point before, 20 keV"),
         ("[[20, 1], [30, 9]]", "measured up to the tube's max_kV"),
-        ("[[20, -1], [300, 9]]", "greater than or equal to 0"),
+        ("[[20, -1], [300, 9]]", "allowed: at least 0"),
         ("[[20]]", "response.0"),
     ],
 )
