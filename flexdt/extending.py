@@ -28,8 +28,8 @@ from flexdt.clients.cli.options import (
     argument,
     option,
 )
-from flexdt.library.extras import package
 from flexdt.library.failure import CommandError
+from flexdt.library.optional.extras import package
 from flexdt.library.reconstruction.volume_files import volume_writer
 from flexdt.message_words import problem_words
 from flexdt.runtime.files.dataset_folder import tiff_bytes

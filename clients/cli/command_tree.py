@@ -309,7 +309,7 @@ def found(name: str) -> Callable[..., Any] | None:
     `name` is a word or two, e.g. "job watch". An extension that cannot be imported raises
     its error.
     """
-    from flexdt.library.extras import offered
+    from flexdt.library.optional.extras import offered
 
     function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
     return function
@@ -323,7 +323,7 @@ def listed(name: str) -> Callable[..., None]:
     """
 
     def command(words: list[str] | None = argument(None, "...")) -> None:
-        from flexdt.library.extras import extension
+        from flexdt.library.optional.extras import extension
 
         extension(name.replace(" ", "."), f"`flexdt {name}`", GROUP)
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.gateway.connected_twin import ConnectedTwin
 from flexdt.library import machines
-from flexdt.library.extras import lacking
+from flexdt.library.optional.extras import lacking
 from flexdt.runtime.access import client_tls, read_token
 from flexdt.runtime.log import set_up
 from flexdt.runtime.process import (

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from typing import TextIO
 
-from flexdt.library.extras import lacking
+from flexdt.library.optional.extras import lacking
 from flexdt.runtime.access import PublicAddress, ViewerLimits, limit_names
 from flexdt.runtime.process import INVALID, REFUSED
 from flexdt.runtime.process_settings import (

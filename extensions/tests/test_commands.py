@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from flexdt.clients.cli.command_tree import GROUP, KNOWN, run
-from flexdt.library import extras
+from flexdt.library.optional import extras
 
 Run = Callable[..., tuple[int, str, str]]
 

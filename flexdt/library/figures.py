@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.extras import package
+from flexdt.library.optional.extras import package
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

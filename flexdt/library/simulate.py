@@ -480,7 +480,7 @@ def _of_scenario(
             "no geometry; allowed without one: the path of a CTSimU scenario, and noise",
             {"asked": None},
         )
-    from flexdt.library.extras import extension
+    from flexdt.library.optional.extras import extension
 
     scenario = extension("scenario", "a CTSimU scenario")
     made: DataSet = scenario(sample, noise, rays)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from flexdt.library.datasets.image_set import ImageSet
-from flexdt.library.extras import package
+from flexdt.library.optional.extras import package
 from flexdt.twin.exchange.number_tables import VECTOR_NAMES
 from flexdt.twin.projection.volume import Volume
 

@@ -11,7 +11,7 @@ Needs Hypothesis: `pip install 'flexdt[testing]'`.
 
 from __future__ import annotations
 
-from flexdt.library.extras import package
+from flexdt.library.optional.extras import package
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.description import (
     Machine,

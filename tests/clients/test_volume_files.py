@@ -193,10 +193,12 @@ def test_nifti_of_another_form_is_refused(tmp_path: Path, change: str) -> None:
 def test_zarr_without_the_extensions_says_how_to_install_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flexdt.library.extras.entry_points", lambda **named: ())
+    monkeypatch.setattr("flexdt.library.optional.extras.entry_points", lambda **named: ())
     (tmp_path / "v.zarr").mkdir()
     for use in (VOLUME.save, fx.Volume.load):
-        with pytest.raises(fx.TwinError, match=r"in \.zarr needs .*: pip install flexdt"):
+        with pytest.raises(
+            fx.TwinError, match=r"in \.zarr needs .*: pip install \./extensions"
+        ):
             use(tmp_path / "v.zarr")
     assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
 

@@ -364,7 +364,11 @@ def compare(
         The document of --json, then a table of residuals before and after. Raises
         CommandError above the tolerance, after the files are written.
     """
-    from flexdt.library.comparison import compare_folder, rows_of, write_comparison
+    from flexdt.library.comparison import (
+        compare_folder,
+        rows_of,
+        write_comparison,
+    )
     from flexdt.library.figures import require_plots
 
     if out is not None:

@@ -337,7 +337,7 @@ def _workers(
     Raises:
         TwinError: flexdt-extensions is not installed.
     """
-    from flexdt.library.extras import extension
+    from flexdt.library.optional.extras import extension
 
     if scheduler is None and slurm is None:
         return None

@@ -89,7 +89,7 @@ def follow(
                 "--frames needs --sample, and a folder that is there", USAGE
             )
         beside = (frames, FramesBeside(follower, as_phantom(sample), out))
-    from flexdt.library.extras import package
+    from flexdt.library.optional.extras import package
 
     zmq = package("zmq", "flexdt follow", "gateway")
     from flexdt.clients.following.listening import endpoint

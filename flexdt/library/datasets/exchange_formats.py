@@ -72,7 +72,7 @@ def _export_ctsimu(
     Raises:
         TwinError: flexdt-extensions is not installed.
     """
-    from flexdt.library.extras import extension
+    from flexdt.library.optional.extras import extension
     from flexdt.runtime.files.whole_files import write_whole
 
     scenario = extension("ctsimu.export", "the format ctsimu")(dataset, parameters, real)
@@ -87,7 +87,7 @@ def _read_ctsimu(path: Path, given: Given) -> ScanGeometry:
         ExchangeError: the file is no scenario.
     """
     from flexdt.library.datasets.geometry_content import text_of
-    from flexdt.library.extras import extension
+    from flexdt.library.optional.extras import extension
 
     read: Callable[..., ScanGeometry] = extension("ctsimu.import", "the format ctsimu")
     return read(text_of(path), str(path), lambda other: text_of(path.parent / other))

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.datasets.scan_options import Said
-from flexdt.library.extras import package
-from flexdt.library.hdf5_files import hdf5_file
+from flexdt.library.optional.extras import package
+from flexdt.library.optional.hdf5_files import hdf5_file
 from flexdt.runtime.files.dataset_folder import list_folder, read_values
 from flexdt.runtime.files.image_files import ImageHead, image_head
 from flexdt.runtime.files.image_meaning import MAX_IMAGE_BYTES

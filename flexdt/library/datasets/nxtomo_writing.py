@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from flexdt.library.datasets.image_set import ImageSet, references
-from flexdt.library.extras import package
+from flexdt.library.optional.extras import package
 from flexdt.runtime.files.whole_files import require_bytes, whole_file
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.physics.tube import tube_spectrum, voltages

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from flexdt.library.datasets.pictures import png_of
-from flexdt.library.extras import lacking, package
 from flexdt.library.notebook.notebook_pages import (
     NotebookPage,
     geometry_page,
     volume_page,
 )
 from flexdt.library.notebook.notebook_slices import AXES, grey_of, layer_of, window_of
+from flexdt.library.optional.extras import lacking, package
 from flexdt.runtime.progress import in_notebook
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
-from flexdt.library.extras import package
+from flexdt.library.optional.extras import package
 from flexdt.library.reading.zeiss_table import ZEISS
 from flexdt.runtime.files.reading_within import opened
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError

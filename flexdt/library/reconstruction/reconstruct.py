@@ -26,7 +26,7 @@ import numpy as np
 
 from flexdt.library.datasets.image_doubts import image_doubts
 from flexdt.library.datasets.image_set import ImageSet
-from flexdt.library.extras import extension
+from flexdt.library.optional.extras import extension
 from flexdt.library.reconstruction.bad_pixels import without_bad_pixels
 from flexdt.library.reconstruction.kept_images import (
     CountsOnce,

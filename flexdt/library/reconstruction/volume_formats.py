@@ -19,8 +19,8 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.extras import extension, package
-from flexdt.library.hdf5_files import hdf5_file
+from flexdt.library.optional.extras import extension, package
+from flexdt.library.optional.hdf5_files import hdf5_file
 from flexdt.twin.projection import Grid
 from flexdt.twin.projection.volume import edges_xyz
 

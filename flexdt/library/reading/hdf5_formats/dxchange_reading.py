@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flexdt.library.data_set import DataSet
 from flexdt.library.datasets.nxtomo_writing import DARK, FLAT, PROJECTION
-from flexdt.library.hdf5_files import hdf5_file
+from flexdt.library.optional.hdf5_files import hdf5_file
 from flexdt.library.reading.foreign_parsing import require_memory
 from flexdt.library.reading.hdf5_formats.dxchange_table import DATA_EXCHANGE, INSTRUMENT
 from flexdt.library.reading.hdf5_formats.hdf5_values import (

@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import faulthandler
 import os
-import signal
 import subprocess
 import sys
 import threading
-import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -21,13 +19,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from flexdt.library.extras import package
+from flexdt.library.optional.extras import package
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 
 SMALL_BYTES: Final = 1 << 20
 """Largest data set that is read whole on the way; of others three members are."""
-PATIENCE_S: Final = 60.0
-"""Time that a child has for a file of a healthy structure: it reads hardly any pixels."""
+PATIENCE_CPU_S: Final = 60
+"""Processor time that a child has: of a healthy file it reads hardly any pixels (assumed)."""
 MAX_SOUND: Final = 64
 """Files that are remembered as sound, by what a change of them changes."""
 FORKS: Final = sys.platform.startswith("linux")
@@ -85,25 +83,17 @@ def _survived_fork(path: Path, h5py: Any) -> bool:
             child = os.fork()
             if not child:
                 _end_as_child(path, h5py)
-    ends = time.monotonic() + PATIENCE_S
-    pause = 0.0005
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.WIFEXITED(status)
-        if time.monotonic() > ends:
-            with suppress(ProcessLookupError):
-                os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            return False
-        time.sleep(pause)
-        pause = min(2.0 * pause, 0.05)
+    _, status = os.waitpid(child, 0)
+    return os.WIFEXITED(status)
 
 
 def _end_as_child(path: Path, h5py: Any) -> None:
     """Walk through a file and end this process, whatever happens; nothing is printed."""
     try:
         faulthandler.disable()
+        import resource  # POSIX alone has it, and there alone is forked
+
+        resource.setrlimit(resource.RLIMIT_CPU, (PATIENCE_CPU_S, PATIENCE_CPU_S))
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
@@ -117,7 +107,7 @@ def _survived_program(path: Path, h5py: Any) -> bool:
     code = f"import h5py; from {__name__} import walk; walk({str(path)!r}, h5py)"
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, timeout=PATIENCE_S
+            [sys.executable, "-c", code], capture_output=True, timeout=PATIENCE_CPU_S
         )
     except subprocess.TimeoutExpired:
         return False

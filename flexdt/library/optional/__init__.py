@@ -1,0 +1,1 @@
+"""Optional packages: which extra brings one, and HDF5 files opened with h5py."""
