@@ -3,7 +3,7 @@ alone?
 
     python tests/studies/ring_scans.py --count 200 --seed 7
 
-Scans of `bias_bound.py` in whole turns, of the objects of `misfits.py`, with noise. Pixels, a
+Scans of `bias_bound.py` in whole turns, of several kinds of objects, with noise. Pixels, a
 few of them, or whole columns add normally distributed errors of none, .3, 1 or 3 % to all
 views. The root mean square error of uniform regions is compared: with the errors, and with them
 corrected, over that of the scan without errors.
@@ -19,7 +19,6 @@ import time
 from dataclasses import dataclass, replace
 
 import bias_bound
-import misfits
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -67,6 +66,43 @@ class Outcome:
         return self.corrected > MOST_WORSE * self.ringed
 
 
+def thing(scan: bias_bound.Scan, rng: np.random.Generator) -> bias_bound.Scan:
+    """The scan of one of several kinds of objects in the drawn one's place."""
+    body = scan.solids[0]
+    kind = str(
+        rng.choice(["drawn", "wires", "foam", "bottle", "bricks"], p=[0.4] + [0.15] * 4)
+    )
+    room = body.half
+
+    def part(
+        shape: str, at: np.ndarray, half: np.ndarray, times: float
+    ) -> bias_bound.Solid:
+        return bias_bound.Solid(
+            shape, at, half, float(rng.uniform(0.0, 3.0)), times * body.mu
+        )
+
+    if kind == "drawn":
+        return scan
+    if kind == "wires":
+        solids = [part("cylinder", np.append(rng.uniform(-0.5, 0.5, 2) * room[:2], 0.0),
+                       np.array([0.06, 0.06, 1.0]) * room, 8.0) for _ in range(6)]  # fmt: skip
+        return replace(scan, solids=[replace(body, mu=0.3 * body.mu), *solids])
+    if kind == "foam":
+        holes = [part("ellipsoid", rng.uniform(-0.5, 0.5, 3) * room,
+                      np.full(3, rng.uniform(0.1, 0.16)) * room.min(), -1.0)
+                 for _ in range(25)]  # fmt: skip
+        return replace(scan, solids=[body, *holes])
+    round_ = replace(
+        body, kind="cylinder", half=np.array([*np.full(2, 0.9 * room[:2].min()), room[2]])
+    )
+    if kind == "bottle":
+        inside = replace(round_, half=0.8 * round_.half, mu=-0.6 * body.mu)
+        return replace(scan, solids=[round_, inside])
+    bricks = [part("box", rng.uniform(-0.4, 0.4, 3) * room, rng.uniform(0.15, 0.3, 3) * room, 1.0)
+              for _ in range(5)]  # fmt: skip
+    return replace(scan, solids=[replace(body, mu=0.3 * body.mu), *bricks])
+
+
 def drawn(
     seed: int, number: int
 ) -> tuple[bias_bound.Scan, str, float, np.ndarray] | None:
@@ -76,7 +112,7 @@ def drawn(
     scan = bias_bound.drawn(seed, number)
     if not scan.said.startswith(("whole", "turns")) or " cut " in scan.said:
         return None
-    scan = misfits.thing(scan, rng)
+    scan = thing(scan, rng)
     scan = replace(scan, counts=float(10.0 ** rng.uniform(3.5, 5.5)), drift=0.0)
     gain, kind = float(rng.choice(GAINS)), str(rng.choice(KINDS))
     errors = gain * rng.normal(size=scan.shape)

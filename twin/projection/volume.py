@@ -30,18 +30,28 @@ WARNING_BOUND: Final = 0.03
 regions exceed it. The bound is two to four times the actual deviation: about 1 %."""
 CAUSES: Final = {
     "angles": "missing or few views",
-    "aside": "the narrow overlap of an offset panel",
+    "aside": "an offset panel's narrow overlap",
     "cone": "the cone angle",
-    "rows": "truncation above or below the panel's rows",
-    "beyond": "truncation at the panel's sides",
-    "drift": "an open beam beside the object that is not the flat field's",
+    "rows": "truncation above or below",
+    "beyond": "truncation at the sides",
+    "drift": "an open beam unlike the flat",
+    "axis": "the axis offset",
+    "slip": "a slip along the axis",
+    "height": "the panel's height",
+    "roll": "the panel's roll",
+    "pitch": "the panel's pitch",
+    "yaw": "the panel's yaw",
+    "distance": "the panel's distance",
+    "turn": "the angle scale",
+    "lost": "lost or doubled views",
+    "gain": "the gain of views",
+    "curve": "beam hardening, scatter or haze",
+    "lens": "lens distortion",
+    "images": "images that no object explains",
+    "geometry": "what images leave open",
     "stopping": "iterations that ended early",
     "penalty": "the penalty of the total variation",
 }
-GRANTED: Final = (
-    "taken for granted: the geometry, as far as images do not contradict it, and line "
-    "integrals without beam hardening and scatter"
-)
 NOT_BOUNDED: Final = (
     "accuracy: not bounded, because the object extends beyond the panel's sides: "
     "a denser shell out there makes every value too low, and no image shows it"
@@ -65,31 +75,35 @@ class Accuracy:
         half: of the attenuation there, in half of them at most: the figure by which
             volumes are compared.
         most: in nine of ten at most.
-        cause: main contribution to the others: angles, aside, cone, rows, beyond or
-            drift.
+        cause: main contribution to the others, of `CAUSES`.
         cut_off: the object continues beyond the panel's sides: the figures are estimates,
             not bounds.
+        figure: size of the cause with its standard error, where the images tell one.
+        taken: what is taken as stated, because the images do not decide it.
     """
 
     half: float
     most: float
     cause: str
     cut_off: bool = False
+    figure: str = ""
+    taken: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return the accuracy sentence: largest errors [%] in nine of ten and in half of
-        the uniform regions, and their largest cause; that none is bounded if the
-        object is cut off. See docs/glossary.md.
+        the uniform regions, their largest cause, and what they are conditional on; that
+        none is bounded if the object is cut off. See docs/glossary.md.
         """
         if self.cut_off:
-            return f"{NOT_BOUNDED}; {GRANTED}"
+            return NOT_BOUNDED
         half, most = (
             f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most)
         )
+        figure = f" ({self.figure})" if self.figure else ""
+        taken = f"; if {', '.join(self.taken)} are as stated" if self.taken else ""
         return (
-            f"accuracy: within {most} in nine of ten uniform regions and {half} "
-            "in half of them (noise not included); largest cause: "
-            f"{CAUSES[self.cause]}; {GRANTED}"
+            f"accuracy: within {most} in nine of ten uniform regions ({half} in half), "
+            f"mainly {CAUSES[self.cause]}{figure}{taken}"
         )
 
     @property

@@ -11,8 +11,8 @@ voxel's bound is what all of them come to about it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Container, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Final
@@ -33,23 +33,25 @@ from flexdt.twin.reconstruction.coarse_scan import (
     ScanCopies,
 )
 from flexdt.twin.reconstruction.consistency.agreement import (
-    MIN_DOUBTED_MISFIT,
-    SMOOTH_CHANGE_SHARE,
-    Comparison,
+    Agreement,
     Contradiction,
-    Undetermined,
-    compared,
-    first_look,
-    in_doubt,
-    still_misfits,
-    too_few,
+    agreement_of,
+    looked_at,
 )
-from flexdt.twin.reconstruction.uniform_nodes import MIN_EVENNESS, UniformNodes
+from flexdt.twin.reconstruction.consistency.cause_table import Finding
+from flexdt.twin.reconstruction.consistency.suspects import SIDES, suspects
+from flexdt.twin.reconstruction.uniform_nodes import (
+    MIN_EVENNESS,
+    UniformNodes,
+    smoothed,
+)
 from flexdt.twin.reconstruction.volume_errors import interpolated
 from flexdt.twin.reconstruction.volume_residuals import residuals_of
 
-SAFETY_FACTOR: Final = 1.0 / SMOOTH_CHANGE_SHARE
+SAFETY_FACTOR: Final = 3.0
 """Factor of the bound, which makes up for what the smooth coarse volume does not show."""
+SIGMAS: Final = 2.0
+"""Standard errors within which an error may be larger, or another be."""
 PRISM_ERROR_SHARE: Final = 0.15
 """Share of a prism's part beyond the edges that may be wrong if it explains the
 images."""
@@ -68,6 +70,16 @@ USUAL_SHARE: Final = {
 """Cause -> share of its bound that half of a scan's uniform regions stay below. Causes
 that reach their bound in narrow places have small ones
 (`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
+STATED: Final = {
+    "axis": "axis",
+    "distance": "distances",
+    "turn": "angles",
+    "lost": "angles",
+    "slip": "axis",
+    "curve": "spectrum",
+    "gain": "beam",
+}
+"""Error -> what is taken as stated where images do not decide on it; others by their names."""
 ALL_CAUSES: Final = frozenset(USUAL_SHARE)
 """All causes."""
 STREAK_ROWS: Final = 6
@@ -87,24 +99,25 @@ class Bias:
         even: weights of its nodes, little where values change fast and where some views
             do not see them, (nz, ny, nx).
         inside: nodes of the object, (nz, ny, nx).
-        causes: angles, aside, cone, rows, beyond or drift -> its largest change [1/mm],
+        causes: of `flexdt.twin.projection.volume.CAUSES` -> its largest change [1/mm],
             (nz, ny, nx).
-        contradiction: between images and geometry, or the reason why none would be seen,
-            with which nothing is bounded.
-        widening: factor of all causes, of images that fit less well than usual.
+        contradiction: between images and geometry, with which nothing is bounded.
+        figures: cause -> its size, in words.
+        taken: what is taken as stated, because the images do not decide it.
     """
 
     found: Volume
     even: FloatArray
     inside: npt.NDArray[np.bool_]
     causes: dict[str, FloatArray]
-    contradiction: Contradiction | Undetermined | None = None
-    widening: float = 1.0
+    contradiction: Contradiction | None = None
+    figures: Mapping[str, str] = field(default_factory=dict)
+    taken: tuple[str, ...] = ()
 
     @cached_property
     def total(self) -> Float32Array:
         """Bound at the nodes [1/mm]."""
-        flaws = self.widening * np.sum(list(self.causes.values()), axis=0)
+        flaws = np.sum(list(self.causes.values()), axis=0)
         return np.asarray(FDK_ERROR_SHARE * np.abs(self.found.data) + flaws, np.float32)
 
     def bound(self, grid: Volume) -> Float32Array | None:
@@ -151,15 +164,15 @@ class Bias:
             inside &= self.even > MIN_EVENNESS
         if not inside.any():
             return None
-        share = self.widening / value[inside]
-        off = {cause: share * flaw[inside] for cause, flaw in self.causes.items()}
+        off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
         most = float(np.percentile(self.total[inside] / value[inside], 90.0))
         usual = USUAL_FLOOR + sum(
-            USUAL_SHARE[cause] * part for cause, part in off.items()
+            USUAL_SHARE.get(cause, 1.0) * part for cause, part in off.items()
         )
         half = min(float(np.median(usual)), most)
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
-        return Accuracy(half, most, worst, "beyond" in off)
+        figure = self.figures.get(worst, "")
+        return Accuracy(half, most, worst, "beyond" in off, figure, self.taken)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong: a contradiction, or large errors."""
@@ -186,16 +199,13 @@ def too_coarse(grid: Grid | Volume, nodes: Volume) -> bool:
 class BiasOnDemand:
     """Possible errors of FDK's volume of a scan, from coarse copies of it.
 
-    Whether images and geometry contradict each other is looked at when this is made, in
-    the stated geometry alone; other geometries are tried at once only where that leaves a
+    Whether images and geometry agree is looked at when this is made, in the stated geometry
+    alone; errors and other geometries are looked for at once only where that leaves a
     doubt. All else is found when it is asked for, and then kept.
 
     Args:
         copied: makes a coarse copy of the whole scan, of so many nodes.
         sides_known: beads have told the direction of rotation and mirrored images.
-
-    Attributes:
-        contradiction: that was found at once; None without one.
 
     Raises:
         GeometryError: a coarse copy cannot be reconstructed.
@@ -207,12 +217,8 @@ class BiasOnDemand:
         """Look at the scan once; see the class."""
         self._copied = copied
         self._sides_known = sides_known
-        self._trial = first_look(copied(NODES))
-        self.contradiction: Contradiction | None = None
-        trial = self._trial
-        self._doubtful = trial is not None and in_doubt(trial, MIN_DOUBTED_MISFIT)
-        if self._doubtful:
-            self.contradiction = self._contradicted
+        look = looked_at(copied(FINE_NODES))
+        self._doubtful = look is not None and look.doubtful
 
     @classmethod
     def of(
@@ -241,24 +247,23 @@ class BiasOnDemand:
     def bias(self) -> Bias:
         """The errors, cause by cause.
 
-        If images and geometry contradict each other, nothing else is bounded; a misfit
-        that nothing explains must be there on a finer copy, too. Bounds are
-        `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing
-        angles, the rungs of `ladder`, another continuation of truncated rows ("beyond"),
-        or for complete rows their level beside the object ("drift"). A whole scan whose
-        images fit another geometry as well, also those of a finer copy, or do not show
-        whether they fit their own, has a contradiction besides its causes.
+        If the images fit another geometry better, nothing is bounded. Bounds are
+        `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
+        the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
+        complete rows their level beside the object ("drift"). Errors that the images tell
+        change it by their size and `SIGMAS` standard errors. What they leave open is bounded
+        together ("geometry"), but what would change the volume by more than all that is
+        taken as stated, and named.
         """
-        if self._contradicted is not None:
-            scan = self._copied(NODES)
-            values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
-            nodes = UniformNodes.of(values, scan.rim)
-            found = scan.grid.like(nodes.found)
-            return Bias(found, nodes.even, nodes.inside, {}, self._contradicted)
-        bias = self._bounded
-        if self._comparison is not None:
-            bias = replace(bias, widening=self._comparison.widening)
-        return replace(bias, contradiction=self._undecided(bias))
+        bounded = self._told
+        if bounded.contradiction is not None:
+            return bounded
+        accuracy = bounded.accuracy(bounded.found)
+        if accuracy is None or accuracy.cut_off:
+            return bounded
+        if not self._agreement.compared:
+            return replace(bounded, taken=("geometry",))
+        return self._open(bounded, accuracy.most)
 
     def bound(self, grid: Volume) -> Float32Array | None:
         """Compute the bound of the error at each voxel of a grid; see `Bias.bound`."""
@@ -271,23 +276,18 @@ class BiasOnDemand:
         return self.bias.accuracy(grid)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
-        """List what is wrong at first sight: a contradiction, too few views to find one,
-        or large errors by the trajectory and the panel's edges. Those are not looked for
-        in a scan that fits and is `CoarseScan.easy`; of one that has few views, but is
-        easy otherwise, only what few views do to some of its rows.
+        """List what is wrong at first sight: another geometry that fits better, or large
+        errors by the trajectory and the panel's edges. Those are not looked for in a scan
+        that fits and is `CoarseScan.easy`; of one that has few views, but is easy otherwise,
+        only what few views do to some of its rows.
 
         Args:
             grid: of the volume.
         """
-        if self.contradiction is not None:
-            return [str(self.contradiction)]
+        if self._doubtful:
+            return self._told.warnings(grid)
         scan = self._copied(NODES)
-        trial = self._trial
-        if (trial is not None and not trial.telling.any()) or too_few(scan):
-            self.accuracy(grid)
-            if self.bias.contradiction is not None:
-                return [str(self.bias.contradiction)]
-        if not scan.easy or self._doubtful:
+        if not scan.easy:
             return self._bounded.warnings(grid)
         if scan.sparse:
             thin = scan.thinned(all_views=True, least_rows=STREAK_ROWS)
@@ -309,45 +309,84 @@ class BiasOnDemand:
         return _bounded(self._copied(NODES))
 
     @cached_property
-    def _comparison(self) -> Comparison | None:
-        """The images, compared with other geometries."""
-        if self._trial is None:
-            return None
-        return compared(self._copied(NODES), self._trial)
+    def _agreement(self) -> Agreement:
+        """The images, compared with the stated geometry and others."""
+        return agreement_of(self._copied(FINE_NODES), sides_known=self._sides_known)
 
     @cached_property
-    def _contradicted(self) -> Contradiction | None:
-        """What contradicts, if a misfit alone does not, or does on a finer copy, too."""
-        if self._comparison is None:
-            return None
-        found = self._comparison.contradiction()
-        return _confirmed(found, self._copied(NODES), self._copied)
+    def _told(self) -> Bias:
+        """The errors, with those that the images tell."""
+        found = self._agreement
+        if found.contradiction is not None:
+            scan = self._copied(NODES)
+            nodes = UniformNodes.of(scan.fdk(scan.images, scan.cone_vec), scan.rim)
+            blank = scan.grid.like(nodes.found)
+            return Bias(blank, nodes.even, nodes.inside, {}, found.contradiction)
+        bounded = self._bounded
+        causes = dict(bounded.causes)
+        figures = {}
+        for one in found.findings:
+            if one.told:
+                change = self._changed(one, one.size)
+                more = 1.0 + SIGMAS * one.sigma / abs(one.size)
+                name = one.cause.name
+                causes[name] = causes.get(name, 0.0) + more * _about(change, bounded.even)
+                figures[name] = one.figure
+        if found.unexplained:
+            causes["images"] = found.unexplained * np.abs(bounded.found.data)
+        return replace(bounded, causes=causes, figures=figures)
 
-    def _undecided(self, bias: Bias) -> Contradiction | Undetermined | None:
-        """Find geometries that images do not exclude, or why they exclude none.
+    def _changed(self, one: Finding, size: float) -> Float32Array:
+        """Compute the change of the coarse volume by an error of a size, (nz, ny, nx)."""
+        scan = self._copied(NODES)
+        if one.cause.unit == "px":
+            size /= scan.binned[0 if one.cause.name in ("height", "slip") else 1]
+        images, views = one.cause.corrected(
+            scan.images, scan.cone_vec, size * one.course(scan.share)
+        )
+        return self._moved(images, views)
+
+    def _moved(self, images: Float32Array, views: ConeVec) -> Float32Array:
+        """Compute the change of the coarse volume with other images or another geometry."""
+        scan = self._copied(NODES)
+        other = np.nan_to_num(scan.fdk(images, views, scan.truncation))
+        return np.asarray(other - self._volume, np.float32)
+
+    @cached_property
+    def _volume(self) -> Float32Array:
+        """The coarse volume, 0 where no data cover it."""
+        scan = self._copied(NODES)
+        return np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, scan.truncation))
+
+    def _open(self, bounded: Bias, claimed: float) -> Bias:
+        """Add what the images leave open.
 
         Args:
-            bias: with its causes.
+            bounded: the errors without it.
+            claimed: relative error of nine of ten uniform regions by these.
         """
         scan = self._copied(NODES)
-        comparison = self._comparison
-        sides_known = self._sides_known
-        accuracy = bias.accuracy(bias.found)
-        if accuracy is None or accuracy.cut_off:
-            return None
-        if too_few(scan):
-            return Undetermined(np.inf)
-        if comparison is None:
-            return None
-        if (undetermined := comparison.undetermined) is not None:
-            return undetermined
-        undecided = comparison.undecided(accuracy.most, sides_known=sides_known)
-        if undecided is not None and undecided.finer_copy_decides:
-            fine = self._copied(FINE_NODES)
-            if fine.binned != scan.binned:
-                closer = comparison.finer(undecided, fine)
-                undecided = closer.undecided(accuracy.most, sides_known=sides_known)
-        return undecided
+        nodes = UniformNodes.of(self._volume, scan.rim)
+        taken = ["distances"]
+        squares = np.zeros(scan.grid.shape)
+        for one in self._agreement.findings:
+            if one.told or one.cause.nuisance:
+                continue
+            change = _about(self._changed(one, SIGMAS * one.sigma), bounded.even)
+            if nodes.change(nodes.found + change.astype(np.float32)) > claimed:
+                taken.append(STATED.get(one.cause.name, one.cause.name))
+            else:
+                squares += np.square(change)
+        kinds = [one for one in suspects(scan) if one.kind in self._agreement.open]
+        for suspect in kinds:
+            try:
+                change = self._moved(suspect.images, suspect.cone_vec)
+            except GeometryError:
+                continue
+            if nodes.change(nodes.found + smoothed(change)) > claimed:
+                taken.append("rotation" if suspect.kind in SIDES else "order")
+        causes = {**bounded.causes, "geometry": np.sqrt(squares)}
+        return replace(bounded, causes=causes, taken=tuple(dict.fromkeys(taken)))
 
 
 class BiasOfIterations(BiasOnDemand):
@@ -440,20 +479,6 @@ def copies_of(
         return None
     copies.truncation = truncation
     return copies
-
-
-def _confirmed(
-    seen: Contradiction | None, scan: CoarseScan, copied: Callable[[int], CoarseScan]
-) -> Contradiction | None:
-    """Return a contradiction of a coarse copy; None if there is none, or if a misfit
-    alone tells it and a finer copy has none.
-    """
-    if seen is None or not seen.by_misfit_alone:
-        return seen
-    finer = copied(FINE_NODES)
-    if finer.binned != scan.binned and not still_misfits(finer):
-        return None
-    return seen
 
 
 def _bounded(scan: CoarseScan, only: Container[str] = ALL_CAUSES) -> Bias:

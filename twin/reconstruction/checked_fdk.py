@@ -198,7 +198,7 @@ def bias_warnings(bias: BiasOnDemand | Bias | None, grid: Grid | Volume) -> list
             "accuracy is not known: a coarse copy of the scan, by which it is found, "
             "cannot be reconstructed"
         ]
-    if bias.contradiction is None and too_coarse(grid, bias.found):
+    if too_coarse(grid, bias.found):
         edge = float(np.max(grid.voxel_mm))
         return [
             f"accuracy is not known: voxels of {edge:g} mm are too large to hold a "

@@ -196,6 +196,11 @@ class CoarseScan:
             return 1.0
         return max(1.0, float(np.ptp(self.circle.angle)) / (2.0 * np.pi))
 
+    @property
+    def share(self) -> FloatArray:
+        """Share of the scan before each view, (n,), 0 to 1; views are in order of angle."""
+        return np.asarray(self.numbers / max(float(self.numbers.max()), 1.0))
+
     @cached_property
     def seen_rows(self) -> npt.NDArray[np.bool_] | None:
         """Mark the rows of a helix whose rays stay among the layers that FDK gives values

@@ -15,9 +15,9 @@ from flexdt.twin import long_work
 from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.long_work import Progress
-from flexdt.twin.reconstruction.consistency.agreement import MAX_MISFIT
 from flexdt.twin.reconstruction.consistency.peer_conventions import (
     CHANGES,
+    MAX_MISFIT,
     Fit,
     changed,
     fits,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import shift
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.projection import Grid
@@ -14,25 +13,9 @@ from flexdt.twin.reconstruction.acquisition.truncation import Prism
 from flexdt.twin.reconstruction.consistency.reprojection import (
     ARCS,
     Reprojection,
-    shifted_back,
 )
 from flexdt.twin.reconstruction.feldkamp import fdk_plan
 from flexdt.twin.reconstruction.white_noise import MEDIAN_OF_SQUARES, noise_of
-
-
-@pytest.mark.parametrize("size", [0.4, 4.0, 40.0])
-@pytest.mark.parametrize("shape", [(30, 16, 32), (12, 5, 13), (9, 1, 32)])
-def test_shifts_are_those_of_scipy(size: float, shape: tuple[int, int, int]) -> None:
-    rng = np.random.default_rng(5)
-    images = rng.random(shape).astype(np.float32)
-    shifts = rng.normal(0.0, size, (shape[0], 2))
-    if shape[1] == 1:
-        shifts[:, 1] = 0.0
-    each = [
-        shift(image, (-up, -left), order=3, mode="nearest")
-        for image, (left, up) in zip(images, shifts, strict=True)
-    ]
-    assert np.abs(shifted_back(images, shifts) - each).max() < 1e-6
 
 
 @pytest.mark.parametrize("shape", [(12, 6, 9), (13, 6, 9), (12, 1, 9), (61, 16, 32)])

@@ -22,16 +22,11 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
 from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, NODES, CoarseScan
-from flexdt.twin.reconstruction.consistency.agreement import MAX_MISFIT, too_few
 from flexdt.twin.reconstruction.consistency.reprojection import (
     Reprojection,
     layers_off,
 )
 from flexdt.twin.reconstruction.consistency.suspects import moved
-from flexdt.twin.reconstruction.consistency.trials import (
-    MAX_RELIABLE_RESIDUAL,
-    MIN_SIGNAL_SHARE,
-)
 from flexdt.twin.reconstruction.white_noise import noise_of
 
 CHANGES: Final = {
@@ -42,6 +37,17 @@ CHANGES: Final = {
     "height": "the panel's offset along columns has the other sign",
 }
 """Change of a geometry -> its description."""
+MAX_MISFIT: Final = 2.5
+"""Largest residual of a right combination, over that of the volume's second reconstruction: of
+127 right scans half had 1.4 and more, 1 % 2.25, and one 2.52."""
+MAX_RELIABLE_RESIDUAL: Final = 0.3
+"""Residual of the second reconstruction, over the images, below which it is reliable."""
+MIN_SIGNAL_SHARE: Final = 0.01
+"""Share of a residual that is never attributed to noise."""
+MIN_VIEWS: Final = 12
+"""Least number of views and coarse columns; with fewer a volume fits anything."""
+MIN_SEEN_SHARE: Final = 0.1
+"""Least share of a helix's rows that are compared, of an object that goes on beyond it."""
 MAX_WRONG: Final = 0.01
 """Largest probability that a combination is named and another one is right."""
 SAME: Final = 1e-6
@@ -355,3 +361,13 @@ def remaining(found: list[Fit]) -> Iterator[Fit]:
     if not found or found[0].arcs is None or found[0].misfit > MAX_MISFIT:
         return
     yield from (fit for fit in found if fit.odds >= level_of(found))
+
+
+def too_few(scan: CoarseScan) -> bool:
+    """Return whether a scan has fewer than `MIN_VIEWS` views or columns, or a helix too few
+    rows that see only what is reconstructed (`MIN_SEEN_SHARE`).
+    """
+    rows = scan.seen_rows
+    if rows is not None and float(rows.mean()) < MIN_SEEN_SHARE:
+        return True
+    return bool(min(len(scan.circle.step), scan.images.shape[2]) < MIN_VIEWS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
-from flexdt.twin.reconstruction.consistency.suspects import moved
 from flexdt.twin.reconstruction.white_noise import noise_of
 
 ARCS = 12
@@ -21,10 +20,6 @@ NOISE_VARIANCE_RATIO = 1.5
 """Variance of noise relative to the estimate by its median: few photons deviate more."""
 NOISE_OF_CHANGES = np.array([1.0, 0.25])
 """Variance of white noise in the values, and in their changes, over that in the values."""
-SPLINE_MARGIN = 12
-"""Values that repeat the end of a line before it is interpolated by splines."""
-MAX_KEPT_SIZES = 8
-"""Lengths of lines whose spline coefficients are remembered."""
 MIN_SIGNAL_SHARE = 0.3
 """Share of a residual that is kept whatever the noise, so that of two in much noise
 none is far better than the other."""
@@ -59,7 +54,6 @@ class Reprojection:
         images: Float32Array,
         cone_vec: ConeVec,
         truncation: Truncation | None,
-        shifts: FloatArray | None = None,
         noise: float | None = None,
     ) -> Reprojection | None:
         """Reconstruct images as of a geometry, and project the volume again coarsely; NaN
@@ -72,26 +66,21 @@ class Reprojection:
             images: (n, rows, cols).
             cone_vec: n views.
             truncation: object beyond their edges, or None.
-            shifts: (n, 2) by which each image is to the right and below [pixels]: images
-                are shifted back before the reconstruction, and its projections shifted as
-                the images; None for none.
             noise: variance of white noise in the images; None: estimated.
 
         Returns:
             None where FDK cannot use the geometry.
         """
-        straight = images if shifts is None else shifted_back(images, shifts)
         layers = layers_off(scan, cone_vec)
         if layers:
             up_mm = [0.0, 0.0, layers * scan.grid.voxel_xyz[2]]
             cone_vec = cone_vec.moved(np.eye(3), up_mm)
         try:
-            values = scan.fdk(straight, cone_vec, truncation)
+            values = scan.fdk(images, cone_vec, truncation)
         except GeometryError:
             return None
         shape = (images.shape[1], images.shape[2])
-        seen_from = cone_vec if shifts is None else moved(cone_vec, *-shifts.T)
-        again = scan.projected(np.nan_to_num(values), seen_from, shape, fine=False)
+        again = scan.projected(np.nan_to_num(values), cone_vec, shape, fine=False)
         if layers:
             values = lowered(values, layers)
         if noise is None:
@@ -147,15 +136,6 @@ class Reprojection:
         return rest, _changes(rest)
 
     @cached_property
-    def centroid_variance(self) -> float:
-        """Variance of the centroids of images along rows by their noise [pixels^2]."""
-        count, rows, cols = self.images.shape
-        along = np.arange(cols) - 0.5 * (cols - 1)
-        mass = float(np.maximum(self.images, 0.0).sum(dtype=np.float64)) / count
-        spread = rows * float(np.square(along).sum())
-        return float(self._noise * spread / max(mass**2, np.finfo(np.float64).tiny))
-
-    @cached_property
     def _powers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean squares (2,) of residual, images and noise: first of the values, then of
         their changes along rows. Noise is the images' less the reprojection's, at least
@@ -208,59 +188,6 @@ def lowered(values: Float32Array, layers: float) -> Float32Array:
         beside = np.concatenate([values[:1], values[:-1]])
     share = np.float32(abs(layers))
     return np.asarray((1.0 - share) * values + share * beside, np.float32)
-
-
-def shifted_back(images: Float32Array, shifts: FloatArray) -> Float32Array:
-    """Shift images to the left and up, by cubic splines; pixels beyond an edge repeat the
-    edge's.
-
-    Args:
-        images: (n, rows, cols).
-        shifts: (n, 2) to the left and up [pixels].
-    """
-    rows, cols = images.shape[1:]
-    down = _interpolation(shifts[:, 1], rows)
-    across = _interpolation(shifts[:, 0], cols)
-    back = down @ images.astype(np.float64) @ across.transpose(0, 2, 1)
-    return np.asarray(back, np.float32)
-
-
-def _interpolation(shifts: FloatArray, size: int) -> FloatArray:
-    """Compute the matrices that shift lines of `size` values towards their first, as
-    `scipy.ndimage.shift` does by cubic splines and repeated ends, image by image.
-
-    Args:
-        shifts: (n,) [values].
-        size: of a line.
-
-    Returns:
-        (n, size, size): each new value's shares of the line's.
-    """
-    coefficients = _spline_coefficients(size)
-    last = len(coefficients) - 1
-    at = SPLINE_MARGIN + np.arange(size) + shifts[:, None]
-    at = np.clip(at, 0.0, last)
-    first = np.floor(at)
-    t = at - first
-    s = 1.0 - t
-    shares = s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3
-    line, place = np.indices(at.shape)
-    weights = np.zeros((*at.shape, last + 1))
-    for step, share in enumerate(shares, -1):
-        index = np.abs(first.astype(np.intp) + step)
-        weights[line, place, last - np.abs(last - index)] += share / 6.0
-    return np.asarray(weights @ coefficients)
-
-
-@lru_cache(MAX_KEPT_SIZES)
-def _spline_coefficients(size: int) -> FloatArray:
-    """Compute the coefficients of cubic splines through lines whose values are 0 but for one, and
-    whose ends are repeated `SPLINE_MARGIN` times, (size + 2 `SPLINE_MARGIN`, size).
-    """
-    from scipy.ndimage import spline_filter1d
-
-    lines = np.pad(np.eye(size), ((SPLINE_MARGIN, SPLINE_MARGIN), (0, 0)), "edge")
-    return np.asarray(spline_filter1d(lines, 3, axis=0, mode="nearest"))
 
 
 def _sums_of_squares(images: Float32Array) -> FloatArray:

@@ -24,8 +24,6 @@ pixels]."""
 KINDS: Final = {
     "direction": "the rotation runs the other way",
     "columns": "images are mirrored left to right",
-    "rows": "images are mirrored top to bottom",
-    "turned": "images are turned by 180 degrees",
     "listed": "images are in the order of their angles",
     "interlaced": "the scan was interlaced, its images in the order of exposure:",
     "reversed": "images are in the reverse order",
@@ -33,13 +31,10 @@ KINDS: Final = {
     "span": "the views span",
     "sign": "the panel is offset to the other side",
     "middle": "the panel has no offset",
-    "height": "the panel's offset along the axis has the other sign",
-    "offset": "the panel, or the axis, is moved:",
-    "movement": "object or scanner moved between views:",
 }
 """Kind of error -> its description."""
 
-SIDES: Final = ("direction", "columns", "rows", "turned")
+SIDES: Final = ("direction", "columns")
 """Kinds that mirror the object or its motion, which beads of known places exclude."""
 
 
@@ -52,15 +47,12 @@ class Suspect:
         images: (n, rows, cols).
         cone_vec: n views.
         figure: the right value, in words; "" if the kind is enough.
-        shifts: (n, 2) by which each image is to the right and below [coarse pixels], or
-            None. Images are shifted back before they are reconstructed.
     """
 
     kind: str
     images: Float32Array
     cone_vec: ConeVec
     figure: str = ""
-    shifts: FloatArray | None = None
 
 
 def reversed_turn(scan: CoarseScan) -> Suspect:
@@ -69,41 +61,23 @@ def reversed_turn(scan: CoarseScan) -> Suspect:
     return Suspect("direction", scan.images, turned(scan, turn))
 
 
-def suspects(scan: CoarseScan, *, whole: bool) -> Iterator[Suspect]:
-    """Yield all suspects except the reversed rotation and other distances of the panel.
+def suspects(scan: CoarseScan) -> Iterator[Suspect]:
+    """Yield the scan as it would be with each error: the rotation reversed, images mirrored
+    left to right, the panel on the other side or without offset, if it has one (above
+    `CENTRE_TOLERANCE`), other orders and spans.
 
     Args:
-        scan: coarse.
-        whole: the panel sees the complete object; if not, only mirrored columns, a panel
-            offset to the other side and one without offset are suspected, which make an
-            object seem cut off.
-
-    Yields:
-        Mirrored columns (of a truncated scan only with an offset), offsets along rows if
-        above `CENTRE_TOLERANCE`; for a whole scan also mirrored rows, both mirrored,
-        other orders and spans, and the opposite offset along columns if above it. Images
-        are mirrored about the middle of the panel with `CoarseScan.rest`.
+        scan: coarse; images are mirrored about the middle of the panel with its `rest`.
     """
-    images = scan.images
-    cone_vec = scan.cone_vec
-    below, beside = scan.rest
-    aside, above = _axis_from_middle(scan)
-    offset = abs(aside) > CENTRE_TOLERANCE
-    if whole or offset:
-        mirrored = moved(cone_vec, beside)
-        yield Suspect("columns", np.ascontiguousarray(images[:, :, ::-1]), mirrored)
-    if offset:
+    images, cone_vec = scan.images, scan.cone_vec
+    yield reversed_turn(scan)
+    mirrored = moved(cone_vec, scan.rest[1])
+    yield Suspect("columns", np.ascontiguousarray(images[:, :, ::-1]), mirrored)
+    aside = _axis_from_middle(scan)
+    if abs(aside) > CENTRE_TOLERANCE:
         yield Suspect("sign", images, moved(cone_vec, 2.0 * aside))
         yield Suspect("middle", images, moved(cone_vec, aside))
-    if not whole:
-        return
-    upside_down = moved(cone_vec, 0.0, below)
-    yield Suspect("rows", np.ascontiguousarray(images[:, ::-1]), upside_down)
-    turned_panel = moved(cone_vec, beside, below)
-    yield Suspect("turned", np.ascontiguousarray(images[:, ::-1, ::-1]), turned_panel)
     yield from _orders(scan)
-    if abs(above) > CENTRE_TOLERANCE:
-        yield Suspect("height", images, moved(cone_vec, 0.0, 2.0 * above))
 
 
 def turned(scan: CoarseScan, turn: FloatArray, *, rising: bool = False) -> ConeVec:
@@ -161,23 +135,6 @@ def moved(
     return ConeVec.from_vectors(cone_vec.source, panel, cone_vec.u, cone_vec.v)
 
 
-def shifts_of(scan: CoarseScan, suspect: Suspect) -> FloatArray:
-    """Compute the shifts of images to the right and below that a panel at another place
-    makes, (n, 2) [coarse pixels].
-
-    Args:
-        scan: coarse, n views.
-        suspect: the same images, and each panel moved in its plane.
-    """
-    stated = scan.cone_vec
-    step = suspect.cone_vec.detector - stated.detector
-    along, down = (
-        (step * axis).sum(axis=1) / np.square(axis).sum(axis=1)
-        for axis in (stated.u, stated.v)
-    )
-    return -np.column_stack([along, down])
-
-
 def _orders(scan: CoarseScan) -> Iterator[Suspect]:
     """Yield suspected scans whose images belong to other angles: in another order
     (`_permutations`), then over half and twice the span; each with the same images and
@@ -229,24 +186,18 @@ def _permutations(angle: FloatArray) -> Iterator[tuple[str, npt.NDArray[np.intp]
     yield "listed", np.argsort(angle, kind="stable"), ""
 
 
-def _axis_from_middle(scan: CoarseScan) -> tuple[float, float]:
-    """Compute where the source's foot on the axis falls, from the middle of the panel
-    with the rows and columns that the copy leaves out (`CoarseScan.rest`), averaged over
-    about eight views.
+def _axis_from_middle(scan: CoarseScan) -> float:
+    """Compute where the axis falls along rows, from the middle of the panel with the columns
+    that the copy leaves out (`CoarseScan.rest`), averaged over about eight views [coarse
+    pixels].
 
     Args:
         scan: coarse.
-
-    Returns:
-        offset along rows and down columns [coarse pixels].
     """
     shape = (scan.images.shape[1], scan.images.shape[2])
-    x, y = scan.circle.centre
     views = scan.cone_vec[:: max(1, len(scan.angles) // 8)]
     foot = views.source.copy()
-    foot[:, :2] = x, y
+    foot[:, :2] = scan.circle.centre
     each = np.arange(len(views))
-    at = views.project_points(foot, shape)[each, each]
-    middle = (np.array(shape[::-1]) + scan.rest[::-1] - 1.0) / 2.0
-    along, down = at.mean(axis=0) - middle
-    return float(along), float(down)
+    at = views.project_points(foot, shape)[each, each, 0]
+    return float(at.mean() - (shape[1] + scan.rest[1] - 1.0) / 2.0)

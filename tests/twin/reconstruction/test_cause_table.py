@@ -1,0 +1,135 @@
+"""Errors of a scan are found with their sizes; right scans, of any object, are told of none.
+
+Images are those of the study's own closed forms, which share nothing with the projectors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import claims
+import numpy as np
+import pytest
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
+from flexdt.twin.reconstruction.bias import copies_of
+from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan
+from flexdt.twin.reconstruction.consistency.agreement import Agreement, agreement_of
+from flexdt.twin.reconstruction.consistency.opposed_rays import OpposedRays
+from flexdt.twin.reconstruction.consistency.view_pairs import ViewPairs
+
+SOD, SDD, PIXEL = 90.0, 200.0, 0.95
+SHAPE = (30, 60)
+ANGLES = np.arange(96) * 2.0 * np.pi / 96
+BODIES = (
+    claims.Body(3, (0.5, 0.0, 0.0), (9.0, 7.0, 5.0), 0.4, 0.05),
+    claims.Body(3, (4.0, 1.5, 1.0), (2.0, 2.5, 2.0), 0.0, 0.05),
+    claims.Body(2, (-3.0, -2.0, -0.5), (2.0, 1.5, 2.5), 0.9, -0.04),
+)
+
+
+def scan(**changes: object) -> claims.Drawn:
+    """An ellipsoid with a ball and a hole, without symmetry, of little noise."""
+    rows = claims.circle(ANGLES, SOD, SDD, PIXEL)
+    made = claims.Drawn("", rows, rows, SHAPE, BODIES, counts=1e5, seed=3)
+    return replace(made, **changes)
+
+
+def coarse(drawn: claims.Drawn) -> CoarseScan:
+    images = drawn.images()
+    copies = copies_of(ConeVec(drawn.stated), drawn.shape, None)
+    assert copies is not None
+    for number in copies.wanted:
+        copies.take(number, images[number])
+    return copies(FINE_NODES)
+
+
+def found(drawn: claims.Drawn) -> Agreement:
+    return agreement_of(coarse(drawn))
+
+
+def test_numbers_of_the_conditions_agree_in_a_right_scan() -> None:
+    """Of a smooth object, without noise, to some thousandths of their size."""
+    ball = claims.Body(3, (2.0, -1.0, 0.3), (6.0, 5.0, 4.0), 0.7, 0.06)
+    seen = coarse(scan(bodies=(ball,), counts=0.0))
+    for kind in (ViewPairs, OpposedRays):
+        rows = kind.of(seen.images, seen.cone_vec, circle_of(seen.cone_vec))
+        assert rows is not None
+        numbers = rows.condition(seen.images, seen.cone_vec, 0.0)
+        off = np.abs(numbers.first - numbers.second)
+        assert np.sqrt(np.mean(off**2)) < 8e-3 * numbers.scale
+
+
+GEOMETRIES = {
+    "axis": (claims._moved(scan().true, 1.7), -1.7),
+    "roll": (claims.circle(ANGLES, SOD, SDD, PIXEL, tilts=(2.0, 0.0, 0.0)), None),
+    "yaw": (claims.circle(ANGLES, SOD, SDD, PIXEL, tilts=(0.0, 0.0, 6.0)), None),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(GEOMETRIES))
+def test_a_wrong_geometry_is_named_with_its_size(name: str) -> None:
+    stated, size = GEOMETRIES[name]
+    told = [one for one in found(scan(stated=stated)).findings if one.told]
+    assert told[0].cause.name == name
+    if size is None:
+        size = np.sign(told[0].size) * {"roll": 2.0, "yaw": 6.0}[name]
+    assert abs(told[0].size - size) < max(3.0 * told[0].sigma, 0.05 * abs(size))
+
+
+@pytest.mark.slow
+def test_the_sizes_of_haze_and_of_a_gain_step_are_found() -> None:
+    def hazy(p: np.ndarray, _: object) -> np.ndarray:
+        return -np.log((np.exp(-p) + 0.02) / 1.02)
+
+    def stepped(p: np.ndarray, _: object) -> np.ndarray:
+        return p * (1.0 + 0.1 * (np.arange(len(p)) >= len(p) // 2))[:, None, None]
+
+    dense = tuple(replace(body, mu=3.0 * body.mu) for body in BODIES)
+    curve = found(scan(bodies=dense, change=hazy)).findings[0]
+    assert curve.told
+    assert curve.cause.name == "curve"
+    assert curve.size > 0.0
+    gain = found(scan(change=stepped)).findings[0]
+    assert gain.told
+    assert (gain.cause.name, gain.course.kind) == ("gain", "step")
+    assert gain.size == pytest.approx(9.5, abs=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["direction", "names", "interlaced"])
+def test_another_geometry_that_fits_is_named(kind: str) -> None:
+    make, _ = claims.WRONG[kind]
+    contradiction = found(make(scan(), np.random.default_rng(1))).contradiction
+    assert contradiction is not None
+    assert kind in contradiction.kinds
+    assert contradiction.p_value < 0.01
+    assert "images and geometry contradict each other" in str(contradiction)
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_a_right_scan_is_told_of_nothing_that_contradicts(number: int) -> None:
+    agreement = found(claims.right(5, number, "rolled", ("boxes", "soft")[number]))
+    assert agreement.contradiction is None
+    assert agreement.compared
+
+
+@pytest.mark.slow
+def test_the_order_is_left_open_of_a_round_body() -> None:
+    body = claims.Body(2, (0.0, 0.0, 0.0), (8.0, 8.0, 5.0), 0.0, 0.05)
+    agreement = found(scan(bodies=(body,)))
+    assert agreement.contradiction is None
+    assert "direction" in agreement.open
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+@pytest.mark.parametrize("seed", [31, 32])
+def test_the_study_in_its_short_form(seed: int) -> None:
+    """Drawn scans that chose no constant."""
+    made = [claims.judged(claims.right(seed, number)) for number in range(6)]
+    tested = [one for one in made if np.isfinite(one.claimed) and np.isfinite(one.off)]
+    assert not any(one.told for one in made)
+    assert sum(one.true for one in tested) >= 0.8 * len(tested)

@@ -1,0 +1,449 @@
+"""One linear table: differences that are zero in a right scan, and what each error adds to them.
+
+Rows are the pairs of numbers of `view_pairs` and `opposed_rays`, weighted by their measured
+noise and error of sampling. Columns are derivatives by the errors of `causes`. Errors are taken
+in, the one that explains most first, while they are significant. Standard errors are those of
+clusters: differences that share an arc of views are not taken as independent (Cameron, Gelbach and
+Miller, J. Bus. Econ. Stat. 29 (2011) 238), so that they hold whatever the object's shape does to
+sampling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.acquisition.trajectory import Circle
+from flexdt.twin.reconstruction.consistency.causes import (
+    Cause,
+    Course,
+    causes_of,
+    courses,
+)
+from flexdt.twin.reconstruction.consistency.opposed_rays import OpposedRays
+from flexdt.twin.reconstruction.consistency.view_pairs import Condition, ViewPairs
+from flexdt.twin.reconstruction.white_noise import noise_of
+
+ARCS: Final = 12
+"""Arcs of the scan whose differences are taken as one observation."""
+FALSE_ALARMS: Final = 0.01
+"""Share of right scans in which some error may be told."""
+MOST_ERRORS: Final = 3
+"""Errors that are told of one scan (assumed: more are rarely told apart)."""
+BLURS: Final = (3.0, 1.0)
+"""Smoothing of the images [pixels]: large errors are found in smooth ones."""
+FINE_BLUR: Final = BLURS[-1]
+MOST_STEPS: Final = 4
+"""Corrections in images of one smoothing."""
+TRIED: Final = 8
+"""Errors that are tried in a table, those that explain most."""
+SHARED: Final = 0.05
+"""Share of the sampling's and noise's standard deviation that may be the same in all
+differences, as an object's shape may make it (`tests/studies/claims.py --table`, seed 11)."""
+FREEDOM: Final = 4.0
+"""Degrees of freedom of Student's distribution of a difference over its standard deviation: an edge
+that is parallel to a ray differs by far more than usual."""
+
+
+@dataclass(frozen=True, eq=False)
+class CauseTable:
+    """The rows and columns of a scan.
+
+    Attributes:
+        images: (n, rows, cols) line integrals.
+        cone_vec: n views.
+        circle: of them.
+        share: (n,) of the scan before each view.
+        rows: of `ViewPairs` and `OpposedRays`, with their conditions.
+        blur: standard deviation of the images' smoothing [pixels].
+    """
+
+    images: Float32Array
+    cone_vec: ConeVec
+    circle: Circle
+    share: FloatArray
+    rows: list[tuple[ViewPairs | OpposedRays, Condition]]
+    blur: float
+
+    @classmethod
+    def of(
+        cls,
+        images: Float32Array,
+        cone_vec: ConeVec,
+        circle: Circle,
+        share: FloatArray,
+        blur: float = FINE_BLUR,
+    ) -> CauseTable | None:
+        """Make the table; None where no two views see the object so that they compare.
+
+        Args:
+            images: (n, rows, cols) line integrals of an object that the panel does not cut
+                off at its sides.
+            cone_vec: n views.
+            circle: of them.
+            share: (n,) of the scan before each view, 0 to 1.
+            blur: standard deviation of the images' smoothing [pixels]: noise that
+                interpolation reduces would show as an error that moves rays between pixels.
+        """
+        from scipy.ndimage import gaussian_filter
+
+        along = min(blur, 0.25 * (images.shape[1] - 1))
+        smooth = gaussian_filter(images, (0.0, along, blur), mode="nearest")
+        noise = noise_of(images)
+        # Squares of the kernel's values sum to 1 / (2 sqrt(pi) blur), along a line or each way.
+        kept = min(1.0, 0.28 / max(along, 0.28))
+        rows: list[tuple[ViewPairs | OpposedRays, Condition]] = []
+        pairs = ViewPairs.of(smooth, cone_vec, circle, along)
+        if pairs is not None:
+            rows.append((pairs, pairs.condition(smooth, cone_vec, noise * kept)))
+        rays = OpposedRays.of(smooth, cone_vec, circle, blur)
+        if rays is not None:
+            kept *= min(1.0, 0.28 / blur)
+            rows.append((rays, rays.condition(smooth, cone_vec, noise * kept)))
+        return cls(smooth, cone_vec, circle, share, rows, blur) if rows else None
+
+    @cached_property
+    def differences(self) -> FloatArray:
+        """(m,)."""
+        return np.concatenate([one.first - one.second for _, one in self.rows])
+
+    @cached_property
+    def variance(self) -> FloatArray:
+        """(m,)."""
+        return np.concatenate([one.variance for _, one in self.rows])
+
+    @cached_property
+    def arcs(self) -> npt.NDArray[np.intp]:
+        """Arcs of each difference's two views, (m, 2)."""
+        views = np.concatenate([one.views for _, one in self.rows])
+        return np.asarray(views * ARCS // len(self.cone_vec), np.intp)
+
+    def _by_arcs(self, values: FloatArray) -> dict[str, FloatArray]:
+        """Average values (m,) over each kind of rows, by the first view's arc, (ARCS,)."""
+        found, first = {}, 0
+        for kind, one in self.rows:
+            some = slice(first, first + len(one.first))
+            arc = self.arcs[some, 0]
+            count = np.maximum(np.bincount(arc, minlength=ARCS), 1)
+            found[type(kind).__name__] = np.bincount(arc, values[some], ARCS) / count
+            first += len(one.first)
+        return found
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of differences of each kind of rows."""
+        return {type(kind).__name__: len(one.first) for kind, one in self.rows}
+
+    def surprise(self, left: FloatArray | None = None) -> dict[str, FloatArray]:
+        """Compute how improbable the differences are: minus the logarithm of their
+        likelihood, but for a constant, kind of rows -> (ARCS,).
+
+        Args:
+            left: of the differences; all of them without.
+        """
+        ratio = np.square(self.differences if left is None else left) / self.variance
+        return self._by_arcs(0.5 * (FREEDOM + 1.0) * np.log1p(ratio / FREEDOM))
+
+    @property
+    def surprises(self) -> float:
+        """Mean of the `surprise`."""
+        return self.surprises_without([], [])
+
+    def surprises_without(self, errors: list[Error], sizes: list[float]) -> float:
+        """Compute the mean of the `surprise` without errors of some sizes, as if the
+        differences were linear in them."""
+        left = self.differences
+        for error, size in zip(errors, sizes, strict=True):
+            left = left - size * self.columns[error]
+        return float(np.mean([one.mean() for one in self.surprise(left).values()]))
+
+    @property
+    def doubtful(self) -> bool:
+        """True if differences of some kind are larger than noise and sampling explain:
+        their mean square, over its variance, is above 1 by the scatter of the arcs.
+        """
+        ratio = self._by_arcs(np.square(self.differences) / self.variance)
+        bar = quantile(2.0 * FALSE_ALARMS) / np.sqrt(ARCS)
+        return any(one.mean() - 1.0 > bar * one.std(ddof=1) for one in ratio.values())
+
+    def unexplained(self) -> float:
+        """Compute by how much the numbers differ that should agree, beyond noise and sampling,
+        relative to them: the largest of the kinds of rows.
+        """
+        beyond = self._by_arcs(np.square(self.differences) - self.variance)
+        parts = zip(beyond.values(), self.rows, strict=True)
+        return max(
+            float(np.sqrt(max(one.mean(), 0.0))) / max(row.scale, 1e-30)
+            for one, (_, row) in parts
+        )
+
+    def most_telling(self, told: list[Error]) -> Error | None:
+        """Find the significant error that explains most beside those that are told; None
+        without one.
+        """
+        weights = self._weights(self.differences)
+        for error in self._by_gain(weights, told):
+            size, sigma = self.fit([error, *told], weights)[0]
+            if self.bar * sigma < abs(size) <= error[0].most:
+                return error
+        return None
+
+    @cached_property
+    def bar(self) -> float:
+        """Size of an estimate from which on it is told [standard errors]."""
+        return quantile(FALSE_ALARMS / max(len(self.columns), 1))
+
+    def fit(
+        self, errors: list[Error], weights: FloatArray | None = None
+    ) -> list[tuple[float, float]]:
+        """Fit errors together, beside those that are nuisances: size and standard error of
+        each."""
+        if not errors:
+            return []
+        if weights is None:
+            weights = self._weights(self.differences)
+        nuisances = [one for one in self.columns if one[0].nuisance and one not in errors]
+        listed = [self.columns[one] for one in (*errors, *nuisances)]
+        sizes, covariance = self._fit(listed, weights)
+        deviation = np.sqrt(self.variance)
+        found = []
+        for place, column in enumerate(listed[: len(errors)]):
+            power = float((weights * np.square(column)).sum())
+            shared = float((weights * np.abs(column) * deviation).sum()) / max(
+                power, 1e-300
+            )
+            spread = max(float(covariance[place, place]), 0.0)
+            found.append(
+                (float(sizes[place]), float(np.hypot(np.sqrt(spread), SHARED * shared)))
+            )
+        return found
+
+    def _by_gain(self, weights: FloatArray, told: list[Error]) -> list[Error]:
+        """Order the errors that are not told by how much they explain beside the others."""
+        root = np.sqrt(weights)
+        base = [one for one in self.columns if one[0].nuisance or one in told]
+        rest = self.differences * root
+        coarse = self.blur > FINE_BLUR
+        listed = [
+            one
+            for one in self.columns
+            if one not in base and not (coarse and one[0].fine)
+        ]
+        matrix = (
+            np.array([self.columns[one] for one in listed]).reshape(-1, len(rest)) * root
+        )
+        power = np.square(matrix).sum(axis=1)
+        if base:
+            known, _ = np.linalg.qr(
+                np.array([self.columns[one] * root for one in base]).T
+            )
+            matrix -= (matrix @ known) @ known.T
+            rest = rest - known @ (known.T @ rest)
+        own = np.square(matrix).sum(axis=1)
+        gain = np.square(matrix @ rest) / np.maximum(own, 1e-6 * power + 1e-300)
+        return [listed[k] for k in np.argsort(-gain)[:TRIED]]
+
+    def _weights(self, left: FloatArray) -> FloatArray:
+        """Weigh differences by Student's distribution, of a scale that lets those of an error
+        of some views count, too."""
+        ratio = np.square(left) / self.variance
+        usual = max(float(ratio.mean()), 1e-12)
+        return np.asarray(
+            (FREEDOM + 1.0) / (FREEDOM + ratio / usual) / (self.variance * usual)
+        )
+
+    def _fit(
+        self, columns: list[FloatArray], weights: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Fit columns: sizes (k,), and their covariance by clusters, (k, k)."""
+        matrix = np.array(columns).T
+        normal = (matrix.T * weights) @ matrix
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        scaled = normal / np.outer(size, size)
+        inverse = np.linalg.pinv(scaled, 1e-9, hermitian=True) / np.outer(size, size)
+        sizes = inverse @ (matrix.T @ (weights * self.differences))
+        left = self.differences - matrix @ sizes
+        scores = matrix * (weights * left)[:, None]
+        one, other = self.arcs.T
+        arcs = np.zeros((ARCS, len(columns)))
+        np.add.at(arcs, one, scores)
+        apart = one != other
+        np.add.at(arcs, other[apart], scores[apart])
+        cells = np.zeros((ARCS * ARCS, len(columns)))
+        np.add.at(cells, np.minimum(one, other) * ARCS + np.maximum(one, other), scores)
+        both = inverse @ (arcs.T @ arcs) @ inverse
+        spread = both - inverse @ (cells.T @ cells) @ inverse
+        # Sums over arcs count each pair twice; where that cannot be taken off, half is.
+        few = np.diag(spread) < 0.25 * np.diag(both)
+        spread[few, few] = 0.25 * np.diag(both)[few]
+        return sizes, spread * ARCS / (ARCS - 1.0)
+
+    @cached_property
+    def columns(self) -> dict[Error, FloatArray]:
+        """Errors that change the differences, with their columns (m,)."""
+        found: dict[Error, FloatArray] = {}
+        size = float(np.sqrt(np.square(self.differences).sum() + self.variance.sum()))
+        views = np.concatenate([one.views for _, one in self.rows])
+        for cause in causes_of(self.circle.centre):
+            parts = [self._derivative(cause, kind, one) for kind, one in self.rows]
+            first, second = (
+                np.concatenate([one[side] for one in parts]) for side in (0, 1)
+            )
+            if cause.turns and self.circle.rise:
+                continue  # of a helix views rise, too
+            for course in courses(cause):
+                share = course(self.share)
+                column = share[views[:, 0]] * first + share[views[:, 1]] * second
+                if np.linalg.norm(column) > 1e-7 * size:
+                    found[cause, course] = column
+        return found
+
+    def _derivative(
+        self, cause: Cause, kind: ViewPairs | OpposedRays, condition: Condition
+    ) -> tuple[FloatArray, FloatArray]:
+        """Compute what an error of 1 in the first, and in the second view, adds to the
+        differences, (m,) each."""
+        sizes = np.full(len(self.cone_vec), cause.step)
+        if cause.images is not None:
+            if cause.of_integral and isinstance(kind, OpposedRays):
+                return np.zeros(len(condition.first)), np.zeros(len(condition.first))
+            added = cause.images(self.images, sizes / cause.step)
+            first, second = kind.sides(added, self.cone_vec, self.cone_vec)
+            return first, -second
+        assert cause.views is not None
+        other = cause.views(self.cone_vec, sizes)
+        stated = condition.first - condition.second
+        found = []
+        for pair in ((other, self.cone_vec), (self.cone_vec, other)):
+            one, two = kind.sides(self.images, *pair)
+            found.append((stated - (one - two)) / cause.step)
+        return found[0], found[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """An error, or the range in which it may be.
+
+    Attributes:
+        cause: of `causes`.
+        course: through the scan.
+        size: estimate [unit of the cause].
+        sigma: its standard error.
+        told: it is significant.
+    """
+
+    cause: Cause
+    course: Course
+    size: float
+    sigma: float
+    told: bool
+
+    @property
+    def figure(self) -> str:
+        """Its size with the standard error, in words."""
+        where = ""
+        if self.course.kind in ("line", "wave"):
+            where = " in the course of the scan"
+        if self.course.kind == "step":
+            where = f" from {100.0 * self.course.number:.0f} % of the scan on"
+        return f"{self.size:+.2g} ± {self.sigma:.1g} {self.cause.unit}{where}"
+
+
+def findings(
+    images: Float32Array, cone_vec: ConeVec, circle: Circle, share: FloatArray
+) -> tuple[list[Finding], CauseTable] | None:
+    """Find the errors of a scan, one after the other, and the ranges of the others.
+
+    The images, or the geometry, are corrected by each error before the next is looked for:
+    first in smooth images (`BLURS`).
+
+    Args:
+        images, cone_vec, circle, share: see `CauseTable.of`.
+
+    Returns:
+        Told errors, the first found first, then the others; and the table of the corrected
+        scan. None where no two views compare.
+    """
+    sizes: dict[Key, float] = {}
+    table = None
+    for blur in BLURS:
+        table = CauseTable.of(images, cone_vec, circle, share, blur)
+        for _ in range(MOST_STEPS):
+            if table is None:
+                return None
+            known = _again(table, sizes)
+            error = table.most_telling(known)
+            if error is None or len(sizes) >= MOST_ERRORS:
+                break
+            # What is known already is fitted anew: errors are not quite linear.
+            chosen = [error, *known]
+            steps = [size for size, _ in table.fit(chosen)]
+            there = images, cone_vec
+            for (cause, course), size in zip(chosen, steps, strict=True):
+                there = cause.corrected(*there, size * course(share))
+            closer = CauseTable.of(*there, circle, share, blur)
+            whole = [
+                sizes.get(_key(one), 0.0) + size
+                for one, size in zip(chosen, steps, strict=True)
+            ]
+            if any(
+                abs(size) > one[0].most for one, size in zip(chosen, whole, strict=True)
+            ):
+                break
+            hoped = table.surprises_without(chosen, steps)
+            if closer is None or closer.surprises > 0.5 * (hoped + table.surprises):
+                break  # far from linear
+            table, (images, cone_vec) = closer, there
+            for one, size in zip(chosen, steps, strict=True):
+                sizes[_key(one)] = sizes.get(_key(one), 0.0) + size
+    assert table is not None
+    return _findings(table, sizes), table
+
+
+def _findings(table: CauseTable, sizes: dict[Key, float]) -> list[Finding]:
+    """List told errors that are significant in the corrected scan, then one of each other
+    cause."""
+    told = _again(table, sizes)
+    found = []
+    for error, (size, sigma) in zip(told, table.fit(told), strict=True):
+        whole = sizes[_key(error)] + size
+        if table.bar * sigma < abs(whole) <= error[0].most:
+            found.append(Finding(*error, whole, sigma, told=True))
+    named = {one.cause.name for one in found}
+    for error in table.columns:
+        cause, course = error
+        if course.kind in ("constant", "line") and cause.name not in named:
+            named.add(cause.name)
+            size, sigma = table.fit([error, *told])[0]
+            found.append(Finding(cause, course, size, sigma, told=False))
+    return found
+
+
+def _key(error: Error) -> Key:
+    return error[0].name, error[1]
+
+
+def _again(table: CauseTable, sizes: dict[Key, float]) -> list[Error]:
+    """Return the errors of a table that are known by name, in the order of `sizes`."""
+    known = {_key(one): one for one in table.columns}
+    return [known[key] for key in sizes if key in known]
+
+
+Error = tuple[Cause, Course]
+"""An error and its course through the scan."""
+Key = tuple[str, Course]
+"""Name of an error's cause, and its course."""
+
+
+def quantile(share: float) -> float:
+    """Compute the size that `share` of the estimates of nothing exceed, in standard errors of
+    `ARCS` clusters."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(ARCS - 1.0, 1.0 - 0.5 * share))

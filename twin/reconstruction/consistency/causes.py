@@ -1,0 +1,203 @@
+"""Errors of a scan's geometry and line integrals, each with one number: the table's columns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+
+Views = Callable[[ConeVec, FloatArray], ConeVec]
+Images = Callable[[Float32Array, FloatArray], Float32Array]
+WAVES: Final = 6
+"""Half waves of a course through the scan, up to which movement is smooth."""
+STEPS: Final = 15
+"""Places of a scan at which something may have stepped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """A possible error, of so much in each view.
+
+    Attributes:
+        name: of `flexdt.twin.projection.volume.CAUSES`.
+        unit: of its size, as it is printed.
+        step: for its derivative [unit].
+        most: that can be told: beyond it a scan is not nearly the stated one (assumed).
+        views: geometry, sizes (n,) [unit] -> the geometry that is right if the stated one
+            is wrong by them; None for an error of the images.
+        images: line integrals (n, rows, cols), sizes (n,) -> what the error adds to them;
+            None for an error of the geometry.
+        constant: the same in all views may be told from a right scan.
+        course: a course through the scan may be.
+        nuisance: fitted in every table, and never told: nearly the same as another object.
+        turns: views about the axis.
+        fine: told in hardly smoothed images alone.
+        of_integral: a function of the line integral alone: opposed rays do not show it.
+    """
+
+    name: str
+    unit: str
+    step: float
+    most: float
+    views: Views | None = None
+    images: Images | None = None
+    constant: bool = True
+    course: bool = False
+    nuisance: bool = False
+    turns: bool = False
+    fine: bool = False
+    of_integral: bool = False
+
+    def corrected(
+        self, images: Float32Array, cone_vec: ConeVec, sizes: FloatArray
+    ) -> tuple[Float32Array, ConeVec]:
+        """Return images and geometry without an error of these sizes, (n,)."""
+        if self.views is not None:
+            return images, self.views(cone_vec, sizes)
+        assert self.images is not None
+        return np.asarray(images - self.images(images, sizes), np.float32), cone_vec
+
+
+@dataclass(frozen=True)
+class Course:
+    """How the size of an error goes through the scan.
+
+    Attributes:
+        kind: "constant", "line", "wave" or "step".
+        number: half waves, or the share of the scan before the step.
+    """
+
+    kind: str = "constant"
+    number: float = 0.0
+
+    def __call__(self, share: FloatArray) -> FloatArray:
+        """Compute sizes at shares (n,) of the scan, for a size of 1: of a line from begin to
+        end, of a step that of the step."""
+        if self.kind == "line":
+            return share - 0.5
+        if self.kind == "wave":
+            return np.asarray(np.cos(np.pi * self.number * share))
+        if self.kind == "step":
+            return np.asarray(share >= self.number, np.float64) - (1.0 - self.number)
+        return np.ones_like(share)
+
+
+def courses(cause: Cause) -> list[Course]:
+    """List the courses of an error that are told."""
+    found = [Course()] * cause.constant
+    if cause.course:
+        found.append(Course("line"))
+        found += [Course("wave", float(k)) for k in range(2, WAVES + 1)]
+        found += [Course("step", k / (STEPS + 1.0)) for k in range(1, STEPS + 1)]
+    return found
+
+
+def causes_of(centre: FloatArray) -> list[Cause]:
+    """List the errors that are looked for.
+
+    Args:
+        centre: (x, y) of the rotation axis.
+    """
+
+    def turned(views: ConeVec, sizes: FloatArray) -> ConeVec:
+        """Turn each view about the axis [degrees]."""
+        cos, sin = np.cos(np.deg2rad(sizes)), np.sin(np.deg2rad(sizes))
+        axis = np.append(centre, 0.0)
+
+        def about(vectors: FloatArray) -> FloatArray:
+            x, y, z = vectors.T
+            return np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
+
+        source, panel = (
+            about(place - axis) + axis for place in (views.source, views.detector)
+        )
+        return ConeVec.from_vectors(source, panel, about(views.u), about(views.v))
+
+    def scaled(views: ConeVec, sizes: FloatArray) -> ConeVec:
+        """Stretch the angles about their mean [%]."""
+        azimuth = np.unwrap(np.arctan2(*(views.source[:, :2] - centre).T[::-1]))
+        return turned(views, 0.01 * sizes * np.rad2deg(azimuth - azimuth.mean()))
+
+    return [
+        Cause("axis", "px", 0.05, 20.0, _beside, course=True),
+        Cause("height", "px", 0.05, 20.0, _below, nuisance=True),
+        Cause("slip", "px", 0.05, 20.0, _below, constant=False, course=True),
+        Cause("roll", "deg", 0.1, 20.0, _rolled),
+        Cause("pitch", "deg", 0.3, 45.0, _pitched, nuisance=True),
+        Cause("yaw", "deg", 0.3, 45.0, _yawed),
+        Cause("distance", "%", 0.2, 10.0, _farther),
+        Cause("turn", "%", 0.1, 20.0, scaled, turns=True),
+        Cause("lost", "deg", 0.1, 45.0, turned, constant=False, course=True, turns=True),
+        Cause("gain", "%", 1.0, 30.0, images=_gained, constant=False, course=True),
+        Cause(
+            "curve", "% per unit", 1.0, 50.0, images=_curved, fine=True, of_integral=True
+        ),
+        Cause("lens", "%", 1.0, 20.0, images=_bulged, fine=True),
+    ]
+
+
+def _beside(views: ConeVec, sizes: FloatArray) -> ConeVec:
+    panel = views.detector + sizes[:, None] * views.u
+    return ConeVec.from_vectors(views.source, panel, views.u, views.v)
+
+
+def _below(views: ConeVec, sizes: FloatArray) -> ConeVec:
+    panel = views.detector + sizes[:, None] * views.v
+    return ConeVec.from_vectors(views.source, panel, views.u, views.v)
+
+
+def _tilted(views: ConeVec, sizes: FloatArray, axis: FloatArray) -> ConeVec:
+    """Turn panels about axes (n, 3) through their centres [degrees], to first order in what
+    is small."""
+    turn = np.deg2rad(sizes)[:, None] * axis
+    u, v = (side + np.cross(turn, side) for side in (views.u, views.v))
+    return ConeVec.from_vectors(views.source, views.detector, u, v)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def _rolled(views: ConeVec, sizes: FloatArray) -> ConeVec:
+    return _tilted(views, sizes, _unit(np.cross(views.u, views.v)))
+
+
+def _pitched(views: ConeVec, sizes: FloatArray) -> ConeVec:
+    return _tilted(views, sizes, _unit(views.u))
+
+
+def _yawed(views: ConeVec, sizes: FloatArray) -> ConeVec:
+    return _tilted(views, sizes, _unit(views.v))
+
+
+def _farther(views: ConeVec, sizes: FloatArray) -> ConeVec:
+    away = 1.0 + 0.01 * sizes[:, None]
+    panel = views.source + away * (views.detector - views.source)
+    return ConeVec.from_vectors(views.source, panel, views.u, views.v)
+
+
+def _gained(images: Float32Array, sizes: FloatArray) -> Float32Array:
+    return np.asarray(0.01 * sizes[:, None, None] * images, np.float32)
+
+
+def _curved(images: Float32Array, sizes: FloatArray) -> Float32Array:
+    return np.asarray(-0.01 * sizes[:, None, None] * np.square(images), np.float32)
+
+
+def _bulged(images: Float32Array, sizes: FloatArray) -> Float32Array:
+    """Compute what a lens adds that moves the end of a row outwards by so many % of its half."""
+    _, rows, cols = images.shape
+    x = (np.arange(cols) - 0.5 * (cols - 1)) / (0.5 * cols)
+    y = (np.arange(rows) - 0.5 * (rows - 1)) / (0.5 * cols)
+    far = np.square(x) + np.square(y)[:, None]
+    across = np.gradient(images, axis=2) * x
+    if rows > 1:
+        across = across + np.gradient(images, axis=1) * y[:, None]
+    return np.asarray(
+        -0.01 * sizes[:, None, None] * far * across * (0.5 * cols), np.float32
+    )
