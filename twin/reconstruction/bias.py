@@ -380,10 +380,10 @@ class BiasOnDemand:
         kinds = [one for one in suspects(scan) if one.kind in self._agreement.open]
         for suspect in kinds:
             try:
-                change = self._moved(suspect.images, suspect.cone_vec)
+                moved = self._moved(suspect.images, suspect.cone_vec)
             except GeometryError:
                 continue
-            if nodes.change(nodes.found + smoothed(change)) > claimed:
+            if nodes.change(nodes.found + smoothed(moved)) > claimed:
                 taken.append("rotation" if suspect.kind in SIDES else "order")
         causes = {**bounded.causes, "geometry": np.sqrt(squares)}
         return replace(bounded, causes=causes, taken=tuple(dict.fromkeys(taken)))

@@ -447,10 +447,8 @@ def test_a_thin_jacket_that_is_cut_off_is_as_dense_as_a_wider_panel_finds(
     like = Grid((1, 61, 61), float(at[1] - at[0])).blank()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Two upright ellipses turned the other way are nearly the same images.
-        warnings.filterwarnings(
-            "ignore", "no accuracy is claimed: the images do not decide"
-        )
+        # Rows of a fan, repeated, are not quite those of a cone beam.
+        warnings.filterwarnings("ignore", "values may be off")
         found, wanted = (
             float(fdk(data, scan, like).data[0, middle].mean())
             for data in (wide[..., 40:-40], wide)
