@@ -415,7 +415,9 @@ class BiasOfIterations(BiasOnDemand):
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong at first sight: a contradiction."""
-        return [] if self.contradiction is None else [str(self.contradiction)]
+        if not self._doubtful or self._agreement.contradiction is None:
+            return []
+        return [str(self._agreement.contradiction)]
 
     @cached_property
     def _bounded(self) -> Bias:
