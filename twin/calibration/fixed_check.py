@@ -116,17 +116,21 @@ def without_groups(state: Calibration, fit: FitResult) -> Calibration:
         tracks[:, (places != problem.model.beads).any(axis=1)] = np.nan
     ends = np.cumsum([0, *(len(scan.poses) for scan in state.scans)]).tolist()
     parts = [slice(*ends[i : i + 2]) for i in range(len(state.scans))]
+    scans = tuple(
+        replace(scan, poses=problem.poses[own])
+        for scan, own in zip(state.scans, parts, strict=True)
+    )
     if state.measured:
         measured = [
             replace(one, tracks=tracks[own])
             for one, own in zip(state.measured, parts, strict=True)
         ]
-        return replace(state, measured=tuple(measured))
+        return replace(state, scans=scans, measured=tuple(measured))
     found = [
         replace(one, tracks=tracks[own])
         for one, own in zip(state.identifications, parts, strict=True)
     ]
-    return replace(state, identifications=tuple(found))
+    return replace(state, scans=scans, identifications=tuple(found))
 
 
 def _limits(state: Calibration, request: CalibrationRequest) -> dict[str, float]:

@@ -22,6 +22,7 @@ from flexdt.twin.calibration.diagnose.table.linearised import (
     Linearised,
     State,
     image_shape,
+    motion_of,
     moved,
     with_every_column,
 )
@@ -354,11 +355,13 @@ def _with_groups(
 ) -> tuple[FitProblem, FloatArray]:
     """Return the problem of a fit with those columns that groups of the best model have, and
     the values of its columns; what the other groups do is taken out of its positions, so that
-    its poses are those of the mean.
+    its poses are those of each scan's mean.
     """
     every, x = moved(plain, state)
     if state.frames:
-        still = replace(every, poses=plain.poses)
+        still = replace(
+            every, poses=motion_of(_of_scans(plain, state)).applied(plain.poses)
+        )
         motion = every.residuals(x)[0] - still.residuals(x)[0]
         every = replace(still, measured=every.measured - motion)
     names = {posterior.name(g) for g in posterior.best.widths}
@@ -423,6 +426,16 @@ def _with_groups(
         prior_sigma=np.concatenate([widths, panel.sigmas if panel else []]),
     )
     return problem, np.concatenate([x[keep], terms])
+
+
+def _of_scans(plain: FitProblem, state: State) -> dict[str, FloatArray]:
+    """Return the deviations of frames that all frames of a scan share, as in `State`."""
+    group = plain.group
+    count = np.bincount(group)
+    return {
+        name: (np.bincount(group, off) / count)[group]
+        for name, off in state.frames.items()
+    }
 
 
 def _ends(columns: slice) -> tuple[int, int]:
