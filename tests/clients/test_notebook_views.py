@@ -21,17 +21,23 @@ class Page(HTMLParser):
         self.cells: list[str] = []
         self.images: list[str] = []
         self.text = ""
+        self._in_cell = False
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         if tag in ("td", "th"):
             self.cells.append("")
+            self._in_cell = True
         if tag == "img":
             self.images.append(str(dict(attrs)["src"]))
 
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("td", "th"):
+            self._in_cell = False
+
     def handle_data(self, data: str) -> None:
         self.text += data
-        if self.cells:
+        if self._in_cell:
             self.cells[-1] += data
 
 
