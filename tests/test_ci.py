@@ -124,7 +124,7 @@ def test_every_step_of_the_workflows_is_a_sound_command() -> None:
         assert set(step) <= STEP_KEYS, where
         assert ("run" in step) != ("uses" in step), where
         if "run" not in step:
-            assert re.fullmatch(r"[\w.-]+/[\w./-]+@v\d+", step["uses"]), where
+            assert re.fullmatch(r"[\w.-]+/[\w./-]+@(v|release/v)\d+", step["uses"]), where
             continue
         text = EXPRESSION.sub("expression", step["run"])
         read = subprocess.run(

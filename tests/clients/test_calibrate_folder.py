@@ -224,7 +224,10 @@ def test_missing_and_broken_frames_are_named_and_survived(copy: Path) -> None:
     tifffile.imwrite(copy / "scan_000011.tif", np.zeros((10, 20), np.uint16))
     outcome = calibrate_datasets([load_dataset(copy)], "lego")
     assert outcome.document["identifiable"] is True
-    assert [p["code"] for p in outcome.document["problems"]] == ["frames_missing"]  # type: ignore[attr-defined]
+    codes = [p["code"] for p in outcome.document["problems"]]  # type: ignore[attr-defined]
+    # What six images fewer leave open may widen the intervals, and is told.
+    assert codes[0] == "frames_missing"
+    assert set(codes[1:]) <= {"causes_open"}
     text = outcome.document["problems"][0]["text"]  # type: ignore[index]
     assert "6 of 37" in text
     assert "scan_000009.tif" in text

@@ -30,7 +30,7 @@ FLEXRAY = (resources.files("flexdt.twin") / "data/machines/flexray.toml").read_t
         ('axis = "tra_tube"', 'axis = "tra_det"',
          r"axis: must be a known motor of anchor 'source': tra_tube, ver_tube .*'tra_det'"),
         ('axis = "tra_tube"\nsize_mm = [100.0, 100.0, 1000.0]',
-         'axis = "tra_tube"\nsize_mm = [100.0, 100.0, 0.0]', r"size_mm.*greater than 0"),
+         'axis = "tra_tube"\nsize_mm = [100.0, 100.0, 0.0]', r"size_mm.*allowed: above 0"),
         ("size_mm = [150.0, 150.0, 20.0]", "size_mm = [150.0, 140.0, 20.0]",
          r"size_mm: must be as wide in x as in y, for a cylinder .*\(150.0, 140.0, 20.0\)"),
         ('role = "panel"', 'role = "plate"', "role"),

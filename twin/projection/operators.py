@@ -832,7 +832,7 @@ def geometry_change(
     if moved.shape not in ((12,), (len(geometry), 12)):
         wanted = (len(geometry), 12)
         raise GeometryError.of_shape(
-            "the geometry's change", moved.shape, wanted, " or (12,)"
+            "the geometry's change", moved.shape, wanted, " or 12"
         )
     shape = geometry.of_shape(shape)
     result = np.zeros((len(geometry), *shape), np.float32)

@@ -40,6 +40,7 @@ from flexdt.twin.reconstruction.consistency.agreement import (
 )
 from flexdt.twin.reconstruction.consistency.cause_table import Finding
 from flexdt.twin.reconstruction.consistency.suspects import SIDES, suspects
+from flexdt.twin.reconstruction.feldkamp.fdk_plan import plan_fdk
 from flexdt.twin.reconstruction.uniform_nodes import (
     MIN_EVENNESS,
     UniformNodes,
@@ -80,6 +81,8 @@ STATED: Final = {
     "gain": "beam",
 }
 """Error -> what is taken as stated where images do not decide on it; others by their names."""
+PARTS_OF_ERRORS: Final = (1.0, -1.0, 0.5, -0.5, 0.25, -0.25)
+"""Parts of an error whose effect on the volume is taken in proportion, in this order."""
 ALL_CAUSES: Final = frozenset(USUAL_SHARE)
 """All causes."""
 STREAK_ROWS: Final = 6
@@ -215,6 +218,9 @@ class BiasOnDemand:
         self, copied: Callable[[int], CoarseScan], *, sides_known: bool = False
     ) -> None:
         """Look at the scan once; see the class."""
+        scan = copied(NODES)
+        rows, cols = scan.images.shape[1:]
+        plan_fdk(scan.cone_vec, (rows, cols), scan.grid, truncation=scan.truncation)
         self._copied = copied
         self._sides_known = sides_known
         look = looked_at(copied(FINE_NODES))
@@ -337,7 +343,25 @@ class BiasOnDemand:
         return replace(bounded, causes=causes, figures=figures)
 
     def _changed(self, one: Finding, size: float) -> Float32Array:
-        """Compute the change of the coarse volume by an error of a size, (nz, ny, nx)."""
+        """Compute the change of the coarse volume by an error of a size, (nz, ny, nx).
+
+        Where FDK cannot use the views so corrected, as of a short scan that loses more, the
+        change is that of a part of the error, or of the opposite one, in proportion; where it
+        can use none of these, the whole volume.
+        """
+        for part in PARTS_OF_ERRORS:
+            try:
+                return self._changed_exactly(one, part * size) / np.float32(part)
+            except GeometryError:
+                continue
+        return self._volume
+
+    def _changed_exactly(self, one: Finding, size: float) -> Float32Array:
+        """Compute the change by an error of a size; see `_changed`.
+
+        Raises:
+            GeometryError: FDK cannot use the views.
+        """
         scan = self._copied(NODES)
         if one.cause.unit == "px":
             size /= scan.binned[0 if one.cause.name in ("height", "slip") else 1]

@@ -263,7 +263,7 @@ def test_what_workers_do_not_do(
         (
             ["127.0.0.1:1", "--algorithm", "sirt"],
             2,
-            "--scheduler: sirt is not done by workers",
+            "--scheduler: sirt has none",
         ),
         (["127.0.0.1:1", "--preview"], 2, "--preview chooses for itself"),
     ):

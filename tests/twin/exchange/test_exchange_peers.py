@@ -183,7 +183,7 @@ def test_tigre_refuses_what_its_angles_cannot_hold() -> None:
     ("name", "value", "says"),
     [
         ("COR", np.array([0.2]), "COR is 0.2"),
-        ("DSD", np.array([1.0, 2.0]), r"DSD of shape \(2,\)"),
+        ("DSD", np.array([1.0, 2.0]), "DSD of shape 2;"),
         ("offOrigin", np.full(3, np.nan), "not finite"),
         ("nDetector", np.array([0, 9]), "whole numbers"),
         ("dDetector", np.array([0.0, 9]), "above 0"),

@@ -6,14 +6,16 @@ Images are those of the study's own closed forms, which share nothing with the p
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import claims
 import numpy as np
 import pytest
 
+from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
-from flexdt.twin.reconstruction.bias import copies_of
+from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of
 from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import Agreement, agreement_of
 from flexdt.twin.reconstruction.consistency.opposed_rays import OpposedRays
@@ -133,3 +135,26 @@ def test_the_study_in_its_short_form(seed: int) -> None:
     tested = [one for one in made if np.isfinite(one.claimed) and np.isfinite(one.off)]
     assert not any(one.told for one in made)
     assert sum(one.true for one in tested) >= 0.8 * len(tested)
+
+
+def test_the_effect_of_an_error_that_fdk_cannot_take_back_is_taken_in_proportion() -> (
+    None
+):
+    class Half(BiasOnDemand):
+        """Takes back errors of one sign alone, up to a size."""
+
+        def __init__(self, most: float) -> None:
+            self.most = most
+
+        _volume = np.full((1, 1, 1), 7.0, np.float32)
+
+        def _changed_exactly(self, one, size):
+            if not 0.0 < size <= self.most:
+                raise GeometryError("too short a scan")
+            return np.full((1, 1, 1), 3.0 * size, np.float32)
+
+    told = SimpleNamespace()
+    assert Half(9.0)._changed(told, 2.0) == 6.0
+    assert Half(9.0)._changed(told, -2.0) == -6.0
+    assert Half(0.5)._changed(told, 2.0) == 6.0
+    assert Half(0.1)._changed(told, 2.0) == 7.0, "the whole volume"

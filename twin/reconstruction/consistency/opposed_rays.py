@@ -122,7 +122,9 @@ class OpposedRays:
         """
         ray, row = self._rays(first)
         place = self.columns - 0.5 * (self.shape[2] - 1)
-        here, bend, seen = self._at(images, self.views, place, row)
+        here, bend, seen = self._at(
+            images, self.views, np.asarray(place, np.float64), row
+        )
         at = self._opposite(first, ray)
         azimuth = self._azimuths(second)
         found, bends = [], []
