@@ -175,8 +175,8 @@ class Core:
         """Have `listener` subscribed with these params whenever a connection is made;
         nothing is subscribed at once.
 
-        Rate, and for projections kind and binning, must be those of all listeners to the
-        same topic, also those with which this one was followed before.
+        Rate, and for projections kind and binning, must be those of all other listeners to
+        the same topic.
 
         Args:
             listener: gets the events.
@@ -186,6 +186,8 @@ class Core:
             ValueError: they are not.
         """
         for other, theirs in self._listeners.items():
+            if other is listener:
+                continue
             for topic in set(listener.topics) & set(other.topics):
                 _require_same(topic, params, theirs)
         self._listeners[listener] = params

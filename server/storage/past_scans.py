@@ -156,6 +156,8 @@ def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[
         directory = Directory(root)
         with directory, confined(directory):
             result = _ANSWERS[type(asked)](directory, asked, context, codec)
+    except TwinError:  # a missing data set is an OSError, too
+        raise
     except OSError as error:  # it has gone meanwhile, or the disk fails
         name = getattr(asked, "name", "the data directory")
         raise ds.DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None

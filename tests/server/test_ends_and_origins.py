@@ -44,6 +44,7 @@ def said_of(state: dict[str, Any]) -> dict[str, Any]:
         **{key: tube[key] for key in ("kV", "power_W")},
         **{key: camera[key] for key in ("mode", "exposure_ms", "averages", "roi")},
         "correction": None if correction is None else correction["name"],
+        **dict.fromkeys(("dataset", "index", "file")),  # it is of no scan
     }
 
 
