@@ -98,6 +98,8 @@ WRONG = [
     ("viewer.layers", {"beam": "yes"}),
     ("viewer.layers", {"opacity": []}),
     ("viewer.theme", {"dark": 3}),
+    ("viewer.ghost", {"shown": "yes"}),
+    ("viewer.thumbnail", {"name": "a", "index": -1}),
     ("viewer.person", {"name": 7}),
     ("viewer.camera", {"view": 7}),
     ("viewer.feed", {"kind": "films"}),
