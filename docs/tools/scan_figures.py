@@ -357,9 +357,11 @@ def metal() -> tuple[Figure, Numbers]:
     tube = fx.Tube(kV=90)
     detector = fx.Detector(averages=16)
     data = fx.simulate(parts, turn, tube=tube, detector=detector, noise=SEED)
-    grid = {"voxel": 0.35, "shape": (4, 96, 96), "tube": tube}
+    grid = {"voxel": 0.35, "shape": (4, 96, 96)}
+    plain = data.reconstruct("fdk", errors=False, **grid)
+    grid["tube"] = tube
     shown = {
-        "FDK": data.reconstruct("fdk", errors=False, **grid).data[2],
+        "FDK": plain.data[2],
         "material='pmma'": data.reconstruct(
             "fdk", errors=False, material="pmma", **grid
         ).data[2],

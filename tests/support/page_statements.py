@@ -234,7 +234,7 @@ def of_scan(said: dict[str, Any], wire: Wire) -> list[str]:
         if off == wire.state.tube.on:
             found.append(f"scan: {texts['job-what']}, and X-rays: {wire.state.tube.on}")
         for motor, value in re.findall(
-            r"(?!began)\b(\w+) at (-?[\d.]+)", texts["job-what"]
+            r"\b([a-z]+_[a-z]+) at (-?[\d.]+)", texts["job-what"]
         ):
             if abs(wire.state.axes[motor].position - float(value)) > 0.02:
                 found.append(f"scan: {motor} at {value}")
