@@ -144,6 +144,7 @@ def test_kernels_are_published_and_cleared(
     monkeypatch.setenv("FLEXDT_CACHE", str(tmp_path / "own"))
     for name in ("NUMBA_CACHE_DIR", "HOME", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "home"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     (tmp_path / "prefix").mkdir()
     kernel_files.put(tmp_path / "own", "k", b"code")
     shared = kernel_files.publish()
