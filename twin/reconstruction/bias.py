@@ -152,7 +152,7 @@ class Bias:
             that is largest in nine of ten; None if the grid holds no node of the object
             or has too large voxels, or if images and geometry contradict each other.
         """
-        if self.contradiction is not None or self.too_coarse(grid):
+        if self.contradiction is not None or too_coarse(grid, self.found):
             return None
         size = np.array(grid.shape[::-1]) * grid.voxel_mm + self.found.voxel_xyz
         near = [
@@ -183,10 +183,6 @@ class Bias:
             return [str(self.contradiction)]
         accuracy = self.accuracy(grid)
         return [] if accuracy is None else accuracy.warnings
-
-    def too_coarse(self, grid: Grid | Volume) -> bool:
-        """Return whether a grid's voxels are too large to hold a uniform region."""
-        return too_coarse(grid, self.found)
 
 
 def too_coarse(grid: Grid | Volume, nodes: Volume) -> bool:
@@ -363,8 +359,7 @@ class BiasOnDemand:
             GeometryError: FDK cannot use the views.
         """
         scan = self._copied(NODES)
-        if one.cause.unit == "px":
-            size /= scan.binned[0 if one.cause.name in ("height", "slip") else 1]
+        size /= one.cause.whole_unit(scan.binned)
         images, views = one.cause.corrected(
             scan.images, scan.cone_vec, size * one.course(scan.share)
         )
@@ -379,8 +374,7 @@ class BiasOnDemand:
     @cached_property
     def _volume(self) -> Float32Array:
         """The coarse volume, 0 where no data cover it."""
-        scan = self._copied(NODES)
-        return np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, scan.truncation))
+        return np.nan_to_num(self._copied(NODES).volume)
 
     def _open(self, bounded: Bias, claimed: float) -> Bias:
         """Add what the images leave open.
@@ -447,8 +441,7 @@ class BiasOfIterations(BiasOnDemand):
     def _bounded(self) -> Bias:
         """The errors, but for what the comparison adds."""
         scan = self._copied(NODES)
-        values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
-        nodes = UniformNodes.of(values, scan.rim)
+        nodes = UniformNodes.of(scan.volume, scan.rim)
         shape = (scan.images.shape[1], scan.images.shape[2])
         images = scan.projected(nodes.found, scan.cone_vec, shape)
         again = self._run(images, scan.cone_vec, scan.grid).data
@@ -514,9 +507,8 @@ def _bounded(scan: CoarseScan, only: Container[str] = ALL_CAUSES) -> Bias:
         scan: the coarse copy.
         only: causes that are looked for.
     """
-    values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
-    nodes = UniformNodes.of(values, scan.rim)
-    causes = _causes(scan, nodes, np.nan_to_num(values), only)
+    nodes = UniformNodes.of(scan.volume, scan.rim)
+    causes = _causes(scan, nodes, np.nan_to_num(scan.volume), only)
     return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
 
 

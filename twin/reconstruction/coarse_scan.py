@@ -344,6 +344,15 @@ class CoarseScan:
         beside = float(ends.mean()) <= MAX_EASY_LEVEL * float(self.images.max())
         return climb <= MAX_EASY_CLIMB and beside
 
+    @cached_property
+    def volume(self) -> Float32Array:
+        """The scan's own images, reconstructed by `fdk`; not to be changed.
+
+        Raises:
+            GeometryError: FDK cannot use the views.
+        """
+        return self.fdk(self.images, self.cone_vec, self.truncation)
+
     def fdk(
         self,
         images: Float32Array,

@@ -31,8 +31,7 @@ def residuals_of(volume: Volume, scan: CoarseScan) -> Residuals:
     if own:
         thing = volume.like(np.nan_to_num(volume.data))
     else:
-        values = scan.fdk(scan.images, scan.cone_vec, scan.truncation)
-        thing = scan.grid.like(np.nan_to_num(values))
+        thing = scan.grid.like(np.nan_to_num(scan.volume))
     count, rows, cols = scan.images.shape
     views = scan.cone_vec
     finer = ConeVec.from_vectors(

@@ -165,9 +165,7 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
 
 def _of_panel(one: Finding, binned: tuple[int, int]) -> Finding:
     """Convert coarse pixels to the panel's."""
-    if one.cause.unit != "px":
-        return one
-    pixels = binned[0] if one.cause.name in ("height", "slip") else binned[1]
+    pixels = one.cause.whole_unit(binned)
     return replace(one, size=pixels * one.size, sigma=pixels * one.sigma)
 
 

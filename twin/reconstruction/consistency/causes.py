@@ -53,6 +53,16 @@ class Cause:
     fine: bool = False
     of_integral: bool = False
 
+    def whole_unit(self, binned: tuple[int, int]) -> float:
+        """Return how many units of the panel one of a binned copy is.
+
+        Args:
+            binned: rows and columns of the panel that are one of the copy.
+        """
+        if self.unit != "px":
+            return 1.0
+        return binned[0] if self.name in ("height", "slip") else binned[1]
+
     def corrected(
         self, images: Float32Array, cone_vec: ConeVec, sizes: FloatArray
     ) -> tuple[Float32Array, ConeVec]:
