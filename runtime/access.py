@@ -32,18 +32,23 @@ class ConnectionLimits:
     times in real seconds.
 
     Attributes:
-        max_message: largest line or frame received (MessagePack: below 16 MiB anyway).
-        max_batch: messages in a batch.
-        max_clients: connections at a time.
+        max_message: largest line or frame received (MessagePack: below 16 MiB anyway);
+            beyond it error -32008, and the connection goes on.
+        max_batch: messages in a batch; beyond it -32008.
+        max_clients: connections at a time, with a token those that have shown it. Beyond
+            it hello, stop, emergency stop, ping and abort are served (the newest 16 such
+            clients), the rest is answered with -32003.
         max_waiting: queued requests of one connection above which it is not read.
-        max_events: ordered events (job, log) queued for a client that does not read.
+        max_events: ordered events (job, log) queued for a client that does not read;
+            beyond it the client is cut off.
         max_unsent: bytes of replies queued for a client, above which its next request
             waits.
-        send_timeout_s: a client that takes nothing for so long is disconnected.
+        send_timeout_s: a client that takes nothing for so long is cut off.
         message_timeout_s: a message begun must be complete after this.
         hello_timeout_s: with a token, session.hello must come within this.
         end_timeout_s: after the client's end of file, replies may take this long.
-        requests_per_s: rate above which requests are refused; None: any rate.
+        requests_per_s: rate above which requests are refused with -32003, but never
+            stops, emergency stops, aborts and pings; None is any rate.
         malformed: broken messages in a row after which the connection is closed.
     """
 
@@ -72,19 +77,20 @@ class TwinLimits:
     """Limits on the cost of all clients of a twin together.
 
     Attributes:
-        max_jobs: jobs in the queue.
+        max_jobs: jobs in the queue; beyond it error -32003.
         max_ended_jobs: ended jobs that are known; beyond them the oldest is forgotten.
         ended_job_days: after which an ended job is forgotten [days].
-        max_upload: size of an uploaded sample [bytes].
-        max_samples: uploads there may be.
+        max_upload: size of an uploaded sample; beyond it -32008.
+        max_samples: uploads there may be; -32001 until some are deleted.
         max_observer_samples: uploads there may be that came while another client had
-            control.
-        max_observer_bytes: size of these together [bytes].
-        max_corrections: corrections there may be.
-        disk_quota: of the data directory [bytes]; None: no limit but the disk's.
-        max_subscriptions: topics that all connections together follow.
-        max_views: different kinds and binnings in which they want their events; an image
-            is rendered and encoded once for each.
+            control; beyond it -32001.
+        max_observer_bytes: size of these together.
+        max_corrections: corrections there may be; -32001 until some are deleted.
+        disk_quota: size of the data directory, checked before a scan or an upload begins
+            (-32001); None is what the disk holds, less 16 MiB.
+        max_subscriptions: topics that all connections together follow; beyond it -32003.
+        max_views: different kinds and binnings in which they want their events, beyond it
+            -32003; an image is rendered and encoded once for each.
         control_idle_s: a controller idle for this long loses control to the next client
             that requests it [s].
     """

@@ -1,5 +1,5 @@
 """Write the pages that follow from code and data: wire, commands, Python modules, formats of
-scans, evidence.
+scans, codes of findings, limits, evidence.
 
 They are written to `_generated/` beside the pages, only when they change.
 """
@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import evidence_pages
 import format_pages
+import list_pages
 
 MODULE = re.compile(r"^### `(flexdt[\w.]*)`$", re.MULTILINE)
 """Heading of a public module on a page that lists them."""
@@ -250,7 +251,13 @@ def benchmark() -> str:
     ])  # fmt: skip
 
 
-PAGES = {"wire.md": wire, "commands.md": commands, "evidence/bench.md": benchmark}
+PAGES = {
+    "wire.md": wire,
+    "commands.md": commands,
+    "findings.md": list_pages.findings,
+    "limits.md": list_pages.limits,
+    "evidence/bench.md": benchmark,
+}
 
 
 def module_pages(pages: Path) -> dict[str, str]:

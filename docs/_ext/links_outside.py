@@ -1,8 +1,9 @@
 """Links from pages to files of the repository that are no pages.
 
 On a forge they open the file; on the site they become its path, since the site has no copy of
-it. A link to a document of `docs/evidence/` leads to the page that is rendered from it. A link
-to something that does not exist is a warning, so the build fails.
+it. A link to a document of `docs/evidence/` leads to the page that is rendered from it, and one
+to a file that declares a list to the page of that list (`list_pages.py`). A link to something
+that does not exist is a warning, so the build fails.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ import os
 import re
 from pathlib import Path
 from typing import Any
+
+import list_pages
 
 EVIDENCE = Path("evidence")
 """Folder of the evidence documents, below the folder of all pages."""
@@ -55,6 +58,11 @@ def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:
             rendered = pages / RENDERED / f"{path.stem}.md"
             link = Path(os.path.relpath(rendered, page.parent)).as_posix()
             return f"[{words}]({link}{match[3] or ''})"
+        if path.is_relative_to(pages.parent) and (
+            listed := list_pages.LISTED.get(path.relative_to(pages.parent).as_posix())
+        ):
+            made = pages / RENDERED.parent / listed
+            return f"[{words}]({Path(os.path.relpath(made, page.parent)).as_posix()})"
         inside = path.is_relative_to(pages) and path.suffix == ".md"
         if inside or not path.is_relative_to(pages.parent):
             return match[0]

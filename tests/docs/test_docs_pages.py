@@ -10,6 +10,13 @@ import pytest
 from doc_pages import evidence
 from loaded_script import load
 
+from flexdt.runtime.access import (
+    ConnectionLimits,
+    TwinLimits,
+    ViewerLimits,
+    limit_names,
+)
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(
@@ -19,6 +26,7 @@ PAGES = sorted(
 
 LINKS = load(DOCS / "_ext" / "links_outside.py")
 GENERATED = load(DOCS / "_ext" / "generated_pages.py")
+ACCESS = ConnectionLimits(), TwinLimits(), ViewerLimits()
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda p: p.stem)
@@ -65,6 +73,23 @@ def test_generated_pages_name_every_method_and_every_command() -> None:
     for path, _ in GENERATED._walk(get_command(build()), "flexdt"):
         assert f"## `{path}`" in commands
     assert "`--criterion a\\|d\\|worst`" in commands
+
+
+def test_links_to_a_file_that_declares_a_list_lead_to_its_page() -> None:
+    page = DOCS / "reference" / "page.md"
+    text = "[codes](../../twin/script/problems.py)"
+    assert LINKS.rewritten(text, page, DOCS) == ("[codes](../_generated/findings.md)", [])
+    for file, listed in LINKS.list_pages.LISTED.items():
+        assert (ROOT / file).is_file()
+        assert listed in GENERATED.PAGES
+
+
+def test_the_limits_that_are_set_by_name_are_listed_with_their_meaning() -> None:
+    page = GENERATED.PAGES["limits.md"]()
+    rows = re.findall(r"^\| `(\w+)` \| ([^|]+) \| ([^|]+) \|$", page, re.MULTILINE)
+    names = [name for made in ACCESS for name in limit_names(made)]
+    assert [name for name, *_ in rows] == names
+    assert all(len(meaning.split()) > 2 for *_, meaning in rows)
 
 
 def test_docstrings_become_restructured_text() -> None:

@@ -4,13 +4,14 @@ Clicks are counted as a hand makes them: a press is one, held or dragged too, a 
 list two (open it, take one), a field to type into one, a file to pick one. Keys are not
 counted.
 
-The clicks of the table in docs/viewer.md are those counted here, on a small desktop screen,
-a tablet and a phone; `pytest -s tests/viewer/test_viewer_first_visit.py` prints the seconds,
-too.
+The clicks of the table in docs/evidence/viewer.json are those counted here, on a small desktop
+screen, a tablet and a phone; `pytest -s tests/viewer/test_viewer_first_visit.py` prints the
+seconds, too.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from collections.abc import Callable
@@ -27,7 +28,7 @@ from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import ScanRequest
 
 pytestmark = pytest.mark.browser
-HEAD = "| task | clicks | what is seen then |\n|---|---|---|\n"
+FIGURES = Path(__file__).parents[2] / "docs" / "evidence" / "viewer.json"
 SIZES = ((1366, 768), (820, 1180), (390, 844))
 HOME = {"mag_obj": 600, "mag_det": 1000, "ver_tube": 26.29, "ver_det": 20, "tra_obj": 0}
 WRONG = {"dO_x": 0.6, "dO_z": -0.8}
@@ -317,8 +318,10 @@ def test_the_table_of_the_page_lists_these_tasks() -> None:
 
 
 def table() -> dict[str, tuple[str, str]]:
-    """Task -> clicks, and what is seen then, in docs/viewer.md."""
-    text = (Path(__file__).parents[2] / "docs" / "viewer.md").read_text("utf-8")
-    rows = text.partition(HEAD)[2].partition("\n\n")[0].splitlines()
-    cells = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)
-    return {task: (clicks, seen) for task, clicks, seen in cells}
+    """Task -> clicks, and what is seen then, in docs/evidence/viewer.json."""
+    [section] = [
+        section
+        for section in json.loads(FIGURES.read_text("utf-8"))["sections"]
+        if section["columns"] == ["task", "clicks", "what is seen then"]
+    ]
+    return {task: (clicks, seen) for task, clicks, seen in section["rows"]}

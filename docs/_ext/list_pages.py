@@ -1,0 +1,78 @@
+"""Pages of the lists that code declares: codes of findings, limits of the servers."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from typing import Any
+
+LISTED = {
+    "twin/script/problems.py": "findings.md",
+    "twin/calibration/diagnose/__init__.py": "findings.md",
+    "twin/plausibility/contradictions.py": "findings.md",
+    "runtime/access.py": "limits.md",
+}
+"""File of the repository that declares a list -> its page below `_generated/`."""
+
+
+def findings() -> str:
+    """List the codes of all checks, with what each means and the gravest it can be."""
+    from flexdt.twin.calibration.diagnose import CalibrationCode
+    from flexdt.twin.commissioning import CommissionCode
+    from flexdt.twin.plausibility import PlausibilityCode
+    from flexdt.twin.script.problems import ScriptCode
+
+    out = [
+        "# Codes of findings",
+        "",
+        "An error forbids the use of the input or withholds the result; a warning offers "
+        "it. A finding may be milder than the gravest that its code can be, and its message "
+        "says what to do.",
+        "",
+    ]
+    for title, room in (
+        ("Scripts", ScriptCode),
+        ("Data and geometry", PlausibilityCode),
+        ("Calibration", CalibrationCode),
+        ("Commissioning", CommissionCode),
+    ):
+        out += [f"## {title}", "", "| code | gravest | means |", "|---|---|---|"]
+        out += [f"| `{code}` | {code.gravest} | {code.meaning} |" for code in room]
+        out.append("")
+    return "\n".join(out)
+
+
+def limits() -> str:
+    """List what `--limit NAME=VALUE` takes, with the defaults."""
+    from flexdt.runtime import access
+
+    out = [
+        "# Limits of the servers",
+        "",
+        "`--limit NAME=VALUE`, as often as needed, on `flexdt up`, `twin`, `projector` (those "
+        "of connections) and `viewer` (those of the page). Sizes are in bytes.",
+        "",
+    ]
+    for title, made in (
+        ("Connections", access.ConnectionLimits()),
+        ("A twin", access.TwinLimits()),
+        ("The page", access.ViewerLimits()),
+    ):
+        meanings = attributes(made)
+        out += [f"## {title}", "", "| limit | default | meaning |", "|---|---|---|"]
+        for field in fields(made):
+            value = getattr(made, field.name)
+            shown = "none" if value is None else f"{value:,}".replace(",", " ")
+            out.append(f"| `{field.name}` | {shown} | {meanings[field.name]} |")
+        out.append("")
+    return "\n".join(out)
+
+
+def attributes(value: Any) -> dict[str, str]:
+    """Return what a class's docstring says of each attribute."""
+    text = (type(value).__doc__ or "").partition("Attributes:")[2]
+    parts = re.split(r"^ {8}(\w+): ", text, flags=re.MULTILINE)[1:]
+    return {
+        name: " ".join(said.split()).rstrip(".")
+        for name, said in zip(parts[::2], parts[1::2], strict=True)
+    }
