@@ -410,33 +410,30 @@ export function imageMade(image) {
   return ofImage(image.origin, image.cone_vec, image.twin);
 }
 
-/** What the twin's clock shows now; null before a state has come. */
-export function twinNow() {
-  if (!store.state || !told) return null;
-  const now = performance.now();
-  const trip = Number.isFinite(quickest) ? quickest : 0;
-  const since = (now - told.at - delay(now)) / 1000 + told.late + trip;
-  return clockNow(store.state.clock, since);
-}
+/** How many seconds ago the newest state was told, if news takes so long; 0 without any. */
+const toldAgo = (/** @type {number} */ now, /** @type {number} */ trip) =>
+  told === null ? 0 : (now - told.at) / 1000 + told.late + trip;
 function look() {
   const now = performance.now();
-  const own = delay(now) / 1000;
   const silent = heard === null ? 0 : (now - heard.at) / 1000 + heard.late + heard.silent;
+  const trip = Number.isFinite(quickest) ? quickest : 0;
   // A state may wait behind other things where a heartbeat does not; at rest one comes every .5 s.
-  const trip = Number.isFinite(quickest) ? quickest / 2 : 0;
-  const behind = told === null ? 0 : (now - told.at) / 1000 + told.late + trip;
-  store.age = Math.max(0, Math.max(silent, behind) - own);
+  const behind = toldAgo(now, trip / 2);
+  // Nobody is blamed for the time that the page itself stood still ...
+  store.age = Math.max(0, Math.max(silent, behind) - delay(now) / 1000);
   store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
   const image = store.image;
-  const time_s = twinNow();
   store.imageAge = 0;
   store.imageDiffers = [];
-  if (image && !image.recorded && store.now && store.state && time_s !== null) {
-    const present = { made: store.now, told_s: store.state.time, time_s };
+  if (image && !image.recorded && store.now && store.state) {
+    const { clock, time } = store.state;
+    // ... but the image is as old as it is.
+    const time_s = clockNow(clock, toldAgo(now, trip));
+    const present = { made: store.now, told_s: time, time_s, since_s: behind };
     const { age_s, differ } = age({ made, time_s: image.time }, present);
     // As old as when the page looks next: until then it is not marked.
-    const next_s = clockNow(store.state.clock, LOOK_MS / 1000) - store.state.clock.time_s;
-    store.imageAge = differ.length ? age_s + next_s : 0;
+    const next_s = clockNow(clock, LOOK_MS / 1000) - clock.time_s;
+    store.imageAge = differ.length ? age_s + next_s : age_s;
     store.imageDiffers = differ;
   }
   emit("age");

@@ -21,16 +21,18 @@ import { differences } from "./fingerprint.js";
  */
 
 /**
- * The newest state: what stands and is set, when that was so, and what the twin's clock shows by
- * now.
+ * The newest state: what stands and is set, when that was so, what the twin's clock shows by
+ * now, and how many seconds of ours ago the state was true.
  * @typedef {object} Present
  * @property {Fingerprint} made
  * @property {number} told_s
  * @property {number} time_s
+ * @property {number} since_s
  */
 
 /**
- * In what an arrival differs from now, and how long it has not been so, in seconds of the twin.
+ * In what an arrival differs from now, and how long it has not been so, in seconds of the twin;
+ * of one that fits the newest state, how many seconds of ours nothing newer has been read.
  * @typedef {object} Age
  * @property {Quantity[]} differ
  * @property {number} age_s
@@ -57,7 +59,8 @@ export function belongs(made, moment) {
 }
 
 /**
- * Keeps until when the newest arrival has been of now; a state that it fits renews it.
+ * Keeps until when the newest arrival has been of now; a state that it fits renews it, and speaks
+ * for OLD_S.
  * @returns {(arrival: Arrival, present: Present) => Age}
  */
 export function aging() {
@@ -72,7 +75,7 @@ export function aging() {
     const differ = differences(made, present.made);
     if (!differ.length) {
       true_s = Math.max(true_s, present.told_s);
-      return { differ, age_s: 0 };
+      return { differ, age_s: present.since_s > OLD_S ? present.since_s : 0 };
     }
     // Another run counts from 0 again.
     if (differ.includes("twin")) return { differ, age_s: Infinity };

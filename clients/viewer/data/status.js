@@ -245,7 +245,7 @@ on("age", () => {
   tag.hidden = store.imageAge <= OLD_S;
   if (tag.hidden) return;
   const age = Number.isFinite(store.imageAge) ? `: ${fixed(store.imageAge, 0)} s old` : "";
-  setText(tag, `of another ${old()}${age}`);
+  setText(tag, `${store.imageDiffers.length ? `of another ${old()}` : "of now?"}${age}`);
 });
 
 /**

@@ -359,7 +359,8 @@ test("an image's age is how long it has not been true, by the twin's clock", () 
       waiting = waiting.filter((each) => each.due > k);
       if (!image) continue;
       const now = time + random();
-      const present = { made: { pose: [pose] }, told_s: time, time_s: now };
+      const since_s = 2 * random();
+      const present = { made: { pose: [pose] }, told_s: time, time_s: now, since_s };
       const { age_s, differ } = age(image, present);
       const true_s = Math.max(
         image.time_s,
@@ -368,14 +369,16 @@ test("an image's age is how long it has not been true, by the twin's clock", () 
       const fits = image.made.pose[0] === pose;
       assert.equal(differ.length, fits ? 0 : 1);
       // Seen only while it was shown: never younger than it is, and old only where it is.
-      assert.ok(fits ? age_s === 0 : age_s >= now - true_s - 1e-9);
+      // A state speaks for a second of ours.
+      const spoken = since_s > moments.OLD_S ? since_s : 0;
+      assert.ok(fits ? age_s === spoken : age_s >= now - true_s - 1e-9);
       assert.ok(fits || age_s <= now - image.time_s + 1e-9);
     }
   }
 });
 
 test("another run of the twin has no age, and what belongs nowhere is not shown", () => {
-  const present = { made: { twin: "b" }, told_s: 1, time_s: 1 };
+  const present = { made: { twin: "b" }, told_s: 1, time_s: 1, since_s: 0 };
   assert.equal(moments.aging()({ made: { twin: "a" }, time_s: 900 }, present).age_s, Infinity);
   const live = { dataset: null };
   const five = { dataset: "x", frame: 5 };
