@@ -32,10 +32,15 @@ from flexdt.twin.geometry.conventions import FloatArray
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "other-scanners.md").read_text(encoding="utf-8")
 FORMATS = load(ROOT / "docs" / "_ext" / "format_pages.py")
-BLOCKS = {
-    form.name: FORMATS.block(FORMATS.page(form)) for form in SCAN_FORMATS if form.table
-} | dict(
-    re.findall(r"^### ([^\n]+)\n(?:(?!^### ).)*?```python\n(.*?)```", PAGE, re.M | re.S)
+RTK_PAGE = (ROOT / "docs" / "coming-from" / "rtk.md").read_text(encoding="utf-8")
+BLOCKS = (
+    {form.name: FORMATS.block(FORMATS.page(form)) for form in SCAN_FORMATS if form.table}
+    | {"RTK": FORMATS.block(RTK_PAGE)}
+    | dict(
+        re.findall(
+            r"^### ([^\n]+)\n(?:(?!^### ).)*?```python\n(.*?)```", PAGE, re.M | re.S
+        )
+    )
 )
 """Format -> the block of its page, from its file to a volume."""
 START = 0.4

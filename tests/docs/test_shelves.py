@@ -14,7 +14,7 @@ from loaded_script import load
 
 ROOT = DOCS.parent
 MADE = DOCS / "images" / "made"
-MAX_WORDS = 34_000
+MAX_WORDS = 28_100
 """Of all pages; figures of the evidence shelf are data, and counted apart."""
 MAX_PAGES = 60
 """Notebooks of the story included; pages made from code or data left out."""
@@ -32,9 +32,9 @@ QUOTED = {
     "calibration.md": [
         ("calibrated", "miss_before_px", "up to {:.1f} pixels"),
         ("tile-gap", "correlation_before", "geometry {:.3f} and"),
-        ("tile-gap", "correlation_after", "and {:.3f} ("),
+        ("tile-gap", "correlation_after", "and {:.3f}.*"),
         ("motion", "correlation_before", "correlation {:.3f} and"),
-        ("motion", "correlation_after", "and {:.3f} ("),
+        ("motion", "correlation_after", "and {:.3f}.*"),
     ],
     "align.md": [
         ("aligned", "correlation_before", "{:.3f} before"),
@@ -82,6 +82,14 @@ def test_the_documentation_is_short() -> None:
         sum(COUNTS.words(path) for paths in SHELVES.values() for path in paths)
         <= MAX_WORDS
     )
+
+
+@pytest.mark.parametrize(
+    "page", [page for shelf in SHELVES.values() for page in shelf], ids=lambda p: p.stem
+)
+def test_each_page_says_who_may_skip_it(page: Path) -> None:
+    first, *_ = re.split(r"^## |^### ", page.read_text("utf-8"), flags=re.MULTILINE)
+    assert re.search(r"\bskip\b", first, re.IGNORECASE)
 
 
 TASKS = [p for p in SHELVES["use"] if p.parent == DOCS and p.name not in INDEXES]
@@ -152,13 +160,14 @@ def test_made_figures_are_kept_and_named_with_their_command() -> None:
     assert kept == set(numbers)
     assert all(f'"{name}":' in script for name in kept)
     assert all(path.stat().st_size < MAX_PICTURE_BYTES for path in MADE.glob("*.png"))
-    shown = set()
-    for path, text in pages().items():
-        for name in re.findall(r"images/made/([\w-]+)\.png", text):
-            shown.add(name)
-            flat = " ".join(text.split())
-            assert f"scan_figures.py --only {name}`" in flat, (path.name, name)
+    shown = {
+        name
+        for text in pages().values()
+        for name in re.findall(r"images/made/([\w-]+)\.png", text)
+    }
     assert shown == kept
+    index = (DOCS / "evidence" / "index.md").read_text("utf-8")
+    assert "`python docs/tools/scan_figures.py --only NAME`" in index
 
 
 @pytest.mark.parametrize("page", QUOTED)
