@@ -24,7 +24,7 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeGuard, TypeVar
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.client.transport import ConnectionLost, Transport
@@ -98,6 +98,30 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         finally:
             self.alone = False
 
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        """Log what failed in a callback or a task; end the loop with what is no `Exception`.
+
+        Such is the end of a test at its time limit: it comes wherever the thread is, also
+        in a callback, whose caller would log it and wait for ever for what the callback had
+        to do.
+
+        Raises:
+            BaseException: the one of the context, unless it is an `Exception` or a
+                cancellation.
+        """
+        error = context.get("exception")
+        if _ends_all(error):
+            raise error
+        super().call_exception_handler(context)
+
+    def create_task(  # type: ignore[override]
+        self, coro: Coroutine[Any, Any, T], **options: Any
+    ) -> asyncio.Task[T]:
+        """Make a task; what is no `Exception` ends the loop, not the task alone."""
+        task = super().create_task(coro, **options)
+        task.add_done_callback(_pass_on)
+        return task
+
     def come_to_rest(self) -> None:
         """Stop the loop if another thread runs it, and wait for that thread's end.
 
@@ -122,6 +146,19 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         return done
 
 
+def _ends_all(error: BaseException | None) -> TypeGuard[BaseException]:
+    """Return whether an error ends the program or the test, not what it came to."""
+    return error is not None and not isinstance(error, Exception | asyncio.CancelledError)
+
+
+def _pass_on(task: asyncio.Task[Any]) -> None:
+    """Raise what ended a task if that ends all; others are left to who awaits the task."""
+    # Its own field: to ask `exception` would count as having looked at every error.
+    error = None if task.cancelled() else task._exception
+    if _ends_all(error):
+        raise error
+
+
 def _work(
     done: asyncio.Future[Any], func: Callable[..., Any], args: tuple[Any, ...]
 ) -> None:
@@ -133,12 +170,31 @@ def _work(
     """
     try:
         result = func(*args)
+    except StopIteration as error:  # no future may have it
+        if not done.cancelled():
+            done.set_exception(RuntimeError(f"{func} raised {error!r}"))
     except Exception as error:
         if not done.cancelled():
             done.set_exception(error)
     else:
         if not done.cancelled():
             done.set_result(result)
+
+
+def _waits(loop: asyncio.AbstractEventLoop) -> Iterator[str]:
+    """Yield a line for each task of a loop that is not done: its name, and the chain of
+    awaits, outermost first, that ends with what it waits for.
+    """
+    for task in asyncio.all_tasks(loop):
+        places = []
+        at: Any = task.get_coro()
+        while frame := getattr(at, "cr_frame", None) or getattr(at, "gi_frame", None):
+            code = frame.f_code
+            place = f"{Path(code.co_filename).name}:{frame.f_lineno}"
+            places.append(f"{code.co_qualname} ({place})")
+            at = getattr(at, "cr_await", None) or getattr(at, "gi_yieldfrom", None)
+        places.append(repr(task._fut_waiter))  # type: ignore[attr-defined]
+        yield f"{task.get_name()}: {' > '.join(places)}"
 
 
 class _Jumps(selectors.DefaultSelector):
@@ -166,7 +222,8 @@ class _Jumps(selectors.DefaultSelector):
             return super().select()
         events = super().select(0.0)
         if not events and timeout is None:
-            raise Deadlock("nothing is left that could happen")
+            waiting = "".join(f"\n  {line}" for line in sorted(_waits(self._loop)))
+            raise Deadlock(f"nothing is left that could happen; waiting:{waiting}")
         if not events and timeout is not None:
             self._loop.jump(timeout)
         return events

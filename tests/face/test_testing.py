@@ -247,6 +247,61 @@ def test_a_connection_that_was_lost_is_made_anew(flexdt_twin: InProcessTwin) -> 
     assert flexdt_twin.run(again()) == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
 
 
+class TimeIsOver(BaseException):
+    """What ends a test at its time limit, wherever the thread is then."""
+
+
+def _raise(error: BaseException) -> None:
+    raise error
+
+
+@pytest.mark.parametrize("place", ["a thread", "a callback", "a task"])
+def test_the_end_of_a_test_is_no_deadlock(flexdt_twin: InProcessTwin, place: str) -> None:
+    """It came as one: what it interrupted was logged, and what waited for that, waited."""
+    loop = flexdt_twin.loop
+
+    async def interrupted() -> None:
+        error = TimeIsOver("after 300 s")
+        match place:
+            case "a thread":
+                await asyncio.to_thread(_raise, error)
+            case "a callback":
+                loop.call_later(1.0, _raise, error)
+            case _:
+
+                async def service() -> None:
+                    _raise(error)
+
+                started = loop.create_task(service())
+                assert not started.done()
+        await asyncio.Event().wait()
+
+    with pytest.raises(TimeIsOver, match="after 300 s"):
+        flexdt_twin.run(interrupted())
+
+
+def test_a_threads_error_that_no_future_may_have_is_told(
+    flexdt_twin: InProcessTwin,
+) -> None:
+    with pytest.raises(RuntimeError, match="StopIteration"):
+        flexdt_twin.run(asyncio.to_thread(next, iter(())))
+
+
+def test_a_deadlock_names_what_waits_and_where(flexdt_twin: InProcessTwin) -> None:
+    async def inner() -> None:
+        await asyncio.Event().wait()
+
+    async def outer() -> None:
+        await inner()
+
+    with pytest.raises(Deadlock) as caught:
+        flexdt_twin.run(outer())
+    said = str(caught.value)
+    assert re.search(r"outer \(test_testing.py:\d+\) > .*inner \(test_testing.py:\d+\) > "
+                     r"Event.wait", said)  # fmt: skip
+    assert "Jobs.work" in said
+
+
 def test_waits_that_cannot_end_are_said(flexdt_twin: InProcessTwin) -> None:
     with pytest.raises(Deadlock, match="nothing is left that could happen"):
         flexdt_twin.run(asyncio.Event().wait())
