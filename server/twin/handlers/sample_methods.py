@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from functools import lru_cache
 
 from flexdt.phantoms import Phantom, is_shipped, load_phantom, materials
 from flexdt.protocol.messages import Encoded
@@ -88,7 +89,7 @@ def _listed(twin: TwinServer, name: str) -> p.SampleInfo | None:
             name=name, description="nothing on the stage", size_mm=(0.0, 0.0, 0.0)
         )
     if is_shipped(name):
-        return _sample_info(name, load_phantom(name))
+        return _shipped_info(name)
     head = twin.samples.head(name)
     return None if head is None else _upload_info(head)
 
@@ -280,6 +281,12 @@ def _ensure_replaceable(twin: TwinServer, client: h.Client, name: str) -> None:
             twin.feed.changed()
     if name == twin.scanner.sample.name:
         h.ensure_idle(twin, client, "sample.upload", "sample.upload")()
+
+
+@lru_cache(maxsize=64)
+def _shipped_info(name: str) -> p.SampleInfo:
+    """Describe a shipped phantom, which never changes; making one takes milliseconds."""
+    return _sample_info(name, load_phantom(name))
 
 
 def _sample_info(
