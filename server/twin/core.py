@@ -7,7 +7,6 @@ translate to it. Framing is in `server/network`, the process in `main`.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import math
 import secrets
@@ -73,6 +72,8 @@ MAX_FAILURES = 5
 """Number of failures within `FAILURE_WINDOW_S` after which a service is not restarted."""
 FAILURE_WINDOW_S = 60.0
 """Time within which a service's failures count [real s]."""
+END_PATIENCE_S = 1.0
+"""Time after which a service is told again to end [s]."""
 SERVICE_PAUSE_S = 0.1
 
 
@@ -397,11 +398,11 @@ class TwinServer:
         A running scan's data set is marked incomplete. Before `start` no state is
         written.
         """
-        for task in self._tasks:
-            task.cancel()
-        for task in self._tasks:
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+        # One that takes its end for an error of its own is told again.
+        while not all(task.done() for task in self._tasks):
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.wait(self._tasks, timeout=END_PATIENCE_S)
         self.submissions.close()
         self.past_scans.close()
         self.predictors.close()
