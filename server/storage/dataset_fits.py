@@ -42,6 +42,7 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
     # Here, as only workers fit: the server's own process loads nothing of it.
     from flexdt.library.analysis import calibrate
     from flexdt.library.calibration.bead_tracks import tracks_document
+    from flexdt.library.calibration.calibration_options import ON_THE_WIRE
     from flexdt.twin.calibration.fit.fit import covariance_by_step
     from flexdt.twin.calibration.unknown_markers import UNKNOWN
 
@@ -50,19 +51,14 @@ def fit(root: Directory, asked: p.CalibrationFit, *_: object) -> p.CalibrationFi
         phantom = load_phantom_file(_text(root, phantom), phantom)
     elif phantom != UNKNOWN and not is_shipped(phantom):
         load_phantom(phantom)  # the error lists the names
-    marks = None
+    options: Any = {name: getattr(asked, name) for name in ON_THE_WIRE}
     if asked.markers is not None:
         marks = [(m.frame, m.marker, m.column, m.row, m.sigma) for m in asked.markers]
+        options["markers"] = marks
     found = calibrate(
         [_dataset_path(root, name) for name in asked.datasets],
         phantom,
-        free=asked.free,
-        priors=asked.priors,
-        exclude=asked.exclude,
-        bead_tolerance=asked.bead_tolerance,
-        per_frame=asked.per_frame,
-        markers=marks,
-        scale=asked.scale,
+        **options,
     )
     document = dict(found.document)
     fitted = found.calibration.fit

@@ -426,7 +426,7 @@ def test_options_that_do_not_go_together(
     for more, code, says in (
         (["unknown"], 2, "no data set; allowed: --frames DIR or --markers FILE"),
         (["lego", "--markers", markers], 1, "is no bead of 'lego'; allowed: 0 to 4"),
-        (["lego", "--markers", markers, "--scale", "0-1=5"], 1, "states its own size"),
+        (["lego", "--markers", markers, "--scale", "0-1=5"], 2, "states its own size"),
         (
             ["unknown", "--markers", markers, "--scale", "0-99=5"],
             1,

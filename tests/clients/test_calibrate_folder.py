@@ -175,8 +175,10 @@ def test_the_command_knows_readings_scans_and_what_is_held(
     printed, mount = values(), values("--reading", "mount")
     assert mount["dO_x"] == pytest.approx(printed["dO_x"] + printed["tau_x"], abs=1e-4)
     assert mount["dO_y"] == pytest.approx(printed["dO_y"], abs=1e-6)
-    assert set(values("--per-scan", "alpha")) == set(printed)  # one scan: the same
-    assert run([*words, "--per-scan", "alpha", "--free", "dO_x"]) == 1
+    assert run([*words, "--per-scan", "alpha"]) == 2
+    assert "allowed with: several data sets" in " ".join(capsys.readouterr().err.split())
+    twice = ["calibrate", str(folder), str(folder), "--phantom", "lego"]
+    assert run([*twice, "--per-scan", "alpha", "--free", "dO_x"]) == 1
     assert (
         "alpha is to have a value in each scan but is not free" in capsys.readouterr().err
     )

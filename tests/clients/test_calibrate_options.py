@@ -12,9 +12,16 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.command_settings import CalibrateSettings
+from flexdt.clients.cli.command_tree import run
 from flexdt.clients.cli.commands import calibrate_commands
-from flexdt.library.calibration.calibration_options import CalibrationOptions
+from flexdt.library.calibration.calibration_options import (
+    CONDITIONS,
+    ON_THE_WIRE,
+    RULES,
+    CalibrationOptions,
+)
 from flexdt.library.calibration.calibration_request import detection_of, request_of
+from flexdt.protocol.methods.calibration_messages import CalibrationFit
 from flexdt.twin.errors import TwinError
 
 OF_FILES = {"datasets", "geometry", "frames", "shape", "pixel", "report", "tracks"}
@@ -89,3 +96,106 @@ def test_an_option_that_does_not_exist_is_named_with_its_neighbour() -> None:
         fx.calibrate([], "lego", bead_tolerence=0.1)  # type: ignore[call-arg]
     with pytest.raises(TypeError, match="allowed: a number or None"):
         fx.calibrate([], "lego", bead_tolerance="wide")  # type: ignore[arg-type]
+
+
+SCAN = {"sod": 600, "sdd": 1059, "angles": 12, "shape": (190, 239), "pixel": 0.5984}
+SEEN_WITH: dict[str, Any] = {
+    "free": ["dO_x", "dO_y"],
+    "per_frame": ["dO_y"],
+    "reading": "mount",
+    "bead_tolerance": 0.05,
+    "priors": {"dD_x": 0.01},
+    "exclude": ["beads", "shape", "motion", "distortion"],
+    "start": {"det_roll": 1.5},
+    "bound": 1e-6,
+    "scale": "0-1=41.5",
+    "radius": 4.0,
+    "per_scan": ["dO_x"],
+}
+"""Values that show in a result, if the option has an effect."""
+MARKS: Any = {}
+
+
+def result(phantom: str, **options: Any) -> dict[str, Any]:
+    """The document of a calibration from marks, of a scan whose panel stands aside and whose
+    beads are not where the phantom has them."""
+    if not MARKS:
+        rng = np.random.default_rng(3)
+        beads = fx.phantoms.lego().beads + rng.normal(0.0, 0.05, (5, 3))
+        really = fx.ConeVec.circular(**SCAN, offset=(0.8, 0.3), tilts=(0.4, 0, 0))
+        spots = really.project_points(beads, SCAN["shape"])
+        spots = spots + rng.normal(0.0, 0.05, spots.shape)
+        MARKS["marks"] = [
+            (i, str(k), *map(float, spots[i, k]), 0.05)
+            for i in range(12)
+            for k in range(5)
+        ]
+    found = fx.calibrate(
+        None,
+        phantom,
+        geometry=fx.ConeVec.circular(**SCAN),
+        markers=MARKS["marks"],
+        **options,
+    )
+    left_out = {"seconds", "next", "geometry"}
+    return {key: value for key, value in found.document.items() if key not in left_out}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phantom", ["lego", "unknown"])
+def test_what_is_taken_shows_in_the_result_and_the_rest_is_refused(phantom: str) -> None:
+    """No option is dropped in silence. The result is the witness, not the table."""
+    plain = result(phantom)
+    refused = {}
+    for name, value in SEEN_WITH.items():
+        try:
+            other = result(phantom, **{name: value})
+        except TwinError as error:
+            refused[name] = error.message
+            continue
+        assert other != plain, f"{name} has no effect with {phantom}, and is taken"
+    assert all("has no effect" in said for said in refused.values()), refused
+    more = {"scale"} if phantom == "lego" else {"bead_tolerance"}
+    assert set(refused) == {"radius", "per_scan"} | more
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.option)
+def test_the_command_refuses_by_the_rules_before_it_reads_anything(
+    rule: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words: dict[str, list[str]] = {
+        "unknown": ["a", "b", "--phantom", "unknown"],
+        "markers": ["a", "b", "--markers", "m.csv", "--phantom", "lego"],
+        "scale": ["a", "--scale", "0-1=4", "--phantom", "lego"],
+        "radius": [
+            "--markers",
+            "m.csv",
+            "--geometry",
+            "g",
+            "--radius",
+            "4",
+            "--phantom",
+            "lego",
+        ],
+        "bead_tolerance": ["a", "--bead-tolerance", "0.1", "--phantom", "unknown"],
+        "per_scan": ["a", "--per-scan", "dO_x", "--phantom", "lego"],
+        "shape": ["a", "--shape", "4,5", "--phantom", "lego"],
+        "pixel": ["a", "--pixel", "0.1", "--phantom", "lego"],
+        "push": ["a", "b", "--per-scan", "dO_x", "--push", "--phantom", "lego"],
+    }
+    assert run(["calibrate", *words[rule.option]]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert rule.meaning in said
+    assert "allowed with: " in said
+    assert "{" not in said
+    if rule.option != "unknown":
+        assert f"--{rule.option.replace('_', '-')}: has no effect" in said
+
+
+def test_every_option_of_a_rule_is_one_of_a_door() -> None:
+    declared = set(CalibrationOptions.__annotations__)
+    assert {rule.option for rule in RULES} <= declared | OF_FILES | {"unknown", "push"}
+    assert {rule.needs for rule in RULES} <= set(CONDITIONS)
+    wire = set(CalibrationFit.model_fields)
+    assert set(ON_THE_WIRE) == declared & wire
+    assert {rule.option for rule in RULES} & wire <= set(ON_THE_WIRE)

@@ -210,7 +210,7 @@ def test_marks_that_do_not_hold_are_refused(served: Served) -> None:
                 True,
             ), says
         for phantom, scale, says in (
-            ("lego", "0-1=3", "this phantom states its own size"),
+            ("lego", "0-1=3", "a known phantom states its own size"),
             ("unknown", "0-1", "allowed: A-B=MM"),
             ("unknown", None, "1 markers; allowed: three or more"),
         ):
@@ -222,7 +222,8 @@ def test_marks_that_do_not_hold_are_refused(served: Served) -> None:
         both = await client.error(
             "calibration.fit", datasets=["lego", "lego"], phantom="lego", markers=[mark]
         )
-        assert "2 data sets with markers" in both.message
+        assert "markers: has no effect" in both.message
+        assert "allowed with: one data set" in both.message
         # Too few of them are no error: the answer says that they do not determine anything.
         few = await client.call(
             "calibration.fit",

@@ -7,7 +7,7 @@ and choose the exit code.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -119,8 +119,9 @@ def calibrate(
     folders = datasets or []
     geometries = geometry or []
     target = _require_phantom(phantom)
+    own = {"shape": shape, "pixel": pixel, "push": push or None}
+    _require_effect(target, options, own, len(folders), geometry=bool(geometries))
     if push:
-        _require_one_geometry(per_scan, folders)
         _require_answer(twin)
     as_json_file = report is not None and report.suffix.lower() == ".json"
     if report is not None and not as_json_file:
@@ -163,14 +164,40 @@ def _report_problems(document: Mapping[str, Any]) -> None:
         raise CommandError(f"not to be used{codes and ': '}{codes}", NOT_IDENTIFIABLE)
 
 
-def _require_one_geometry(per_scan: str, folders: Collection[Path]) -> None:
-    """Check that a calibration gives one geometry; several scans with parameters of their
-    own are a usage error.
+def _require_effect(
+    phantom: str,
+    options: CalibrationOptions,
+    own: Mapping[str, object],
+    count: int,
+    *,
+    geometry: bool,
+) -> None:
+    """Check that every option has an effect, before anything is read (`RULES`).
+
+    Args:
+        phantom: its name or file.
+        options: those that Python has, too.
+        own: those of the command alone; None for those that are not given.
+        count: number of data sets.
+        geometry: whether a file of geometry is given.
+
+    Raises:
+        typer.BadParameter: one has none; says with what it has one.
     """
-    if per_scan and len(folders) > 1:
-        raise typer.BadParameter(
-            "--push: with --per-scan there is no one geometry to push"
-        )
+    from flexdt.library.calibration.calibration_options import conditions, misfit
+
+    stated = {**options, **own, "unknown": phantom == "unknown" or None}
+    given = {name for name, value in stated.items() if value not in (None, [], ())}
+    holding = conditions(
+        phantom,
+        count,
+        marked=options.get("markers") is not None,
+        geometry=geometry,
+        joint=not options.get("per_scan"),
+    )
+    found = misfit(given, holding, lambda name: f"--{name.replace('_', '-')}")
+    if found is not None:
+        raise typer.BadParameter(found[1])
 
 
 def _words(**options: object) -> dict[str, str]:

@@ -22,7 +22,11 @@ from typing import Final, Generic
 
 import numpy as np
 
-from flexdt.library.calibration.calibration_options import CalibrationOptions
+from flexdt.library.calibration.calibration_options import (
+    CalibrationOptions,
+    conditions,
+    misfit,
+)
 from flexdt.library.calibration.calibration_request import detection_of, request_of
 from flexdt.library.calibration.dataset_frames import DatasetFrames
 from flexdt.library.calibration.exposure_share import exposure_share
@@ -253,9 +257,9 @@ def calibrate_datasets(
         data sets as used, and the phantom.
 
     Raises:
-        TwinError: no data sets, several with markers or an unknown phantom, a scale with
-            a known one, a radius out of range, a phantom without beads, a request of
-            unknown parameters, or invalid markers.
+        TwinError: no data sets, an option that would have no effect (`RULES`), a radius out
+            of range, a phantom without beads, a request of unknown parameters, or invalid
+            markers.
     """
     start = time.perf_counter()
     if isinstance(scale, str):
@@ -264,13 +268,12 @@ def calibrate_datasets(
         raise TwinError("no data sets; allowed: one or more", {"asked": 0, "allowed": 1})
     unknown = phantom == UNKNOWN
     want = request or CalibrationRequest(free=("dO_x",) if unknown else SIX)
+    located = {"markers": markers, "scale": scale, "radius": radius_px}
+    _require_effect(len(datasets), unknown, want, **located)
     if markers is None:
         datasets = [squared(d) for d in datasets]
     saturated = [finding for d in datasets if (finding := saturation(d)) is not None]
     sought = _spots_of_radius(radius_px)
-    _require_together(
-        len(datasets), marked=markers is not None, unknown=unknown, scale=scale
-    )
     marked = None
     if markers is not None:
         marked = read_markers(markers, len(datasets[0]))
@@ -312,30 +315,34 @@ def _spots_of_radius(radius_px: float | None) -> SpotFinder | None:
     return SpotFinder((0.65 * radius_px, 1.5 * radius_px))
 
 
-def _require_together(
-    count: int, *, marked: bool, unknown: bool, scale: Scale | None
+def _require_effect(
+    count: int, unknown: bool, request: CalibrationRequest, **located: object
 ) -> None:
-    """Check that data sets, markers, phantom and scale go together.
+    """Check that every option of a calibration has an effect (`RULES`).
 
     Args:
         count: number of data sets.
-        marked: whether markers are given.
-        unknown: whether their positions are to be found.
-        scale: a known distance of two of them.
+        unknown: whether the positions of markers are to be found.
+        request: of the user.
+        **located: options that say where beads are; None for those that are not given.
 
     Raises:
-        TwinError: several data sets with markers or an unknown phantom, or a scale with a
-            known one.
+        TwinError: one has none; says with what it has one.
     """
-    if (unknown or marked) and count != 1:
-        raise TwinError(
-            f"{count} data sets with markers or an unknown phantom; allowed: one",
-            {"asked": count, "allowed": 1},
-        )
-    if scale is not None and not unknown:
-        raise TwinError(
-            "a scale is for phantom unknown: this phantom states its own size"
-        )
+    stated: dict[str, object] = {
+        **located,
+        "unknown": unknown or None,
+        "bead_tolerance": request.bead_tolerance_mm,
+        "per_scan": request.per_scan or None,
+    }
+    given = {name for name, value in stated.items() if value is not None}
+    holding = conditions(
+        UNKNOWN if unknown else "", count, marked=located["markers"] is not None
+    )
+    found = misfit(given, holding)
+    if found is not None:
+        option, sentence = found
+        raise TwinError(sentence, {"asked": option, "data_sets": count})
 
 
 def _phantom_of(model: BeadModel) -> Phantom:

@@ -1,12 +1,16 @@
 """The options of a calibration: one declaration, which `flexdt.calibrate`,
-`DataSet.calibrate` and `flexdt calibrate` have in common.
+`DataSet.calibrate`, `flexdt calibrate` and `calibration.fit` have in common.
+
+`CalibrationOptions` says what they are, `RULES` with what each has an effect. Names are there
+without an import of what computes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from os import PathLike
-from typing import Any, Literal, TypedDict
+from typing import Any, Final, Literal, TypedDict
 
 
 class CalibrationOptions(TypedDict, total=False):
@@ -49,3 +53,129 @@ class CalibrationOptions(TypedDict, total=False):
     markers: str | PathLike[str] | Sequence[Any] | None
     scale: str | None
     radius: float | None
+
+
+ON_THE_WIRE: Final = (
+    "free",
+    "priors",
+    "exclude",
+    "bead_tolerance",
+    "per_frame",
+    "markers",
+    "scale",
+)
+"""Options that `calibration.fit` takes, under these names."""
+
+Condition = Literal["known", "unknown", "images", "one", "several", "geometry", "joint"]
+
+CONDITIONS: Final[Mapping[Condition, str]] = {
+    "known": "a phantom that states its beads",
+    "unknown": "{phantom} unknown",
+    "images": "beads that are found in images, without {markers}",
+    "one": "one data set",
+    "several": "several data sets",
+    "geometry": "{geometry}",
+    "joint": "one geometry for all data sets, without {per_scan}",
+}
+"""With what an option has an effect; in braces names of options, as the door spells them."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """When an option of a calibration has an effect.
+
+    Attributes:
+        option: its name in Python, or at the command line alone; "unknown" is the phantom.
+        meaning: what it states.
+        needs: the condition without which it would have none.
+    """
+
+    option: str
+    meaning: str
+    needs: Condition
+
+
+RULES: Final = (
+    Rule("unknown", "markers of unknown positions are looked for in one scan", "one"),
+    Rule("markers", "where beads were seen in a scan", "one"),
+    Rule(
+        "scale",
+        "the distance of two markers; a known phantom states its own size",
+        "unknown",
+    ),
+    Rule("radius", "the size of spots in images", "images"),
+    Rule("bead_tolerance", "how well the stated places of beads are known", "known"),
+    Rule("per_scan", "values that differ from scan to scan", "several"),
+    Rule("shape", "the detector shape that a file of geometry lacks", "geometry"),
+    Rule("pixel", "the pixel pitch that a file of geometry lacks", "geometry"),
+    Rule("push", "puts one geometry in force", "joint"),
+)
+"""Every option that does not go with everything else. Python, the command line and the wire
+refuse by this table what would have no effect."""
+
+
+def conditions(
+    phantom: object,
+    count: int,
+    *,
+    marked: bool,
+    geometry: bool = True,
+    joint: bool = True,
+) -> set[Condition]:
+    """Return which conditions of an option hold.
+
+    Args:
+        phantom: as of `flexdt.calibrate`.
+        count: number of data sets.
+        marked: whether markers are given.
+        geometry: whether a file of geometry is.
+        joint: whether all data sets have one geometry.
+    """
+    holds: dict[Condition, bool] = {
+        "known": phantom != "unknown",
+        "unknown": phantom == "unknown",
+        "images": not marked,
+        "one": count <= 1,
+        "several": count > 1,
+        "geometry": geometry,
+        "joint": joint,
+    }
+    return {name for name, held in holds.items() if held}
+
+
+def misfit(
+    given: Collection[str],
+    holding: Collection[Condition],
+    spelled: Callable[[str], str] = str,
+) -> tuple[str, str] | None:
+    """Say which option of a calibration would have no effect.
+
+    Args:
+        given: names of the options that the user states.
+        holding: of `conditions`.
+        spelled: how the user's door writes an option.
+
+    Returns:
+        The first such option of `RULES`, and the sentence that refuses it; None if all have
+        an effect.
+
+    Example:
+        >>> misfit({"scale"}, conditions("lego", 1, marked=False))[0]
+        'scale'
+    """
+    for rule in RULES:
+        if rule.option in given and rule.needs not in holding:
+            words = {
+                name: spelled(name)
+                for name in ("phantom", "markers", "geometry", "per_scan")
+            }
+            if rule.option == "unknown":
+                said = f"{words['phantom']} unknown"
+            else:
+                said = spelled(rule.option)
+            allowed = CONDITIONS[rule.needs].format(**words)
+            return (
+                rule.option,
+                f"{said}: has no effect ({rule.meaning}); allowed with: {allowed}",
+            )
+    return None
