@@ -43,6 +43,14 @@ class Who:
     view: str
 
 
+@dataclass(frozen=True)
+class Put:
+    """A camera as it was put, and the aspect (width over height) of its pane then."""
+
+    camera: Standpoint
+    aspect: float
+
+
 @dataclass
 class Aim:
     """What a close camera is aimed at: the sample, wherever it stands.
@@ -80,7 +88,7 @@ class SceneClients:
         self._server = scenes.server
         self._lock = threading.Lock()
         self._who: dict[int, Who] = {}
-        self._sent: dict[int, Standpoint] = {}
+        self._sent: dict[int, Put] = {}
         """Client -> its camera as put last; a person may have moved it since."""
         self._theme: dict[str, tuple[bool, bool]] = {}
         """Page -> whether its frames are dark, and finely lit."""
@@ -162,8 +170,9 @@ class SceneClients:
     def fit(self, anew: bool = False) -> None:
         """Put each view's camera so that it holds its points.
 
-        A camera moves only if the points no longer fit its view and no person has moved
-        it. Views whose pane has no known size yet are left out.
+        A camera moves only if its pane has another aspect than when it was put, or the
+        points no longer fit its view, and no person has moved it. Views whose pane has no
+        known size yet are left out.
 
         Args:
             anew: put all cameras to their presets, moved or not.
@@ -173,7 +182,11 @@ class SceneClients:
                 with contextlib.suppress(AssertionError):  # its width is not known yet
                     aspect = client.camera.aspect
                     if anew or (
-                        self._untouched(client) and not preset.fits(_now(client), aspect)
+                        self._untouched(client)
+                        and not (
+                            self._sent[client.client_id].aspect == aspect
+                            and preset.fits(_now(client), aspect)
+                        )
                     ):
                         self._put(client, preset.at(aspect))
 
@@ -272,9 +285,10 @@ class SceneClients:
 
         The camera is stored as put, so that a person's move is recognised.
         """
-        if self._sent.get(client.client_id) == camera and self._untouched(client):
+        put = Put(camera, client.camera.aspect)
+        if self._sent.get(client.client_id) == put and self._untouched(client):
             return
-        self._sent[client.client_id] = camera
+        self._sent[client.client_id] = put
         set_camera(client, camera)
 
     def _untouched(self, client: viser.ClientHandle) -> bool:
@@ -286,8 +300,8 @@ class SceneClients:
         put = self._sent.get(client.client_id)
         if put is None:
             return False
-        reach_m = math.dist(put.position, put.look_at)
-        apart_m = math.dist(put.position, tuple(client.camera.position))
+        reach_m = math.dist(put.camera.position, put.camera.look_at)
+        apart_m = math.dist(put.camera.position, tuple(client.camera.position))
         return apart_m < MOVED_SHARE * reach_m
 
     def _connected(self, client: viser.ClientHandle) -> None:

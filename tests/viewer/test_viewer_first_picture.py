@@ -3,6 +3,7 @@ computes."""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import re
@@ -19,6 +20,7 @@ from PIL import Image
 from scipy.spatial import ConvexHull
 
 from flexdt.clients.client.client import TwinClient
+from flexdt.clients.viewer.page_cameras import SceneClients
 from flexdt.clients.viewer.scenes.meshes.cabinet import cabinet, room_of
 from flexdt.clients.viewer.scenes.sample_looks import MeshCache
 from flexdt.clients.viewer.scenes.still import Shape, drawn
@@ -123,6 +125,52 @@ def test_no_nearer_camera_holds_all_points() -> None:
     assert np.abs(seen_at(points, closer, WIDE)).max() > ROOM
 
 
+class Pane:
+    """viser with one client, whose frame can be resized and whose camera a person can move."""
+
+    client_id = 1
+
+    def __init__(self) -> None:
+        self.aspect, self.position, self.look_at = WIDE, (0.0,) * 3, (0.0, 1.0, 0.0)
+        self.up_direction, self.fov = (0.0, 0.0, 1.0), 1.0
+        self.server = self.camera = self._websock_connection = self.gui = self
+
+    def path_of(self, client_id: int) -> str:
+        return "/scene/0123456789abcdef/iso"
+
+    def get_clients(self) -> dict[int, Any]:
+        return {1: self}
+
+    def on_client_connect(self, call: Callable[[Any], None]) -> None:
+        self.connect = call
+
+    def on_client_disconnect(self, call: Any) -> None: ...
+
+    atomic = contextlib.nullcontext
+
+    def configure_theme(self, **words: bool) -> None: ...
+
+    def queue_message(self, message: Any) -> None: ...
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_camera_that_nobody_moved_is_the_one_of_its_pane(seed: int) -> None:
+    """Whatever sizes the pane has had: a bar above it comes and goes. One that a person has
+    moved stays."""
+    rng, pane = np.random.default_rng(seed), Pane()
+    clients = SceneClients(pane)  # type: ignore[arg-type]
+    clients.cameras = presets(world_at(), 45.0)
+    pane.connect(pane)
+    for _ in range(30):
+        pane.aspect = float(rng.uniform(0.4, 3.0))
+        clients.fit()
+        assert pane.position == clients.cameras["iso"].at(pane.aspect).position
+    pane.position = moved = (5.0, 5.0, 5.0)
+    pane.aspect = 1.0
+    clients.fit()
+    assert pane.position == moved
+
+
 EYE = Standpoint((0.3, -2.0, 0.4), (0.1, 0.1, 0.05), (0.0, 0.0, 1.0), 0.6)
 
 
@@ -219,6 +267,8 @@ def test_the_viewer_paints_the_scene_until_the_live_one_is_there(
 
     # Both pictures are of one scene, from one place: edges of the one are edges of the other,
     # once the live one has faded in.
+    settled(box, same)
+    page.set_viewport_size({"width": 1366, "height": 600})
     settled(box, same)
     inset = page.locator(".view .inset")
     inset.click()
