@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -131,7 +131,7 @@ def still(target: Any) -> Picture:
     """A picture of a view once it no longer changes (scenes fade in)."""
     arrived(target)
     last = picture(target)
-    for _ in range(60):
+    for _ in looks():
         frames(target)
         now = picture(target)
         if now.shape == last.shape and np.abs(now - last).max() < 3.0 and now.std() > 2.0:
@@ -143,11 +143,22 @@ def still(target: Any) -> Picture:
 def settled(target: Any, reached: Callable[[Picture], Any]) -> Picture:
     """A picture at rest of which `reached` holds: what was asked may take a while to be
     drawn."""
-    for _ in range(40):
+    for _ in looks():
         now = still(target)
         if reached(now):
             return now
     raise AssertionError("the picture never shows what was asked for")
+
+
+def looks(least: int = 40, seconds: float = 120.0) -> Iterator[None]:
+    """Looks at something that may take a while: at least so many, over at least so long.
+
+    A slow machine has as many as a quick one, a quick one as much time as a slow one.
+    """
+    begun, seen = time.monotonic(), 0
+    while seen < least or time.monotonic() - begun < seconds:
+        yield
+        seen += 1
 
 
 def drawn(view: Picture) -> bool:
