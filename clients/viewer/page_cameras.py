@@ -30,9 +30,9 @@ picture."""
 RESTS_S = 0.5
 """Time without motion of the stage after which a close camera belongs to its person again: its
 browser has told where that has put it."""
-MOVED_SHARE = 0.005
-"""Displacement of a camera, as a part of its distance, from which it counts as moved
-by a person."""
+MOVED_SHARE = 1e-4
+"""Displacement of a camera, as a part of its distance, from which it counts as another one:
+a frame reports to 1e-7, and a person's drag by a pixel is some 1e-3."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,11 @@ class SceneClients:
         self._who: dict[int, Who] = {}
         self._sent: dict[int, Put] = {}
         """Client -> its camera as put last; a person may have moved it since."""
+        self._due: dict[int, Standpoint] = {}
+        """Client -> the camera it was told and has not reported yet."""
+        self._elsewhere: set[int] = set()
+        """Clients that have reported another camera than the one due: a frame may lose one
+        that comes while it opens."""
         self._theme: dict[str, tuple[bool, bool]] = {}
         """Page -> whether its frames are dark, and finely lit."""
         self._shown: dict[int, tuple[int, Nodes]] = {}
@@ -168,7 +173,8 @@ class SceneClients:
             self._put(client, camera)
 
     def fit(self, anew: bool = False) -> None:
-        """Put each view's camera so that it holds its points.
+        """Put each view's camera so that it holds its points, and tell frames again what
+        they have not reported.
 
         A camera moves only if its pane has another aspect than when it was put, or the
         points no longer fit its view, and no person has moved it. Views whose pane has no
@@ -185,10 +191,13 @@ class SceneClients:
                         self._untouched(client)
                         and not (
                             self._sent[client.client_id].aspect == aspect
-                            and preset.fits(_now(client), aspect)
+                            and preset.fits(self._camera(client), aspect)
                         )
                     ):
                         self._put(client, preset.at(aspect))
+        clients = self._server.get_clients()
+        for id in self._elsewhere & clients.keys() & self._due.keys():
+            self._tell(clients[id], self._due[id])
 
     def reset(self, page: str, view: str) -> None:
         """Set a page's view back to its preset for the client's aspect ratio; nothing
@@ -235,7 +244,7 @@ class SceneClients:
         way = np.subtract(preset.position, preset.look_at)
         x, y, z = (middle + far * way / np.linalg.norm(way)).tolist()
         target = tuple(middle.tolist())
-        set_camera(client, replace(preset, position=(x, y, z), look_at=target))
+        self._tell(client, replace(preset, position=(x, y, z), look_at=target))
         self._aims[client.client_id] = Aim(middle, radius_mm)
 
     def ride(self, at: FloatArray | None, radius_mm: float) -> None:
@@ -257,7 +266,9 @@ class SceneClients:
             elif radius_mm != aim.radius_mm:
                 self._aim(client, who.view, at * MM, radius_mm)
             else:
-                _carry(client, aim, at * MM)
+                camera = _carried(self._camera(client), aim, at * MM)
+                if camera is not None:
+                    self._tell(client, camera)
 
     def theme(self, page: str, dark: bool, fine: bool) -> None:
         """Set light or dark, plain or fine light, for all frames of a page."""
@@ -289,20 +300,33 @@ class SceneClients:
         if self._sent.get(client.client_id) == put and self._untouched(client):
             return
         self._sent[client.client_id] = put
+        self._tell(client, camera)
+
+    def _tell(self, client: viser.ClientHandle, camera: Standpoint) -> None:
+        """Set a client's camera; it is due until a report of the client has it."""
+        self._due[client.client_id] = camera
+        self._elsewhere.discard(client.client_id)
         set_camera(client, camera)
 
-    def _untouched(self, client: viser.ClientHandle) -> bool:
-        """Check that a client's camera is still where it was put, within a share of its
-        distance; False if it never was.
+    def _reported(self, client: viser.ClientHandle) -> None:
+        """Take a client's report of its camera: what was due has arrived, or was lost."""
+        camera = self._due.get(id := client.client_id)
+        if camera is not None and _stands(_now(client), camera):
+            self._due.pop(id, None)
+        else:
+            self._elsewhere.add(id)
 
-        The share is `MOVED_SHARE`; only the place is compared, not the direction.
-        """
+    def _untouched(self, client: viser.ClientHandle) -> bool:
+        """Check that a client's camera is still where it was put, or on its way there;
+        False if it never was put."""
         put = self._sent.get(client.client_id)
         if put is None:
             return False
-        reach_m = math.dist(put.camera.position, put.camera.look_at)
-        apart_m = math.dist(put.camera.position, tuple(client.camera.position))
-        return apart_m < MOVED_SHARE * reach_m
+        return _stands(self._camera(client), put.camera)
+
+    def _camera(self, client: viser.ClientHandle) -> Standpoint:
+        """Return the camera that a client is on its way to, or else the one it reported."""
+        return self._due.get(client.client_id) or _now(client)
 
     def _connected(self, client: viser.ClientHandle) -> None:
         """Register a new client with its page and view, set its camera and theme, and
@@ -324,6 +348,7 @@ class SceneClients:
         who = Who(match[1], match[2])
         with self._lock:
             self._who[client.client_id] = who
+        client.camera.on_update(lambda _: self._reported(client))
         if who.view == "beam" and self._beam is not None:
             self._put(client, self._beam)
         elif who.view in self.cameras:
@@ -339,24 +364,39 @@ class SceneClients:
         with self._lock:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
+            self._due.pop(client.client_id, None)
+            self._elsewhere.discard(client.client_id)
             self._shown.pop(client.client_id, None)
 
 
-def _carry(client: viser.ClientHandle, aim: Aim, middle: FloatArray) -> None:
-    """Move a close camera by as much as the sample has moved since it was put."""
+def _carried(seen: Standpoint, aim: Aim, middle: FloatArray) -> Standpoint | None:
+    """Compute where a close camera goes with its sample; None if the sample has not moved
+    since.
+
+    Args:
+        seen: the camera now.
+        aim: what it is aimed at; is brought up to date.
+        middle: (3,) of the sample now [m].
+    """
     now = time.monotonic()
     if np.allclose(middle, aim.middle, atol=1e-6):
         if now > aim.moved_at + RESTS_S:
             aim.arm = None
-        return
-    seen = _now(client)
+        return None
     if aim.arm is None:
         place, target = np.array(seen.position), np.array(seen.look_at)
         aim.arm = place - aim.middle, target - aim.middle
     place, target = (middle + part for part in aim.arm)
     aim.middle, aim.moved_at = middle, now
     (px, py, pz), (tx, ty, tz) = place.tolist(), target.tolist()
-    set_camera(client, replace(seen, position=(px, py, pz), look_at=(tx, ty, tz)))
+    return replace(seen, position=(px, py, pz), look_at=(tx, ty, tz))
+
+
+def _stands(seen: Standpoint, camera: Standpoint) -> bool:
+    """Check that one camera is at the place of another, within `MOVED_SHARE` of that one's
+    distance; directions are not compared."""
+    reach_m = math.dist(camera.position, camera.look_at)
+    return math.dist(camera.position, seen.position) < MOVED_SHARE * reach_m
 
 
 def _now(client: viser.ClientHandle) -> Standpoint:

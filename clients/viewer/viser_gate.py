@@ -220,21 +220,15 @@ def set_camera(client: viser.ClientHandle, camera: Standpoint) -> None:
     """Set up direction, place, target and field of view [rad] of a client's camera in one
     message.
 
-    It does not wait for the browser.
-
-    viser's own setters leave out what its record of the camera has already. A frame that
-    reports an older camera replaces that record, also between two of them: the target was
-    then left out after its place had moved it. So all four are queued, last, in any case.
+    It does not wait for the browser. viser's own setters also replace its record of the
+    camera, and leave out what stands in it already; here the record stays what the frame
+    has reported last, and all four are sent.
 
     Args:
         client: of viser, whose first report has come.
         camera: its new one.
     """
     with client.atomic():
-        client.camera.up_direction = camera.up
-        client.camera.position = camera.position
-        client.camera.look_at = camera.look_at
-        client.camera.fov = camera.fov
         for message in (
             SetCameraUpDirectionMessage(camera.up),
             SetCameraPositionMessage(camera.position),

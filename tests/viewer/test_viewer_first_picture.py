@@ -7,7 +7,7 @@ import contextlib
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,11 @@ import trimesh
 from looking import changed, picture, settled, until
 from PIL import Image
 from scipy.spatial import ConvexHull
+from viser._messages import (
+    SetCameraFovMessage,
+    SetCameraLookAtMessage,
+    SetCameraPositionMessage,
+)
 
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.page_cameras import SceneClients
@@ -126,14 +131,17 @@ def test_no_nearer_camera_holds_all_points() -> None:
 
 
 class Pane:
-    """viser with one client, whose frame can be resized and whose camera a person can move."""
+    """viser with one client, whose frame can be resized, whose camera a person can move, and
+    which loses what it is told now and then."""
 
     client_id = 1
 
-    def __init__(self) -> None:
-        self.aspect, self.position, self.look_at = WIDE, (0.0,) * 3, (0.0, 1.0, 0.0)
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng, self.aspect = rng, WIDE
+        self.position, self.look_at = (0.0,) * 3, (0.0, 1.0, 0.0)
         self.up_direction, self.fov = (0.0, 0.0, 1.0), 1.0
         self.server = self.camera = self._websock_connection = self.gui = self
+        self.told = 0
 
     def path_of(self, client_id: int) -> str:
         return "/scene/0123456789abcdef/iso"
@@ -144,31 +152,54 @@ class Pane:
     def on_client_connect(self, call: Callable[[Any], None]) -> None:
         self.connect = call
 
-    def on_client_disconnect(self, call: Any) -> None: ...
+    def on_update(self, call: Callable[[Any], None]) -> None:
+        self.report = call
 
-    atomic = contextlib.nullcontext
+    def on_client_disconnect(self, call: Any) -> None: ...
 
     def configure_theme(self, **words: bool) -> None: ...
 
-    def queue_message(self, message: Any) -> None: ...
+    @contextlib.contextmanager
+    def atomic(self) -> Iterator[None]:
+        self.heard = self.rng.random() < 0.5
+        self.told += 1
+        yield
+        self.report(self)
+
+    def queue_message(self, message: Any) -> None:
+        match message:
+            case SetCameraPositionMessage() if self.heard:
+                self.position = message.position
+            case SetCameraLookAtMessage() if self.heard:
+                self.look_at = message.look_at
+            case SetCameraFovMessage() if self.heard:
+                self.fov = message.fov
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_a_camera_that_nobody_moved_is_the_one_of_its_pane(seed: int) -> None:
-    """Whatever sizes the pane has had: a bar above it comes and goes. One that a person has
-    moved stays."""
-    rng, pane = np.random.default_rng(seed), Pane()
+    """Whatever sizes the pane has had (a bar above it comes and goes) and whatever of its
+    cameras it lost. One that a person has moved stays, and at rest nothing is said."""
+    rng = np.random.default_rng(seed)
+    pane = Pane(rng)
     clients = SceneClients(pane)  # type: ignore[arg-type]
     clients.cameras = presets(world_at(), 45.0)
     pane.connect(pane)
     for _ in range(30):
-        pane.aspect = float(rng.uniform(0.4, 3.0))
-        clients.fit()
-        assert pane.position == clients.cameras["iso"].at(pane.aspect).position
+        for _ in range(rng.integers(1, 4)):
+            pane.aspect = float(rng.uniform(0.4, 3.0))
+            clients.fit()
+        for _ in range(60):  # it hears every other time
+            clients.fit()
+        wanted = clients.cameras["iso"].at(pane.aspect).position
+        assert pane.position == pytest.approx(wanted, abs=2e-4)  # [m]
+    told = pane.told
+    clients.fit()
     pane.position = moved = (5.0, 5.0, 5.0)
+    pane.report(pane)
     pane.aspect = 1.0
     clients.fit()
-    assert pane.position == moved
+    assert (pane.position, pane.told) == (moved, told)
 
 
 EYE = Standpoint((0.3, -2.0, 0.4), (0.1, 0.1, 0.05), (0.0, 0.0, 1.0), 0.6)
@@ -234,8 +265,13 @@ def test_the_cabinet_never_stands_between_a_camera_outside_and_the_machine() -> 
 
 
 def still_of(page: Any, url: str) -> Image.Image:
-    """Fetch the viewer's own picture of the scene; a JPEG of at most 60 kB."""
-    raw = page.request.get(url).body()
+    """Fetch the viewer's own picture of the scene; a JPEG of at most 60 kB.
+
+    A viewer that has none yet says so (204), and is asked again.
+    """
+    reply = until(lambda: (r := page.request.get(url)).status != 204 and r, url)
+    raw = reply.body()
+    assert reply.ok
     assert len(raw) <= 60_000
     painted = Image.open(io.BytesIO(raw))
     assert painted.format == "JPEG"
