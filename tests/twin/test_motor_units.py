@@ -12,6 +12,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
 from flexdt.twin.machine.travel import check_target
 from flexdt.twin.scanner.scanner import ScannerTwin
+from flexdt.twin.script.dry_run import check_script
 
 NEAR_MM = 0.01
 """Positions of parts agree to the tolerance of a sweep."""
@@ -53,6 +54,10 @@ def test_the_least_rate_is_that_of_the_parts(unit: str) -> None:
         least, _ = refused.value.data["allowed"]
         assert least * size == pytest.approx(1e-6)
         scanner.set_axis(axis, speed=1.01 * least)
+        text = f"{axis} set speed {{:.12f}} ACK"  # a script knows the same one
+        assert check_script(text.format(1.01 * least), machine).errors == ()
+        [below] = check_script(text.format(0.99 * least), machine).errors
+        assert below.message.endswith(f"allowed: from {least:g} on")
 
 
 @pytest.mark.slow

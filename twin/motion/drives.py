@@ -284,6 +284,15 @@ def plan_jog(
     return {name: run(name, lease) for name in moves}
 
 
+def least_rate(machine: Machine, axis: str) -> float:
+    """Return the least speed, and acceleration, that an axis may be set to [per s, per s2].
+
+    It is that of its motor that would be the slowest; see `MIN_RATE`.
+    """
+    shares = machine.moves(axis).items()
+    return max(MIN_RATE * machine.counts(name) / abs(share) for name, share in shares)
+
+
 def with_settings(
     machine: Machine,
     drives: Drives,
@@ -308,12 +317,12 @@ def with_settings(
 
     Raises:
         UnknownNameError: no such axis.
-        LimitError: not from `MIN_RATE` (of each motor) to the maximum; axis, setting,
+        LimitError: not from `least_rate` to the maximum; axis, setting,
             value and range.
     """
     out = dict(drives)
     shares = {name: abs(factor) for name, factor in machine.moves(axis).items()}
-    low = max(MIN_RATE * machine.counts(name) / share for name, share in shares.items())
+    low = least_rate(machine, axis)
     settings: tuple[tuple[Rate, float | None], ...] = (
         ("speed", speed),
         ("acceleration", acceleration),

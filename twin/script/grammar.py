@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from flexdt.twin.machine.camera import Roi
-from flexdt.twin.motion.profiles import MIN_RATE
 from flexdt.twin.script import commands as c
 from flexdt.twin.script.commands import ImageKind
 from flexdt.twin.script.problems import ScriptCode
@@ -119,20 +118,18 @@ def number(text: str, what: str, index: int = 0) -> float:
 
 
 def positive(text: str, what: str) -> float:
-    """Read a number of at least `MIN_RATE`, below which no setting of a scanner goes.
+    """Read a number above zero; the least one that may be set is the machine's.
 
     Args:
         text: of the argument.
         what: name of the argument, for the message.
 
     Raises:
-        ArgumentError: a lower number, or none.
+        ArgumentError: another number, or none.
     """
     value = number(text, what)
-    if value < MIN_RATE:
-        raise ArgumentError(
-            f"{what} is {shorten(text)}; it must be at least {MIN_RATE:g}"
-        )
+    if value <= 0.0:
+        raise ArgumentError(f"{what} is {shorten(text)}; it must be above 0")
     return value
 
 

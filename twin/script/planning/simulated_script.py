@@ -19,6 +19,7 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.findings import Place
 from flexdt.twin.machine.description import Machine, unknown_axis
 from flexdt.twin.machine.travel import Arrival, Rate, arrival, rate
+from flexdt.twin.motion.drives import least_rate
 from flexdt.twin.motion.profiles import Trajectory
 from flexdt.twin.scanner.state import (
     CameraChange,
@@ -353,7 +354,7 @@ class Simulation:
 
     def _set_rate(self, command: c.SetSpeed | c.SetAcceleration) -> planned.Span:
         """Set an axis's speed or acceleration, limited to those of its motors; report
-        what lies beyond.
+        what lies beyond, or below the least one, at which it then stays.
 
         The motors of a virtual axis get their share. An axis that the machine lacks is
         reported and changes nothing.
@@ -370,6 +371,13 @@ class Simulation:
         if isinstance(command, c.SetSpeed):
             what = "speed"
         requested = getattr(command, what)
+        least = least_rate(self.machine, command.component)
+        if requested < least:
+            self.findings.error(
+                ScriptCode.LIMIT,
+                f"{what} of {command.component} is {requested:g}; allowed: from {least:g} on",
+            )
+            requested = least
         limited = rate(self.machine, command.component, what, requested)
         note = ""
         shares = self.machine.moves(command.component)
