@@ -161,3 +161,26 @@ def problem_words(problem: Mapping[str, Any]) -> str:
         for name, value in problem.get("ctx", {}).items()
     }
     return said.format(**context)
+
+
+def reason_of(error: BaseException, otherwise: str = "") -> str:
+    """Return why a file or a connection is not to be had: the system's words, else a
+    library's.
+
+    What the system raises has words, number and name apart; what libraries and flexdt
+    raise as OSError often has one text alone. So no message takes `strerror` as it is.
+
+    Args:
+        error: an OSError, or what may come beside one.
+        otherwise: where the error has no words, or is no OSError; "" is its type's name.
+
+    Example:
+        >>> reason_of(OSError(28, "No space left on device", "a.tif"))
+        'No space left on device'
+        >>> reason_of(OSError("bad signature")), reason_of(TimeoutError())
+        ('bad signature', 'TimeoutError')
+    """
+    said = getattr(error, "strerror", None)  # ZeroMQ's errors have one, too
+    if not said and isinstance(error, OSError):
+        said = str(error).partition("\n")[0]
+    return said or otherwise or type(error).__name__

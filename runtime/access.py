@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
+from flexdt.message_words import reason_of
+
 
 class AccessError(ValueError):
     """A configuration that would admit anybody; the message names the missing part."""
@@ -271,7 +273,7 @@ def read_token(file: Path | None) -> str | None:
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or error
+        why = reason_of(error, str(error))
         raise AccessFileError(f"token file {file}: {why}") from None
     token = text.split("\n", 1)[0].strip()
     if not token:

@@ -29,6 +29,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Final, TextIO, TypeVar
 
+from flexdt.message_words import reason_of
 from flexdt.runtime.access import AccessError, AccessFileError
 from flexdt.runtime.log import Sparing
 from flexdt.runtime.process_settings import ProcessSettings
@@ -390,11 +391,11 @@ def run_process(settings: S, run: Callable[[S], Coroutine[None, None, int]]) -> 
     except OSError as error:
         if error.filename is None:
             problem = (
-                f"cannot listen on {settings.host}:{settings.port}: {error.strerror}"
+                f"cannot listen on {settings.host}:{settings.port}: {reason_of(error)}"
             )
             code = REFUSED
         else:
-            problem = f"{error.filename}: {error.strerror}"
+            problem = f"{error.filename}: {reason_of(error)}"
             code = INVALID
     print(f"flexdt {settings.command}: {problem}", file=sys.stderr)
     return code

@@ -25,6 +25,7 @@ from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from flexdt.message_words import reason_of
 from flexdt.runtime.process import SUPERVISED, session_seconds, stop_signal
 from flexdt.runtime.process_settings import Address
 from flexdt.twin.long_work import Rhythm
@@ -252,7 +253,7 @@ class Supervisor:
                 env=os.environ | {SUPERVISED: "1"},
             )
         except OSError as error:
-            raise _Ended(f"no process: {error.strerror}") from None
+            raise _Ended(f"no process: {reason_of(error)}") from None
         self._running[service.name] = process
         return process
 

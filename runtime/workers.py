@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
+from flexdt.message_words import reason_of
 from flexdt.protocol.rpc_errors import Code, RpcError, busy, too_large
 from flexdt.runtime.fair_turns import FairTurns
 from flexdt.runtime.process import process_seconds
@@ -287,7 +288,7 @@ class Workers:
             return Worker(self.memory_bytes)
         except OSError as error:  # descriptors, processes or memory have run out
             data = {"allowed": "try again later"}
-            raise busy(f"no process could be started: {error.strerror}", data) from None
+            raise busy(f"no process could be started: {reason_of(error)}", data) from None
 
     def _keep(self, worker: Worker) -> None:
         """Make a worker idle if it may have further work, and begin anew the `MAX_IDLE_S`

@@ -6,12 +6,14 @@ for a program. The server maps the types to wire codes.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Final, Self
 
 from flexdt.message_words import SUGGESTION as SUGGESTION
 from flexdt.message_words import nearest_name as nearest_name
+from flexdt.message_words import reason_of
 
 
 def shape_words(shape: Sequence[int | str]) -> str:
@@ -92,7 +94,15 @@ class TwinError(ValueError):
 
 
 class FileError(TwinError, OSError):
-    """A file or folder that cannot be read or written, because the system says no."""
+    """A file or folder that cannot be read or written, because the system says no.
+
+    It is an OSError, so that who knows only those has its number and words, too.
+    """
+
+    def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
+        """Make the error; its `strerror` is its message where the system has said none."""
+        super().__init__(message, data)
+        self.strerror = message
 
     @classmethod
     def of(cls, error: OSError) -> FileError:
@@ -107,9 +117,10 @@ class FileError(TwinError, OSError):
         if isinstance(error, FileNotFoundError):
             found = MissingFileError(f"there is no file or folder {error.filename}", data)
         else:
-            why = (error.strerror or "not to be had").lower()
-            found = cls(f"{error.filename}: {why}", data)
-        found.errno, found.strerror = error.errno, error.strerror
+            why = reason_of(error, "not to be had").lower()
+            where = f"{error.filename}: " if error.filename else ""
+            found = cls(f"{where}{why}", data)
+        found.errno, found.strerror = error.errno, error.strerror or found.strerror
         found.filename, found.filename2 = error.filename, error.filename2
         return found
 
@@ -120,6 +131,11 @@ class FileError(TwinError, OSError):
 
 class MissingFileError(FileError, FileNotFoundError):
     """A file or folder that is not there; the one type for it, at every call."""
+
+    def __init__(self, message: str, data: Mapping[str, object] | None = None) -> None:
+        """Make the error, with the system's number of such."""
+        super().__init__(message, data)
+        self.errno = errno.ENOENT
 
 
 class GeometryError(TwinError):

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from flexdt.library.failure import CommandError
-from flexdt.message_words import SUGGESTION, nearest_name, problem_words
+from flexdt.message_words import SUGGESTION, nearest_name, problem_words, reason_of
 
 if TYPE_CHECKING:
     import typer
@@ -85,11 +85,11 @@ def describe(error: Exception, words: Sequence[str] = ()) -> tuple[tuple[str, ..
             lines = [_first_line(error)]
             code = REFUSED
         case OSError() if error.errno in UNREACHABLE:
-            lines = [str(error.strerror)]
+            lines = [reason_of(error)]
             code = REFUSED
         case OSError():
             where = f"{_named_file(error.filename)}: " if error.filename else ""
-            lines = [f"{where}{error.strerror or _first_line(error)}"]
+            lines = [f"{where}{reason_of(error)}"]
         case UnicodeDecodeError():
             lines = [f"not valid {error.encoding} text: {error.reason}"]
         case _:

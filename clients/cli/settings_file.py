@@ -34,6 +34,7 @@ from flexdt.clients.cli.command_settings import (
     ScriptNewSettings,
 )
 from flexdt.library.failure import CommandError
+from flexdt.message_words import reason_of
 from flexdt.runtime.process_settings import (
     GatewaySettings,
     ProjectorSettings,
@@ -177,7 +178,7 @@ def _of_file(path: Path, *, required: bool) -> dict[str, Any]:
             raise CommandError(f"{path}: no such file (FLEXDT_CONFIG names it)") from None
         return {}
     except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "not UTF-8 text"
+        why = reason_of(error, "not UTF-8 text")
         raise CommandError(f"{path}: {why}") from None
     except InputLimitError as error:
         raise CommandError(error.message) from None

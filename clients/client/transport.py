@@ -16,6 +16,7 @@ import ssl as tls
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Protocol
 
+from flexdt.message_words import reason_of
 from flexdt.protocol import (
     MAX_FRAME,
     Answered,
@@ -170,7 +171,7 @@ class TcpTransport:
                     limit=MAX_FRAME,
                 )
         except OSError as error:  # TimeoutError is one
-            why = error.strerror or str(error) or "no answer in time"
+            why = reason_of(error, "no answer in time")
             number = error.errno
             if number is None and f"[Errno {errno.ECONNREFUSED}]" in why:
                 number = errno.ECONNREFUSED  # of each of the addresses that a name has
@@ -206,7 +207,7 @@ class TcpTransport:
             writer.write(data)
             await writer.drain()
         except OSError as error:
-            why = error.strerror or str(error)
+            why = reason_of(error)
             raise ConnectionLost(
                 f"the connection to {self.host}:{self.port} broke ({why})", sent=True
             ) from error

@@ -16,6 +16,7 @@ from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress
 from flexdt.clients.gateway.connected_twin import ConnectedTwin
 from flexdt.library import machines
 from flexdt.library.optional.extras import lacking
+from flexdt.message_words import reason_of
 from flexdt.runtime.access import client_tls, read_token
 from flexdt.runtime.log import set_up
 from flexdt.runtime.process import (
@@ -71,7 +72,7 @@ async def run(options: GatewaySettings) -> int:
     try:
         gateway = Gateway(twin, options.host, options.port, options.inbound_port)
     except ZMQError as error:
-        raise OSError(error.errno, error.strerror) from None
+        raise OSError(error.errno, reason_of(error)) from None
     stop = stop_signal()
     tasks = [
         asyncio.create_task(work) for work in (link.run(), gateway.run(), stop.wait())

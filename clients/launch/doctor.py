@@ -19,6 +19,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Final, Literal
 
+from flexdt.message_words import reason_of
 from flexdt.runtime.files.directory import memory_bytes
 from flexdt.runtime.files.whole_files import free_bytes, nearest_there
 from flexdt.twin import kernel_threads
@@ -259,7 +260,7 @@ def listening(what: str, port: int) -> CheckOutcome:
     if answer:
         return CheckOutcome(name, "ok", f"{answer} listens")
     advice = f"fine if that is your {what}; else choose another port"
-    return CheckOutcome(name, "warning", f"in use ({taken.strerror})", advice)
+    return CheckOutcome(name, "warning", f"in use ({reason_of(taken)})", advice)
 
 
 def disk(data: Path) -> CheckOutcome:
@@ -283,7 +284,7 @@ def disk(data: Path) -> CheckOutcome:
             took = time.perf_counter() - begun
     except OSError as error:
         return CheckOutcome(
-            "disk", "error", f"{folder} cannot be written: {error.strerror}", "--data"
+            "disk", "error", f"{folder} cannot be written: {reason_of(error)}", "--data"
         )
     free = free_bytes(folder)
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"

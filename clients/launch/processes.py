@@ -27,6 +27,7 @@ from typing import IO, Any, Literal
 from flexdt.clients.client.client import TwinClient
 from flexdt.clients.launch.start_checks import require_startable
 from flexdt.library.failure import CommandError
+from flexdt.message_words import reason_of
 from flexdt.runtime.process_settings import Physics, Scatter
 from flexdt.runtime.settings import words
 from flexdt.twin import long_work
@@ -352,7 +353,7 @@ class LocalTwin:
         except TwinError as error:
             raise ServersError(str(error)) from None
         except OSError as error:
-            raise ServersError(f"data: {error.filename}: {error.strerror}") from None
+            raise ServersError(f"data: {error.filename}: {reason_of(error)}") from None
 
     def stop(self) -> None:
         """End the client and the servers, and delete a temporary data folder; does

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from typing import TextIO
 
 from flexdt.library.optional.extras import lacking
+from flexdt.message_words import reason_of
 from flexdt.runtime.access import PublicAddress, ViewerLimits, limit_names
 from flexdt.runtime.process import INVALID, REFUSED
 from flexdt.runtime.process_settings import (
@@ -161,7 +162,7 @@ def port_problem(option: str, host: str, port: int) -> str | None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
     except OSError as error:
-        where = f"cannot listen on {Address(host, port)}: {error.strerror}"
+        where = f"cannot listen on {Address(host, port)}: {reason_of(error)}"
         return f"{where}; choose another {option}, or 0 for any free one"
     return None
 

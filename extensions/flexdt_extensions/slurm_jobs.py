@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from flexdt.extending import CommandError
+from flexdt.message_words import reason_of
 
 REFUSED: Final = 4
 """Exit code where no workers can be had."""
@@ -257,7 +258,9 @@ def _run(*words: str) -> subprocess.CompletedProcess[str]:
             words, 1, "", f"no answer within {TIMEOUT_S:g} s"
         )
     except OSError as error:
-        return subprocess.CompletedProcess(words, 1, "", f"{words[0]}: {error.strerror}")
+        return subprocess.CompletedProcess(
+            words, 1, "", f"{words[0]}: {reason_of(error)}"
+        )
 
 
 Tend = Callable[[Collection[str]], list[str]]

@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.message_words import reason_of
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.image_files import Pixels, as_counts, read_pixels
 from flexdt.runtime.files.reading_within import opened, within
@@ -202,7 +203,7 @@ def list_folder(path: Path) -> Folder:
             links = inside is None
             names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
-        message = f"cannot read folder {path}: {error.strerror}"
+        message = f"cannot read folder {path}: {reason_of(error)}"
         raise ds.DatasetMissingError(message, {"path": str(path)}) from None
     return Folder(path, names)
 
@@ -227,7 +228,7 @@ def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:
                 raise ds.DatasetFormatError.instead(message, size, most, path=str(path))
             raw = file.read()
     except OSError as error:
-        message = f"cannot read {path}: {error.strerror}"
+        message = f"cannot read {path}: {reason_of(error)}"
         raise ds.DatasetFormatError(message, {"path": str(path)}) from None
     try:
         return raw.decode("utf-8-sig")
@@ -257,7 +258,7 @@ def read_document(folder: Directory) -> DatasetDocument:
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no UTF-8 text"
+        reason = reason_of(error, "it is no UTF-8 text")
         raise ds.DatasetFormatError(
             f"cannot read {path}: {reason}", {"path": str(path)}
         ) from None

@@ -23,6 +23,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from flexdt.message_words import reason_of
 from flexdt.twin.dataset import dataset_errors as ds
 from flexdt.twin.dataset.file_names import plain_name
 
@@ -74,7 +75,7 @@ def writing(path: Path, refused: str) -> Iterator[None]:
     except OSError as error:
         kind = ds.DiskFullError if error.errno in _NO_ROOM else ds.DatasetWriteError
         raise kind(
-            f"{refused}: {error.strerror or error}",
+            f"{refused}: {reason_of(error)}",
             {"path": str(path), "errno": error.errno},
         ) from None
 
@@ -617,9 +618,7 @@ class Directory:
             if data["free"] is not None:
                 free = f", {data['free']} bytes free"
             return ds.DiskFullError(f"no room for {path}: {size} bytes asked{free}", data)
-        return ds.DatasetWriteError(
-            f"cannot write {path}: {error.strerror or error}", data
-        )
+        return ds.DatasetWriteError(f"cannot write {path}: {reason_of(error)}", data)
 
 
 def _allocate(file: int, size: int) -> None:

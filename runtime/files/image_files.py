@@ -14,6 +14,7 @@ from typing import Any, BinaryIO, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.message_words import reason_of
 from flexdt.runtime.files import plain_images, tiff_images
 from flexdt.runtime.files.image_meaning import ImageHead, UnreadImageError
 from flexdt.runtime.files.reading_within import opened
@@ -227,7 +228,7 @@ def _answered(path: Path, ask: Callable[[ImageFormat, BinaryIO], _T]) -> _T:
     except FileNotFoundError:
         raise DatasetMissingError(f"{path} is missing", {"path": str(path)}) from None
     except OSError as error:
-        reason = error.strerror or type(error).__name__
+        reason = reason_of(error)
         raise DatasetFormatError(
             f"cannot read {path}: {reason}", {"path": str(path)}
         ) from None

@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TypeVar
 
+from flexdt.message_words import reason_of
 from flexdt.protocol.field_checks import MAX_STEM, encoded
 from flexdt.runtime.files.directory import BEFORE, MAX_READ_BYTES, Directory, writing
 from flexdt.runtime.log import log
@@ -340,7 +341,7 @@ def set_aside(folder: Directory, name: str, error: object, without: str) -> None
         folder.rename(name, aside)
         kept = aside
     except OSError as refused:
-        kept = f"not set aside: {refused.strerror}"
+        kept = f"not set aside: {reason_of(refused)}"
     log(without, logging.ERROR, file=str(file), kept=kept, reason=str(error)[:500])
 
 

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from flexdt.message_words import reason_of
+
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of the system's errors where a disk or a quota is full."""
 FULL_BYTES: Final = 64 << 10
@@ -72,7 +74,7 @@ def room_named(path: Path) -> Iterator[None]:
             raise OSError(number, problem, str(path)) from None
         if number is None or not isinstance(error, OSError):
             raise
-        raise type(error)(number, error.strerror, str(path)) from None
+        raise OSError(number, reason_of(error), str(path)) from None
 
 
 @contextmanager

@@ -5,6 +5,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from flexdt.message_words import reason_of
+
 
 def require_writable(path: Path | None) -> None:
     """Check that a file can be made in the folder of an output path, or in the nearest
@@ -31,4 +33,4 @@ def require_writable(path: Path | None) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise type(error)(error.errno, error.strerror, str(path)) from None
+        raise OSError(error.errno, reason_of(error), str(path)) from None

@@ -31,6 +31,8 @@ from typing import Final, assert_never
 
 import platformdirs
 
+from flexdt.message_words import reason_of
+
 LOG = logging.getLogger("flexdt.kernels")
 FOLDER: Final = "kernels"
 ENDING: Final = ".kernel"
@@ -71,7 +73,7 @@ class Place:
         except FileNotFoundError:
             return None
         except OSError as error:
-            return error.strerror or type(error).__name__
+            return reason_of(error)
         if not stat.S_ISDIR(seen.st_mode):
             return "not a folder"
         if not hasattr(os, "getuid"):
@@ -205,7 +207,7 @@ class KernelFiles:
                     keep=keep,
                 )
             except OSError as error:
-                self._unsuitable[place.folder] = error.strerror or type(error).__name__
+                self._unsuitable[place.folder] = reason_of(error)
                 continue
             return place
         return None

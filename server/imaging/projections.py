@@ -29,6 +29,7 @@ from typing import Any, Final, Literal, Protocol, assert_never
 
 import numpy as np
 
+from flexdt.message_words import reason_of
 from flexdt.phantoms import Phantom
 from flexdt.phantoms.channels import Channel, attenuating, channels, scatter_object
 from flexdt.phantoms.checked_reading import scene_to_dict
@@ -154,7 +155,7 @@ def load_truth(path: Path, data: Path) -> TrueGeometry:
         values = parse_toml(limited_text(file, "toml"), str(path))
     except OSError as error:
         raise MachineFileError(
-            f"cannot read {path}: {error.strerror}", {"file": str(path)}
+            f"cannot read {path}: {reason_of(error)}", {"file": str(path)}
         ) from None
     except InputLimitError as error:
         raise MachineFileError(error.message, {"file": str(path)}) from None

@@ -16,6 +16,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.message_words import reason_of
 from flexdt.phantoms.checked_reading import scene_to_dict
 from flexdt.protocol import Code, RpcError, hello_params, image, parse_result
 from flexdt.protocol.projector import Health, volumes_there
@@ -295,7 +296,7 @@ class ProjectorClient:
                 channel.close()
                 raise
         except OSError as error:
-            why = getattr(error, "strerror", None) or str(error) or "no answer"
+            why = reason_of(error, str(error) or "no answer")
             raise ProjectorUnavailable(
                 f"no projector at {self.host}:{self.port} ({why})"
             ) from None

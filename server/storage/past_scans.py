@@ -20,6 +20,7 @@ from typing import Any, Final, assert_never
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.message_words import reason_of
 from flexdt.protocol import Codec, image
 from flexdt.protocol.connection import MAX_ANSWER, answer_bytes, encoded
 from flexdt.protocol.fields import ImageValue, Params
@@ -160,7 +161,9 @@ def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[
         raise
     except OSError as error:  # it has gone meanwhile, or the disk fails
         name = getattr(asked, "name", "the data directory")
-        raise ds.DatasetMissingError(f"{name} cannot be read: {error.strerror}") from None
+        raise ds.DatasetMissingError(
+            f"{name} cannot be read: {reason_of(error)}"
+        ) from None
     return list(encoded(result, codec).pieces)
 
 

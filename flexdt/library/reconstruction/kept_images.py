@@ -15,6 +15,7 @@ from typing import IO, Any, Final, cast
 import numpy as np
 
 from flexdt.library.datasets.image_set import Arrays, Counts, CountsReader, ImageSet
+from flexdt.message_words import reason_of
 from flexdt.twin.geometry.conventions import Float32Array
 
 ALL_ROWS: Final = slice(None)
@@ -114,9 +115,8 @@ class ImagesOnDisk:
         return count
 
     def _disk_error(self, error: OSError) -> OSError:
-        return type(error)(
-            error.errno, error.strerror, f"{self._folder} (images kept for a while)"
-        )
+        place = f"{self._folder} (images kept for a while)"
+        return OSError(error.errno, reason_of(error), place)
 
 
 class CountsOnce:

@@ -155,7 +155,7 @@ def read_volume(file: File) -> Volume:
         cubes = along_x == along_y == along_z
         return Volume(values, along_x if cubes else edges, (x, y, z))
     except OSError as error:
-        if error.errno is not None and error.strerror:
+        if error.errno is not None:
             raise
         raise _no_volume(path, "it is cut off or damaged") from None  # h5py's
     except OtherFormError as error:
