@@ -45,13 +45,17 @@ CAUSES: Final = {
     "turn": "the angle scale",
     "lost": "lost or doubled views",
     "gain": "the gain of views",
-    "curve": "beam hardening, scatter or haze",
+    "haze": "haze, scatter or beam hardening",
+    "clipped": "clipped line integrals",
+    "hardening": "beam hardening",
     "lens": "lens distortion",
     "images": "images that no object explains",
     "geometry": "what images leave open",
     "stopping": "iterations that ended early",
     "penalty": "the penalty of the total variation",
 }
+ONE_ENERGY: Final = "one energy"
+"""What is taken as stated where no spectrum is known."""
 NOT_BOUNDED: Final = (
     "accuracy: not bounded, because the object extends beyond the panel's sides: "
     "a denser shell out there makes every value too low, and no image shows it"
@@ -80,6 +84,7 @@ class Accuracy:
             not bounds.
         figure: size of the cause with its standard error, where the images tell one.
         taken: what is taken as stated, because the images do not decide it.
+        next: the next of the errors that images tell, with its size; "" without one.
     """
 
     half: float
@@ -88,6 +93,7 @@ class Accuracy:
     cut_off: bool = False
     figure: str = ""
     taken: tuple[str, ...] = ()
+    next: str = ""
 
     def __str__(self) -> str:
         """Return the accuracy sentence: largest errors [%] in nine of ten and in half of
@@ -100,10 +106,13 @@ class Accuracy:
             f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most)
         )
         figure = f" ({self.figure})" if self.figure else ""
-        taken = f"; if {', '.join(self.taken)} are as stated" if self.taken else ""
+        further = f", then {self.next}" if self.next else ""
+        stated = [one for one in self.taken if one != ONE_ENERGY]
+        taken = f"; if {', '.join(stated)} are as stated" if stated else ""
+        energy = f" at {ONE_ENERGY}" * (len(stated) < len(self.taken))
         return (
-            f"accuracy: within {most} in nine of ten uniform regions ({half} in half), "
-            f"mainly {CAUSES[self.cause]}{figure}{taken}"
+            f"accuracy{energy}: within {most} in nine of ten uniform regions ({half} in half), "
+            f"mainly {CAUSES[self.cause]}{figure}{further}{taken}"
         )
 
     @property
@@ -461,7 +470,7 @@ class Volume:
         size = " x ".join(f"{side:g}" for side in self.size_mm)
         rows = {"size (x, y, z)": f"{size} mm", "values": self._range_words()}
         if self.accuracy is not None:
-            rows["accuracy"] = str(self.accuracy).removeprefix("accuracy: ")
+            rows["accuracy"] = str(self.accuracy).removeprefix("accuracy").lstrip(": ")
         if getattr(self, "_bias", None) is not None:
             rows["sharpness"] = str(self.sharpness).removeprefix("sharpness: ")
         body = "".join(

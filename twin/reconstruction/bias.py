@@ -24,11 +24,12 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
-from flexdt.twin.projection.volume import Accuracy, Residuals
+from flexdt.twin.projection.volume import CAUSES, Accuracy, Residuals
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import (
     FINE_NODES,
     NODES,
+    Clipped,
     CoarseScan,
     ScanCopies,
 )
@@ -41,6 +42,11 @@ from flexdt.twin.reconstruction.consistency.agreement import (
 from flexdt.twin.reconstruction.consistency.cause_table import Finding
 from flexdt.twin.reconstruction.consistency.suspects import SIDES, suspects
 from flexdt.twin.reconstruction.feldkamp.fdk_plan import plan_fdk
+from flexdt.twin.reconstruction.known_beam import (
+    UNKNOWN_BEAM,
+    KnownBeam,
+    StraightCopies,
+)
 from flexdt.twin.reconstruction.uniform_nodes import (
     MIN_EVENNESS,
     UniformNodes,
@@ -77,7 +83,7 @@ STATED: Final = {
     "turn": "angles",
     "lost": "angles",
     "slip": "axis",
-    "curve": "spectrum",
+    "haze": "haze",
     "gain": "beam",
 }
 """Error -> what is taken as stated where images do not decide on it; others by their names."""
@@ -104,7 +110,8 @@ class Bias:
         inside: nodes of the object, (nz, ny, nx).
         causes: of `flexdt.twin.projection.volume.CAUSES` -> its largest change [1/mm],
             (nz, ny, nx).
-        contradiction: between images and geometry, with which nothing is bounded.
+        contradiction: between images and geometry, or clipped images, with which nothing is
+            bounded.
         figures: cause -> its size, in words.
         taken: what is taken as stated, because the images do not decide it.
     """
@@ -113,7 +120,7 @@ class Bias:
     even: FloatArray
     inside: npt.NDArray[np.bool_]
     causes: dict[str, FloatArray]
-    contradiction: Contradiction | None = None
+    contradiction: Contradiction | Clipped | None = None
     figures: Mapping[str, str] = field(default_factory=dict)
     taken: tuple[str, ...] = ()
 
@@ -174,8 +181,17 @@ class Bias:
         )
         half = min(float(np.median(usual)), most)
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
+        told = {
+            cause: float(np.percentile(off[cause], 90.0))
+            for cause in self.figures
+            if cause in off and cause != worst
+        }
+        following = max(told, key=lambda cause: told[cause], default="")
+        further = ""
+        if following and told[following] > USUAL_FLOOR:
+            further = f"{CAUSES[following]} ({self.figures[following]})"
         figure = self.figures.get(worst, "")
-        return Accuracy(half, most, worst, "beyond" in off, figure, self.taken)
+        return Accuracy(half, most, worst, "beyond" in off, figure, self.taken, further)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong: a contradiction, or large errors."""
@@ -205,38 +221,53 @@ class BiasOnDemand:
     Args:
         copied: makes a coarse copy of the whole scan, of so many nodes.
         sides_known: beads have told the direction of rotation and mirrored images.
+        known: of the scan's energies.
 
     Raises:
         GeometryError: a coarse copy cannot be reconstructed.
     """
 
     def __init__(
-        self, copied: Callable[[int], CoarseScan], *, sides_known: bool = False
+        self,
+        copied: Callable[[int], CoarseScan],
+        *,
+        sides_known: bool = False,
+        known: KnownBeam = UNKNOWN_BEAM,
     ) -> None:
         """Look at the scan once; see the class."""
         scan = copied(NODES)
         rows, cols = scan.images.shape[1:]
         plan_fdk(scan.cone_vec, (rows, cols), scan.grid, truncation=scan.truncation)
+        self._known = known
+        self._bent = None
+        if known.beam is not None and not scan.cut_off:
+            copied = self._bent = StraightCopies(copied, known.beam)
+        self._measured = self._bent.measured if self._bent else copied
         self._copied = copied
         self._sides_known = sides_known
         look = looked_at(copied(FINE_NODES))
-        self._doubtful = look is not None and look.doubtful
+        self._clipped = scan.clipped
+        self._doubtful = self._clipped is not None or (look is not None and look.doubtful)
 
     @classmethod
     def of(
-        cls, copied: ScanCopies | None, *, sides_known: bool = False
+        cls,
+        copied: ScanCopies | None,
+        *,
+        sides_known: bool = False,
+        known: KnownBeam = UNKNOWN_BEAM,
     ) -> BiasOnDemand | None:
         """Look at copies of a scan; None where a coarse copy cannot be reconstructed (any
         GeometryError), as of a steep helix or of neither a circle nor a helix.
 
         Args:
             copied: that have taken all images they want; None where they cannot be made.
-            sides_known: see the class.
+            sides_known, known: see the class.
         """
         if copied is None:
             return None
         try:
-            return cls(copied, sides_known=sides_known)
+            return cls(copied, sides_known=sides_known, known=known)
         except GeometryError:
             return None
 
@@ -253,18 +284,20 @@ class BiasOnDemand:
         `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
         the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
         complete rows their level beside the object ("drift"). Errors that the images tell
-        change it by their size and `SIGMAS` standard errors. What they leave open is bounded
+        change it by their size and `SIGMAS` standard errors, and a known spectrum by what
+        straightened line integrals change ("hardening"). What they leave open is bounded
         together ("geometry"), but what would change the volume by more than all that is
         taken as stated, and named.
         """
         bounded = self._told
         if bounded.contradiction is not None:
             return bounded
-        accuracy = bounded.accuracy(bounded.found)
+        straight = {k: one for k, one in bounded.causes.items() if k != "hardening"}
+        accuracy = replace(bounded, causes=straight).accuracy(bounded.found)
         if accuracy is None or accuracy.cut_off:
             return bounded
         if not self._agreement.compared:
-            return replace(bounded, taken=("geometry",))
+            return replace(bounded, taken=(*self._known.taken, "geometry"))
         return self._open(bounded, accuracy.most)
 
     def bound(self, grid: Volume) -> Float32Array | None:
@@ -279,9 +312,9 @@ class BiasOnDemand:
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong at first sight: another geometry that fits better, or large
-        errors by the trajectory and the panel's edges. Those are not looked for in a scan
-        that fits and is `CoarseScan.easy`; of one that has few views, but is easy otherwise,
-        only what few views do to some of its rows.
+        errors by the trajectory, the panel's edges and the spectrum. Those are not looked
+        for in a scan that fits, is `CoarseScan.easy` and hardly hardens the beam; of one that
+        has few views, but is easy otherwise, only what few views do to some of its rows.
 
         Args:
             grid: of the volume.
@@ -289,7 +322,7 @@ class BiasOnDemand:
         if self._doubtful:
             return self._told.warnings(grid)
         scan = self._copied(NODES)
-        if not scan.easy:
+        if not scan.easy or (self._bent is not None and self._bent.strong):
             return self._bounded.warnings(grid)
         if scan.sparse:
             thin = scan.thinned(all_views=True, least_rows=STREAK_ROWS)
@@ -301,14 +334,28 @@ class BiasOnDemand:
         None where neither that nor a coarse one can be projected.
         """
         try:
-            return residuals_of(volume, self._copied(FINE_NODES))
+            return residuals_of(volume, self._measured(FINE_NODES))
         except GeometryError:
             return None
 
     @cached_property
     def _bounded(self) -> Bias:
         """The errors, but for what the comparison adds."""
-        return _bounded(self._copied(NODES))
+        return self._of_beam(_bounded(self._copied(NODES)))
+
+    def _of_beam(self, found: Bias) -> Bias:
+        """Add what is known of the scan's energies."""
+        found = replace(found, taken=self._known.taken)
+        if self._bent is None:
+            return found
+        scan = self._copied(NODES)
+        nodes = UniformNodes.of(scan.volume, scan.rim)
+        bent = self._bent.bent_share(nodes) * np.abs(nodes.found)
+        return replace(
+            found,
+            causes={**found.causes, "hardening": bent},
+            figures={"hardening": self._bent.figure},
+        )
 
     @cached_property
     def _agreement(self) -> Agreement:
@@ -318,21 +365,22 @@ class BiasOnDemand:
     @cached_property
     def _told(self) -> Bias:
         """The errors, with those that the images tell."""
-        found = self._agreement
-        if found.contradiction is not None:
+        doubt = self._clipped or self._agreement.contradiction
+        if doubt is not None:
             scan = self._copied(NODES)
             nodes = UniformNodes.of(scan.fdk(scan.images, scan.cone_vec), scan.rim)
             blank = scan.grid.like(nodes.found)
-            return Bias(blank, nodes.even, nodes.inside, {}, found.contradiction)
-        bounded = self._bounded
+            return Bias(blank, nodes.even, nodes.inside, {}, doubt)
+        bounded, found = self._bounded, self._agreement
         causes = dict(bounded.causes)
-        figures = {}
+        figures = dict(bounded.figures)
         for one in found.findings:
             if one.told:
                 change = self._changed(one, one.size)
                 more = 1.0 + SIGMAS * one.sigma / abs(one.size)
                 name = one.cause.name
                 causes[name] = causes.get(name, 0.0) + more * _about(change, bounded.even)
+                causes[name] += one.level * np.abs(bounded.found.data)
                 figures[name] = one.figure
         if found.unexplained:
             causes["images"] = found.unexplained * np.abs(bounded.found.data)
@@ -385,7 +433,7 @@ class BiasOnDemand:
         """
         scan = self._copied(NODES)
         nodes = UniformNodes.of(self._volume, scan.rim)
-        taken = ["distances"]
+        taken = [*self._known.taken, "distances"]
         squares = np.zeros(scan.grid.shape)
         for one in self._agreement.findings:
             if one.told or one.cause.nuisance:
@@ -412,7 +460,7 @@ class BiasOfIterations(BiasOnDemand):
     penalty, leave out of the smooth coarse volume's projections.
 
     Args:
-        copied, sides_known: as of `BiasOnDemand`.
+        copied, sides_known, known: as of `BiasOnDemand`.
         run: reconstructs images (n, rows, cols) of n views on a grid, by the algorithm
             and with the options of the volume.
         cause: stopping or penalty.
@@ -425,17 +473,18 @@ class BiasOfIterations(BiasOnDemand):
         cause: str,
         *,
         sides_known: bool = False,
+        known: KnownBeam = UNKNOWN_BEAM,
     ) -> None:
         """Look at the scan once; see the class."""
         self._run = run
         self._cause = cause
-        super().__init__(copied, sides_known=sides_known)
+        super().__init__(copied, sides_known=sides_known, known=known)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong at first sight: a contradiction."""
-        if not self._doubtful or self._agreement.contradiction is None:
+        if not self._doubtful or self._told.contradiction is None:
             return []
-        return [str(self._agreement.contradiction)]
+        return [str(self._told.contradiction)]
 
     @cached_property
     def _bounded(self) -> Bias:
@@ -447,7 +496,8 @@ class BiasOfIterations(BiasOnDemand):
         again = self._run(images, scan.cone_vec, scan.grid).data
         change = np.nan_to_num(again) - nodes.found
         causes = {self._cause: SAFETY_FACTOR * _about(change, nodes.even)}
-        return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
+        found = scan.grid.like(nodes.found)
+        return self._of_beam(Bias(found, nodes.even, nodes.inside, causes))
 
 
 def bias_of(

@@ -53,8 +53,33 @@ there, below `WARNING_BOUND`; at 0.065, of 2 to 5 plates, up to 12 %."""
 MAX_EASY_LEVEL: Final = 0.01
 """Largest level beside the object, over the largest line integral, that is a small error:
 it is about the error in the volume, of which `WARNING_BOUND` tells from 3 % on."""
+PEAK_COLUMNS: Final = 2
+"""Largest number of columns in which a view of a right scan has the scan's largest value."""
+MAX_FLAT_VIEWS: Final = 0.05
+"""Share of views in which it may have more: those along a flat face, by parallel rays
+(assumed)."""
 PARALLEL_SOURCE_RADII: Final = 50.0
 """Distance of the source for parallel rays, in radii of the scan."""
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """Line integrals that all end at the same largest value.
+
+    Attributes:
+        value: at which they are clipped.
+        share: of the object's.
+    """
+
+    value: float
+    share: float
+
+    def __str__(self) -> str:
+        """Say so as one sentence."""
+        return (
+            f"no accuracy is claimed: {100.0 * self.share:.2g} % of the object's line "
+            f"integrals are clipped at {self.value:.3g}, and no image shows what is behind"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +112,7 @@ class CoarseScan:
         nodes: largest number of voxels along the longest side.
         rest: rows and columns at the panel's end that fill no pixel and are left out
             [coarse pixels].
+        clipped: line integrals of the scan that end at one value; None without any.
     """
 
     images: Float32Array
@@ -98,6 +124,7 @@ class CoarseScan:
     binned: tuple[int, int]
     nodes: int = NODES
     rest: tuple[float, float] = (0.0, 0.0)
+    clipped: Clipped | None = None
 
     @classmethod
     def of(
@@ -188,6 +215,11 @@ class CoarseScan:
         if self.truncation is None or not self.truncation.beyond:
             return None
         return self.truncation.nothing
+
+    @property
+    def cut_off(self) -> bool:
+        """True if the object continues beyond the panel's sides."""
+        return self.truncation is not None and bool(self.truncation.cut_off.any())
 
     @property
     def turns(self) -> float:
@@ -333,8 +365,7 @@ class CoarseScan:
         low, high = self.ends
         cols = self.images.shape[2]
         aside = abs(high - low) > (low + high) / cols
-        cut_off = self.truncation is not None and bool(self.truncation.cut_off.any())
-        if self.circle.rise or not self.circle.full or aside or cut_off or self.more:
+        if self.circle.rise or not self.circle.full or aside or self.cut_off or self.more:
             return False
         level = self.level
         away = np.linalg.norm((level.detector - level.source)[:, :2], axis=1)
@@ -551,6 +582,10 @@ class CoarseCopy:
         """Numbers of the views that are taken."""
         return np.flatnonzero(self._slots >= 0).tolist()
 
+    def wants(self, number: int) -> bool:
+        """Return whether a view is still to be taken."""
+        return bool(self._slots[number] >= 0 and not self._taken[number])
+
     def take(self, number: int, image: npt.NDArray[np.generic]) -> None:
         """Add a view's image, averaged over pixels, unless it is not wanted or has been
         taken.
@@ -559,9 +594,9 @@ class CoarseCopy:
             number: of the view among all.
             image: line integrals, (rows, cols); not changed.
         """
-        slot = self._slots[number]
-        if slot < 0 or self._taken[number]:
+        if not self.wants(number):
             return
+        slot = self._slots[number]
         self._taken[number] = True
         values = np.asarray(image, np.float32)
         self._sums[slot] += binned_mean(values.T if self._flip else values, self._binned)
@@ -596,6 +631,38 @@ class CoarseCopy:
         )
 
 
+class Plateaus:
+    """Looks for a largest line integral that whole areas of images have.
+
+    Columns of a right scan that have its largest value are one or two in a view (a body of
+    parallel rays), but for views along a flat face.
+    """
+
+    def __init__(self) -> None:
+        """Begin without an image."""
+        self._peaks: list[tuple[float, int, int, int]] = []
+
+    def take(self, image: npt.NDArray[np.generic]) -> None:
+        """Look at line integrals (rows, cols)."""
+        peak = image.max()
+        at = image == peak
+        columns = int(at.any(axis=0).sum())
+        thick = int((image > 0.5 * peak).sum()) if columns > PEAK_COLUMNS else 0
+        self._peaks.append((float(peak), columns, int(at.sum()), thick))
+
+    @property
+    def clipped(self) -> Clipped | None:
+        """What the images have in common; None if they have no plateau."""
+        if not self._peaks:
+            return None
+        peak, columns, count, thick = np.array(self._peaks).T
+        highest = float(peak.max())
+        flat = (peak == highest) & (columns > PEAK_COLUMNS)
+        if highest <= 0.0 or flat.sum() <= MAX_FLAT_VIEWS * len(flat):
+            return None
+        return Clipped(highest, float(count[flat].sum() / max(thick[flat].sum(), 1.0)))
+
+
 class ScanCopies:
     """Copies of a scan of `NODES` and of `FINE_NODES`, from images that are seen once.
 
@@ -613,6 +680,7 @@ class ScanCopies:
             nodes: CoarseCopy(cone_vec, shape, nodes) for nodes in (NODES, FINE_NODES)
         }
         self._scans: dict[int, CoarseScan] = {}
+        self._plateaus = Plateaus()
         self.truncation: Truncation | None = None
 
     @property
@@ -622,6 +690,8 @@ class ScanCopies:
 
     def take(self, number: int, image: npt.NDArray[np.generic]) -> None:
         """Take a view's image; see `CoarseCopy.take`."""
+        if self._copies[FINE_NODES].wants(number):
+            self._plateaus.take(image)
         for copy in self._copies.values():
             copy.take(number, image)
 
@@ -641,7 +711,8 @@ class ScanCopies:
     def __call__(self, nodes: int) -> CoarseScan:
         """Return the copy of `NODES` or `FINE_NODES`, with the `truncation`."""
         if nodes not in self._scans:
-            self._scans[nodes] = self._copies.pop(nodes).scan(self.truncation)
+            scan = self._copies.pop(nodes).scan(self.truncation)
+            self._scans[nodes] = replace(scan, clipped=self._plateaus.clipped)
         return self._scans[nodes]
 
 

@@ -83,9 +83,17 @@ from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, distinc
 from flexdt.twin.reconstruction.acquisition.truncation import SAMPLES as TRUNCATION_VIEWS
 from flexdt.twin.reconstruction.bias import BiasOfIterations, BiasOnDemand, copies_of
 from flexdt.twin.reconstruction.coarse_scan import ScanCopies
+from flexdt.twin.reconstruction.known_beam import (
+    CORRECTED_BEAM,
+    STRAIGHT_BEAM,
+    UNKNOWN_BEAM,
+    Beam,
+    KnownBeam,
+)
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
 
 if TYPE_CHECKING:
+    from flexdt.twin.physics.detector import Detector
     from flexdt.twin.physics.scatter import ScanScatter
     from flexdt.twin.physics.tube import Tube, TubeModel
     from flexdt.twin.reconstruction import Hardening
@@ -171,6 +179,7 @@ class ScanFrames:
         sides_known: their geometry is corrected by beads, which determine the direction of
             rotation and mirrored images.
         copies: take the corrected images as they are read, to find the errors of FDK.
+        known: of the energies of their line integrals.
     """
 
     dataset: ImageSet
@@ -185,6 +194,7 @@ class ScanFrames:
     kept: KeptImages | None = None
     sides_known: bool = False
     copies: ScanCopies | None = None
+    known: KnownBeam = UNKNOWN_BEAM
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -515,7 +525,7 @@ def _bias(views: ScanFrames) -> BiasOnDemand | None:
     """Find what the copies of all views tell of FDK's errors; None where the scan cannot
     be copied.
     """
-    return BiasOnDemand.of(views.copies, sides_known=views.sides_known)
+    return BiasOnDemand.of(views.copies, sides_known=views.sides_known, known=views.known)
 
 
 def _bias_read_again(views: ScanFrames) -> BiasOnDemand | None:
@@ -875,19 +885,21 @@ def _apply_corrections(views: ScanFrames, request: VolumeRequest) -> ScanFrames:
         views = _without_scatter(views, request.scatter_correction, request)
     if request.rings:
         views = replace(views, rings=scan_rings(views.view, views.cone_vec, views.shape))
+    views = replace(views, known=_known_beam(views.dataset, request))
     if request.material is not None:
         from flexdt.twin.attenuation.materials import material, stated_keV
 
         made_of = [material(name) for name in _names(request.material)]
-        kV, tube, mono_keV = _source(views.dataset, request)
+        source = _source(views.dataset, request)
+        kV, tube, mono_keV = source.kV, source.tube, source.mono_keV
         substances = [one.substance for one in made_of]
         if mono_keV is None and len(made_of) == 1:
             harden = hardening(
-                substances[0], kV, made_of[0].effective_energy_keV, tube=tube
+                substances[0], kV, made_of[0].effective_energy_keV, source.panel, tube
             )
             views = replace(views, harden=harden)
         elif mono_keV is None:
-            mixture = Polychromatic.of(substances, kV, stated_keV(), tube=tube)
+            mixture = Polychromatic.of(substances, kV, stated_keV(), source.panel, tube)
             views = replace(views, mixture=mixture)
     return views
 
@@ -934,8 +946,9 @@ def _without_scatter(
             },
         )
     substances = tuple(material(name).substance for name in names)
-    kV, tube, mono_keV = _source(views.dataset, request)
-    chain = Chain(Detector(), tube, substances, mono_keV=mono_keV)
+    source = _source(views.dataset, request)
+    kV = source.kV
+    chain = Chain(Detector(), source.tube, substances, mono_keV=source.mono_keV)
     factor = max(1, min(max(views.shape) // SCATTER_PIXELS, min(views.shape) // 2))
     each = max(1, len(views.indices) // SCATTER_VIEWS)
     geometry = views.cone_vec[::each].binned(factor, views.shape)
@@ -947,27 +960,39 @@ def _without_scatter(
     return replace(views, scatter=scatter, doubts=(*views.doubts, *scatterer.doubts))
 
 
-def _source(
-    dataset: ImageSet, request: VolumeRequest
-) -> tuple[float, TubeModel, float | None]:
-    """Return voltage, tube and single energy, as requested or as the data set names them.
+@dataclass(frozen=True)
+class _Source:
+    """Of the X-rays: voltage, tube, panel (None: the default one) and single energy."""
+
+    kV: float
+    tube: TubeModel
+    panel: Detector | None = None
+    mono_keV: float | None = None
+
+
+def _source(dataset: ImageSet, request: VolumeRequest) -> _Source:
+    """Return the source as requested, as the data set names it, or as it was simulated.
 
     The request's tube is taken first, then its voltage, then the data set's. A single
-    energy comes from the request's tube only; filters and focal spot otherwise from the
-    data set's figures, if it has any.
+    energy comes from the request's tube or the simulation's; filters and focal spot otherwise
+    from the data set's figures, if it has any.
 
     Raises:
-        LimitError: neither states the voltage.
+        LimitError: none states the voltage.
         TwinError: the data set's images have no beam hardening.
     """
     from flexdt.twin.physics.tube import TubeModel
 
     if request.tube is not None:
-        return request.tube.kV, request.tube.model(), request.tube.mono_keV
+        return _Source(request.tube.kV, request.tube.model(), None, request.tube.mono_keV)
     if dataset.settings is None:
         stated_kV = None
     else:
         stated_kV = dataset.settings.kV
+    chain = getattr(dataset.truth, "chain", None)
+    if stated_kV is None and chain is not None:
+        kV = dataset.truth.exposure.kV if request.kV is None else request.kV
+        return _Source(kV, chain.tube, chain.panel, chain.mono_keV)
     kV = stated_kV if request.kV is None else request.kV
     if kV is None:
         raise LimitError(
@@ -984,7 +1009,22 @@ def _source(
             "straight, and a correction of beam hardening would bend them",
             {"asked": "material", "allowed": "physics poly, or a scanner's data"},
         )
-    return kV, TubeModel.of_figures(figures), None
+    return _Source(kV, TubeModel.of_figures(figures))
+
+
+def _known_beam(dataset: ImageSet, request: VolumeRequest) -> KnownBeam:
+    """Say what is known of the energies of the line integrals, as they are corrected."""
+    try:
+        source = _source(dataset, request)
+    except LimitError:
+        return UNKNOWN_BEAM
+    except TwinError:  # of one energy
+        return STRAIGHT_BEAM
+    if source.mono_keV is not None:
+        return STRAIGHT_BEAM
+    if request.material is not None:
+        return CORRECTED_BEAM
+    return KnownBeam(Beam(source.kV, source.tube, source.panel))
 
 
 def _require_room(out: Path, grid: Grid) -> None:
@@ -1101,7 +1141,9 @@ def _iterative(
     try:
         copies.truncation = truncation_of(stack.__getitem__, views.cone_vec, views.shape)
         quiet = partial(run, progress=False)
-        bias = BiasOfIterations(copies, quiet, cause, sides_known=views.sides_known)
+        bias = BiasOfIterations(
+            copies, quiet, cause, sides_known=views.sides_known, known=views.known
+        )
     except GeometryError:  # a trajectory that is not looked at
         return made
     for doubt in bias.warnings(made):

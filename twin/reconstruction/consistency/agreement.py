@@ -150,7 +150,10 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
         better.append((evidence, gain, one))
     left = table.unexplained()
     bar = quantile(FALSE_ALARMS / max(len(better), 1))
-    fitting = sorted((one for one in better if one[0] > bar), key=lambda one: -one[1])
+    # Of a round body any order averages the error of sampling: it has to explain most.
+    least = 0.5 * table.surprises
+    fitting = [one for one in better if one[0] > bar and one[1] > least]
+    fitting.sort(key=lambda one: -one[1])
     if not fitting or not table.doubtful:
         return Agreement(None, told, left, tuple(dict.fromkeys(undecided)), compared=True)
     most = fitting[0][1]

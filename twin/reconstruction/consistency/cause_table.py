@@ -345,6 +345,16 @@ class Finding:
     told: bool
 
     @property
+    def level(self) -> float:
+        """Share of all values that stays open: of a gain that changes any part of the scan
+        may be the right one.
+        """
+        if self.cause.name != "gain":
+            return 0.0
+        course = self.course(np.linspace(0.0, 1.0, 201))
+        return 0.01 * abs(self.size) * float(np.abs(course).max())
+
+    @property
     def figure(self) -> str:
         """Its size with the standard error, in words."""
         where = ""

@@ -145,7 +145,13 @@ def causes_of(centre: FloatArray) -> list[Cause]:
         Cause("lost", "deg", 0.1, 45.0, turned, constant=False, course=True, turns=True),
         Cause("gain", "%", 1.0, 30.0, images=_gained, constant=False, course=True),
         Cause(
-            "curve", "% per unit", 1.0, 50.0, images=_curved, fine=True, of_integral=True
+            "haze",
+            "% of the open beam",
+            0.1,
+            30.0,
+            images=_hazed,
+            fine=True,
+            of_integral=True,
         ),
         Cause("lens", "%", 1.0, 20.0, images=_bulged, fine=True),
     ]
@@ -195,8 +201,16 @@ def _gained(images: Float32Array, sizes: FloatArray) -> Float32Array:
     return np.asarray(0.01 * sizes[:, None, None] * images, np.float32)
 
 
-def _curved(images: Float32Array, sizes: FloatArray) -> Float32Array:
-    return np.asarray(-0.01 * sizes[:, None, None] * np.square(images), np.float32)
+def _hazed(images: Float32Array, sizes: FloatArray) -> Float32Array:
+    """Compute what a constant adds that is in the beam beside the flat, or was left in by the
+    dark image: a scale of small line integrals, and a bend of large ones.
+
+    The constant is at most half of what a pixel has.
+    """
+    share = 0.01 * sizes[:, None, None]
+    light = np.exp(-images)
+    constant = np.minimum(share * (1.0 - light), 0.5 * light)
+    return np.asarray(-constant / light, np.float32)
 
 
 def _bulged(images: Float32Array, sizes: FloatArray) -> Float32Array:
