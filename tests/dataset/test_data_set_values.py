@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,9 +48,9 @@ def test_images_are_line_integrals_by_number_and_in_order(data: fx.DataSet) -> N
     assert_allclose(data[np.int64(-1)], expected[-1], atol=1e-5)
     with pytest.raises(IndexError):
         data[12]
-    assert (
-        repr(data)
-        == "<DataSet 'scene': 12 projections of 20 x 24 (rows x columns), complete>"
+    assert re.fullmatch(
+        r"<DataSet 'scene': 12 projections of 20 x 24 \(rows x columns\), \d+ kV, complete>",
+        repr(data),
     )
 
 

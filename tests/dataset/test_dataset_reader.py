@@ -46,10 +46,13 @@ def test_an_own_data_set_comes_back(
     d = load_dataset(written())
     assert (d.name, len(d), d.shape) == ("scan", 5, (24, 30))
     assert d.complete
-    assert (
-        repr(d)
-        == "<DataSet 'scan': 5 projections of 24 x 30 (rows x columns), complete, 1 warning>"
+    assert repr(d) == (
+        "<DataSet 'scan': 5 projections of 24 x 30 (rows x columns) of 'bricks', 80 kV, "
+        "complete, 1 warning>"
     )
+    page = d._repr_html_()
+    for fact in ("bricks", "80 kV", "flexray"):
+        assert fact in page
     (told,) = d.warnings  # one flat image is three times as bright as the other
     assert "flat images differ by 100 %" in told
     assert d.require_complete() is d

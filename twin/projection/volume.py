@@ -140,7 +140,7 @@ class Width:
 
 
 @public
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Sharpness:
     """How sharp a volume is.
 
@@ -178,6 +178,10 @@ class Sharpness:
             MIN_DOUBLED_SIGMAS * self.doubled_error_mm, MIN_DOUBLED_VOXELS * self.voxel_mm
         )
         return self.doubled_mm > least
+
+    def __repr__(self) -> str:
+        """Return the sentence as a value."""
+        return f"<{self}>"
 
     def __str__(self) -> str:
         """Say in one sentence how wide edges are, what details are told, and whether

@@ -255,10 +255,14 @@ class ImageSet:
         return len(self.frames)
 
     def __repr__(self) -> str:
-        """Format name, number and shape of the projections, complete or not, and how many
-        warnings (none: left out).
+        """Format name, number and shape of the projections, sample and voltage where they are
+        known, complete or not, and how many warnings (none: left out).
         """
         rows, cols = self.shape
+        known = self._known_facts()
+        of = known.get("sample", self.name)
+        sample = "" if of == self.name else f" of {of!r}"
+        beam = f", {known['beam'].partition(',')[0]}" if "beam" in known else ""
         if self.complete:
             state = "complete"
         else:
@@ -269,16 +273,17 @@ class ImageSet:
         else:
             doubts = ""
         images = f"{len(self)} projections of {rows} x {cols} (rows x columns)"
-        return f"<DataSet {self.name!r}: {images}, {state}{doubts}>"
+        return f"<DataSet {self.name!r}: {images}{sample}{beam}, {state}{doubts}>"
 
     def _repr_html_(self) -> str:
-        """Make a table (HTML) of the number and size of projections, completeness,
-        numbers of dark and flat images and warnings, and a thumbnail of the first
-        projection, if one is present.
+        """Make a table (HTML) of the number and size of projections, what is known of sample,
+        beam and scanner, completeness, numbers of dark and flat images and warnings, and a
+        thumbnail of the first projection, if one is present.
         """
         rows, cols = self.shape
         facts = {
             "projections": f"{len(self)} of {rows} x {cols} pixels",
+            **self._known_facts(),
             "complete": "yes" if self.complete else "no",
             "dark, flat images": ", ".join(map(str, self._reference_counts())),
             **{f"warning {i}": text for i, text in enumerate(self.warnings, 1)},
@@ -290,6 +295,37 @@ class ImageSet:
         heads, *stated = self.provenance.rows
         values = values_table(heads, stated) if stated else ""
         return facts_table(f"DataSet {self.name}", facts) + values + picture
+
+    def _known_facts(self) -> dict[str, str]:
+        """Return what is known of sample, beam, scanner and correction, in words; what nobody
+        states is left out. A simulated scan's truth goes before its files, these before the
+        texts.
+        """
+        sample, beam = "", None
+        if self.truth is not None:
+            sample = self.truth.sample.name
+            lit = self.truth.exposure
+            beam = lit.kV, lit.power_W, lit.exposure_ms, lit.averages
+        elif self.document is not None:
+            sample = self.document.sample.name
+            tube, panel = self.document.tube, self.document.detector
+            beam = tube.kV, tube.power_W, panel.exposure_ms, panel.averages
+        elif self.settings is not None:
+            sample = self.settings.sample_name or ""
+            said = self.settings
+            beam = said.kV, said.power_W, said.exposure_ms, said.averages
+        facts = {"sample": sample}
+        if beam is not None and beam[0]:
+            kV, power_W, exposure_ms, averages = beam
+            parts = [f"{kV:g} kV", f"{power_W:g} W" if power_W else ""]
+            if exposure_ms:
+                parts.append(f"{averages or 1:g} x {exposure_ms:.4g} ms")
+            facts["beam"] = ", ".join(part for part in parts if part)
+        if self.machine is not None:
+            facts["scanner"] = self.machine.name
+        if self.correction is not None:
+            facts["correction"] = self.correction.name
+        return {name: said for name, said in facts.items() if said}
 
     def _reference_counts(self) -> tuple[int, int]:
         """Return the numbers of dark and of flat images, of those in memory if there are,
