@@ -11,6 +11,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -112,7 +113,34 @@ def commands() -> str:
         rows = [_option(p) for p in command.params if not getattr(p, "hidden", False)]
         if rows:
             out += ["| argument | default | |", "|---|---|---|", *rows, ""]
-    return "\n".join(out) + "\n"
+    return "\n".join([*out, *_settings()]) + "\n"
+
+
+def _settings() -> list[str]:
+    """Describe the keys of the settings file that are no options, as lines of Markdown."""
+    from flexdt.clients.cli import command_settings
+    from flexdt.runtime.settings import Settings
+
+    rows = [
+        f"| `[{table.command.replace(' ', '_')}]` | `{field.name}` | "
+        f"{'' if field.default is None else _code(str(field.default))} | "
+        f"{_cell(list_pages.attributes(table)[field.name])} |"
+        for table in vars(command_settings).values()
+        if isinstance(table, type)
+        and issubclass(table, Settings)
+        and table is not Settings
+        for field in fields(table)
+    ]
+    return [
+        "## Keys of the settings file",
+        "",
+        "Choices that are rarely made are no options, but keys of the [settings "
+        "file](../command-line.md#configuration).",
+        "",
+        "| table | key | default | |",
+        "|---|---|---|---|",
+        *rows,
+    ]
 
 
 def _walk(command: Any, path: str) -> Iterator[tuple[str, Any]]:

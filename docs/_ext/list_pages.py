@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields
-from typing import Any
 
 LISTED = {
     "twin/script/problems.py": "findings.md",
     "twin/calibration/diagnose/__init__.py": "findings.md",
     "twin/plausibility/contradictions.py": "findings.md",
     "runtime/access.py": "limits.md",
+    "clients/cli/command_settings.py": "commands.md",
 }
 """File of the repository that declares a list -> its page below `_generated/`."""
 
@@ -58,7 +58,7 @@ def limits() -> str:
         ("A twin", access.TwinLimits()),
         ("The page", access.ViewerLimits()),
     ):
-        meanings = attributes(made)
+        meanings = attributes(type(made))
         out += [f"## {title}", "", "| limit | default | meaning |", "|---|---|---|"]
         for field in fields(made):
             value = getattr(made, field.name)
@@ -68,9 +68,9 @@ def limits() -> str:
     return "\n".join(out)
 
 
-def attributes(value: Any) -> dict[str, str]:
+def attributes(declared: type) -> dict[str, str]:
     """Return what a class's docstring says of each attribute."""
-    text = (type(value).__doc__ or "").partition("Attributes:")[2]
+    text = (declared.__doc__ or "").partition("Attributes:")[2]
     parts = re.split(r"^ {8}(\w+): ", text, flags=re.MULTILINE)[1:]
     return {
         name: " ".join(said.split()).rstrip(".")

@@ -14,7 +14,7 @@ from loaded_script import load
 
 ROOT = DOCS.parent
 MADE = DOCS / "images" / "made"
-MAX_WORDS = 28_100
+MAX_WORDS = 27_000
 """Of all pages; figures of the evidence shelf are data, and counted apart."""
 MAX_PAGES = 60
 """Notebooks of the story included; pages made from code or data left out."""

@@ -18,7 +18,7 @@ from PIL import Image
 
 PROGRAM = load(DOCS.parent / "tests" / "studies" / "story_from_wheel.py")
 BOOKS = sorted((DOCS / "story").glob("*.ipynb"))
-IMPORTS = {"flexdt", "numpy", "matplotlib.pyplot"}
+IMPORTS = {"warnings", "flexdt", "numpy", "matplotlib.pyplot"}
 
 
 def read(path: Path) -> dict[str, Any]:
