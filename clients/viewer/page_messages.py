@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import msgpack
 from annotated_types import Ge, Gt, Le, MaxLen
@@ -28,6 +28,15 @@ Triple = Annotated[tuple[Length, Length, Length], Field(strict=False)]
 Turn = Annotated[tuple[Part, Part, Part, Part], Field(strict=False)]
 Pixels = Annotated[float, Ge(1), Le(100_000)]
 Name = Annotated[str, MaxLen(200)]
+Modifier = Literal[
+    "cmd/ctrl",
+    "alt",
+    "shift",
+    "cmd/ctrl+alt",
+    "cmd/ctrl+shift",
+    "alt+shift",
+    "cmd/ctrl+alt+shift",
+]
 
 
 class ViewerCameraMessage(Params):
@@ -62,6 +71,18 @@ class TransformControlsDragEndMessage(TransformControlsDragStartMessage):
     """A drag of a handle ends."""
 
 
+class SceneNodeClickMessage(Params):
+    """A part is clicked; the ray [m] and the place in the frame (0 to 1) are not used."""
+
+    name: Name
+    instance_index: Annotated[int, Ge(0), Le(2**31)] | None = None
+    ray_origin: Triple
+    ray_direction: Triple
+    screen_pos: Annotated[tuple[Length, Length], Field(strict=False)]
+    modifier: Modifier | None = None
+    owner: Name = ""
+
+
 class GetRenderResponseMessage(Params):
     """A picture that the viewer has requested."""
 
@@ -76,6 +97,7 @@ ALLOWED: Final[dict[str, type[Params]]] = {
         TransformControlsDragStartMessage,
         TransformControlsUpdateMessage,
         TransformControlsDragEndMessage,
+        SceneNodeClickMessage,
         GetRenderResponseMessage,
     )
 }

@@ -523,7 +523,13 @@ class Viewer:
         profile = self._profile or profile_of(machine, named)
         if self.lab is None or (self.lab.machine, self.lab.profile) != (machine, profile):
             scene = await asyncio.to_thread(
-                LabScene, self.viser, machine, profile, self._dragged, self.looks
+                LabScene,
+                self.viser,
+                machine,
+                profile,
+                self._dragged,
+                self.looks,
+                self._picked,
             )
             self.lab = scene
             self._built = self.scenes.said
@@ -764,3 +770,12 @@ class Viewer:
         page = self.pages.get(self.clients.page_of(client) or "")
         if page is not None and self._loop is not None:
             self._loop.call_soon_threadsafe(page.drag, dict(targets))
+
+    def _picked(self, client: int | None, part: str, motor: str | None) -> None:
+        """Tell a page that a part was clicked in a frame of it; called in one of viser's
+        threads."""
+        page = self.pages.get(self.clients.page_of(client) or "")
+        if page is not None and self._loop is not None:
+            self._loop.call_soon_threadsafe(
+                partial(page.say, "part", part=part, motor=motor)
+            )

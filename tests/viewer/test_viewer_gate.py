@@ -50,6 +50,11 @@ DRAG: dict[str, Any] = {
     "type": "TransformControlsUpdateMessage", "name": "/gizmos/object", "owner": "",
     "wxyz": [1, 0, 0, 0], "position": [0.1, 0.2, 0.3],
 }  # fmt: skip
+CLICK: dict[str, Any] = {
+    "type": "SceneNodeClickMessage", "name": "/machine/detector/look", "instance_index": None,
+    "ray_origin": [3, 3, 3], "ray_direction": [0.6, 0, 0.8], "screen_pos": [0.5, 0.25],
+    "modifier": None, "owner": "",
+}  # fmt: skip
 PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 640, 480)
 PICTURE: dict[str, Any] = {
     "type": "GetRenderResponseMessage", "payload": PNG, "render_uuid": "u",
@@ -63,7 +68,7 @@ def without(message: dict[str, Any], *names: str) -> dict[str, Any]:
 # -- the form of messages ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("message", [CAMERA, DRAG, without(DRAG, "owner"), PICTURE,
+@pytest.mark.parametrize("message", [CAMERA, DRAG, without(DRAG, "owner"), CLICK, PICTURE,
                                      PICTURE | {"payload": b""}])  # fmt: skip
 def test_what_scenes_send_gets_through_as_it_is(message: dict[str, Any]) -> None:
     heard = _messages.Message.deserialize(admitted(msgpack.packb(message)))
@@ -95,6 +100,8 @@ def test_what_scenes_send_gets_through_as_it_is(message: dict[str, Any]) -> None
         DRAG | {"wxyz": None},
         DRAG | {"name": "x" * 201},
         DRAG | {"name": 2**63},
+        CLICK | {"modifier": "meta"},
+        CLICK | {"instance_index": 1.5},
         PICTURE | {"payload": "text"},
         PICTURE | {"payload": b"GIF89a" * 9},
         PICTURE | {"payload": PNG[:-8] + struct.pack(">II", 65_000, 65_000)},
@@ -125,7 +132,9 @@ ANYTHING = st.recursive(
 TYPES = sorted(_messages.Message._subclass_from_type_string())
 
 
-@given(st.sampled_from(TYPES), st.sampled_from([CAMERA, DRAG, PICTURE, {}]), st.data())
+@given(
+    st.sampled_from(TYPES), st.sampled_from([CAMERA, DRAG, CLICK, PICTURE, {}]), st.data()
+)
 def test_whatever_gets_through_is_on_the_list_and_viser_can_read_it(
     kind: str, base: dict[str, Any], data: st.DataObject
 ) -> None:

@@ -356,7 +356,10 @@ function axisRow(name, axis, what) {
     if (Number.isFinite(value)) void move(name, value);
     else emit("note", "error", `${name} does not move`, `“${text}” is not a number`);
   }
-  number.addEventListener("blur", () => draw(row));
+  number.addEventListener("blur", () => {
+    box.classList.remove("chosen");
+    draw(row);
+  });
   const letGo = () =>
     setTimeout(() => {
       row.dragging = false;
@@ -475,6 +478,24 @@ function draw(row) {
     !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5),
   );
 }
+
+/**
+ * A part that was clicked in a scene selects the motor that moves it, or all that a machine
+ * shows of it; its number takes the next key.
+ */
+on("part", (part, motor) => {
+  const row = motor === null ? undefined : rows.get(motor);
+  if (!row) {
+    emit("note", "", part, "no motor moves it");
+    return;
+  }
+  emit("show-tab", "move");
+  if (row.box.closest("#motors")) motors.open = true;
+  row.box.scrollIntoView({ block: "nearest" });
+  row.number.focus({ preventScroll: true });
+  row.number.select();
+  row.box.classList.add("chosen");
+});
 
 on("state", refresh);
 on("connection", () => {

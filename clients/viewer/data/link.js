@@ -360,6 +360,9 @@ const handlers = {
   log(m) {
     emit("log", m.data);
   },
+  part(m) {
+    emit("part", m.part, m.motor);
+  },
   beat(m) {
     heard = { at: performance.now(), late: late(m.at), silent: m.silent_s };
     look();

@@ -5,7 +5,7 @@ viser sends only what changes. Setters may be called from any one thread at a ti
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -43,7 +43,7 @@ from flexdt.clients.viewer.scenes.world import MM, World, motors, quaternion
 from flexdt.protocol.state_model import State
 from flexdt.twin.collision.collision_scene import build_scene
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.machine.description import Machine, Profile
+from flexdt.twin.machine.description import Component, Machine, Profile
 
 LAMP_M: Final = 0.045
 """Radius of the cabinet's lamp in the FleX-ray."""
@@ -61,6 +61,10 @@ GAP_MM: Final = 0.6
 """Distance of the image from the panel's face, in front of which it floats."""
 NEAR: Final = ("sample_mount", "sample_holder")
 """Roles of the parts that turn with the sample."""
+SAMPLE: Final = "sample"
+"""What is picked where the sample is clicked."""
+Pick = Callable[[int | None, str, str | None], None]
+"""Called with viser's client, the part that was clicked, and the motor nearest to it."""
 WORLD_POSE: Final = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """The pose of parts in the world's own frame."""
 AXIS_REACH_MM: Final = 120.0
@@ -75,6 +79,7 @@ class LabScene:
         server: to draw in.
         machine, profile: to draw.
         drag: called when a stage is dragged.
+        pick: called when a part is clicked.
         looks: part -> its own mesh (`own_looks`).
     """
 
@@ -85,6 +90,7 @@ class LabScene:
         profile: Profile,
         drag: Drag = lambda client, targets: None,
         looks: Mapping[str, bytes] | None = None,
+        pick: Pick = lambda client, part, motor: None,
     ) -> None:
         """Build all nodes, each shown or hidden as in `Shown()`; see the class.
 
@@ -96,6 +102,7 @@ class LabScene:
         self.machine = machine
         self.profile = profile
         self._own = looks or {}
+        self._pick = pick
         self._collision = build_scene(machine, profile)
         self._bodies = {b.name: b for b in self._collision.bodies}
         self._frames: dict[str, viser.FrameHandle] = {}
@@ -156,7 +163,7 @@ class LabScene:
             own = self._own.get(part.name)
             pieces = pieces_of(part)
             self._solids[part.name] = cut(pieces)
-            scene.add_glb(
+            look = scene.add_glb(
                 f"/machine/{part.name}/look",
                 own or glb(pieces),
                 position=tuple(
@@ -164,6 +171,7 @@ class LabScene:
                 ),
                 receive_shadow=part is ground,  # a part's shadow on itself has stripes
             )
+            self._clickable(look, part.name, motor_of(self.machine, part))
             if part.name in standing:
                 scene.add_glb(
                     f"/machine/{part.name}/look/shadow",
@@ -227,6 +235,14 @@ class LabScene:
             thickness=2.5,
             **SCREEN,
         )
+
+    def _clickable(self, node: Any, part: str, motor: str | None) -> None:
+        """Pass clicks of a node on, with what it is and its motor, to `pick`."""
+
+        async def clicked(event: Any) -> None:
+            self._pick(event.client_id, part, motor)
+
+        node.on_click(clicked)
 
     def _build_bodies(self) -> None:
         """Add the hull of each collision body, and one grown by the safety margin if the
@@ -484,6 +500,8 @@ class LabScene:
                 )
                 for skin in look.skins
             ]
+            for handle in self._skins:
+                self._clickable(handle, SAMPLE, sample_motor(self.machine))
             self._stand(look)
         self.plain = self.nodes(Shown())
 
@@ -578,6 +596,30 @@ class LabScene:
         if lines:
             self._ranges.points = (np.array(lines) * MM).astype(np.float32)
             self._ranges.colors = np.full((len(lines), 2, 3), RANGE, dtype=np.uint8)
+
+
+def motor_of(machine: Machine, part: Component | None) -> str | None:
+    """Name the motor nearest to a part on its chain: its own, or that of the part which
+    carries it; None where nothing moves it.
+
+    >>> from flexdt.twin.machine.description import builtin_machine
+    >>> flexray = builtin_machine("flexray")
+    >>> parts = {part.name: part for part in flexray.components}
+    >>> [motor_of(flexray, parts[n]) for n in ("xray_source", "sample_mount", "main_platform")]
+    ['ver_tube', 'rot_obj', None]
+    """
+    parts = {each.name: each for each in machine.components}
+    while part is not None:
+        if part.axis is not None:
+            return part.axis
+        part = parts.get(part.parent or "")
+    return None
+
+
+def sample_motor(machine: Machine) -> str | None:
+    """Name the motor nearest to the sample: that of the last part that carries it."""
+    holders = [each for each in machine.components if each.role in NEAR]
+    return motor_of(machine, holders[-1] if holders else None)
 
 
 def _clear(opacity: float, dense: bool) -> dict[str, Any]:

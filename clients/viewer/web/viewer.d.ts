@@ -182,6 +182,8 @@ export interface Messages {
   note: { level: string; title: string; body: string };
   log: { data: { level: string; message: string } };
   beat: { at: number; silent_s: number };
+  // What was clicked in a scene, and the motor nearest to it.
+  part: { part: string; motor: string | null };
 }
 
 export interface Offer {
@@ -274,6 +276,7 @@ export interface Events {
   image: [image?: Shown | null];
   log: [entry: { level: string; message: string }];
   tab: [name: string];
+  part: [part: string, motor: string | null];
   "show-tab": [name: string];
   moment: [moment: Moment];
   recorded: [name: string | null];
