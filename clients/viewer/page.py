@@ -223,19 +223,20 @@ class Page:
 
     async def _follow(self) -> None:
         """Send the axes' newest dragged targets to the twin, one request at a time with a
-        pause, until none is left; a refusal is shown to the page and goes on.
+        pause, until none is left; the page is told whether each can be reached.
 
-        The pause is `DRAG_S`; targets given meanwhile replace each other. Refusals and
-        lost connections become a note.
+        The pause is `DRAG_S`; targets given meanwhile replace each other. A refusal and a
+        lost connection say why not.
         """
         while (targets := self._dragged) is not None:
             self._dragged = None
+            told: dict[str, object] = {"type": "drag", "targets": targets}
             try:
-                await self.link.request("axes.move", {"targets": targets})
+                answer: Any = await self.link.request("axes.move", {"targets": targets})
+                told |= {"why": None, "duration_s": answer["duration_s"]}
             except (RpcError, ConnectionLost) as error:
-                self.say(
-                    "note", level="error", title="Cannot go there", body=_words(error)
-                )
+                told |= {"why": _words(error), "duration_s": None}
+            self.show("drag", json.dumps(told))
             await asyncio.sleep(DRAG_S)
 
     async def _send(self) -> None:

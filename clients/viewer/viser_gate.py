@@ -26,12 +26,14 @@ from typing import Any, Final
 import viser
 import websockets.asyncio.server as library
 from viser._messages import (
+    DragBinding,
     Message,
     SceneNodeUpdateMessage,
     SetCameraFovMessage,
     SetCameraLookAtMessage,
     SetCameraPositionMessage,
     SetCameraUpDirectionMessage,
+    SetSceneNodeClickBindingsMessage,
     SetSceneNodeVisibilityMessage,
     ShareUrlDisconnect,
     ShareUrlRequest,
@@ -204,14 +206,17 @@ def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
 
 
 def _changes(nodes: Nodes) -> Iterator[Message]:
-    """Yield viser's messages that set the nodes' properties: visibility apart, the others
-    together.
+    """Yield viser's messages that set the nodes' properties: visibility and clicks apart,
+    the others together.
 
     A visibility of None is left out; nodes without properties give nothing.
     """
     for name, properties in nodes.items():
         if (rest := dict(properties)).pop("visible", None) is not None:
             yield SetSceneNodeVisibilityMessage(name, properties["visible"])
+        if (clickable := rest.pop("clickable", None)) is not None:
+            bindings = (DragBinding("left", None),) if clickable else ()
+            yield SetSceneNodeClickBindingsMessage(name, bindings)
         if rest:
             yield SceneNodeUpdateMessage(name, rest)
 
@@ -246,7 +251,8 @@ def look_from(serializer: Any, camera: Standpoint, nodes: Nodes) -> None:
     """
     serializer._insert_message(SetCameraPositionMessage(camera.position, initial=True))
     serializer._insert_message(SetCameraLookAtMessage(camera.look_at, initial=True))
-    for message in _changes(nodes):
+    still = {name: {**of, "clickable": None} for name, of in nodes.items()}
+    for message in _changes(still):
         serializer._insert_message(message)
 
 

@@ -27,6 +27,10 @@ const later = window.setTimeout;
 window.setTimeout = (f, ms, ...more) => later(f, ms > 5000 ? 2 ** 31 - 1 : ms, ...more);
 """
 """Notes stay until the test ends: a slow machine may look for one later than people do."""
+TOOLS_OPEN = """
+if (!localStorage.getItem('flexdt-tools')) localStorage.setItem('flexdt-tools', 'open');
+"""
+"""As `KNOWN_HERE`, for window and tools of the radiograph."""
 HARMLESS = ("ERR_FILE_NOT_FOUND", "favicon")
 
 
@@ -216,6 +220,7 @@ def open_page(
         page.on("console", lambda m: console.append(m.text) if _matters(m) else None)
         if not fresh:
             page.add_init_script(KNOWN_HERE)
+            page.add_init_script(TOOLS_OPEN)
         if notes_stay:
             page.add_init_script(NOTES_STAY)
         given = {"view": view, "theme": "light", "patience": PATIENCE_S, **query}

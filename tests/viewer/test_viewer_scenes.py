@@ -229,6 +229,7 @@ def test_dragging_a_handle_moves_its_stage(
         lambda: abs(twin.state().axes[axis].target - before) > 1.0,
         f"{axis} is sent somewhere",
     )
+    assert re.search(f"{axis} .*can be reached", str(scene.text_content("#dragged")))
     scene.uncheck("#handles")
     wait(lambda: (twin.state().axes[axis].position - before) * sign > 1.0, axis)
     wait(lambda: not any(a.moving for a in twin.state().axes.values()))

@@ -135,10 +135,14 @@ const panel = el(
     button("record-next", "›", "The next image", () => show(index + 1)),
     el("span", { id: "record-at", class: "mono small-text cut" }),
   ),
-  compare.row,
-  marks.row((all) => {
-    if (told) emit("calibrate", told.info.name, told.info.sample, all);
-  }),
+  el(
+    "div",
+    { class: "row-pair" },
+    compare.row,
+    marks.row((all) => {
+      if (told) emit("calibrate", told.info.name, told.info.sample, all);
+    }),
+  ),
   el(
     "div",
     {

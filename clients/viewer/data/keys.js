@@ -30,7 +30,7 @@ export const JOGS = {
   Digit7: ["mag_det", -1, "detector towards source"],
 };
 const HELP =
-  "With “keys move axes” ticked in the Move tab, an axis moves while its key is held. " +
+  "With “keys move” ticked in the Move tab, an axis moves while its key is held. " +
   "Space stops wherever the focus is, except in text, lists and checkboxes; " +
   "Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; " +
   "W A S D Q E and the arrows fly the camera. " +

@@ -52,11 +52,11 @@ export function large(on) {
 $button("#film-large").addEventListener("click", () =>
   large(!document.body.classList.contains("large")),
 );
-// Tools of the radiograph stay as they were left in this browser.
+// Window and tools of the radiograph are closed until somebody opens them; this browser remembers.
 const TOOLS = "flexdt-tools";
 /** @type {HTMLDetailsElement} */
 const tools = $("#film-tools");
-tools.open = localStorage.getItem(TOOLS) !== "closed";
+tools.open = localStorage.getItem(TOOLS) === "open";
 tools.addEventListener("toggle", () => keep(TOOLS, tools.open ? "open" : "closed"));
 on("tab", () => large(false));
 // An image of a data set is in view, though a volume was looked at before.

@@ -360,6 +360,9 @@ const handlers = {
   log(m) {
     emit("log", m.data);
   },
+  drag(m) {
+    emit("drag", m);
+  },
   part(m) {
     emit("part", m.part, m.motor);
   },

@@ -537,9 +537,10 @@ class LabScene:
     ) -> Nodes:
         """Collect the nodes of all layers, for frames of a page that shows `shown`.
 
-        Returns node -> its properties: `visible` for each node, and the opacity for the
-        sample's surfaces, at most FADED_OPACITY within a drawn volume. Dense skins stay
-        opaque unless the sample fades.
+        Returns node -> its properties: `visible` for each node, `clickable` for parts and
+        sample, and the opacity for the sample's surfaces, at most FADED_OPACITY within a
+        drawn volume. Dense skins stay opaque unless the sample fades. Parts are not clicked
+        while there are handles: the pointer would not reach those behind them.
 
         Args:
             near: components near a contact, whose collision bodies and margins are drawn, too.
@@ -556,7 +557,10 @@ class LabScene:
         clear = {
             f"/sample/{s.name}": _clear(opacity, s.dense and not within) for s in skins
         }
-        return {**out, **clear}
+        picked = {"clickable": "gizmos" not in shown}
+        looks = [f"/machine/{part.name}/look" for part in self.machine.components]
+        clicks = {n: {**out.get(n, {}), **picked} for n in looks}
+        return {**out, **clicks, **{n: {**of, **picked} for n, of in clear.items()}}
 
     def _visible(self, shown: Shown, near: Collection[str] = ()) -> dict[str, bool]:
         """Determine for each node that exists whether it is visible; a margin of 0 has no

@@ -182,6 +182,8 @@ export interface Messages {
   note: { level: string; title: string; body: string };
   log: { data: { level: string; message: string } };
   beat: { at: number; silent_s: number };
+  // Where a handle is dragged to: why that cannot be reached, or how long it takes (twin's clock).
+  drag: { targets: Record<string, number>; why: string | null; duration_s: number | null };
   // What was clicked in a scene, and the motor nearest to it.
   part: { part: string; motor: string | null };
 }
@@ -276,6 +278,7 @@ export interface Events {
   image: [image?: Shown | null];
   log: [entry: { level: string; message: string }];
   tab: [name: string];
+  drag: [told: Messages["drag"]];
   part: [part: string, motor: string | null];
   "show-tab": [name: string];
   moment: [moment: Moment];
