@@ -227,6 +227,66 @@ def _bent_phantom(draft: Draft, rng: np.random.Generator) -> Draft:
     return replace(draft, world=replace(draft.world, beads=beads))
 
 
+def _warped(
+    shape: Callable[[Array, np.random.Generator], Array],
+    low_mm: float = 0.01,
+    high_mm: float = 0.3,
+) -> Change:
+    """Displace beads by a field of a drawn size, of places by the phantom's half length about a
+    point of it that is drawn: only there the phantom is as its file says.
+    """
+
+    def change(draft: Draft, rng: np.random.Generator) -> Draft:
+        beads = draft.world.beads
+        low, high = beads.min(axis=0), beads.max(axis=0)
+        at = (beads - rng.uniform(low, high)) / (0.5 * (high - low).max())
+        off = _log(rng, low_mm, high_mm) * shape(at, rng)
+        return replace(draft, world=replace(draft.world, beads=beads + off))
+
+    return change
+
+
+def _bow(at: Array, rng: np.random.Generator) -> Array:
+    """A rod that sags to a side between its ends."""
+    side = rng.uniform(0.0, 2 * math.pi)
+    return at[:, 2:] ** 2 * [math.cos(side), math.sin(side), 0.0]
+
+
+def _twist(at: Array, rng: np.random.Generator) -> Array:
+    return at[:, 2:] * np.stack([-at[:, 1], at[:, 0], 0 * at[:, 0]], axis=1)
+
+
+def _dropped_end(at: Array, rng: np.random.Generator) -> Array:
+    """What is above a joint leans, and sinks by a little."""
+    above = np.maximum(at[:, 2] - rng.uniform(-0.6, 0.6), 0.0)
+    side = rng.uniform(0.0, 2 * math.pi)
+    return above[:, None] * [math.cos(side), math.sin(side), rng.uniform(-0.3, 0.0)]
+
+
+def _barrel(at: Array, rng: np.random.Generator) -> Array:
+    """Thicker in the middle, like glue that has sagged."""
+    return (1.0 - at[:, 2:] ** 2) * at * [1.0, 1.0, 0.0]
+
+
+def _s_shape(at: Array, rng: np.random.Generator) -> Array:
+    side = rng.uniform(0.0, 2 * math.pi)
+    return np.sin(2.0 * at[:, 2:]) * [math.cos(side), math.sin(side), 0.0]
+
+
+def _quadratic(at: Array, rng: np.random.Generator) -> Array:
+    """All monomials of second degree, each with its own weight."""
+    pairs = np.einsum("ki,kj->kij", at, at).reshape(len(at), -1)
+    return pairs @ rng.normal(size=(9, 3)) / 3.0
+
+
+def _slant(at: Array, rng: np.random.Generator) -> Array:
+    """Aslant about a point of its own, and nothing else, by more than a file's tolerance of .1 %,
+    which is about its origin.
+    """
+    side = rng.uniform(0.0, 2 * math.pi)
+    return at[:, 2:] * [math.cos(side), math.sin(side), 0.0]
+
+
 def _encoder(draft: Draft, rng: np.random.Generator) -> Draft:
     """An encoder errs with the turn, by harmonics that no table lists together."""
     turn = np.radians(draft.world.angles)
@@ -291,6 +351,13 @@ STILL: Final[dict[str, Change]] = {
     "misplaced": _misplaced,
     "bent_phantom": _bent_phantom,
     "loose": _loose,
+    "bowed": _warped(_bow),
+    "twisted": _warped(_twist),
+    "dropped_end": _warped(_dropped_end),
+    "barrel": _warped(_barrel),
+    "s_shape": _warped(_s_shape),
+    "quadratic": _warped(_quadratic),
+    "slanted": _warped(_slant, 0.2, 1.5),
 }
 MIXED: Final[dict[str, Change]] = {
     "ramp+gap": _both(MOVING["ramp"], _gap),

@@ -39,8 +39,10 @@ ALIKE = {
     # A phantom that grows is one that comes nearer; angles off by a factor are a turn.
     "growth": {"motion"},
     "angle scale": {"motion"},
-    # Of a few beads, places of all are those of each.
+    # Of a few beads, places of all are those of each, and any smooth map is near.
     "strain": {"beads"},
+    "bend": {"beads", "strain"},
+    "beads": {"bend"},
     # An arc draws a turning phantom in.
     "arc": {"strain"},
     # A rise that is told wrong is an object that rises.

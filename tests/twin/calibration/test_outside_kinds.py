@@ -30,3 +30,24 @@ def test_a_right_scan_is_offered() -> None:
     found = scored("right", 1)
     assert found.offered
     assert found.worst < FAR_SIGMAS
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [("bent_phantom", s) for s in (501, 502, 503, 509)]
+    + [("twisted", 701), ("twisted", 705), ("slanted", 701), ("dropped_end", 703)],
+)
+def test_a_bent_phantom_has_no_place_of_its_own(kind: str, seed: int) -> None:
+    """It was fitted as aslant about the origin of its file, or as beads that are each by
+    itself elsewhere: its place was up to 39 sigmas off.
+    """
+    found = scored(kind, seed)
+    assert found.offered, found.said
+    assert found.worst < FAR_SIGMAS, found.where
+
+
+def test_a_bent_phantom_is_told() -> None:
+    found = scored("bent_phantom", 509)
+    assert any("bent" in words for words in found.said), found.said

@@ -140,13 +140,16 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
             break
         before = (names, factor)
     moves = [some[f].places[g] for f, g in model.widths if some[f].cause == moving.NAME]
-    held = [
-        at[name]
+    held = {
+        at[name]: 0.0
         for name in (*_never_exact(table, known), *moving.confused(moves, table))
         if name in at and at[name] not in model.widths
-    ]
-    for group in held:
-        model = search.with_open(model, further, group)
+    }
+    own = {name: math.sqrt(width) for name, width in widths.items()}
+    if strain.PLACE in at and (width := strain.place_width(own, table)) > 0.0:
+        held[at[strain.PLACE]] = width
+    for group, width in held.items():
+        model = search.with_open(model, further, group, width)
         further = search.further(model)
     if held:
         state = _stepped(search, model, table.state)
@@ -268,7 +271,11 @@ def _made(
                 max(fit.strain_prior[i], _own_width(search, posterior, name))
                 for i, name in enumerate(strain.SHAPES)
             )  # type: ignore[assignment]
-        tolerance = max(tolerance, _own_width(search, posterior, "beads"))
+        tolerance = max([tolerance, *(
+            _largest(search, posterior, (f, g))
+            for f, g in _on(posterior, table.problem.layout.bead_columns)
+            if np.ptp(np.asarray(posterior.families[f].places[g])) > 2  # of many beads
+        )])  # fmt: skip
     factor = edge_factors(problem.layout.names[:count])
     unit = np.outer(factor, factor)
     rivals = _rivals(posterior, factor, best.solved.mean[:count])
@@ -375,7 +382,7 @@ def _with_groups(
         if posterior.families[g[0]].cause == tiles.NAME
         and isinstance(border := posterior.families[g[0]].places[g[1]], Border)
     )
-    free_beads = old.bead_column >= 0 or any(n.startswith("bead") for n in names)
+    free_beads = old.bead_column >= 0 or bool(_on(posterior, layout.bead_columns))
     strained = old.strain_column >= 0 or any(n in names for n in strain.SHAPES)
     arc, rows = (old_ >= 0 or n in names for n, old_ in
                  (("arc", old.arc_column), ("rows", old.rows_column)))  # fmt: skip
@@ -480,11 +487,8 @@ def _widths(
     out = []
     own = dict(zip(plain.layout.names, plain.prior_sigma.tolist(), strict=True))
     groups = {
-        "bead": max(
-            [_own_width(search, posterior, posterior.name(g)) for g in posterior.best.widths
-             if posterior.name(g).startswith("bead") and "slips" not in posterior.name(g)],
-            default=0.0,
-        ),
+        "bead": max((_largest(search, posterior, g) for g in
+                     _on(posterior, search.table.problem.layout.bead_columns)), default=0.0),
         "arc": _own_width(search, posterior, "arc"),
         "rows": _own_width(search, posterior, "rows"),
     }  # fmt: skip
@@ -501,6 +505,26 @@ def _widths(
             width = own[name]
         out.append(max(width, 1e-9))
     return np.array(out)
+
+
+def _on(posterior: Posterior, columns: slice) -> list[Group]:
+    """List the groups of the best model that act on some columns of the fit."""
+    return [
+        (f, g)
+        for f, g in posterior.best.widths
+        if posterior.families[f].acts is Acts.COLUMNS
+        and posterior.name((f, g)) != strain.PLACE
+        and columns.start
+        <= int(np.min(np.asarray(posterior.families[f].places[g], dtype=np.intp)))
+        < columns.stop
+    ]
+
+
+def _largest(search: Search, posterior: Posterior, group: Group) -> float:
+    """Return the largest standard deviation of the columns on which a group acts."""
+    root = posterior.families[group[0]].root
+    size = 1.0 if root is None else float(np.linalg.norm(root, axis=1).max())
+    return size * _own_width(search, posterior, posterior.name(group))
 
 
 def _gap(search: Search, posterior: Posterior, border: Border) -> FloatArray:
@@ -529,7 +553,12 @@ def _strain(search: Search, posterior: Posterior) -> tuple[FloatArray, FloatArra
         unit = float(search.products.units[f][g])
         parts.append(((f, g), slice(at, at + count), 1.0 / unit))
         at += count
-    shapes = [p for p in parts if posterior.families[p[0][0]].cause == strain.NAME]
+    shapes = [
+        p
+        for p in parts
+        if posterior.families[p[0][0]].cause == strain.NAME
+        and posterior.name(p[0]) != strain.PLACE
+    ]
     for (f, g), own, scale in shapes:
         family = posterior.families[f]
         rows = np.asarray(family.places[g], dtype=np.intp) - first

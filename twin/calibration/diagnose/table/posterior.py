@@ -474,7 +474,11 @@ class Search:
         return model, further
 
     def with_open(
-        self, model: Model, further: Mapping[int, Further], group: Group
+        self,
+        model: Model,
+        further: Mapping[int, Further],
+        group: Group,
+        width: float = 0.0,
     ) -> Model:
         """Return a model with a group, held from now on, as wide as the residuals leave it
         open: the largest width that they speak against by odds of `OPEN_LOG_ODDS` at most.
@@ -483,11 +487,15 @@ class Search:
             model: without the group.
             further: what groups would add to it.
             group: of the table.
+            width: that it has, in its own unit; 0: see above.
         """
         f, g = group
         gain = further[f].gain[g]
         open_ = GRID[gain >= max(float(gain.max()), 0.0) - OPEN_LOG_ODDS]
-        widths = {**model.widths, group: model.noise2 * float(open_.max()) ** 2}
+        width2 = model.noise2 * float(open_.max()) ** 2
+        if width > 0.0:
+            width2 = (width * float(self.products.units[f][g])) ** 2
+        widths = {**model.widths, group: width2}
         self.held.add(group)
         solved = self.solve(widths, model.noise2, model.factor)
         return self._judged(widths, model.noise2, model.factor, solved)

@@ -14,6 +14,7 @@ from flexdt.twin.calibration.diagnose.table.groups import (
     angle_scale,
     arc,
     bead_places,
+    bend,
     growth,
     moving,
     panel_shape,
@@ -50,7 +51,7 @@ class Cause(NamedTuple):
 CAUSES: Final = tuple(
     Cause(module.NAME, module.WORDS, module.families, module.told)
     for module in (
-        strain, bead_places, slips, arc, rows, panel_shape, tiles, moving, growth, wobble,
+        strain, bend, bead_places, slips, arc, rows, panel_shape, tiles, moving, growth, wobble,
         angle_scale, spots, told, positions,
     )
 )  # fmt: skip
@@ -61,6 +62,7 @@ STATED: Final = (
     (tiles.NAME, "", "gap"),
     (panel_shape.NAME, "", "distortion"),
     (strain.NAME, "", "shape"),
+    (bend.NAME, "", "shape"),
     (bead_places.NAME, "", "beads"),
     (arc.NAME, "", "arc"),
     (rows.NAME, "", "rows"),
