@@ -14,7 +14,6 @@ from flexdt.twin.physics.exposure import (
     open_beam,
 )
 from flexdt.twin.physics.readout import read_out
-from flexdt.twin.physics.sampled_views import check_rays, within_pixels
 from flexdt.twin.physics.scatter import Beam, ScanScatter, ScatterSettings, scan_scatter
 from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import (
@@ -40,7 +39,6 @@ __all__ = [
     "Spectrum",
     "TubeModel",
     "blurred",
-    "check_rays",
     "deposited",
     "detector_of",
     "effective_beam",
@@ -57,5 +55,4 @@ __all__ = [
     "tube_of",
     "tube_spectrum",
     "weights_of",
-    "within_pixels",
 ]

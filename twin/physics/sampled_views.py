@@ -1,10 +1,9 @@
-"""Views from several points of the focal spot, and through several points of each pixel."""
+"""Views from several points of the focal spot, and the error that a pixel on an edge may have."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.physics.blur import FWHM
 
@@ -13,8 +12,6 @@ NOISE_SHARE = 1.0
 pixel."""
 LARGEST_ERROR = 0.1
 """Largest permitted error of a pixel on an edge, however noisy the exposure."""
-MAX_RAYS = 16
-"""Largest number of rays along each side of a pixel."""
 
 
 def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
@@ -57,26 +54,3 @@ def permitted_error(noise: float, blur_px: float, points: int = 1) -> float:
     error = min(NOISE_SHARE * noise * np.sqrt(averaged), LARGEST_ERROR)
     # Two digits: geometries that differ in the last ones have the same rays, and bytes.
     return float(f"{error:.2g}")
-
-
-def check_rays(rays: int) -> None:
-    """Check a number of rays along each side of a pixel.
-
-    Raises:
-        LimitError: the message lists the allowed values.
-    """
-    if not isinstance(rays, int | np.integer) or rays not in range(1, MAX_RAYS + 1):
-        allowed = f"1 to {MAX_RAYS} along each side of a pixel"
-        raise LimitError.instead(f"rays is {rays}", rays, allowed)
-
-
-def within_pixels(rows: FloatArray, rays: int) -> FloatArray:
-    """Sample the pixels: views through a point in each of rays x rays parts of each
-    pixel, (n * rays^2, 12), those of one view in a row: no two in one row or column, so
-    that edges along them come out in rays^2 steps."""
-    j, i = np.divmod(np.arange(rays**2)[:, None], rays)
-    across = (i + (j + 0.5) / rays) / rays - 0.5
-    down = (j + (rays - i - 0.5) / rays) / rays - 0.5
-    out = np.repeat(rows[:, None], rays**2, axis=1)
-    out[:, :, 3:6] += across * rows[:, None, 6:9] + down * rows[:, None, 9:12]
-    return out.reshape(-1, 12)

@@ -40,15 +40,15 @@ from flexdt.twin.physics import (
     ScanScatter,
     ScatterSettings,
     blurred,
-    check_rays,
     effective_beam,
     flux_of,
     frame_rng,
     scan_scatter,
     spot_blur_px,
-    within_pixels,
 )
 from flexdt.twin.projection import TriangleMesh, project_mesh
+from flexdt.twin.projection.pixel_areas import offsets
+from flexdt.twin.rays_a_pixel import MAX_RAYS, check_rays
 from flexdt_extensions.ctsimu.ctsimu_scan import MeshSample, Reference, read_scenario
 
 KEV_J: Final = 1.602176634e-16
@@ -85,10 +85,12 @@ class ScenarioImages:
         """
         if not 0 <= (seed or 0) <= 2**63:
             raise LimitError(f"seed is {seed}; allowed: 0 to 2^63", {"asked": seed})
-        check_rays(rays)
+        checked = check_rays(rays)
+        if checked == "auto":
+            raise LimitError.instead("rays is auto", rays, f"1 to {MAX_RAYS}")
         self.path = Path(path)
         self._seed = seed
-        self._rays = rays
+        self._rays = checked
         self.scan = read_scenario(
             text_of(self.path), str(self.path), self._read_named_file
         )
@@ -171,14 +173,16 @@ class ScenarioImages:
         shape = self.scan.shape
         order = {one: i for i, one in enumerate(self._thickest)}
         air = self.scan.environment is not None
+        across, down = offsets(2 * self._rays - 1)
         out = np.zeros((len(order) + air, *shape), np.float32)
         for sample, mesh in (
             zip(self.scan.samples, self._meshes, strict=True) if samples else ()
         ):
-            rows = within_pixels(sample.views[frame : frame + 1], self._rays)[
-                ray : ray + 1
+            row = sample.views[frame].copy()
+            row[3:6] += across[ray] * row[6:9] + down[ray] * row[9:12]
+            out[order[sample.substance]] += project_mesh(mesh, ConeVec(row[None]), shape)[
+                0
             ]
-            out[order[sample.substance]] += project_mesh(mesh, ConeVec(rows), shape)[0]
         if air:
             out[-1] = np.maximum(self._distance(frame) - out[:-1].sum(axis=0), 0.0)
         return out
