@@ -38,6 +38,10 @@ MOVIE_MS = 400
 """Time of a view in a movie of residuals."""
 MAX_TICKS = 6
 """Of the longest axis of a geometry."""
+GEOMETRY_ZOOM = 0.8
+"""Of the box in its figure; at 1, matplotlib's default, a flat box reaches beyond it."""
+LABEL_PAD_PT = 9.0
+"""From the ticks' numbers to the name of an axis in three dimensions [pt]."""
 MAX_PANELS = 12
 """Largest number of panels drawn, evenly chosen."""
 
@@ -73,9 +77,13 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
     axes.set(
         xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=f"{len(cone_vec)} views"
     )
-    axes.set_aspect("equal")
+    spans = [
+        np.ptp(one.get_view_interval()) for one in (axes.xaxis, axes.yaxis, axes.zaxis)
+    ]
+    axes.set_box_aspect(spans, zoom=GEOMETRY_ZOOM)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         _spread_ticks(axis)
+        axis.labelpad = LABEL_PAD_PT
     axes.legend(loc="upper left", fontsize="small")
     return axes
 
@@ -284,7 +292,8 @@ def _spread_ticks(axis: Any) -> None:
         for one in (axis.axes.xaxis, axis.axes.yaxis, axis.axes.zaxis)
     }
     share = spans[axis] / max(spans.values())
-    axis.set_major_locator(MaxNLocator(max(1, round(MAX_TICKS * share)), min_n_ticks=2))
+    count = max(1, round(MAX_TICKS * share))
+    axis.set_major_locator(MaxNLocator(count, min_n_ticks=min(2, count)))
     axis.set_tick_params(labelsize="small")
 
 

@@ -439,3 +439,36 @@ def test_a_contrast_has_its_time() -> None:
         assert there.asked.cnr == pytest.approx(3.0, rel=0.01)
     with pytest.raises(fx.TwinError, match="contrast is -1; allowed"):
         fx.expose(ball, contrast=-1.0)
+
+
+@pytest.mark.parametrize(
+    "geometry",
+    [
+        fx.ConeVec.circular(sod=600, sdd=1059, angles=36, shape=(190, 239), pixel=0.6),
+        fx.ConeVec.circular(
+            sod=60, sdd=900, angles=np.linspace(0, 200, 21), shape=(760, 956), pixel=0.15
+        ),
+        fx.ConeVec.helical(
+            sod=600, sdd=1059, angles=72, rise=30, turns=8, shape=(190, 239), pixel=0.6
+        ),
+        fx.ConeVec.circular(
+            sod=600, sdd=1059, angles=[10.0], shape=(190, 239), pixel=0.6
+        ),
+    ],
+    ids=["flat", "arc", "helix", "one"],
+)
+def test_the_box_of_a_geometry_lies_within_its_figure(geometry: fx.ConeVec) -> None:
+    """A flat box was cut at its left corner."""
+    pytest.importorskip("matplotlib").use("Agg")
+    from mpl_toolkits.mplot3d.proj3d import proj_transform
+
+    axes = geometry.plot()
+    axes.figure.canvas.draw()
+    ends = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
+    corners = np.array([[ends[k, (n >> k) & 1] for k in range(3)] for n in range(8)])
+    x, y, _ = proj_transform(*corners.T, axes.get_proj())
+    seen = axes.transData.transform(np.stack([x, y], axis=1))
+    low, high = axes.bbox.min, axes.bbox.max
+    assert (seen >= low).all()
+    assert (seen <= high).all()
+    axes.figure.clf()
