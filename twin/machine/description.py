@@ -549,8 +549,7 @@ class Timing(_Frozen):
         )
 
     def seconds(self, kind: str) -> float:
-        """Return the time of a kind of command [s]; None for `sequence_overhead` without
-        a time.
+        """Return the time of a kind of command that has one [s].
 
         Raises:
             AttributeError: a name that is not in `kinds`.

@@ -28,7 +28,7 @@ Rate = Literal["speed", "acceleration"]
 
 @dataclass(frozen=True)
 class Arrival:
-    """Motor targets, or rates, after the rule for limits.
+    """Where motors go, or how fast, once the rule for limits has moved what is asked beyond.
 
     Attributes:
         motors: motor -> target within its travel [mm, deg], or rate.

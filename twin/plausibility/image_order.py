@@ -225,6 +225,7 @@ def _texts(keys: dict[str, Key]) -> set[str]:
 
 
 def _text(key: Key) -> str:
+    """Return a name with # in place of each of its numbers."""
     return "#".join(map(str, key[::2]))
 
 

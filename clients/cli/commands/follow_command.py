@@ -118,6 +118,7 @@ def follow(
 
 
 def _session_lines(session: FollowSession, source: str) -> Answer:
+    """Note how many alarms were raised, and yield the mirror as document of --json."""
     note(f"{session.mirror.raised} alarms{_unread(session)}")
     unread = {"unread": session.unread, "unread_example": session.unread_example}
     yield {"address": source, **unread, **session.mirror.to_dict(session.clock())}

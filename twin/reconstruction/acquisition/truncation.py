@@ -595,6 +595,7 @@ def _fit(
     begin = np.ascontiguousarray(source[:, 0] / field)
 
     def fit(start: npt.ArrayLike, scale: float) -> tuple[float, FloatArray]:
+        """Fit a prism from a start; return its cost and its parameters."""
         x = np.array(start, np.float64)
         cost = fit_prism(begin, directions, lengths, seen, least, most, scale, x)
         return cost, x

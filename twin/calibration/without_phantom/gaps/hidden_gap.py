@@ -214,8 +214,8 @@ def _judged_about(
 
 
 def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
-    """Check whether a gap that both ends of rays show has odds of `REPORTED_ODDS` with
-    single frames beside them.
+    """Check whether single frames leave a gap that both ends of rays show its odds of
+    `REPORTED_ODDS`.
 
     Where both ends of rays differ by what is smooth in the columns (hardening, an object
     that is not symmetric), a step passes for a gap, by `FOOLED_CHANCE`; frames do not
