@@ -108,7 +108,9 @@ class Accuracy:
         figure = f" ({self.figure})" if self.figure else ""
         further = f", then {self.next}" if self.next else ""
         stated = [one for one in self.taken if one != ONE_ENERGY]
-        taken = f"; if {', '.join(stated)} are as stated" if stated else ""
+        *first, last = stated or [""]
+        listed = f"{', '.join(first)} and {last}" if first else last
+        taken = f"; if {listed} are as stated" if stated else ""
         energy = f" at {ONE_ENERGY}" * (len(stated) < len(self.taken))
         return (
             f"accuracy{energy}: within {most} in nine of ten uniform regions ({half} in half), "
