@@ -51,7 +51,7 @@ from flexdt.twin.geometry.poses import Poses
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from faults_drawn import DRAWS, KINDS, PANELS, Faulty, drawn
+from faults_drawn import DRAWS, KINDS, PANELS, UNSEEN, Faulty, drawn
 from faults_paired import drawn_names, drawn_together
 from placements_drawn import PLACED, PLACEMENTS, Placed, angles_apart, drawn_placed
 
@@ -216,7 +216,9 @@ def _verdict(
     others = [
         s
         for s in said
-        if not re.match(FAULTLESS, s) and not any(re.search(one, s) for one in scan.names)
+        if not re.match(FAULTLESS, s)
+        and not _told_rightly(s, scan)
+        and not any(re.search(one, s) for one in scan.names)
     ]
     false = [s for s in others if not any(re.search(one, s) for one in scan.beside)]
     if scan.silent and offered and not others:
@@ -228,6 +230,15 @@ def _verdict(
             if names and all(any(re.search(one, s) for s in said) for one in names):
                 return "part"
     return "vague" if said else "none"
+
+
+def _told_rightly(said: str, scan: Faulty) -> bool:
+    """Check whether lengths are said to disagree of which one was drawn beyond two of the widths
+    that are known of it.
+    """
+    names = re.findall(r"(d[OD]_[xyz]) is", said)
+    far = [n for n in names if abs(np.mean(scan.truth[n])) > 2 * UNSEEN.get(n, np.inf)]
+    return said.startswith("lengths_disagree") and bool(far)
 
 
 def _to_judge(args: argparse.Namespace) -> list[tuple[str, int]]:

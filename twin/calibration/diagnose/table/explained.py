@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -145,6 +145,9 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
         for name in (*_never_exact(table, known), *moving.confused(moves, table))
         if name in at and at[name] not in model.widths
     }
+    for name, width in moving.apart(_courses(search, model)).items():
+        if width > 0.0 and name in at and at[name] not in model.widths:
+            held[at[name]] = width
     own = {name: math.sqrt(width) for name, width in widths.items()}
     if strain.PLACE in at and (width := strain.place_width(own, table)) > 0.0:
         held[at[strain.PLACE]] = width
@@ -180,6 +183,18 @@ def _group_weights(
         out[f, g] = mean[at : at + count] / search.products.units[f][g]
         at += count
     return out
+
+
+def _courses(search: Search, model: Model) -> Iterator[tuple[object, FloatArray]]:
+    """Yield the place of each group of motion of a model, and its course over the frames."""
+    groups = tuple(model.widths)
+    for (f, g), weights in _group_weights(search, model.solved.mean, groups).items():
+        family = search.products.families[f]
+        if family.cause == moving.NAME:
+            assert family.courses is not None
+            assert family.slopes is not None
+            course = family.courses[g // len(family.slopes)][0] @ weights
+            yield family.places[g], course
 
 
 def _stepped(search: Search, model: Model, before: State) -> State:

@@ -68,6 +68,9 @@ LEAST_SWINGING: Final = 12
 ONCE: Final = "swings once a turn"
 TURNING: Final = ("swings", "wanders", "ramps")
 """Ways of motion of which a swing once a turn may be a part; a jump is all that it is."""
+LEAVING: Final = ("jumps", "wanders", "ramps")
+"""Ways of motion after which a thing is elsewhere than before."""
+DIFFERS: Final = "differs between scans"
 KINDS: Final = 4
 """Smooth kinds of motion, which share the odds."""
 
@@ -140,21 +143,19 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             yield _family(table, moves, where, courses, chance)
     if many:
         group = table.problem.group
-        apart = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
-        apart -= np.bincount(group) / len(group)
+        apart_ = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
+        apart_ -= np.bincount(group) / len(group)
         own = {n.split("@")[0] for n in table.problem.layout.names if "@" in n}
         # Of scans that stand apart, what is elsewhere along an axis is the place, as wide as
-        # it is stated: source or panel look alike, and each scan's geometry has its place.
+        # it is stated, unless it moves (`apart`): source or panel look alike, and each scan's
+        # geometry has its place.
         placed = {n[-1] for n in own if n.startswith("place")}
-        shared = tuple(
-            what
-            for what, part in MOVERS.items()
-            if own.isdisjoint(part) and (what == "alpha" or what[-1] not in placed)
-        )
+        shared = tuple(what for what, part in MOVERS.items() if own.isdisjoint(part))
         for names in _alike(shared):
+            still = [what != "alpha" and what[-1] in placed for what in names]
             yield _family(
-                table, [Moves(name, "differs", -1) for name in names], " between scans",
-                apart[None], LOG_CHANCE - math.log(KINDS),
+                table, [Moves(name, DIFFERS, -1) for name in names], "",
+                apart_[None], np.where(still, NEVER, LOG_CHANCE - math.log(KINDS)),
             )  # fmt: skip
 
 
@@ -176,6 +177,23 @@ def confused(places: Iterable[object], table: Linearised) -> list[str]:
     )
 
 
+def apart(courses: Iterable[tuple[object, FloatArray]]) -> dict[str, float]:
+    """Name the differences between scans of all that jumps, wanders or drifts in one of them,
+    with their widths, the range of its course: the mean of what has moved is not where it is in
+    the other scans.
+
+    Args:
+        courses: place of each group of motion that is there, and its course over the frames.
+    """
+    out: dict[str, float] = {}
+    for place, course in courses:
+        _, move = cast("tuple[object, Moves]", place)
+        if move.scan >= 0 and move.how in LEAVING:
+            name = f"{move.what} {DIFFERS}"
+            out[name] = max(out.get(name, 0.0), float(np.ptp(course)))
+    return out
+
+
 def _alike(names: tuple[str, ...]) -> list[list[str]]:
     """Group movers by the number of their parameters, the angle by itself."""
     kinds = sorted({_kind(name) for name in names})
@@ -193,7 +211,11 @@ def _in(n: int, frames: npt.NDArray[np.intp], course: FloatArray) -> FloatArray:
 
 
 def _family(
-    table: Linearised, moves: list[Moves], where: str, courses: FloatArray, chance: float
+    table: Linearised,
+    moves: list[Moves],
+    where: str,
+    courses: FloatArray,
+    chance: float | FloatArray,
 ) -> Family:
     """Make a family of motions of as many parameters each.
 
@@ -267,9 +289,12 @@ def _moved(seen: Sequence[Seen], found: Found) -> Finding:
         if effects[what] > 0.3 * effects[ordered[0]]:
             parameter = "dO_z" if what == "dS_z" else what
             said.append(f"{what} by {to_edge(parameter, reach):.3g} {UNITS[parameter]}")
-    main = max(first, key=lambda s: s.effect_px)
-    how = _how(first, main)
-    many = found.fit.problem.group.max() > 0
+    # What moved in a scan is elsewhere in the next.
+    within = [s for s in first if _moves(s).how != DIFFERS]
+    main = max(within or first, key=lambda s: s.effect_px)
+    group = found.fit.problem.group
+    how = _how(first, main, group)
+    many = group.max() > 0
     scan = _moves(main).scan
     where = f" of scan {scan + 1}" if many and scan >= 0 else ""
     shakes = _moves(main).how == "jitters"
@@ -284,14 +309,19 @@ def _moved(seen: Sequence[Seen], found: Found) -> Finding:
     )
 
 
-def _how(first: Sequence[Seen], main: Seen) -> str:
+def _frame_in_scan(at: int, group: npt.NDArray[np.int64]) -> int:
+    """Return the number of a frame in its own scan."""
+    return at - int(np.flatnonzero(group == group[at])[0])
+
+
+def _how(first: Sequence[Seen], main: Seen, group: npt.NDArray[np.int64]) -> str:
     """Write how something moves."""
     move = _moves(main)
     if move.how == "jumps":
-        return f"at frame {move.at}"
+        return f"at frame {_frame_in_scan(move.at, group)}"
     if move.how == "jitters":
         return "from frame to frame"
-    if move.how == "differs":
+    if move.how == DIFFERS:
         return "from scan to scan"
     _, course = _reach(first)
     some = course[course != 0.0] if (course != 0.0).any() else course
@@ -321,7 +351,9 @@ def _turned(
         course = main.courses[0]
         height = to_edge("alpha", float(course[move.at] - course[move.at - 1]))
         code, text = named_turn(height, angles[group == group[move.at]])
-        return error(code, f"between frames {move.at - 1} and {move.at} {text}")
+        at = _frame_in_scan(move.at, group)
+        where = f" of scan {move.scan + 1}" if group.max() > 0 else ""
+        return error(code, f"between frames {at - 1} and {at}{where} {text}")
     _, course = _reach(seen)
     off = np.array([to_edge("alpha", v) for v in course])
     return warning(
