@@ -69,7 +69,23 @@ export function drawBar(x, mm, px, unit) {
   x.font = `${11 * unit}px system-ui, sans-serif`;
   x.textBaseline = "bottom";
   x.textAlign = "left";
-  x.fillText(`${mm} mm`, 8 * unit, h - 2 * unit);
+  outlined(x, `${mm} mm`, 8 * unit, h - 2 * unit, unit);
+}
+
+/**
+ * Words that are read on dark and on bright matter.
+ * @param {CanvasRenderingContext2D} x
+ * @param {string} words
+ * @param {number} left
+ * @param {number} bottom
+ * @param {number} unit
+ */
+function outlined(x, words, left, bottom, unit) {
+  x.strokeStyle = "#000c";
+  x.lineWidth = 3 * unit;
+  x.lineJoin = "round";
+  x.strokeText(words, left, bottom);
+  x.fillText(words, left, bottom);
 }
 
 /**
@@ -290,7 +306,7 @@ export function slices(canvases, pointed, moved) {
     x.textAlign = "right";
     const depth_mm = (me.cross[k] + 0.5 - size[k] / 2) * b.voxel_mm;
     const place = `${NAMES[i]} →  ${NAMES[j]} ↑  ${NAMES[k]} ${depth_mm.toFixed(2)} mm`;
-    x.fillText(place, wide - 6 * unit, high - 4 * unit);
+    outlined(x, place, wide - 6 * unit, high - 4 * unit, unit);
     canvas.dataset.index = String(me.cross[k]);
   }
 

@@ -16,7 +16,7 @@ import {
   slid,
   words,
 } from "./dom.js";
-import { call, on, store } from "./link.js";
+import { call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
 import { reach } from "./filled.js";
 import { extent, index, slices, valueOf } from "./slices.js";
@@ -274,9 +274,10 @@ splitter.addEventListener("input", parted);
 function compare() {
   comparing = true;
   $button("#volume-compare").disabled = true;
-  void call("viewer.compare", of).catch((/** @type {unknown} */ error) =>
-    setText(note, words(error)),
-  );
+  // A refusal ends it as a failure of the comparison itself does.
+  void call("viewer.compare", of).catch((/** @type {unknown} */ error) => {
+    if (told) emit("volume", { ...told, not_compared: words(error) });
+  });
 }
 
 /**
