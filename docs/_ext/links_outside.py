@@ -22,7 +22,10 @@ RENDERED = Path("_generated", "evidence")
 BENCHMARK = Path("images", "bench.json")
 """The kept benchmark, which is rendered beside them."""
 
-LINK = re.compile(r"(?<!!)\[([^\]\n]+)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)")
+LINK = re.compile(
+    r"(?<!!)\[((?:[^\[\]\n]|\n(?!\s*\n))+)\]\((?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?\)"
+)
+"""A link; its words may go on in the next line, but in no other paragraph."""
 
 
 def rewritten(text: str, page: Path, pages: Path) -> tuple[str, list[str]]:

@@ -42,9 +42,11 @@ def test_links_out_of_the_site_become_paths(tmp_path: Path) -> None:
     pages.mkdir()
     (pages / "a.md").write_text("")
     (tmp_path / "spec.txt").write_text("")
-    text = "[the spec](../spec.txt), [a](a.md), [web](https://example.org/), [gone](b.md#part)"
+    text = "[the\nspec](../spec.txt), [a](a.md), [web](https://example.org/), [gone](b.md#part)"
     new, lost = LINKS.rewritten(text, pages / "page.md", pages)
-    assert new.startswith("the spec (`spec.txt`), [a](a.md), [web](https://example.org/)")
+    assert new.startswith(
+        "the\nspec (`spec.txt`), [a](a.md), [web](https://example.org/)"
+    )
     assert lost == ["b.md"]
 
 
