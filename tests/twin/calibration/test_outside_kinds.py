@@ -51,3 +51,21 @@ def test_a_bent_phantom_has_no_place_of_its_own(kind: str, seed: int) -> None:
 def test_a_bent_phantom_is_told() -> None:
     found = scored("bent_phantom", 509)
     assert any("bent" in words for words in found.said), found.said
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+@pytest.mark.parametrize("seed", [901, 902])
+def test_what_moves_along_the_beam_does_not_say_where_the_beam_is(seed: int) -> None:
+    """A panel that breathed along the beam, and a little aside, was taken as one that breathes
+    along a beam elsewhere: dD_x was 223 sigmas off.
+    """
+    found = scored("breathing", seed)
+    assert found.offered, found.said
+    assert found.worst < FAR_SIGMAS, found.where
+
+
+@pytest.mark.slow
+def test_eigenvalues_that_lapack_does_not_find_are_found() -> None:
+    """Its divide and conquer does not converge for the slow errors of these spots."""
+    assert scored("breathing", 900).offered

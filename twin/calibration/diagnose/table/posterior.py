@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import eigh, lapack
 
 from flexdt.twin.calibration.diagnose.table.group import OPEN_LOG_ODDS, Family
 from flexdt.twin.calibration.diagnose.table.linearised import Linearised
@@ -396,8 +396,7 @@ class Search:
         if own.shape[1] == 1:
             found = beside[:, :, 0], np.ones_like(own)
         else:
-            values, vectors = np.linalg.eigh((beside + beside.transpose(0, 2, 1)) / 2)
-            found = values, vectors
+            found = _eigen((beside + beside.transpose(0, 2, 1)) / 2)
         if self._shapes is not None:
             self._shapes[f] = found
         return found
@@ -570,6 +569,21 @@ class Search:
         return Posterior(
             model, tuple(kept), self.products.families, tuple(self.products.units)
         )
+
+
+def _eigen(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return eigenvalues, (g, c), and vectors, (g, c, c), of symmetric matrices (g, c, c).
+
+    LAPACK's divide and conquer does not converge for some matrices that are finite and well
+    scaled; its QR iteration, which is slower, does.
+    """
+    try:
+        values, vectors = np.linalg.eigh(squares)
+    except np.linalg.LinAlgError:
+        each = [eigh(one, driver="ev") for one in squares]
+        values = np.stack([one[0] for one in each])
+        vectors = np.stack([one[1] for one in each])
+    return values, vectors
 
 
 @dataclass(frozen=True, eq=False)

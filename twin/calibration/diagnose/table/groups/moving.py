@@ -71,6 +71,10 @@ TURNING: Final = ("swings", "wanders", "ramps")
 LEAVING: Final = ("jumps", "wanders", "ramps")
 """Ways of motion after which a thing is elsewhere than before."""
 DIFFERS: Final = "differs between scans"
+ALONG: Final = ("dO_z", "dD_z")
+ASIDE: Final = ("dO_x", "dO_y")
+SLANT: Final = 1.0
+"""Of the way aside over the way along the beam: nothing is known of it."""
 KINDS: Final = 4
 """Smooth kinds of motion, which share the odds."""
 
@@ -88,6 +92,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make each kind of motion of all that may move, in each scan, and shifts from scan to
     scan.
     """
+    yield from _aside(table)
     many = len(table.scans) > 1
     for number, frames in enumerate(table.scans):
         count = len(frames)
@@ -157,6 +162,24 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 table, [Moves(name, DIFFERS, -1) for name in names], "",
                 apart_[None], np.where(still, NEVER, LOG_CHANCE - math.log(KINDS)),
             )  # fmt: skip
+
+
+def _aside(table: Linearised) -> Iterator[Family]:
+    """Make what goes aside with all that moves along the beam: a mount moves in a direction of
+    its own, and a beam that lies in it would look alike.
+    """
+    for name in ALONG:
+        course = table.state.frames.get(name, np.zeros(table.n))
+        if np.ptp(course) <= 0.0:
+            continue
+        courses = np.zeros((1, len(ASIDE), table.n, len(ASIDE)))
+        for i in range(len(ASIDE)):
+            courses[0, i, :, i] = course - course.mean()
+        yield Family(
+            NAME, (f"aside with {name}",), Acts.FRAMES, ((ASIDE, Moves("dO_x", "aside", -1)),),
+            0.0, slopes=np.array([[PER_FRAME.index(p) for p in ASIDE]]), courses=courses,
+            always=SLANT,
+        )  # fmt: skip
 
 
 def confused(places: Iterable[object], table: Linearised) -> list[str]:
