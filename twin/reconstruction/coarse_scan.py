@@ -77,7 +77,7 @@ class Clipped:
     def __str__(self) -> str:
         """Say so as one sentence."""
         return (
-            f"no accuracy is claimed: {100.0 * self.share:.2g} % of the object's line "
+            f"no accuracy is claimed: {min(100.0 * self.share, 99.0):.2g} % of the object's line "
             f"integrals are clipped at {self.value:.3g}, and no image shows what is behind"
         )
 
@@ -643,9 +643,11 @@ class Plateaus:
         self._peaks: list[tuple[float, int, int, int]] = []
 
     def take(self, image: npt.NDArray[np.generic]) -> None:
-        """Look at line integrals (rows, cols)."""
+        """Look at line integrals (rows, cols); an image of one value has no plateau."""
         peak = image.max()
         at = image == peak
+        if at.all():
+            return
         columns = int(at.any(axis=0).sum())
         thick = int((image > 0.5 * peak).sum()) if columns > PEAK_COLUMNS else 0
         self._peaks.append((float(peak), columns, int(at.sum()), thick))
