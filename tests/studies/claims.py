@@ -453,7 +453,7 @@ WRONG: dict[
         _images(lambda p, g: -np.log(np.maximum(np.exp(-p) - 0.02, 1e-4) / 0.98)),
         ("constant", "haze", "hardening"),
     ),
-    "hard": (lambda s, g: replace(s, hard=True), ("hardening",)),
+    "hard": (lambda s, g: replace(s, hard=True), ("hardening", "one energy")),
     "clipped": (_images(lambda p, g: np.minimum(p, 0.6 * p.max())), ("clip",)),
     "lens": (_lens, ("lens", "distort")),
     "log twice": (

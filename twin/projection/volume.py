@@ -49,6 +49,7 @@ CAUSES: Final = {
     "clipped": "clipped line integrals",
     "hardening": "beam hardening",
     "lens": "lens distortion",
+    "sampling": "the size of pixels",
     "images": "images that no object explains",
     "geometry": "what images leave open",
     "stopping": "iterations that ended early",

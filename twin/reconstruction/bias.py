@@ -11,7 +11,7 @@ voxel's bound is what all of them come to about it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -41,6 +41,7 @@ from flexdt.twin.reconstruction.consistency.agreement import (
 )
 from flexdt.twin.reconstruction.consistency.cause_table import Finding
 from flexdt.twin.reconstruction.consistency.suspects import SIDES, suspects
+from flexdt.twin.reconstruction.consistency.view_pairs import sampling_error
 from flexdt.twin.reconstruction.feldkamp.fdk_plan import plan_fdk
 from flexdt.twin.reconstruction.known_beam import (
     UNKNOWN_BEAM,
@@ -55,28 +56,16 @@ from flexdt.twin.reconstruction.uniform_nodes import (
 from flexdt.twin.reconstruction.volume_errors import interpolated
 from flexdt.twin.reconstruction.volume_residuals import residuals_of
 
-SAFETY_FACTOR: Final = 3.0
-"""Factor of the bound, which makes up for what the smooth coarse volume does not show."""
+OTHERWISE_FACTOR: Final = 3.0
+"""Error of the continuation beyond the panel, over its difference from another one (assumed:
+the figures of cut-off objects are no bounds)."""
 SIGMAS: Final = 2.0
-"""Standard errors within which an error may be larger, or another be."""
+"""Standard deviations of the errors that a bound holds."""
 PRISM_ERROR_SHARE: Final = 0.15
 """Share of a prism's part beyond the edges that may be wrong if it explains the
 images."""
-FDK_ERROR_SHARE: Final = 0.003
-"""Error of FDK without flaws, relative to the attenuation about a voxel."""
-USUAL_SHARE: Final = {
-    "angles": 0.3,
-    "aside": 0.1,
-    "cone": 0.7,
-    "rows": 1.0,
-    "beyond": 1.0,
-    "drift": 1.3,
-    "stopping": 1.0,
-    "penalty": 1.0,
-}
-"""Cause -> share of its bound that half of a scan's uniform regions stay below. Causes
-that reach their bound in narrow places have small ones
-(`tests/studies/accuracy_rank.py`, seeds 61 and 62)."""
+SHIFTS: Final = frozenset({"beyond", "drift", "hardening"})
+"""Causes whose size is known: they shift values. Others scatter about zero."""
 STATED: Final = {
     "axis": "axis",
     "distance": "distances",
@@ -89,12 +78,13 @@ STATED: Final = {
 """Error -> what is taken as stated where images do not decide on it; others by their names."""
 PARTS_OF_ERRORS: Final = (1.0, -1.0, 0.5, -0.5, 0.25, -0.25)
 """Parts of an error whose effect on the volume is taken in proportion, in this order."""
-ALL_CAUSES: Final = frozenset(USUAL_SHARE)
-"""All causes."""
 STREAK_ROWS: Final = 6
 """Rows of a scan in which what few views do is looked at: streaks are in each alike."""
-USUAL_FLOOR: Final = 0.001
-"""Usual error of FDK without flaws, relative to the attenuation."""
+FLOOR: Final = 0.001
+"""Standard deviation of FDK's error without flaws, relative to the attenuation."""
+REGION_SIGMA: Final = 0.447
+"""Standard deviation along an axis of a ball of radius 1, 1 / sqrt(5): a region is a ball of a
+node's radius."""
 MAX_VOXEL_NODES: Final = 4.0
 """Largest edge of a voxel for which a grid can hold uniform regions [nodes]."""
 
@@ -108,8 +98,8 @@ class Bias:
         even: weights of its nodes, little where values change fast and where some views
             do not see them, (nz, ny, nx).
         inside: nodes of the object, (nz, ny, nx).
-        causes: of `flexdt.twin.projection.volume.CAUSES` -> its largest change [1/mm],
-            (nz, ny, nx).
+        causes: of `flexdt.twin.projection.volume.CAUSES` -> by how much it shifts values, if
+            it is of `shifts`, or scatters them (standard deviation) [1/mm], (nz, ny, nx).
         contradiction: between images and geometry, or clipped images, with which nothing is
             bounded.
         figures: cause -> its size, in words.
@@ -123,12 +113,25 @@ class Bias:
     contradiction: Contradiction | Clipped | None = None
     figures: Mapping[str, str] = field(default_factory=dict)
     taken: tuple[str, ...] = ()
+    shifts: frozenset[str] = SHIFTS
+
+    @cached_property
+    def shift(self) -> FloatArray:
+        """What known errors change together at the nodes [1/mm]."""
+        known = [one for cause, one in self.causes.items() if cause in self.shifts]
+        return np.asarray(sum(known, np.zeros(self.found.shape)))
+
+    @cached_property
+    def spread(self) -> FloatArray:
+        """Standard deviation of the other errors together, at the nodes [1/mm]."""
+        rest = [one for cause, one in self.causes.items() if cause not in self.shifts]
+        squares = sum(map(np.square, rest), np.square(FLOOR * self.found.data))
+        return np.asarray(np.sqrt(squares), np.float64)
 
     @cached_property
     def total(self) -> Float32Array:
         """Bound at the nodes [1/mm]."""
-        flaws = np.sum(list(self.causes.values()), axis=0)
-        return np.asarray(FDK_ERROR_SHARE * np.abs(self.found.data) + flaws, np.float32)
+        return np.asarray(self.shift + SIGMAS * self.spread, np.float32)
 
     def bound(self, grid: Volume) -> Float32Array | None:
         """Compute the bound of the error at each voxel of a grid, interpolated from the
@@ -155,8 +158,9 @@ class Bias:
             grid: place and size.
 
         Returns:
-            Bounds for half (by `USUAL_SHARE`) and for nine of ten regions, with the cause
-            that is largest in nine of ten; None if the grid holds no node of the object
+            Within what half and nine of ten regions are, of normal errors with the shift and
+            spread of each node, with the cause that is largest in nine of ten; None if the
+            grid holds no node of the object
             or has too large voxels, or if images and geometry contradict each other.
         """
         if self.contradiction is not None or too_coarse(grid, self.found):
@@ -175,11 +179,8 @@ class Bias:
         if not inside.any():
             return None
         off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
-        most = float(np.percentile(self.total[inside] / value[inside], 90.0))
-        usual = USUAL_FLOOR + sum(
-            USUAL_SHARE.get(cause, 1.0) * part for cause, part in off.items()
-        )
-        half = min(float(np.median(usual)), most)
+        errors = self.shift[inside] / value[inside], self.spread[inside] / value[inside]
+        half, most = (_within(share, *errors) for share in (0.5, 0.9))
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
         told = {
             cause: float(np.percentile(off[cause], 90.0))
@@ -188,7 +189,7 @@ class Bias:
         }
         following = max(told, key=lambda cause: told[cause], default="")
         further = ""
-        if following and told[following] > USUAL_FLOOR:
+        if following and told[following] > FLOOR:
             further = f"{CAUSES[following]} ({self.figures[following]})"
         figure = self.figures.get(worst, "")
         return Accuracy(half, most, worst, "beyond" in off, figure, self.taken, further)
@@ -199,6 +200,23 @@ class Bias:
             return [str(self.contradiction)]
         accuracy = self.accuracy(grid)
         return [] if accuracy is None else accuracy.warnings
+
+
+def _within(share: float, shift: FloatArray, spread: FloatArray) -> float:
+    """Compute within what a share of normal errors are, by size.
+
+    Args:
+        share: of them, 0 to 1.
+        shift, spread: mean, at least 0, and standard deviation, above 0, of each (m,).
+    """
+    from scipy.optimize import brentq
+    from scipy.special import ndtr
+
+    def more(size: float) -> float:
+        inside = ndtr((size - shift) / spread) - ndtr((-size - shift) / spread)
+        return float(inside.mean()) - share
+
+    return float(brentq(more, 0.0, float((shift + 9.0 * spread).max()), rtol=1e-3))
 
 
 def too_coarse(grid: Grid | Volume, nodes: Volume) -> bool:
@@ -280,18 +298,20 @@ class BiasOnDemand:
     def bias(self) -> Bias:
         """The errors, cause by cause.
 
-        If the images fit another geometry better, nothing is bounded. Bounds are
-        `SAFETY_FACTOR` times the change of the coarse volume by each flaw: missing angles,
-        the rungs of `ladder`, another continuation of truncated rows ("beyond"), or for
-        complete rows their level beside the object ("drift"). Errors that the images tell
-        change it by their size and `SIGMAS` standard errors, and a known spectrum by what
-        straightened line integrals change ("hardening"). What they leave open is bounded
-        together ("geometry"), but what would change the volume by more than all that is
-        taken as stated, and named.
+        If the images fit another geometry better, nothing is bounded. The coarse volume's
+        change by each flaw is the standard deviation of its error: missing angles, the rungs
+        of `ladder`, and pixels that stand for what is between them ("sampling"). Another
+        continuation of truncated rows ("beyond"), or for complete rows their level beside the
+        object ("drift"), errors that the images tell and a known spectrum ("hardening") shift
+        values. Standard errors of those, and of what the images leave open, scatter them
+        together ("geometry"); but what may change the volume by more than all that is taken as
+        stated, and named.
         """
         bounded = self._told
         if bounded.contradiction is not None:
             return bounded
+        sampling = self._sampling(bounded)
+        bounded = replace(bounded, causes={**bounded.causes, "sampling": sampling})
         straight = {k: one for k, one in bounded.causes.items() if k != "hardening"}
         accuracy = replace(bounded, causes=straight).accuracy(bounded.found)
         if accuracy is None or accuracy.cut_off:
@@ -326,7 +346,7 @@ class BiasOnDemand:
             return self._bounded.warnings(grid)
         if scan.sparse:
             thin = scan.thinned(all_views=True, least_rows=STREAK_ROWS)
-            return _bounded(thin, {"angles"}).warnings(grid)
+            return _bounded(thin, angles_alone=True).warnings(grid)
         return []
 
     def residuals(self, volume: Volume) -> Residuals | None:
@@ -374,17 +394,42 @@ class BiasOnDemand:
         bounded, found = self._bounded, self._agreement
         causes = dict(bounded.causes)
         figures = dict(bounded.figures)
+        shifts = set(bounded.shifts)
+        squares = np.zeros(bounded.found.shape)
         for one in found.findings:
             if one.told:
-                change = self._changed(one, one.size)
-                more = 1.0 + SIGMAS * one.sigma / abs(one.size)
+                change = _about(self._changed(one, one.size), bounded.even)
+                squares += np.square(one.sigma / one.size * change)
                 name = one.cause.name
-                causes[name] = causes.get(name, 0.0) + more * _about(change, bounded.even)
+                causes[name] = causes.get(name, 0.0) + change
                 causes[name] += one.level * np.abs(bounded.found.data)
+                shifts.add(name)
                 figures[name] = one.figure
         if found.unexplained:
             causes["images"] = found.unexplained * np.abs(bounded.found.data)
-        return replace(bounded, causes=causes, figures=figures)
+        if squares.any():
+            causes["geometry"] = np.sqrt(squares)
+        return replace(bounded, causes=causes, figures=figures, shifts=frozenset(shifts))
+
+    def _sampling(self, bounded: Bias) -> FloatArray:
+        """Compute what the pixels' sampling does to the coarse volume: a line integral that
+        bends between pixels is off by a rounded share of the bend (`ROUNDING`), in each pixel
+        by another; one draw of that, averaged over regions.
+        """
+        from scipy.ndimage import gaussian_filter
+
+        scan, fine = self._copied(NODES), self._copied(FINE_NODES)
+        radius = scan.grid.voxel_xyz[0] / fine.grid.voxel_xyz[0]
+        # An edge crosses B of the B x B pixels of the panel in one of the copy, each of which is
+        # off by itself, and in each of the scan's views.
+        pixels = float(np.prod(fine.binned)) ** -0.75
+        views = np.sqrt(len(fine.numbers) / len(fine.circle.angle))
+        off = pixels * views * sampling_error(fine.images, fine.noise)
+        drawn = off * np.random.default_rng(0).standard_normal(off.shape)
+        along = min(1.0, 0.25 * (off.shape[1] - 1)) * REGION_SIGMA * radius
+        smooth = gaussian_filter(drawn, (0.0, along, REGION_SIGMA * radius))
+        change = np.nan_to_num(scan.fdk(smooth.astype(np.float32), fine.cone_vec))
+        return _scatter_about(change, bounded.even)
 
     def _changed(self, one: Finding, size: float) -> Float32Array:
         """Compute the change of the coarse volume by an error of a size, (nz, ny, nx).
@@ -434,22 +479,24 @@ class BiasOnDemand:
         scan = self._copied(NODES)
         nodes = UniformNodes.of(self._volume, scan.rim)
         taken = [*self._known.taken, "distances"]
-        squares = np.zeros(scan.grid.shape)
+        squares = np.square(bounded.causes.get("geometry", np.zeros(scan.grid.shape)))
         for one in self._agreement.findings:
-            if one.told or one.cause.nuisance:
+            if one.told or one.cause.nuisance or one.cause.name == "distance":
                 continue
-            change = _about(self._changed(one, SIGMAS * one.sigma), bounded.even)
-            if nodes.change(nodes.found + change.astype(np.float32)) > claimed:
+            more, less = (self._changed(one, sign * one.sigma) for sign in (1.0, -1.0))
+            change = np.asarray(0.5 * (more - less), np.float32)
+            moved = SIGMAS * _smooth_about(change, bounded.even)
+            if nodes.change(nodes.found + moved.astype(np.float32)) > claimed:
                 taken.append(STATED.get(one.cause.name, one.cause.name))
             else:
-                squares += np.square(change)
+                squares += np.square(_about(change, bounded.even))
         kinds = [one for one in suspects(scan) if one.kind in self._agreement.open]
         for suspect in kinds:
             try:
-                moved = self._moved(suspect.images, suspect.cone_vec)
+                shifted = self._moved(suspect.images, suspect.cone_vec)
             except GeometryError:
                 continue
-            if nodes.change(nodes.found + smoothed(moved)) > claimed:
+            if nodes.change(nodes.found + smoothed(shifted)) > claimed:
                 taken.append("rotation" if suspect.kind in SIDES else "order")
         causes = {**bounded.causes, "geometry": np.sqrt(squares)}
         return replace(bounded, causes=causes, taken=tuple(dict.fromkeys(taken)))
@@ -495,7 +542,7 @@ class BiasOfIterations(BiasOnDemand):
         images = scan.projected(nodes.found, scan.cone_vec, shape)
         again = self._run(images, scan.cone_vec, scan.grid).data
         change = np.nan_to_num(again) - nodes.found
-        causes = {self._cause: SAFETY_FACTOR * _about(change, nodes.even)}
+        causes = {self._cause: _scatter_about(change, nodes.even)}
         found = scan.grid.like(nodes.found)
         return self._of_beam(Bias(found, nodes.even, nodes.inside, causes))
 
@@ -550,67 +597,76 @@ def copies_of(
     return copies
 
 
-def _bounded(scan: CoarseScan, only: Container[str] = ALL_CAUSES) -> Bias:
+def _bounded(scan: CoarseScan, *, angles_alone: bool = False) -> Bias:
     """Bound the errors of a coarse volume, by cause (`BiasOnDemand.bias`).
 
     Args:
         scan: the coarse copy.
-        only: causes that are looked for.
+        angles_alone: look for what few views do, and nothing else.
     """
     nodes = UniformNodes.of(scan.volume, scan.rim)
-    causes = _causes(scan, nodes, np.nan_to_num(scan.volume), only)
+    causes = _angles(scan, nodes)
+    if not angles_alone:
+        _add(causes, _causes(scan, nodes, np.nan_to_num(scan.volume)))
     return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
 
 
+def _add(causes: dict[str, FloatArray], more: dict[str, FloatArray]) -> None:
+    """Add errors to those of the same causes."""
+    for cause, one in more.items():
+        causes[cause] = causes.get(cause, 0.0) + one
+
+
+def _angles(scan: CoarseScan, nodes: UniformNodes) -> dict[str, FloatArray]:
+    """Compute what few views do, if they are few; streaks come from edges.
+
+    Args:
+        scan: the coarse copy.
+        nodes: of its volume.
+    """
+    if not scan.sparse:
+        return {}
+    wide = (max(scan.ends),) * 2
+    best, ours = (
+        scan.seen(nodes.sharp, scan.parallel("", wide, t)) for t in (None, scan.angles)
+    )
+    return {"angles": _scatter_about(ours - best, nodes.even)}
+
+
 def _causes(
-    scan: CoarseScan,
-    nodes: UniformNodes,
-    data: Float32Array,
-    only: Container[str] = ALL_CAUSES,
+    scan: CoarseScan, nodes: UniformNodes, data: Float32Array
 ) -> dict[str, FloatArray]:
-    """Bound the errors of a coarse volume, by cause (`BiasOnDemand.bias`).
+    """Compute the errors of a coarse volume, by cause (`BiasOnDemand.bias`), but for what few
+    views do.
 
     Args:
         scan: the coarse copy.
         nodes: of its volume.
         data: that volume, its unreconstructed voxels 0, (nz, ny, nx).
-        only: causes that are looked for; of `ALL_CAUSES`.
 
     Returns:
-        Cause -> largest error of each node, (nz, ny, nx) [1/mm].
+        Cause -> error at each node, (nz, ny, nx) [1/mm].
     """
     causes: dict[str, FloatArray] = {}
-
-    def add(cause: str, share: float, change: Float32Array) -> None:
-        causes[cause] = causes.get(cause, 0.0) + share * _about(change, nodes.even)
-
-    if scan.sparse and "angles" in only:
-        # Streaks come from edges, and do not cancel about a node.
-        wide = (max(scan.ends),) * 2
-        best, ours = (
-            scan.seen(nodes.sharp, scan.parallel("", wide, t))
-            for t in (None, scan.angles)
-        )
-        add("angles", SAFETY_FACTOR, np.abs(ours - best))
-    if only is not ALL_CAUSES:
-        return causes
     rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in scan.ladder()]
     for (_, before), (flaw, after) in pairwise(rungs):
-        add(flaw, SAFETY_FACTOR, after - before)
+        # Ends that few rays see blur no edge: they count as the middle does.
+        weights = np.where(nodes.inside, 1.0, 1e-3)
+        _add(causes, {flaw: _scatter_about(after - before, weights)})
     truncation = scan.truncation
     if truncation is None or not truncation.cut_off.any():
-        add("drift", 1.0, np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec)))
-        return causes
-    ways = [(truncation.otherwise, SAFETY_FACTOR)]
+        level = np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec))
+        return {**causes, "drift": _about(level, nodes.even)}
+    ways = [(truncation.otherwise, OTHERWISE_FACTOR)]
     if truncation.explained:
         # Prisms explain the rows, but their residual at the edges is as unknown as ever.
         ways = [
             (truncation.otherwise, PRISM_ERROR_SHARE),
-            (truncation.later, SAFETY_FACTOR),
+            (truncation.later, OTHERWISE_FACTOR),
         ]
     for way, share in ways:
         other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
-        add("beyond", share, other - data)
+        _add(causes, {"beyond": share * _about(other - data, nodes.even)})
     return causes
 
 
@@ -640,12 +696,30 @@ def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
     Returns:
         (nz, ny, nx).
     """
+    squares = np.square(_smooth_about(values, weights))
+    return np.sqrt(np.maximum(_smooth_about(squares, weights), 0.0))
+
+
+def _scatter_about(values: Float32Array, weights: FloatArray) -> FloatArray:
+    """Compute the weighted root mean square about each node (Gaussian, 1 node) of the values
+    of regions (`REGION_SIGMA`), which may scatter from node to node.
+
+    Args:
+        values: (nz, ny, nx).
+        weights: (nz, ny, nx), above 0.
+
+    Returns:
+        (nz, ny, nx).
+    """
+    squares = np.square(_smooth_about(values, weights, REGION_SIGMA))
+    return np.sqrt(np.maximum(_smooth_about(squares, weights), 0.0))
+
+
+def _smooth_about(
+    values: npt.NDArray[np.floating], weights: FloatArray, nodes: float = 1.0
+) -> FloatArray:
+    """Compute weighted means about each node, by a Gaussian of some nodes, (nz, ny, nx)."""
     from scipy.ndimage import gaussian_filter
 
-    def mean(what: FloatArray) -> FloatArray:
-        total = gaussian_filter(weights * what, 1.0, mode="nearest")
-        return np.asarray(total / gaussian_filter(weights, 1.0, mode="nearest"))
-
-    return np.asarray(
-        np.sqrt(np.maximum(mean(np.square(mean(values.astype(np.float64)))), 0.0))
-    )
+    total = gaussian_filter(weights * values.astype(np.float64), nodes, mode="nearest")
+    return np.asarray(total / gaussian_filter(weights, nodes, mode="nearest"))

@@ -15,11 +15,14 @@ import pytest
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
-from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of
+from flexdt.twin.reconstruction.bias import BiasOnDemand, _within, copies_of
 from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan
 from flexdt.twin.reconstruction.consistency.agreement import Agreement, agreement_of
 from flexdt.twin.reconstruction.consistency.opposed_rays import OpposedRays
-from flexdt.twin.reconstruction.consistency.view_pairs import ViewPairs
+from flexdt.twin.reconstruction.consistency.view_pairs import (
+    ViewPairs,
+    sampling_error,
+)
 
 SOD, SDD, PIXEL = 90.0, 200.0, 0.95
 SHAPE = (30, 60)
@@ -90,10 +93,12 @@ def test_the_sizes_of_haze_and_of_a_gain_step_are_found() -> None:
         return p * (1.0 + 0.1 * (np.arange(len(p)) >= len(p) // 2))[:, None, None]
 
     dense = tuple(replace(body, mu=3.0 * body.mu) for body in BODIES)
-    curve = found(scan(bodies=dense, change=hazy)).findings[0]
-    assert curve.told
-    assert curve.cause.name == "haze"
-    assert curve.size == pytest.approx(2.0, abs=0.3)
+    listed = {
+        one.cause.name: one for one in found(scan(bodies=dense, change=hazy)).findings
+    }
+    haze = listed["haze"]
+    assert haze.size == pytest.approx(2.0, abs=0.3)
+    assert abs(haze.size - 2.0) < 2.0 * haze.sigma
     gain = found(scan(change=stepped)).findings[0]
     assert gain.told
     assert (gain.cause.name, gain.course.kind) == ("gain", "step")
@@ -110,6 +115,14 @@ def test_another_geometry_that_fits_is_named(kind: str) -> None:
     assert kind in contradiction.kinds
     assert contradiction.p_value < 0.01
     assert "images and geometry contradict each other" in str(contradiction)
+
+
+@pytest.mark.slow
+def test_beads_that_tell_the_direction_exclude_the_other() -> None:
+    make, _ = claims.WRONG["direction"]
+    wrong = coarse(make(scan(), np.random.default_rng(1)))
+    known = agreement_of(wrong, sides_known=True).contradiction
+    assert known is None or not set(known.kinds) & {"direction", "columns"}
 
 
 @pytest.mark.parametrize("number", range(2))
@@ -182,3 +195,25 @@ def test_clipped_line_integrals_are_told_and_nothing_is_claimed() -> None:
     cylinder = claims.Body(2, (0.0, 0.0, 0.0), (8.0, 8.0, 50.0), 0.0, 0.05)
     right = scan(true=far, stated=far, bodies=(cylinder,), counts=0.0)
     assert said(right)._clipped is None
+
+
+def test_the_error_of_sampling_is_that_of_thin_rays() -> None:
+    """Rays through pixels' middles, beside means of 9 x 9 rays."""
+    drawn = scan(counts=0.0)
+    view = replace(drawn, true=drawn.true[:12], stated=drawn.true[:12])
+    thin = view.images()
+    off = thin - replace(view, rays=9).images()
+    predicted = sampling_error(thin, 0.0)
+    ratio = np.sqrt(np.mean(predicted**2)) / np.sqrt(np.mean(off**2))
+    assert 0.8 < ratio < 3.0
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_a_share_of_normal_errors_is_within_what_is_stated(share: float) -> None:
+    rng = np.random.default_rng(4)
+    shift, spread = rng.uniform(0.0, 2.0, 50), rng.uniform(0.1, 1.0, 50)
+    drawn = np.abs(shift + spread * rng.standard_normal((4000, 50)))
+    assert np.mean(drawn <= _within(share, shift, spread)) == pytest.approx(
+        share, abs=5e-3
+    )
+    assert _within(share, np.ones(3), np.full(3, 1e-9)) == pytest.approx(1.0, abs=2e-3)

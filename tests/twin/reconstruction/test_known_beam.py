@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy.ndimage import uniform_filter
 
 import flexdt as fx
 from flexdt.phantoms import as_phantom
@@ -48,14 +49,15 @@ def scan() -> Any:
 
 
 def told(data: Any, **options: Any) -> tuple[Any, float, list[str]]:
-    """Reconstruct; also how much nine of ten places of the wall differ at most from one value."""
+    """Reconstruct; also how much means of 3 x 3 x 3 voxels of the wall differ from one value,
+    nine of ten at most."""
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")
         volume = data.reconstruct("fdk", progress=False, **options)
     x, y, z = volume.centers()
     away = np.hypot(x, y[:, None])
-    wall = (away > WALL[0] + 0.6) & (away < WALL[1] - 0.6)
-    values = volume.data[len(z) // 2][wall]
+    wall = (away > WALL[0] + 0.9) & (away < WALL[1] - 0.9)
+    values = uniform_filter(volume.data, 3)[len(z) // 2][wall]
     off = np.abs(values / np.median(values) - 1.0)
     said = [str(one.message) for one in given]
     return volume.accuracy, float(np.percentile(off, 90.0)), said
@@ -66,7 +68,7 @@ def test_hardening_of_an_aluminium_tube_is_told_and_gone_after_its_correction(
     scan: Any,
 ) -> None:
     plain, off, said = told(scan)
-    assert off > 0.1
+    assert off > 0.08
     assert plain.cause == "hardening"
     assert off / 1.5 < plain.most < 1.7 * off
     assert plain.figure.endswith("at 90 kV")
@@ -75,7 +77,7 @@ def test_hardening_of_an_aluminium_tube_is_told_and_gone_after_its_correction(
     corrected, off, said = told(scan, material="aluminium")
     assert off < 0.01
     assert corrected.cause != "hardening"
-    assert off < corrected.most < 0.02
+    assert off < corrected.most < 0.01
     assert "if material" in str(corrected)
     assert said == []
 

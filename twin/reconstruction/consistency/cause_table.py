@@ -46,6 +46,9 @@ TRIED: Final = 8
 SHARED: Final = 0.05
 """Share of the sampling's and noise's standard deviation that may be the same in all
 differences, as an object's shape may make it (`tests/studies/claims.py --table`, seed 11)."""
+SHARED_OF_PIXELS: Final = 1.0
+"""The same of errors that all images have alike: so has the error of sampling a shadow, and all of
+it may look like them."""
 FREEDOM: Final = 4.0
 """Degrees of freedom of Student's distribution of a difference over its standard deviation: an edge
 that is parallel to a ray differs by far more than usual."""
@@ -219,8 +222,12 @@ class CauseTable:
                 power, 1e-300
             )
             spread = max(float(covariance[place, place]), 0.0)
+            alike = SHARED
+            cause, course = errors[place]
+            if cause.images is not None and course.kind == "constant":
+                alike = SHARED_OF_PIXELS
             found.append(
-                (float(sizes[place]), float(np.hypot(np.sqrt(spread), SHARED * shared)))
+                (float(sizes[place]), float(np.hypot(np.sqrt(spread), alike * shared)))
             )
         return found
 

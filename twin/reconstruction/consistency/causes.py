@@ -143,7 +143,15 @@ def causes_of(centre: FloatArray) -> list[Cause]:
         Cause("distance", "%", 0.2, 10.0, _farther),
         Cause("turn", "%", 0.1, 20.0, scaled, turns=True),
         Cause("lost", "deg", 0.1, 45.0, turned, constant=False, course=True, turns=True),
-        Cause("gain", "%", 1.0, 30.0, images=_gained, constant=False, course=True),
+        Cause(
+            "gain",
+            "% of the mean",
+            1.0,
+            30.0,
+            images=_gained,
+            constant=False,
+            course=True,
+        ),
         Cause(
             "haze",
             "% of the open beam",

@@ -310,6 +310,24 @@ def _interpolated(
     return np.asarray(upper + share * (lower - upper), np.float64)
 
 
+def sampling_error(images: Float32Array, noise: float) -> FloatArray:
+    """Compute by how much pixels may be off because they stand for what is between them: a
+    jump between two pixels, which bends both, is off by `ROUNDING` in one of them.
+
+    Args:
+        images: (n, rows, cols).
+        noise: variance of a pixel, whose second differences are no bends.
+
+    Returns:
+        Standard deviations (n, rows, cols).
+    """
+    squares = np.zeros(images.shape)
+    squares[:, :, 1:-1] += np.square(np.diff(images, n=2, axis=2)) - 6.0 * noise
+    if images.shape[1] > 2:
+        squares[:, 1:-1] += np.square(np.diff(images, n=2, axis=1)) - 6.0 * noise
+    return ROUNDING * np.sqrt(np.maximum(0.5 * squares, 0.0))
+
+
 def _bend(
     images: Float32Array,
     views: npt.NDArray[np.intp],
