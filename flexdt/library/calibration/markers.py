@@ -652,7 +652,24 @@ def _turning_back(
             "object does not turn although the angles say so",
         )
         return replace(calibration, findings=Findings((off, *calibration.findings)))
-    poses = replace(data.poses, angle=-data.poses.angle)
+    stated_px, reversed_px = (
+        _alone_px(data, markers, replace(data.poses, angle=sign * data.poses.angle))
+        for sign in (1.0, -1.0)
+    )
+    if not reversed_px < 0.5 * stated_px:
+        return calibration
+    off = error(
+        CalibrationCode.ANGLE_REVERSED,
+        f"the markers fit to {reversed_px:.2g} px instead "
+        f"of {stated_px:.2g} if the stage turns the other way "
+        "than the angles say, or if the images are mirrored",
+    )
+    return replace(calibration, findings=Findings((off, *calibration.findings)))
+
+
+def _alone_px(data: ImageSet, markers: Markers, poses: Poses) -> float:
+    """Compute the misfit of markers anywhere to poses, with nothing else that could explain
+    it, root mean square [px]."""
     at = centred(markers.tracks, poses, data.shape, NOMINAL)
     places = triangulate(markers.tracks, poses.cone_vec(at), data.shape)
     fit = estimate_geometry(
@@ -667,15 +684,7 @@ def _turning_back(
         priors={"det_roll": 1.0},
         bound=math.inf,
     )
-    if not fit.certificate.rms_px < 0.5 * calibration.fit.certificate.rms_px:
-        return calibration
-    off = error(
-        CalibrationCode.ANGLE_REVERSED,
-        f"the markers fit to {fit.certificate.rms_px:.2g} px instead "
-        f"of {calibration.fit.certificate.rms_px:.2g} if the stage turns the other way "
-        "than the angles say, or if the images are mirrored",
-    )
-    return replace(calibration, findings=Findings((off, *calibration.findings)))
+    return fit.certificate.rms_px
 
 
 def _calibrated(
