@@ -119,12 +119,12 @@ class Posterior:
         there = sum(p.weight for p in self.parts if p.groups & some)
         return _log_odds(there)
 
-    def cause_odds(self, cause: str) -> float:
-        """Return the logarithm of the odds that a cause is there."""
+    def cause_odds(self, *causes: str) -> float:
+        """Return the logarithm of the odds that one of some causes is there."""
         there = sum(
             p.weight
             for p in self.parts
-            if any(self.families[f].cause == cause for f, _ in p.groups)
+            if any(self.families[f].cause in causes for f, _ in p.groups)
         )
         return _log_odds(there)
 

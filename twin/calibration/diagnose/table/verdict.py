@@ -27,11 +27,14 @@ from flexdt.twin.calibration.diagnose.table.group import (
 )
 from flexdt.twin.calibration.diagnose.table.groups import (
     CAUSES,
+    bend,
     growth,
     moving,
     positions,
+    rows,
     spots,
 )
+from flexdt.twin.calibration.diagnose.table.posterior import Posterior
 from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.findings import ERROR, WARNING, Finding, error, warning
@@ -78,6 +81,8 @@ POLICY: Final[Mapping[CalibrationCode, Use]] = {
     CalibrationCode.MISFIT: Use.WITHHOLD,
 }
 """Finding on the residuals -> what it does to the numbers."""
+TOLD_TOGETHER: Final[Mapping[str, tuple[str, ...]]] = {rows.NAME: (bend.NAME,)}
+"""Cause -> causes that its sentence tells as looking alike."""
 UNEXPLAINED_MOTION: Final = ("dO_x", "dO_y", "alpha")
 """Parameters that are advised to differ between frames where no cause explains a misfit."""
 
@@ -126,8 +131,8 @@ def found_in(what: Explained) -> Found:
             posterior.name(group),
             posterior.families[group[0]].cause,
             posterior.families[group[0]].places[group[1]],
-            max(posterior.odds([group]), posterior.cause_odds(
-                posterior.families[group[0]].cause)),
+            max(posterior.odds([group]), _told_odds(
+                posterior, posterior.families[group[0]].cause)),
             weights,
             None
             if posterior.families[group[0]].courses is None
@@ -146,6 +151,11 @@ def found_in(what: Explained) -> Found:
         and (cause.name in there or posterior.cause_odds(cause.name) > -OPEN_LOG_ODDS)
     )
     return Found(what.fit, tuple(seen), rivals, what.strain)
+
+
+def _told_odds(posterior: Posterior, cause: str) -> float:
+    """Return the logarithm of the odds that what a cause's sentence tells is there."""
+    return posterior.cause_odds(cause, *TOLD_TOGETHER.get(cause, ()))
 
 
 def _open(found: Found, told: list[Finding]) -> list[Finding]:

@@ -35,9 +35,10 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make a phantom's bend: beads are displaced together, as they are near each other.
 
     The displacement is a normal process in space that is the same everywhere and in every
-    direction, or along one axis; or a twist about some line. None of them is about a point of
-    the phantom that is known, so that its place is as open as its bend is large. Weights are
-    root mean squares of slopes; what is an affine map alone is `strain`.
+    direction, or along one axis across the phantom's length; or a twist about some line. None
+    of them is about a point of the phantom that is known, so that its place is as open as its
+    bend is large. Weights are root mean squares of slopes; what is an affine map alone is
+    `strain`.
     """
     if known.bead_tolerance_mm == 0 or table.k <= MOST_STRAINED:
         return
@@ -47,8 +48,9 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     smooth = _smooth(beads)
     every = np.asarray(np.kron(smooth, np.eye(3)), dtype=np.float64)
     yield _family(table, (NAME,), [columns], every)
-    along = tuple(f"{NAME} along {axis}" for axis in "xyz")
-    yield _family(table, along, list(columns.reshape(-1, 3).T), smooth)
+    across = np.argsort(np.ptp(beads, axis=0))[:2]  # Bodies bend across their length.
+    along = tuple(f"{NAME} along {'xyz'[i]}" for i in across)
+    yield _family(table, along, [columns.reshape(-1, 3)[:, i] for i in across], smooth)
     for axis in "xyz":
         yield _family(table, (f"twist about {axis}",), [columns], _twist(beads, axis))
 
