@@ -237,7 +237,11 @@ def _told_rightly(said: str, scan: Faulty) -> bool:
     that are known of it.
     """
     names = re.findall(r"(d[OD]_[xyz]) is", said)
-    far = [n for n in names if abs(np.mean(scan.truth[n])) > 2 * UNSEEN.get(n, np.inf)]
+    far = [
+        n
+        for n in names
+        if abs(np.mean(scan.truth.get(n, 0.0))) > 2 * UNSEEN.get(n, np.inf)
+    ]
     return said.startswith("lengths_disagree") and bool(far)
 
 

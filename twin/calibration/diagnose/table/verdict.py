@@ -27,6 +27,7 @@ from flexdt.twin.calibration.diagnose.table.group import (
 )
 from flexdt.twin.calibration.diagnose.table.groups import (
     CAUSES,
+    bead_places,
     bend,
     growth,
     moving,
@@ -81,8 +82,11 @@ POLICY: Final[Mapping[CalibrationCode, Use]] = {
     CalibrationCode.MISFIT: Use.WITHHOLD,
 }
 """Finding on the residuals -> what it does to the numbers."""
-TOLD_TOGETHER: Final[Mapping[str, tuple[str, ...]]] = {rows.NAME: (bend.NAME,)}
-"""Cause -> causes that its sentence tells as looking alike."""
+TOLD_TOGETHER: Final[Mapping[str, tuple[str, ...]]] = {
+    rows.NAME: (bend.NAME,),
+    bead_places.NAME: (bend.NAME,),
+}
+"""Cause -> causes of which its sentence holds, too."""
 UNEXPLAINED_MOTION: Final = ("dO_x", "dO_y", "alpha")
 """Parameters that are advised to differ between frames where no cause explains a misfit."""
 
