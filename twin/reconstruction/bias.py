@@ -182,7 +182,10 @@ class Bias:
         if not inside.any():
             return None
         off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
-        spread = COARSE_FACTOR * self.spread[inside] / value[inside]
+        # Sampling is drawn, not seen in the coarse copy.
+        drawn = np.square(self.causes.get("sampling", np.zeros(self.found.shape)))
+        seen = np.square(COARSE_FACTOR) * (np.square(self.spread) - drawn)
+        spread = np.sqrt(seen + drawn)[inside] / value[inside]
         errors = self.shift[inside] / value[inside], spread
         half, most = (_within(share, *errors) for share in (0.5, 0.9))
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
