@@ -31,7 +31,7 @@ from flexdt.clients.cli.options import (
 from flexdt.library.failure import CommandError
 from flexdt.library.optional.extras import package
 from flexdt.library.reconstruction.volume_files import volume_writer
-from flexdt.message_words import problem_words
+from flexdt.message_words import problem_words, reason_of
 from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.runtime.files.whole_files import free_bytes, write_whole
 
@@ -57,6 +57,7 @@ __all__ = [
     "package",
     "position",
     "problem_words",
+    "reason_of",
     "size",
     "table",
     "tiff_bytes",

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from flexdt.extending import CommandError
-from flexdt.message_words import reason_of
+from flexdt.extending import CommandError, reason_of
 
 REFUSED: Final = 4
 """Exit code where no workers can be had."""

@@ -24,9 +24,11 @@ from flexdt.twin.physics.tube import (
     tube_of,
     tube_spectrum,
 )
+from flexdt.twin.rays_a_pixel import MAX_RAYS, check_rays
 
 __all__ = [
     "FWHM",
+    "MAX_RAYS",
     "Beam",
     "Chain",
     "Counts",
@@ -39,6 +41,7 @@ __all__ = [
     "Spectrum",
     "TubeModel",
     "blurred",
+    "check_rays",
     "deposited",
     "detector_of",
     "effective_beam",

@@ -21,6 +21,7 @@ from flexdt.twin.projection.operators import (
     geometry_change,
     geometry_gradient,
 )
+from flexdt.twin.projection.pixel_areas import ray_offsets
 from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "project_materials",
     "project_mesh",
     "project_scene",
+    "ray_offsets",
     "room_like",
     "warm_up",
 ]

@@ -494,7 +494,7 @@ def _within_voxels(
         first = starts[:-1][chosen]
         for mark in np.unique(marks).tolist():
             some = marks == mark
-            across, down = offsets(mark)
+            across, down = ray_offsets(mark)
             rows = n * r[some, None] + np.floor((down + 0.5) * n).astype(np.int64)
             cols = n * c[some, None] + np.floor((across + 0.5) * n).astype(np.int64)
             out[first[some, None] + np.arange(len(across))] = images[0][rows, cols]
@@ -505,7 +505,7 @@ def rays_of(marks: Marks) -> IntArray:
     return RAYS[marks]
 
 
-def offsets(mark: int) -> tuple[FloatArray, FloatArray]:
+def ray_offsets(mark: int) -> tuple[FloatArray, FloatArray]:
     """Compute the places of a pixel's rays, (columns, rows) from its centre, (rays,) each: no two
     in one row or column, so that edges along them come out in as many steps."""
     a, b = (mark + 1) // 2, mark // 2 + 1

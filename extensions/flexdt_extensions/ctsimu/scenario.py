@@ -34,21 +34,21 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics import (
     FWHM,
+    MAX_RAYS,
     Beam,
     Counts,
     EffectiveBeam,
     ScanScatter,
     ScatterSettings,
     blurred,
+    check_rays,
     effective_beam,
     flux_of,
     frame_rng,
     scan_scatter,
     spot_blur_px,
 )
-from flexdt.twin.projection import TriangleMesh, project_mesh
-from flexdt.twin.projection.pixel_areas import offsets
-from flexdt.twin.rays_a_pixel import MAX_RAYS, check_rays
+from flexdt.twin.projection import TriangleMesh, project_mesh, ray_offsets
 from flexdt_extensions.ctsimu.ctsimu_scan import MeshSample, Reference, read_scenario
 
 KEV_J: Final = 1.602176634e-16
@@ -173,7 +173,7 @@ class ScenarioImages:
         shape = self.scan.shape
         order = {one: i for i, one in enumerate(self._thickest)}
         air = self.scan.environment is not None
-        across, down = offsets(2 * self._rays - 1)
+        across, down = ray_offsets(2 * self._rays - 1)
         out = np.zeros((len(order) + air, *shape), np.float32)
         for sample, mesh in (
             zip(self.scan.samples, self._meshes, strict=True) if samples else ()
