@@ -8,7 +8,6 @@ import sys
 import warnings
 from functools import partial
 from itertools import pairwise, product
-from pathlib import Path
 
 import fan_beam
 import numpy as np
@@ -825,7 +824,7 @@ def test_lesser_processors_give_the_same_numbers(tmp_path):
     program = """
 import sys
 import numpy as np
-from scans import circle
+from circular_scans import circle
 from flexdt.twin.projection import Volume, back, forward
 from flexdt.twin.reconstruction import fdk, sirt
 rng, scan = np.random.default_rng(3), circle(12)
@@ -848,8 +847,8 @@ np.savez(sys.argv[1], forward=images, back=back(images, scan, like).data,
         own = dict.fromkeys(folders, str(tmp_path)) if extra else {}
         subprocess.run(
             [sys.executable, "-c", program, str(tmp_path / name)],
-            env={**os.environ, **extra, **own},
-            cwd=Path(__file__).parent, check=True,
+            env={**os.environ, **extra, **own, "PYTHONPATH": os.pathsep.join(sys.path)},
+            check=True,
         )  # fmt: skip
         found[name] = np.load(tmp_path / f"{name}.npz")
     for name in lesser:
