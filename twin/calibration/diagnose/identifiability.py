@@ -329,9 +329,10 @@ def _foreseen(problem: FitProblem, known: Known) -> Stated:
     noise = (
         rng.normal(size=(len(base), DRAWS)) * np.repeat(table.weight.ravel(), 2)[:, None]
     )
-    search = Search(table, families, 0.0, base @ drawn + noise)
-    search.keep_shapes()
+    # A fit takes the geometry up by iterations: its table is linear there, and has the rest.
     count = table.parameters
+    search = Search(table, families, 0.0, base[:, count:] @ drawn[count:] + noise)
+    search.keep_shapes()
     factor = edge_factors(problem.layout.names)
     unit = np.outer(factor[:count], factor[:count])
     precision = np.diag(1.0 / (problem.prior_sigma * factor) ** 2)

@@ -36,6 +36,9 @@ SETTLED: Final = 0.05
 """Change of the logarithm of widths and noise at which they are found."""
 LEAST_LOG_WEIGHT: Final = -9.0
 """Logarithm of the weight of a model, against the best, from which it counts."""
+LEAST_CHANCE: Final = math.erfc(4.0 / math.sqrt(2.0))
+"""Least probability of an explanation that counts: of a value that is four standard deviations
+off, which is what sigmas are asked to hold for."""
 OPEN_GAIN: Final = -50.0
 """Evidence of widths that a group cannot have."""
 ROUNDING: Final = 1e-9
@@ -308,7 +311,8 @@ class Search:
                 mean = solved.mean[own]
                 fresh = float(mean @ mean) / max(seen, 1e-6)
                 most = float(self.products.widest(f)[g]) ** 2
-                found[group] = min(max(fresh, 1e-10 * noise2), most)
+                least = max(float(self.products.narrowest(f)[g]) ** 2, 1e-10 * noise2)
+                found[group] = min(max(fresh, least), most)
                 at += count
             noise2 = (solved.rest + self.freedom * self.spread**2) / max(
                 self.table.count - told + self.freedom, 1.0
@@ -372,7 +376,9 @@ class Search:
             else:
                 gain -= 0.5 * count * np.log(np.maximum(1.0 - gained / left, 1e-9))
             widest = self.products.widest(f)[:, None]
-            gain = np.where(grid2 * noise2 > widest**2, OPEN_GAIN, gain)
+            narrowest = self.products.narrowest(f)[:, None]
+            stated = grid2 * noise2 < narrowest**2
+            gain = np.where(stated | (grid2 * noise2 > widest**2), OPEN_GAIN, gain)
             for chosen_f, chosen in groups:
                 if chosen_f == f:
                     gain[chosen] = OPEN_GAIN
@@ -562,9 +568,15 @@ class Search:
         logs = np.array([p[0] for p in parts])
         chances = np.exp(logs - logs.max())
         chances /= chances.sum()
+        total: dict[frozenset[Group], float] = {}
+        for c, (_, groups, _, _) in zip(chances, parts, strict=True):
+            total[groups] = total.get(groups, 0.0) + float(c)
+        likely = np.array([total[groups] >= LEAST_CHANCE for _, groups, _, _ in parts])
+        chances = np.where(likely, chances, 0.0) / chances[likely].sum()
         kept = [
             Part(float(c), groups, mean, covariance)
             for c, (_, groups, mean, covariance) in zip(chances, parts, strict=True)
+            if c > 0.0
         ]
         return Posterior(
             model, tuple(kept), self.products.families, tuple(self.products.units)

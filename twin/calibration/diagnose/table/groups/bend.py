@@ -42,21 +42,27 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     """
     if known.bead_tolerance_mm == 0 or table.k <= MOST_STRAINED:
         return
+    stated = max(known.strain)
     first = table.problem.layout.bead_columns.start
     columns = first + np.arange(3 * table.k)
     beads = table.problem.model.beads
     smooth = _smooth(beads)
     every = np.asarray(np.kron(smooth, np.eye(3)), dtype=np.float64)
-    yield _family(table, (NAME,), [columns], every)
+    yield _family(table, stated, (NAME,), [columns], every)
     across = np.argsort(np.ptp(beads, axis=0))[:2]  # Bodies bend across their length.
     along = tuple(f"{NAME} along {'xyz'[i]}" for i in across)
-    yield _family(table, along, [columns.reshape(-1, 3)[:, i] for i in across], smooth)
+    yield _family(
+        table, stated, along, [columns.reshape(-1, 3)[:, i] for i in across], smooth
+    )
     for axis in "xyz":
-        yield _family(table, (f"twist about {axis}",), [columns], _twist(beads, axis))
+        yield _family(
+            table, stated, (f"twist about {axis}",), [columns], _twist(beads, axis)
+        )
 
 
 def _family(
     table: Linearised,
+    stated: float,
     names: tuple[str, ...],
     places: Sequence[npt.NDArray[np.intp]],
     root: FloatArray,
@@ -65,8 +71,9 @@ def _family(
     rows = np.stack([table.columns[:, own] @ root for own in places])
     chance = LOG_CHANCE - math.log(KINDS * len(names))
     return Family(
-        NAME, names, Acts.COLUMNS, tuple(places), chance, rows, widest=WIDEST, root=root
-    )
+        NAME, names, Acts.COLUMNS, tuple(places), chance, rows, widest=WIDEST,
+        narrowest=stated, root=root,
+    )  # fmt: skip
 
 
 def _smooth(beads: FloatArray) -> FloatArray:
