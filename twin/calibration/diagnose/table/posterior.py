@@ -36,9 +36,6 @@ SETTLED: Final = 0.05
 """Change of the logarithm of widths and noise at which they are found."""
 LEAST_LOG_WEIGHT: Final = -9.0
 """Logarithm of the weight of a model, against the best, from which it counts."""
-LEAST_CHANCE: Final = math.erfc(4.0 / math.sqrt(2.0))
-"""Least probability of an explanation that counts: of a value that is four standard deviations
-off, which is what sigmas are asked to hold for."""
 OPEN_GAIN: Final = -50.0
 """Evidence of widths that a group cannot have."""
 ROUNDING: Final = 1e-9
@@ -505,6 +502,12 @@ class Search:
         solved = self.solve(widths, model.noise2, model.factor)
         return self._judged(widths, model.noise2, model.factor, solved)
 
+    def _may_count(self, family: int, model: Model) -> bool:
+        """Return whether what images leave open of a family counts beside a model."""
+        causes = self.products.families[family].beside
+        shown = {self.products.families[f].cause for f, _ in model.widths}
+        return not causes or bool(shown & causes)
+
     def mixture(
         self,
         model: Model,
@@ -532,6 +535,8 @@ class Search:
             mean = one.solved.mean[:count]
             covariance = one.solved.covariance[:count, :count]
             for f, more in some.items():
+                if not self._may_count(f, model):
+                    continue
                 chance = self.products.families[f].chances[:, None] - math.log(len(GRID))
                 weight = log_weight + more.gain + chance
                 for g, w in np.argwhere(weight > LEAST_LOG_WEIGHT).tolist():
@@ -568,15 +573,10 @@ class Search:
         logs = np.array([p[0] for p in parts])
         chances = np.exp(logs - logs.max())
         chances /= chances.sum()
-        total: dict[frozenset[Group], float] = {}
-        for c, (_, groups, _, _) in zip(chances, parts, strict=True):
-            total[groups] = total.get(groups, 0.0) + float(c)
-        likely = np.array([total[groups] >= LEAST_CHANCE for _, groups, _, _ in parts])
-        chances = np.where(likely, chances, 0.0) / chances[likely].sum()
+        chances /= chances.sum()
         kept = [
             Part(float(c), groups, mean, covariance)
             for c, (_, groups, mean, covariance) in zip(chances, parts, strict=True)
-            if c > 0.0
         ]
         return Posterior(
             model, tuple(kept), self.products.families, tuple(self.products.units)

@@ -17,6 +17,7 @@ from flexdt.twin.calibration.diagnose.table.group import (
     Found,
     Known,
 )
+from flexdt.twin.calibration.diagnose.table.groups import strain
 from flexdt.twin.calibration.diagnose.table.groups.bead_places import MOST_STRAINED
 from flexdt.twin.calibration.diagnose.table.groups.strain import WIDEST
 from flexdt.twin.calibration.diagnose.table.linearised import Linearised
@@ -27,6 +28,8 @@ NAME: Final = "bend"
 WORDS: Final = "a bent phantom"
 KINDS: Final = 3 + 2
 """Of bends, equally likely: everywhere, along an axis, and a twist about each."""
+OFF_ITS_FILE: Final = frozenset({strain.NAME, NAME})
+"""Causes of a phantom that is shown not to be as its file says: it may be bent besides."""
 ROUNDING: Final = 1e-9
 """Part of a displacement's variance that keeps the displacements of near beads apart."""
 
@@ -72,7 +75,7 @@ def _family(
     chance = LOG_CHANCE - math.log(KINDS * len(names))
     return Family(
         NAME, names, Acts.COLUMNS, tuple(places), chance, rows, widest=WIDEST,
-        narrowest=stated, root=root,
+        narrowest=stated, beside=OFF_ITS_FILE, root=root,
     )  # fmt: skip
 
 
