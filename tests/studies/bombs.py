@@ -164,11 +164,13 @@ def send(wire: Wire, bomb: Bomb) -> None:
         wire.call("dataset.get", name="own")
         return
     raw = bomb.path.read_bytes()
-    form = {"scene": {"format": "phantom"}}.get(bomb.upload, {"format": bomb.upload})
+    form = {"format": bomb.upload}
+    if bomb.upload == "scene":
+        form = {"format": bomb.path.suffix.removeprefix("."), "kind": "scene"}
     for at in range(0, len(raw), CHUNK):
         part = base64.b64encode(raw[at : at + CHUNK]).decode()
         wire.call(
-            "sample.upload", name="bomb", size=len(raw), offset=at, data=part, **form
+            "sample.upload", name="bomb", total=len(raw), start=at, data=part, **form
         )
     wire.call("sample.set", file="bomb")
 

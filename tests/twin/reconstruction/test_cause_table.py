@@ -16,7 +16,7 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
 from flexdt.twin.reconstruction.bias import BiasOnDemand, _within, copies_of
-from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan
+from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan, ScanCopies
 from flexdt.twin.reconstruction.consistency.agreement import Agreement, agreement_of
 from flexdt.twin.reconstruction.consistency.opposed_rays import OpposedRays
 from flexdt.twin.reconstruction.consistency.view_pairs import (
@@ -41,13 +41,17 @@ def scan(**changes: object) -> claims.Drawn:
     return replace(made, **changes)
 
 
-def coarse(drawn: claims.Drawn) -> CoarseScan:
+def copied(drawn: claims.Drawn) -> ScanCopies:
     images = drawn.images()
     copies = copies_of(ConeVec(drawn.stated), drawn.shape, None)
     assert copies is not None
     for number in copies.wanted:
         copies.take(number, images[number])
-    return copies(FINE_NODES)
+    return copies
+
+
+def coarse(drawn: claims.Drawn) -> CoarseScan:
+    return copied(drawn)(FINE_NODES)
 
 
 def found(drawn: claims.Drawn) -> Agreement:
@@ -181,12 +185,7 @@ def test_clipped_line_integrals_are_told_and_nothing_is_claimed() -> None:
         return np.minimum(p, 0.6 * p.max())
 
     def said(drawn: claims.Drawn) -> BiasOnDemand:
-        images = drawn.images()
-        copies = copies_of(ConeVec(drawn.stated), drawn.shape, None)
-        assert copies is not None
-        for number in copies.wanted:
-            copies.take(number, images[number])
-        return BiasOnDemand(copies)
+        return BiasOnDemand(copied(drawn))
 
     bad = said(scan(counts=0.0, change=clipped))
     assert "clipped at" in bad.warnings(bad.found)[0]

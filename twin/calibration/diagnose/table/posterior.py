@@ -573,7 +573,6 @@ class Search:
         logs = np.array([p[0] for p in parts])
         chances = np.exp(logs - logs.max())
         chances /= chances.sum()
-        chances /= chances.sum()
         kept = [
             Part(float(c), groups, mean, covariance)
             for c, (_, groups, mean, covariance) in zip(chances, parts, strict=True)
