@@ -665,17 +665,16 @@ class Viewer:
     def show_volumes(self) -> None:
         """Draw each page's volume in that page's frames: on the stage where it fits, as a
         ghost where the page asks for one; frames that show it so are sent nothing.
+
+        Frames that have not been sent all that is built are left for later.
         """
-        frames = []
         for page in self.pages.values():
             clients = [
                 client
                 for client in self.clients.of(page.id)
                 if self.scenes.heard(client.client_id, self._built)
             ]
-            frames += [client.client_id for client in clients]
             self.stage.show(clients, page.volume, self._manner(page))
-        self.stage.keep(frames)
 
     def _manner(self, page: Page) -> Manner | None:
         """Choose how a page's volume is drawn now; None: not at all."""

@@ -457,6 +457,16 @@ def test_a_broken_upload_is_told(page: Any, tmp_path: Path) -> None:
     page.locator(".note.error").filter(has_text="broken.stl").first.wait_for()
 
 
+HOLDERS = """(() => {
+  const pill = document.getElementById("holder");
+  window.held = [pill.innerText];
+  new MutationObserver(() => {
+    if (window.held.at(-1) !== pill.innerText) window.held.push(pill.innerText);
+  }).observe(pill, { childList: true, subtree: true, characterData: true });
+})()"""
+"""Records all that is said about who controls."""
+
+
 def test_people_have_names(
     page: Any, twin: TwinClient, open_page: Callable[..., Any], wait: Wait
 ) -> None:
@@ -465,9 +475,17 @@ def test_people_have_names(
     page.fill("#person", "Ada <b>")
     page.press("#person", "Enter")
     wait(lambda: "Ada" in (page.evaluate(connected) or ""), "the name")
+    seen(page, twin)
     if page.inner_text("#take") != "Release":  # control follows a new name
         page.click("#take")
     page.locator("#holder", has_text="you control").wait_for()
+    page.evaluate(HOLDERS)
+    for name in ("Ada Byron", "Ada <b>"):
+        page.fill("#person", name)
+        page.press("#person", "Enter")
+        wait(lambda name=name: name in (page.evaluate(connected) or ""), "the name")
+    seen(page, twin)
+    assert page.evaluate("window.held") == ["you control"]
     assert (twin.state().controller or "").startswith("Ada <b> #")
     other = open_page()
     other.locator("#holder", has_text="held by Ada <b>").wait_for()
@@ -493,6 +511,7 @@ def test_people_have_names(
 def test_control_is_taken_released_and_taken_over(
     page: Any, twin: TwinClient, open_page: Callable[..., Any], wait: Wait
 ) -> None:
+    seen(page, twin)
     if page.inner_text("#take") == "Release":
         page.click("#take")
     page.locator("#holder", has_text="nobody").wait_for()

@@ -30,12 +30,12 @@ export const problem = (job) =>
 
 /**
  * @param {JobStatus} job
- * @param {string | null} session
+ * @param {(name: string) => boolean} isMe
  * @returns {string}
  */
-export function stateWords(job, session) {
+export function stateWords(job, isMe) {
   const by = job.ended_by;
-  if (job.state === "aborted" && by) return `aborted by ${by === session ? "you" : by}`;
+  if (job.state === "aborted" && by) return `aborted by ${isMe(by) ? "you" : by}`;
   if (isOver(job)) return job.state;
   const pace =
     job.speed_up === "max" ? " · max" : job.speed_up === 1 ? "" : ` · ${job.speed_up}×`;

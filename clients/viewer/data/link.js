@@ -238,6 +238,15 @@ export function rename(name) {
   // Without a connection the next one brings it.
   void call("viewer.person", { name: name.trim() }).catch(() => null);
 }
+/**
+ * Whether a name is or was this page's in its session with the twin: what was told under a former
+ * name is still of the same person.
+ * @param {string | null | undefined} name
+ * @returns {boolean}
+ */
+export const isMe = (name) => name != null && names.has(name);
+/** @type {Set<string>} */
+const names = new Set();
 export function connect() {
   // Below the page's own address: a proxy may have put it anywhere.
   const address = new URL(`ws/${pageId}`, document.baseURI);
@@ -263,6 +272,7 @@ export function connect() {
     store.viewer = false;
     store.twin = false;
     store.session = null;
+    names.clear();
     for (const [id, w] of waiting) {
       w.sent = false;
       if (w.urgent) continue;
@@ -337,6 +347,8 @@ const handlers = {
   },
   session(m) {
     store.session = m.session;
+    if (m.session === null) names.clear();
+    else names.add(m.session);
     emit("connection");
     if (!m.connected) return;
     sendUrgent();

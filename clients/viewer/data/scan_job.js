@@ -1,6 +1,6 @@
 // The scan that runs, waits or has ended last: followed by the twin's events, by its states, and
 // by asking where an end was not heard of.
-import { call, command, emit, Failure, on, store } from "./link.js";
+import { call, command, emit, Failure, isMe, on, store } from "./link.js";
 import { isOver, isUnfinished, problem } from "./job_words.js";
 /** @import { JobStatus } from "../web/viewer.d.ts" */
 
@@ -46,7 +46,7 @@ on("job", (job) => {
   if (news && job.error && !isMeant(job)) {
     emit("note", "error", `Scan ${job.state}`, problem(job));
   }
-  if (news && job.state === "aborted" && job.ended_by && job.ended_by !== store.session) {
+  if (news && job.state === "aborted" && job.ended_by && !isMe(job.ended_by)) {
     emit("note", "warning-note", "Scan aborted", `by ${job.ended_by}`);
   }
 });

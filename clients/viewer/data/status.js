@@ -3,7 +3,7 @@
 import { $, $$, $button, $dialog, $input, el, fixed, setText } from "./dom.js";
 import { listed, sampleOf } from "./fingerprint.js";
 import { toYou } from "./names.js";
-import { command, imageMade, on, person, rename, store, unanswered } from "./link.js";
+import { command, imageMade, isMe, on, person, rename, store, unanswered } from "./link.js";
 import { OLD_S } from "./moment.js";
 import { isDown, stopped } from "./warnings.js";
 import "./readouts.js";
@@ -69,7 +69,7 @@ on("state", (s) => {
 function holder() {
   const pill = $("#holder");
   const who = store.state?.controller ?? null;
-  const mine = who !== null && who === store.session;
+  const mine = isMe(who);
   // Without the twin nobody knows who may; with it the next state says.
   pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
   setText(
@@ -87,7 +87,7 @@ function holder() {
 }
 $button("#take").addEventListener("click", () => {
   const who = store.state?.controller ?? null;
-  const action = who === null ? "acquire" : who === store.session ? "release" : "force";
+  const action = who === null ? "acquire" : isMe(who) ? "release" : "force";
   void command("session.control", { action }, "Control");
 });
 const me = $input("#person");

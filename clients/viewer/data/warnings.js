@@ -1,7 +1,7 @@
 // What is wrong with the machine, the sample's place and the image, over the scene. A stop has a
 // row of its own above it.
 import { $, el, fixed } from "./dom.js";
-import { on, store } from "./link.js";
+import { isMe, on, store } from "./link.js";
 import { OLD_S } from "./moment.js";
 import { outline } from "./sample_outline.js";
 /** @import { State } from "../web/viewer.d.ts" */
@@ -24,7 +24,7 @@ export const isDown = (s) => s.safety.estop || s.safety.state !== "ok";
  */
 export function stopped({ safety: { estop, stopped_by: by, message } }) {
   if (!estop) return `Blocked: ${message || "reset to go on"}`;
-  const who = by ? ` by ${by === store.session ? "you" : by}` : "";
+  const who = by ? ` by ${isMe(by) ? "you" : by}` : "";
   return `Emergency stop${who}: nothing moves until it is reset`;
 }
 

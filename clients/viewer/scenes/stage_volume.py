@@ -7,8 +7,9 @@ ask for it as a ghost, which has another colour and carries the volume's name.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -88,11 +89,14 @@ class StageVolume:
         return "ghost" if asked else None
 
 
-@dataclass
 class StageDrawing:
-    """What is drawn of volumes in each frame's own scene."""
+    """What is drawn of volumes in each frame's own scene, as long as the frame is open."""
 
-    _drawn: dict[int, tuple[StageVolume, Manner]] = field(default_factory=dict)
+    def __init__(self) -> None:
+        """Start with nothing drawn."""
+        self._drawn: WeakKeyDictionary[viser.ClientHandle, tuple[StageVolume, Manner]] = (
+            WeakKeyDictionary()
+        )
 
     def show(
         self,
@@ -104,7 +108,7 @@ class StageDrawing:
         of either: nothing. A frame that has it already is sent nothing.
         """
         for client in clients:
-            before = self._drawn.get(client.client_id)
+            before = self._drawn.get(client)
             wanted = None
             if volume is not None and manner is not None and len(volume.faces):
                 wanted = volume, manner
@@ -117,15 +121,9 @@ class StageDrawing:
                 if wanted is not None:
                     _draw(client, *wanted)
             if wanted is None:
-                self._drawn.pop(client.client_id, None)
+                self._drawn.pop(client, None)
             else:
-                self._drawn[client.client_id] = wanted
-
-    def keep(self, ids: Iterable[int]) -> None:
-        """Forget all frames but these: the others have closed."""
-        here = set(ids)
-        for id in self._drawn.keys() - here:
-            del self._drawn[id]
+                self._drawn[client] = wanted
 
 
 def _draw(client: viser.ClientHandle, volume: StageVolume, manner: Manner) -> None:
