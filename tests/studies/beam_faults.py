@@ -161,7 +161,7 @@ def radiographs(
         truth: offsets [mm, deg].
     """
     if lab.strain is not None:
-        beads = beads + beads @ lab.strain.T
+        beads = beads + (beads - beads.mean(axis=0)) @ lab.strain.T
     beads = beads + np.array(lab.loose) * (np.arange(len(beads)) == 0)[:, None]
     step = angles[1] - angles[0]
     flat = _ramp(lab.flat)

@@ -43,7 +43,7 @@ from flexdt.twin.geometry.poses import Poses
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from faults_drawn import SHAPE, SIX, UNSEEN, World, shadows
+from faults_drawn import SHAPE, SIX, UNSEEN, World, reshaped, shadows
 
 PANELS: Final = (
     (190, 239, 0.2992),
@@ -146,7 +146,7 @@ def world_of(plan: Plan, rng: np.random.Generator) -> World:
     strain = 1e-3 * rng.normal(size=(3, 3)) + (1.0 + 1e-3 * rng.normal()) * np.eye(3)
     shown = np.ones((plan.frames, len(plan.model)), dtype=bool)
     return World(
-        plan.model.beads @ strain.T, plan.model.bead_radius_mm, {**plan.six, **unseen},
+        reshaped(plan.model.beads, strain), plan.model.bead_radius_mm, {**plan.six, **unseen},
         360.0 * np.arange(plan.frames) / plan.frames, np.zeros((plan.frames, 3)), shown,
         plan.sod, plan.sdd, plan.pixel,
     )  # fmt: skip

@@ -30,7 +30,7 @@ from flexdt.twin.errors import TwinError
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from causes_named import calibrated
-from faults_drawn import Array, Draft, Faulty, right_draft, taken, usual
+from faults_drawn import Array, Draft, Faulty, reshaped, right_draft, taken, usual
 
 FAR_SIGMAS: Final = 4.0
 MOST_FAR: Final = 1 / 600
@@ -223,8 +223,22 @@ def _bent_phantom(draft: Draft, rng: np.random.Generator) -> Draft:
     """The phantom is bent like a rod that is loaded at its end."""
     beads = draft.world.beads.copy()
     height = (beads[:, 2] - beads[:, 2].min()) / np.ptp(beads[:, 2])
-    beads[:, int(rng.integers(2))] += _log(rng, 0.01, 0.3) * height**2 * (3 - height) / 2
-    return replace(draft, world=replace(draft.world, beads=beads))
+    off = np.zeros_like(beads)
+    off[:, int(rng.integers(2))] = _log(rng, 0.01, 0.3) * height**2 * (3 - height) / 2
+    return _warp(draft, off)
+
+
+def _warp(draft: Draft, off: Array) -> Draft:
+    """Displace balls, (k, 3), and put the phantom where they fit their file best: their mean,
+    and their mean turn about the axis, are as it says.
+    """
+    beads = draft.world.beads
+    off = off - off.mean(axis=0)
+    across = (beads - beads.mean(axis=0))[:, :2]
+    turn = across[:, 0] @ off[:, 1] - across[:, 1] @ off[:, 0]
+    turn /= (across**2).sum()
+    off[:, :2] -= turn * np.stack([-across[:, 1], across[:, 0]], axis=1)
+    return replace(draft, world=replace(draft.world, beads=beads + off))
 
 
 def _warped(
@@ -233,15 +247,14 @@ def _warped(
     high_mm: float = 0.3,
 ) -> Change:
     """Displace beads by a field of a drawn size, of places by the phantom's half length about a
-    point of it that is drawn: only there the phantom is as its file says.
+    point of it that is drawn.
     """
 
     def change(draft: Draft, rng: np.random.Generator) -> Draft:
         beads = draft.world.beads
         low, high = beads.min(axis=0), beads.max(axis=0)
         at = (beads - rng.uniform(low, high)) / (0.5 * (high - low).max())
-        off = _log(rng, low_mm, high_mm) * shape(at, rng)
-        return replace(draft, world=replace(draft.world, beads=beads + off))
+        return _warp(draft, _log(rng, low_mm, high_mm) * shape(at, rng))
 
     return change
 
@@ -280,9 +293,7 @@ def _quadratic(at: Array, rng: np.random.Generator) -> Array:
 
 
 def _slant(at: Array, rng: np.random.Generator) -> Array:
-    """Aslant about a point of its own, and nothing else, by more than a file's tolerance of .1 %,
-    which is about its origin.
-    """
+    """Aslant, and nothing else, by more than a file's tolerance of .1 %."""
     side = rng.uniform(0.0, 2 * math.pi)
     return at[:, 2:] * [math.cos(side), math.sin(side), 0.0]
 
@@ -321,7 +332,7 @@ def _right(draft: Draft, rng: np.random.Generator) -> Draft:
     """Draw the phantom's scale and shape as they are assumed; nothing else is off."""
     beads = draft.world.beads
     change = (1.0 + 1e-3 * rng.normal()) * np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
-    return replace(draft, world=replace(draft.world, beads=beads @ change.T))
+    return replace(draft, world=replace(draft.world, beads=reshaped(beads, change)))
 
 
 MOVING: Final[dict[str, Change]] = {

@@ -85,7 +85,8 @@ def places(scan: Drawn) -> Array:
     pivot = np.array([t["dO_x"], SOD + t["dO_z"], t["dO_y"]]) + tau
     out = []
     for i, angle in enumerate(scan.angles):
-        balls = scan.beads @ scan.lean.T
+        mean = scan.beads.mean(axis=0)
+        balls = mean + (scan.beads - mean) @ scan.lean.T
         if scan.later is not None and i >= scan.later[0]:
             balls = balls @ scan.later[1].T + scan.later[2]
         turn = about(np.array([0, 0, 1.0]), -(angle + t["alpha"]))

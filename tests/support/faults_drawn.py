@@ -324,6 +324,14 @@ def phantom(rng: Rng, beads: int) -> Array:
             return out
 
 
+def reshaped(beads: Array, change: Array) -> Array:
+    """Map balls, (k, 3), by a matrix (3, 3) that leaves their mean where the file has it: the
+    place of a phantom of another shape is that of its balls' mean.
+    """
+    mean = beads.mean(axis=0)
+    return np.asarray(mean + (beads - mean) @ change.T)
+
+
 @dataclass(frozen=True, eq=False)
 class Draft:
     """A scan that a fault may change before and after its shadows are made.
@@ -982,7 +990,7 @@ def _right(draft: Draft, rng: Rng) -> Draft:
     """
     draft = usual(draft, rng)
     change = (1.0 + 1e-3 * rng.normal()) * np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
-    world = replace(draft.world, beads=draft.world.beads @ change.T)
+    world = replace(draft.world, beads=reshaped(draft.world.beads, change))
     return replace(draft, world=world, silent=True,
                    names=("phantom_strained|priors_narrow",))  # fmt: skip
 
@@ -1030,7 +1038,7 @@ def _with_causes(moving: bool) -> Fault:
         np.fill_diagonal(change, stretch * rng.normal(size=3))
         change += (1.0 + stretch * rng.normal()) * np.eye(3)
         place = width(*BEAD_SHARES) * float(np.ptp(beads, axis=0).max())
-        beads = beads @ change.T + place * rng.normal(size=beads.shape)
+        beads = reshaped(beads, change) + place * rng.normal(size=beads.shape)
         arc = math.sqrt(min(width(ARC_WIDTH) * abs(rng.normal()), 1.0))
         bent = width(*PANEL_WIDTHS_PX) * rng.normal(size=16)
         gap = width(*GAP_WIDTHS_PX) * rng.normal(size=2)
@@ -1117,7 +1125,7 @@ def _strained(kind: str) -> Fault:
         change[i, j] += size
         if kind == "shear":
             change[1, 0] += size
-        world = replace(draft.world, beads=draft.world.beads @ change.T)
+        world = replace(draft.world, beads=reshaped(draft.world.beads, change))
         # What is within three sigmas of what is assumed of every phantom need not be said.
         return replace(draft, world=world, names=("phantom_strained|bead_tolerance",),
                        silent=abs(size) < 3e-3)  # fmt: skip

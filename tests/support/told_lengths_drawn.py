@@ -127,7 +127,7 @@ def drawn_told(
     rng = np.random.default_rng([seed, *kind.encode()])
     beads = _phantom(rng, int(rng.integers(6, 10)))
     radii = np.full(len(beads), rng.uniform(0.8, 1.2))
-    real = beads * (1.0 + strain * rng.normal())
+    real = beads + strain * rng.normal() * (beads - beads.mean(axis=0))
     sod, sdd = rng.uniform(500.0, 620.0), rng.uniform(950.0, 1100.0)
     true_sod, true_sdd, true_pixel = sod, sdd, PIXEL
     frames = int(rng.choice([24, 36, 48]))

@@ -134,6 +134,25 @@ class BeadModel:
         return len(self.beads)
 
     @property
+    def middle(self) -> FloatArray:
+        """Mean place of the beads, (3,) [mm]: the point of a phantom that is as its file says,
+        whatever its scale and its shape are.
+
+        No image shows another one, and the origin of a file is where somebody drew it.
+        """
+        return np.asarray(self.beads.mean(axis=0))
+
+    @property
+    def about_middle(self) -> FloatArray:
+        """Bead centres from their middle, (k, 3) [mm]."""
+        return np.asarray(self.beads - self.middle)
+
+    @property
+    def reach(self) -> float:
+        """Root mean square distance of the beads from their middle [mm]."""
+        return float(np.sqrt((self.about_middle**2).sum(axis=1).mean()))
+
+    @property
     def spreads(self) -> FloatArray:
         """Standard deviation of each bead's coordinates over their root mean square, (k,)."""
         stated = None if self.stated is None else self.stated.bead_mm

@@ -227,7 +227,8 @@ def test_the_joint_region_follows_its_bend() -> None:
     for seed in range(40):
         rng = np.random.default_rng([5, seed])
         truth = drawn(rng, 1.0, False)
-        strained = BEADS @ (np.eye(3) + 1e-3 * rng.normal(size=(3, 3))).T
+        about = BEADS - BEADS.mean(axis=0)
+        strained = BEADS + 1e-3 * about @ rng.normal(size=(3, 3)).T
         tracks = pixels(strained, ANGLES, SOD, truth)
         tracks += NOISE_PX * rng.normal(size=tracks.shape)
         found = estimate_geometry(

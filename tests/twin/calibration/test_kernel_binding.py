@@ -40,6 +40,7 @@ class Case:
     offsets: Offsets
     told: np.ndarray
     pivot: float
+    middle: np.ndarray
     beads: np.ndarray
     radius: np.ndarray
     measured: np.ndarray
@@ -71,7 +72,8 @@ def case(seed: int) -> Case:
     values[-1] = 1.0 + 0.1 * values[-1]
     case = Case(
         poses, Offsets(*values), 0.1 * rng.uniform(0.5, 1.0, COUNT - len(NAMES)),
-        float(seed % 2), rng.uniform(-30.0, 30.0, (BEADS, 3)),
+        float(seed % 2), np.random.default_rng([seed, 2]).uniform(-30.0, 30.0, 3),
+        rng.uniform(-30.0, 30.0, (BEADS, 3)),
         rng.uniform(20.0, 40.0, BEADS), np.empty(0), rng.uniform(0.2, 0.7, (FRAMES, BEADS, 3)),
         rng.normal(size=(FRAMES, BEADS, 2, 2)), np.array([0.7, -1.2]),
     )  # fmt: skip
@@ -111,7 +113,8 @@ def as_told(poses: Poses, told: dict[str, float]) -> Poses:
 def expected(case: Case, x: np.ndarray | None = None) -> np.ndarray:
     """Spots from the detector's centre [px], (frames, beads, 2), by way of `Poses.cone_vec`."""
     x = columns_of(case) if x is None else x
-    beads = x[COUNT:-2].reshape(-1, 3) * (1.0 + x[PARAMETERS.index("phantom")])
+    grown = 1.0 + x[PARAMETERS.index("phantom")]
+    beads = case.middle + grown * (x[COUNT:-2].reshape(-1, 3) - case.middle)
     cone = cone_of(case, x[:COUNT])
     rows, cols = SHAPE
     middle = np.array([(cols - 1) / 2, (rows - 1) / 2])
@@ -214,7 +217,7 @@ def check(kernels: object, want: Reference) -> None:
         jac = np.zeros((2 * FRAMES * BEADS, columns))
         hess, grad = np.zeros((columns, columns)), np.zeros(columns)
         data = fit_kernels.Data(
-            geometry, np.zeros(FRAMES, np.int64), case.pivot, case.radius,
+            geometry, np.zeros(FRAMES, np.int64), case.pivot, case.middle, case.radius,
             np.full((FRAMES, BEADS), BIAS), case.measured, case.whiten,
             np.arange(COUNT), np.arange(COUNT)[None], COUNT,
             case.terms,

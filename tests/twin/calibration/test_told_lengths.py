@@ -125,8 +125,8 @@ def test_a_lead_takes_part_of_the_scale_by_its_width() -> None:
     tracks = real.cone_vec().project_points(BEADS, (760, 956))
     for lead, scale in ((1e-3, 1e-3), (2e-3, 1e-3)):
         fit = estimate_geometry(
-            tracks, BEADS, told, ("dO_x", "dO_y", "dO_z"), shape=(760, 956),
-            priors={"travel_y": lead, "phantom": scale},
+            tracks, BEADS, told, ("dO_x", "dO_y", "dO_z", "tau_x", "tau_z"),
+            shape=(760, 956), priors={"travel_y": lead, "phantom": scale},
         )  # fmt: skip
         share = lead**2 / (lead**2 + scale**2)
         assert fit.values["travel_y"] == pytest.approx(2e-3 * share, rel=0.02)

@@ -286,6 +286,7 @@ class Data(NamedTuple):
             x and y, and the ways of axis and panel from their middles [mm]; see `SOURCE`.
         group: (n,) index of each frame's parameter set.
         pivot: 1.0 or 0.0, see the module.
+        middle: (3,) point of the phantom about which it grows [mm].
         radius: (k,) [mm].
         bias: (n, k) factor of the sphere-centre bias.
         measured: (n, k, 2) pixels from the detector's centre.
@@ -300,6 +301,7 @@ class Data(NamedTuple):
     geometry: FloatArray
     group: npt.NDArray[np.int64]
     pivot: float
+    middle: FloatArray
     radius: FloatArray
     bias: FloatArray
     measured: FloatArray
@@ -339,6 +341,7 @@ def evaluate(  # type: ignore[no-untyped-def]
         geometry,
         group,
         pivot,
+        middle,
         radius,
         bias,
         measured,
@@ -380,8 +383,10 @@ def evaluate(  # type: ignore[no-untyped-def]
             at[r] = _dot(rows[r], rows[2])
             for c in range(4):
                 now[r, c] = _dot(rows[r], columns[c])
-                if c < 3:
-                    now[r, c] *= grown
+            about = _dot(now[r], middle)
+            now[r, 3] -= (grown - 1.0) * about
+            for c in range(3):
+                now[r, c] *= grown
         own = 0
         for i in active:
             if want > 0 and colmap[group[f], i] >= 0:
@@ -395,10 +400,14 @@ def evaluate(  # type: ignore[no-untyped-def]
                         slope[own, r, c] = _dot(rows_slope[r], columns[c]) + _dot(
                             rows[r], columns_slope[c]
                         )
-                        if c < 3:
-                            slope[own, r, c] *= grown
-                            if i == PHANTOM:
-                                slope[own, r, c] = now[r, c] / grown
+                    about = _dot(slope[own, r], middle)
+                    slope[own, r, 3] -= (grown - 1.0) * about
+                    for c in range(3):
+                        slope[own, r, c] *= grown
+                        if i == PHANTOM:
+                            slope[own, r, c] = now[r, c] / grown
+                    if i == PHANTOM:
+                        slope[own, r, 3] = -_dot(slope[own, r], middle)
                 cols[own] = colmap[group[f], i]
                 own += 1
         if bead_col >= 0:

@@ -13,8 +13,6 @@ import math
 from collections.abc import Container, Iterable, Mapping
 from typing import Final, Literal
 
-import numpy as np
-
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.fit.problem import SIX, UNSTRAINED, Strain, require_names
 from flexdt.twin.calibration.fit.weak_directions import unit_of
@@ -145,7 +143,7 @@ def known_strain(
     stated = exact(free) if given == "none" else given or {}
     if all(stated.get(name) == 0.0 for name in OFFSETS if name not in free):
         return UNSTRAINED
-    reach = float(np.sqrt(np.mean(np.sum(model.beads**2, axis=1))))
+    reach = model.reach
     scale = stated.get(PHANTOM)
     if bead_tolerance_mm is None:
         tolerance = model.tolerance_mm or math.inf

@@ -386,6 +386,7 @@ class FitProblem:
             ),
             self.group,
             self.reading.pivot,
+            self.model.middle,
             self.model.bead_radius_mm,
             self.bias,
             self.measured,
@@ -403,8 +404,10 @@ class FitProblem:
 
     @cached_property
     def strain_basis(self) -> FloatArray:
-        """Displacement (3 k, 9) of the beads' coordinates [mm] by a unit of each strain."""
-        beads = self.model.beads
+        """Displacement (3 k, 9) of the beads' coordinates [mm] by a unit of each strain, which
+        leaves their middle where it is.
+        """
+        beads = self.model.about_middle
         out = np.zeros((len(beads), 3, len(STRAINS)))
         for i, term in enumerate(STRAINS):
             out[:, "xyz".index(term[0]), i] = beads[:, "xyz".index(term[1])]

@@ -459,8 +459,8 @@ def _turn_between(one: Likeness, other: Likeness) -> float:
 
 
 def _turned(model: BeadModel, turn: FloatArray) -> BeadModel:
-    """Return a model whose beads are turned about the origin."""
-    return replace(model, beads=model.beads @ turn.T)
+    """Return a model whose beads are turned about their middle."""
+    return replace(model, beads=model.middle + model.about_middle @ turn.T)
 
 
 def _taken(d: Detections, rows: npt.NDArray[np.int64]) -> Detections:

@@ -148,9 +148,6 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
     for name, width in moving.apart(_courses(search, model)).items():
         if width > 0.0 and name in at and at[name] not in model.widths:
             held[at[name]] = width
-    own = {name: math.sqrt(width) for name, width in widths.items()}
-    if strain.PLACE in at and (width := strain.place_width(own, table)) > 0.0:
-        held[at[strain.PLACE]] = width
     for group, width in held.items():
         model = search.with_open(model, further, group, width)
         further = search.further(model)
@@ -528,7 +525,6 @@ def _on(posterior: Posterior, columns: slice) -> list[Group]:
         (f, g)
         for f, g in posterior.best.widths
         if posterior.families[f].acts is Acts.COLUMNS
-        and posterior.name((f, g)) != strain.PLACE
         and columns.start
         <= int(np.min(np.asarray(posterior.families[f].places[g], dtype=np.intp)))
         < columns.stop
@@ -568,12 +564,7 @@ def _strain(search: Search, posterior: Posterior) -> tuple[FloatArray, FloatArra
         unit = float(search.products.units[f][g])
         parts.append(((f, g), slice(at, at + count), 1.0 / unit))
         at += count
-    shapes = [
-        p
-        for p in parts
-        if posterior.families[p[0][0]].cause == strain.NAME
-        and posterior.name(p[0]) != strain.PLACE
-    ]
+    shapes = [p for p in parts if posterior.families[p[0][0]].cause == strain.NAME]
     for (f, g), own, scale in shapes:
         family = posterior.families[f]
         rows = np.asarray(family.places[g], dtype=np.intp) - first

@@ -90,10 +90,6 @@ class Family:
         courses: (m, s, n, c) of each slope over the frames: the g = m p groups are each course
             with each of the slopes, in this order.
         widest: largest width of a weight [its own unit], (g,) or of all.
-        narrowest: smallest width of a weight [its own unit], of all: what is less is as
-            stated.
-        beside: causes of which one has to be in the best model, or what images leave open of
-            this one does not count; none: it always does.
         always: width that always holds, so that the group is no question; 0: it is one.
         root: (q, c) what each weight does to the q places of `Acts.COLUMNS`, where these do not
             change by themselves; None: each is one.
@@ -108,8 +104,6 @@ class Family:
     slopes: npt.NDArray[np.intp] | None = None
     courses: FloatArray | None = None
     widest: float | FloatArray = math.inf
-    narrowest: float = 0.0
-    beside: frozenset[str] = frozenset()
     always: float = 0.0
     root: FloatArray | None = None
 

@@ -248,7 +248,7 @@ class Linearised:
         moved_ = each[:, at].T.reshape(-1, n, 2 * k) * share
         own = self.columns[:, problem.layout.bead_columns]
         bead = own.T.reshape(3 * k, n, 2 * k)
-        grown = np.einsum("b,bnq->nq", problem.model.beads.ravel(), bead)
+        grown = np.einsum("b,bnq->nq", problem.model.about_middle.ravel(), bead)
         spots = np.zeros((2 * k, n, 2 * k))
         spots[np.arange(2 * k), :, np.arange(2 * k)] = share.T
         each_bead = bead.reshape(k, 3, n, 2 * k)

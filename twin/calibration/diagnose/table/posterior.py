@@ -308,8 +308,7 @@ class Search:
                 mean = solved.mean[own]
                 fresh = float(mean @ mean) / max(seen, 1e-6)
                 most = float(self.products.widest(f)[g]) ** 2
-                least = max(float(self.products.narrowest(f)[g]) ** 2, 1e-10 * noise2)
-                found[group] = min(max(fresh, least), most)
+                found[group] = min(max(fresh, 1e-10 * noise2), most)
                 at += count
             noise2 = (solved.rest + self.freedom * self.spread**2) / max(
                 self.table.count - told + self.freedom, 1.0
@@ -373,9 +372,7 @@ class Search:
             else:
                 gain -= 0.5 * count * np.log(np.maximum(1.0 - gained / left, 1e-9))
             widest = self.products.widest(f)[:, None]
-            narrowest = self.products.narrowest(f)[:, None]
-            stated = grid2 * noise2 < narrowest**2
-            gain = np.where(stated | (grid2 * noise2 > widest**2), OPEN_GAIN, gain)
+            gain = np.where(grid2 * noise2 > widest**2, OPEN_GAIN, gain)
             for chosen_f, chosen in groups:
                 if chosen_f == f:
                     gain[chosen] = OPEN_GAIN
@@ -502,12 +499,6 @@ class Search:
         solved = self.solve(widths, model.noise2, model.factor)
         return self._judged(widths, model.noise2, model.factor, solved)
 
-    def _may_count(self, family: int, model: Model) -> bool:
-        """Return whether what images leave open of a family counts beside a model."""
-        causes = self.products.families[family].beside
-        shown = {self.products.families[f].cause for f, _ in model.widths}
-        return not causes or bool(shown & causes)
-
     def mixture(
         self,
         model: Model,
@@ -535,8 +526,6 @@ class Search:
             mean = one.solved.mean[:count]
             covariance = one.solved.covariance[:count, :count]
             for f, more in some.items():
-                if not self._may_count(f, model):
-                    continue
                 chance = self.products.families[f].chances[:, None] - math.log(len(GRID))
                 weight = log_weight + more.gain + chance
                 for g, w in np.argwhere(weight > LEAST_LOG_WEIGHT).tolist():

@@ -40,10 +40,6 @@ class Products:
         """Return the largest width of each group, (g,), in units."""
         return np.asarray(self.families[family].widest * self.units[family])
 
-    def narrowest(self, family: int) -> FloatArray:
-        """Return the smallest width of each group, (g,), in units."""
-        return np.asarray(self.families[family].narrowest * self.units[family])
-
     def block(self, columns: FloatArray) -> int:
         """Take columns (2 n k, p) up, and return their number for `cross`."""
         self._blocks.append(columns)

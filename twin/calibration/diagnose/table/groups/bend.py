@@ -1,14 +1,19 @@
-"""Bend: the phantom is bent, twisted or warped, smoothly over its own size."""
+"""Bend: the phantom is bent, twisted or warped, smoothly over its own size.
+
+A bend leaves the mean of the beads where it is, and their mean turn about the axis: what it does
+beside that is tau, dO and alpha (see `strain`).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.table.group import (
     LOG_CHANCE,
@@ -17,7 +22,6 @@ from flexdt.twin.calibration.diagnose.table.group import (
     Found,
     Known,
 )
-from flexdt.twin.calibration.diagnose.table.groups import strain
 from flexdt.twin.calibration.diagnose.table.groups.bead_places import MOST_STRAINED
 from flexdt.twin.calibration.diagnose.table.groups.strain import WIDEST
 from flexdt.twin.calibration.diagnose.table.linearised import Linearised
@@ -26,10 +30,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 NAME: Final = "bend"
 WORDS: Final = "a bent phantom"
-KINDS: Final = 3 + 2
-"""Of bends, equally likely: everywhere, along an axis, and a twist about each."""
-OFF_ITS_FILE: Final = frozenset({strain.NAME, NAME})
-"""Causes of a phantom that is shown not to be as its file says: it may be bent besides."""
+KINDS: Final = 1 + 2 + 3
+"""Of bends, equally likely: everywhere, along an axis across, and a twist about each."""
 ROUNDING: Final = 1e-9
 """Part of a displacement's variance that keeps the displacements of near beads apart."""
 
@@ -38,45 +40,42 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make a phantom's bend: beads are displaced together, as they are near each other.
 
     The displacement is a normal process in space that is the same everywhere and in every
-    direction, or along one axis across the phantom's length; or a twist about some line. None
-    of them is about a point of the phantom that is known, so that its place is as open as its
-    bend is large. Weights are root mean squares of slopes; what is an affine map alone is
-    `strain`.
+    direction, or along one axis across the phantom's length; or a twist about some line. Weights
+    are root mean squares of slopes; what is an affine map alone is `strain`.
     """
     if known.bead_tolerance_mm == 0 or table.k <= MOST_STRAINED:
         return
-    stated = max(known.strain)
-    first = table.problem.layout.bead_columns.start
-    columns = first + np.arange(3 * table.k)
-    beads = table.problem.model.beads
-    smooth = _smooth(beads)
-    every = np.asarray(np.kron(smooth, np.eye(3)), dtype=np.float64)
-    yield _family(table, stated, (NAME,), [columns], every)
-    across = np.argsort(np.ptp(beads, axis=0))[:2]  # Bodies bend across their length.
-    along = tuple(f"{NAME} along {'xyz'[i]}" for i in across)
-    yield _family(
-        table, stated, along, [columns.reshape(-1, 3)[:, i] for i in across], smooth
-    )
-    for axis in "xyz":
-        yield _family(
-            table, stated, (f"twist about {axis}",), [columns], _twist(beads, axis)
-        )
+    model = table.problem.model
+    columns = table.problem.layout.bead_columns
+    places = np.arange(columns.start, columns.stop)
+    for name, fields in _kinds(model):
+        root = _without_place(model, fields)
+        yield Family(
+            NAME, (name,), Acts.COLUMNS, (places,), LOG_CHANCE - math.log(KINDS),
+            (table.columns[:, columns] @ root)[None], widest=WIDEST, root=root,
+        )  # fmt: skip
 
 
-def _family(
-    table: Linearised,
-    stated: float,
-    names: tuple[str, ...],
-    places: Sequence[npt.NDArray[np.intp]],
-    root: FloatArray,
-) -> Family:
-    """Make groups that displace beads' coordinates by a root, (q, c)."""
-    rows = np.stack([table.columns[:, own] @ root for own in places])
-    chance = LOG_CHANCE - math.log(KINDS * len(names))
-    return Family(
-        NAME, names, Acts.COLUMNS, tuple(places), chance, rows, widest=WIDEST,
-        narrowest=stated, beside=OFF_ITS_FILE, root=root,
-    )  # fmt: skip
+def _kinds(model: BeadModel) -> Iterator[tuple[str, npt.NDArray[np.floating]]]:
+    """Yield each bend's name and displacements, (3 k, c)."""
+    smooth = _smooth(model.beads)
+    axes = np.eye(3)
+    yield NAME, np.kron(smooth, axes)
+    # Bodies bend across their length.
+    for i in np.argsort(np.ptp(model.beads, axis=0))[:2]:
+        yield f"{NAME} along {'xyz'[i]}", np.kron(smooth, axes[:, i : i + 1])
+    for i, axis in enumerate(axes):
+        yield f"twist about {'xyz'[i]}", _twist(model, axis)
+
+
+def _without_place(model: BeadModel, fields: npt.NDArray[np.floating]) -> FloatArray:
+    """Take what moves all beads together, and turns them about the axis, out of displacements
+    (3 k, c).
+    """
+    turned = np.cross([0.0, 0.0, 1.0], model.about_middle)
+    whole = np.column_stack([np.tile(np.eye(3), (len(model), 1)), turned.ravel()])
+    basis, _ = np.linalg.qr(whole)
+    return np.asarray(fields - basis @ (basis.T @ fields))
 
 
 def _smooth(beads: FloatArray) -> FloatArray:
@@ -89,20 +88,13 @@ def _smooth(beads: FloatArray) -> FloatArray:
     return np.asarray(size * np.linalg.cholesky(kernel))
 
 
-def _twist(beads: FloatArray, axis: str) -> FloatArray:
-    """Compute displacements of the beads [mm] by a twist about an axis, and by where its line
-    and its rest are, which are like beads, (3 k, 5): slopes of 1 at their usual distance.
+def _twist(model: BeadModel, axis: FloatArray) -> FloatArray:
+    """Compute displacements of the beads [mm] by a twist about an axis through their middle,
+    (3 k, 1): slopes of 1 at their usual distance. About another line it is this and a shear.
     """
-    along = np.eye(3)["xyz".index(axis)]
-    usual = math.sqrt(float((beads**2).sum(axis=1).mean()))
-    aside = np.delete(np.eye(3), "xyz".index(axis), axis=0)
-    at = beads @ along
-    fields = [
-        at[:, None] * np.cross(along, beads) / usual,
-        *(at[:, None] * one for one in aside),
-        *(usual * np.ones_like(beads) * one for one in aside),
-    ]
-    return np.stack([field.ravel() for field in fields], axis=1)
+    beads = model.about_middle
+    field = (beads @ axis)[:, None] * np.cross(axis, beads) / model.reach
+    return np.asarray(field.reshape(-1, 1))
 
 
 def told(found: Found) -> list[Finding]:

@@ -148,8 +148,8 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             yield _family(table, moves, where, courses, chance)
     if many:
         group = table.problem.group
-        apart_ = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
-        apart_ -= np.bincount(group) / len(group)
+        differs = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
+        differs -= np.bincount(group) / len(group)
         own = {n.split("@")[0] for n in table.problem.layout.names if "@" in n}
         # Of scans that stand apart, what is elsewhere along an axis is the place, as wide as
         # it is stated, unless it moves (`apart`): source or panel look alike, and each scan's
@@ -160,7 +160,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             still = [what != "alpha" and what[-1] in placed for what in names]
             yield _family(
                 table, [Moves(name, DIFFERS, -1) for name in names], "",
-                apart_[None], np.where(still, NEVER, LOG_CHANCE - math.log(KINDS)),
+                differs[None], np.where(still, NEVER, LOG_CHANCE - math.log(KINDS)),
             )  # fmt: skip
 
 

@@ -1,8 +1,12 @@
-"""Strain: the phantom has another shape than its file says."""
+"""Strain: the phantom has another shape than its file says, about the middle of its beads.
+
+A strain about another point is the same strain at another place. So the place of a phantom of
+another shape (tau, dO) is defined as that of its beads' mean, which images show and which does not
+depend on where the origin of its file is.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Final
 
@@ -11,7 +15,6 @@ import numpy as np
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.table.group import (
     LOG_CHANCE,
-    NEVER,
     Acts,
     Family,
     Found,
@@ -26,7 +29,6 @@ from flexdt.twin.geometry.told_lengths import PHANTOM
 NAME: Final = "strain"
 WORDS: Final = "a phantom of another shape"
 SHAPES: Final = ("stretch", "shear")
-PLACE: Final = "point of no strain"
 WIDEST: Final = 4e-2
 """Largest standard deviation of a strain: of a phantom that is another, more."""
 SIGNIFICANT: Final = 4.5
@@ -116,30 +118,6 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             NAME, (name,), Acts.COLUMNS, (part,), LOG_CHANCE, rows, widest=WIDEST,
             root=root,
         )  # fmt: skip
-    beads = np.arange(
-        table.problem.layout.bead_columns.start, table.problem.layout.bead_columns.stop
-    )
-    root = np.tile(np.eye(3), (table.k, 1))
-    yield Family(
-        NAME, (PLACE,), Acts.COLUMNS, (beads,), NEVER, (table.columns[:, beads] @ root)[None],
-        root=root,
-    )  # fmt: skip
-
-
-def place_width(widths: Mapping[str, float], table: Linearised) -> float:
-    """Compute the standard deviation of the place of a phantom that is strained beyond what is
-    stated [mm]; 0 if it is not.
-
-    No image shows about which of its points it is strained. Of a point like its beads, the
-    origin of its file is displaced by the strain times the point's distance.
-
-    Args:
-        widths: of the groups that are there, by name.
-        table: of the fit.
-    """
-    strained = max(widths.get(name, 0.0) for name in SHAPES)
-    beads = table.problem.model.beads
-    return strained * math.sqrt(float((beads**2).sum(axis=1).mean()))
 
 
 def _scale_share(table: Linearised, stretch: float) -> float:
