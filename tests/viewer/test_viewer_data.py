@@ -282,7 +282,7 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     read = re.compile(
         r"mm\s+(-?[\d.e-]{9,}) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)"
     )
-    page.locator("#volume-at", has_text=read).wait_for()
+    page.locator("#volume-at", has_text=read).wait_for(timeout=400_000)  # once compared
     exact = page.evaluate(
         "at => flexdt.call('viewer.voxel', { ...flexdt.volume().of, at })", [x, y, z]
     )

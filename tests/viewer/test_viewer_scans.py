@@ -246,6 +246,7 @@ def test_a_stop_during_a_scan_is_one_warning(
     page.locator("#warnings", has_text="Scan paused").wait_for()
     assert page.locator(".note.error").all_inner_texts() == []
     assert page.locator("#thumbs canvas").count() == 0  # no frame has been taken
+    assert page.locator("#thumb-card").is_hidden()
     page.click("#job-abort")
     wait(lambda: twin.job_status().state in ("aborted", "incomplete"))
 

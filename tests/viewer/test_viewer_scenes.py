@@ -209,12 +209,14 @@ def test_dragging_a_handle_moves_its_stage(
     box = with_handles(scene, twin, wait, "side")
     frame = box.bounding_box()
     before = twin.state().axes[axis].position
-    # An arrow begins at its stage's point. Side view: world y runs to the right, z up.
+    # An arrow begins at its stage's point; those of the detector point to the source. Side view:
+    # world y runs to the right, z up.
     point, camera = _handles(scene, twin)[stage], preset(scene, "side", frame)
     direction = np.array([0.0, 0.0, 1.0] if along == "z" else [0.0, 1.0, 0.0])
     sign = -1.0 if along == "y" else 1.0  # towards the source there is room
+    way = -direction if (stage, along) == ("detector", "y") else direction
     for reach in 3 * (1.0, 0.95, 0.9, 0.85):  # the ring, 0.65 wide, lies before the arrow
-        here = _on_screen(frame, camera, point + SIZE_M * reach * direction)
+        here = _on_screen(frame, camera, point + SIZE_M * reach * way)
         scene.mouse.move(*here)
         if held(box):
             break

@@ -19,6 +19,7 @@ on("scan", (fresh) => {
   const job = store.job;
   if (fresh) {
     $("#thumbs").textContent = "";
+    $("#thumb-card").hidden = true;
     steps = new Set();
     dataset = job ? folder(job) : "";
   }

@@ -23,6 +23,10 @@ from flexdt.twin.machine.description import Machine
 COORDINATES: Final = ("x", "y", "z")
 SIZE_M: Final = 0.16
 STAGES: Final = ("source", "object", "detector")
+TURNED: Final = {"detector": (0.0, 0.0, 0.0, 1.0)}
+"""Stage -> quaternion (w, x, y, z) of its handle at rest, where it is not along the world's axes:
+half a turn about z has the detector's arrows point to the source, within every view."""
+UPRIGHT: Final = (1.0, 0.0, 0.0, 0.0)
 
 Drag = Callable[[int | None, Mapping[str, float]], None]
 """Called with viser's client and the targets axis -> value."""
@@ -81,7 +85,7 @@ class Gizmos:
         if tuple(handle.control.position) != at:
             handle.control.position = at
         if handle.stage == "object":
-            handle.control.wxyz = (1.0, 0.0, 0.0, 0.0)
+            handle.control.wxyz = UPRIGHT
 
     def _add(self, server: viser.ViserServer, stage: str) -> _Handle:
         """Add the handle of a stage, with arrows for its motors.
@@ -103,6 +107,7 @@ class Gizmos:
             disable_rotations=not turns,
             depth_test=False,
             line_width=3.0,
+            wxyz=TURNED.get(stage, UPRIGHT),
         )
         handle = _Handle(stage, control)
 
