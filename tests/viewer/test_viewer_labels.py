@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
-from flexdt.clients.viewer.scenes.name_tags import laid_out, leader_end
+from flexdt.clients.viewer.scenes.name_tags import (
+    covered_by_page,
+    laid_out,
+    leader_end,
+)
 
 AREA = (520.0, 700.0)
+BOXES = """['', ' .tag', ' .home', ' .look', ' .inset'].map((part) => {
+  const box = document.querySelector(`.view[data-view=iso]${part}`).getBoundingClientRect();
+  return [box.left, box.top, box.right, box.bottom];
+})"""
 
 
 def crossing(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> bool:
@@ -29,8 +39,11 @@ def test_no_name_covers_another_or_leaves_the_picture(seed: int) -> None:
     middle, spread = rng.uniform(100, 420, 2), rng.uniform(5, 250)
     anchors = np.clip(rng.normal(middle, spread, (count, 2)), 1, np.array(AREA) - 1)
     sizes = np.column_stack([rng.uniform(30, 150, count), np.full(count, 22.0)])
-    corners = laid_out(anchors, sizes, AREA)
+    taken = rng.uniform(0, 500, (3, 1)) + [0.0, 0.0, 120.0, 40.0]
+    corners = laid_out(anchors, sizes, AREA, taken)
     assert not np.isnan(corners).any()
+    for (p, s), box in itertools.product(zip(corners, sizes, strict=True), taken):
+        assert (np.minimum(p + s, box[2:]) - np.maximum(p, box[:2])).min() <= 0.0
     for (p, s), (q, t) in itertools.combinations(zip(corners, sizes, strict=True), 2):
         over = np.minimum(p + s, q + t) - np.maximum(p, q)
         assert over.min() <= 0.0
@@ -59,6 +72,24 @@ def test_what_is_out_of_sight_has_no_name_and_a_full_picture_fewer() -> None:
     crowd = np.tile([60.0, 40.0], (30, 1)) + np.arange(30)[:, None] * 0.1
     placed = laid_out(crowd, np.tile([70.0, 22.0], (30, 1)), (200.0, 120.0))
     assert 2 <= (~np.isnan(placed[:, 0])).sum() < 30
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("size", [(390, 844), (820, 1180), (1366, 768)])
+def test_what_a_page_lays_over_a_view_is_where_no_name_is_put(
+    open_page: Callable[..., Any], size: tuple[int, int]
+) -> None:
+    page = open_page("iso", size)
+    page.wait_for_function("document.querySelector('.inset img').naturalWidth > 0")
+    view, *boxes = page.evaluate(BOXES)
+    width, height = view[2] - view[0], view[3] - view[1]
+    free = covered_by_page((width, height))
+    assert len(boxes) == 4
+    for box in boxes:
+        at = np.subtract(box, [*view[:2], *view[:2]])
+        over = np.minimum(at[2:], free[:, 2:]) - np.maximum(at[:2], free[:, :2])
+        assert (over >= at[2:] - at[:2] - 1.0).all(axis=1).any(), (box, free)
+    page.close()
 
 
 def test_a_leader_ends_at_its_box() -> None:

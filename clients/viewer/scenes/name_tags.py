@@ -33,25 +33,48 @@ PAD_PX = 10.0
 LEAST_PX = 260
 """Least width of a view with names [px]."""
 LEADER: Final = (40, 150, 235)
+NOTHING: Final = np.zeros((0, 4))
 Name = tuple[str, FloatArray]
 """Words, and the point (3,) that they name [m, world]."""
 
 
+def covered_by_page(area: tuple[float, float]) -> FloatArray:
+    """List the boxes (3, 4) of a view that the page lays over its picture: its title, its
+    buttons, and the sample close up; left, top, right, bottom [px].
+
+    As style.css places them (.view .tag, button, .inset).
+
+    >>> covered_by_page((600.0, 400.0))[2].tolist()
+    [458.0, 258.0, 590.0, 390.0]
+    """
+    width, height = area
+    side = max(84.0, min(0.33 * height, 0.46 * width))
+    return np.array([
+        [0.0, 0.0, 110.0, 38.0],
+        [width - 84.0, 0.0, width, 38.0],
+        [width - 10.0 - side, height - 10.0 - side, width - 10.0, height - 10.0],
+    ])  # fmt: skip
+
+
 def laid_out(
-    anchors: FloatArray, sizes: FloatArray, area: tuple[float, float]
+    anchors: FloatArray,
+    sizes: FloatArray,
+    area: tuple[float, float],
+    taken: FloatArray = NOTHING,
 ) -> FloatArray:
     """Place the names' boxes.
 
     From top to bottom, each near its point at a place that covers few others: a covered
     point weighs as much as four rings farther away. Then names are exchanged so that
     leaders do not cross. Places are on rings around a point
-    (`RINGS_PX`, `WAYS` directions), inside the area and `GAP_PX` from other boxes; nearer
+    (`RINGS_PX`, `WAYS` directions), inside the area, off `taken`, `GAP_PX` from other boxes; nearer
     and higher ones are preferred. All boxes are treated as large as the largest.
 
     Args:
         anchors: (n, 2) named points [px]; NaN or outside the picture: no name.
         sizes: (n, 2) widths and heights of the boxes [px].
         area: width and height of the picture [px].
+        taken: (m, 4) boxes where no name may be: left, top, right, bottom [px].
 
     Returns:
         Top left corners (n, 2) of the boxes [px]; NaN where a name has no room.
@@ -75,6 +98,8 @@ def laid_out(
         apart = (
             (np.abs(middles[:, None] - places) >= size + GAP_PX).any(axis=2).all(axis=1)
         )
+        low, high = middles[:, None] - 0.5 * size, middles[:, None] + 0.5 * size
+        apart &= ((high <= taken[:, :2]) | (low >= taken[:, 2:])).any(2).all(1)
         covered = (
             (np.abs(middles[:, None] - anchors) < 0.5 * size + GAP_PX)
             .all(axis=2)
@@ -188,7 +213,7 @@ class NameTags:
             [[PAD_PX + LETTER_PX * len(words), LINE_PX] for words, _ in names]
         )
         sizes = sizes.reshape(-1, 2)
-        corners = laid_out(anchors, sizes, area)
+        corners = laid_out(anchors, sizes, area, covered_by_page(area))
         there = np.flatnonzero(~np.isnan(corners[:, 0]))
 
         def in_space(places: FloatArray, k: int) -> FloatArray:
