@@ -925,13 +925,19 @@ def _row_offset(draft: Draft, rng: Rng) -> Draft:
 
 def _binned(draft: Draft, rng: Rng) -> Draft:
     """Change the pixels' true size to half or 1.6 times the stated one, and expect a
-    finding of beads' sizes, no beads, an implausible offset or a wrong radius.
+    finding of beads' sizes, no beads, an implausible offset, a wrong radius, or other pixels
+    (of 1.6 times the size without a usual reason, which would be another size).
     """
-    world = replace(draft.world, pixel=draft.world.pixel * float(rng.choice([0.5, 1.6])))
+    factor = float(rng.choice([0.5, 1.6]))
+    pixels = (
+        "(the pixels are half|[^:]*or other pixels)" if factor < 1 else "or other pixels"
+    )
     return replace(
         draft,
-        world=world,
-        names=("bead_size|no_beads|implausible_offset|wrong_phantom.*radius",),
+        world=replace(draft.world, pixel=draft.world.pixel * factor),
+        names=(
+            f"bead_size|no_beads|implausible_offset|wrong_phantom.*(radius|{pixels})",
+        ),
     )
 
 

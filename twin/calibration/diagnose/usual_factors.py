@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from typing import Final
 
 SAME_SCALE: Final = math.log(1.25)
-"""Logarithm of the ratio of two lengths that are the same in a nominal geometry, whose SOD may
+"""Logarithm of the ratio of two lengths that may be the same in a nominal geometry, whose SOD may
 be off by centimetres."""
+LIKELY_SCALE: Final = 0.5 * SAME_SCALE
+"""The same, of two that are likely to be: at half of what may be. So 1.6 is no 2."""
 OF_LENGTHS: Final[Mapping[float, str]] = {
     10.0: "lengths of the phantom's file are in cm, not in mm",
     25.4: "lengths of the phantom's file are in inches, not in mm",

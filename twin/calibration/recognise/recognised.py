@@ -20,6 +20,7 @@ from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.data import SOME_SPOTS, convincing
 from flexdt.twin.calibration.diagnose.usual_factors import (
+    LIKELY_SCALE,
     OF_LENGTHS,
     OF_RADII,
     SAME_SCALE,
@@ -190,7 +191,7 @@ def _of_scale(scale: float) -> str:
     """Name the usual reason for a scale; "" for one that a nominal geometry may have."""
     if abs(math.log(scale)) < SAME_SCALE:
         return ""
-    reason = usual_reason(scale, OF_LENGTHS)
+    reason = usual_reason(scale, OF_LENGTHS, LIKELY_SCALE)
     if reason:
         return f"{reason}; or it is another phantom of the same form"
     return "a phantom of another scale, or other pixels or distances"
@@ -248,7 +249,8 @@ def _of_other_size(
     if like is not None and abs(math.log(like.scale)) < SAME_SCALE:
         reason = usual_reason(ratio, OF_RADII)
         return reason or "the beads are where they should be, but of another size"
-    reason = usual_reason(ratio if like is None else like.scale, OF_LENGTHS)
+    scale = ratio if like is None else like.scale
+    reason = usual_reason(scale, OF_LENGTHS, LIKELY_SCALE)
     return f"another phantom, or {reason}" if reason else "another phantom"
 
 

@@ -160,7 +160,10 @@ class Linearised:
             self.weight[state.torn] = 0.0
         self.count = 2.0 * float((self.weight**2).sum())
         share = np.repeat(self.weight.ravel(), 2)
-        jacobian = problem.jacobian(x) * share[:, None]
+        # Of what stands still: beside frames that differ, a phantom that shrinks towards the
+        # source would look like these, in a linear table.
+        still, _ = moved(plain, replace(state, frames={}))
+        jacobian = still.jacobian(x) * share[:, None]
         self.columns = jacobian
         self.geometry = np.ascontiguousarray(jacobian[:, : self.parameters])
         taken = x - problem.start

@@ -57,7 +57,7 @@ JITTERS: Final = ("dO_x", "dO_y", "dO_z", "alpha")
 FOLLOWED: Final = ("dO_x", "dO_y", "dO_z", "alpha")
 """Parameters that are advised to differ between frames where something moves."""
 LEAST_FRAMES: Final = 3
-MOST_WAVES: Final = 24
+MOST_WAVES: Final = 120
 """Half waves in a scan, of a wander."""
 MOST_JUMPS: Final = 60
 """Frames before which a jump is looked for."""
@@ -101,7 +101,9 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         place = (np.arange(count) + 0.5) / count
         where = f" in scan {number + 1}" if many else ""
         waves = np.arange(1, min(count - 1, MOST_WAVES) + 1)
-        wander = np.cos(math.pi * place[:, None] * waves) / waves
+        # A random walk of as many steps: of slow waves this is their number.
+        steep = 2.0 * count / math.pi * np.sin(0.5 * math.pi * waves / count)
+        wander = np.cos(math.pi * place[:, None] * waves) / steep
         ramp = (place - 0.5)[:, None]
         # Of all half waves alike: frames by themselves, but for their mean.
         every = np.arange(1, count)
