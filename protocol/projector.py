@@ -365,6 +365,8 @@ class Health(f.Result):
     memory_limit: int
     memory_evictable: int | None = None
     """part of memory_used that is freed when needed"""
+    working: str | None = None
+    """what takes long now, such as a kernel that compiles"""
 
 
 PROJECTOR_METHODS: Final[Mapping[str, AnyMethod]] = {

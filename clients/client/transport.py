@@ -27,9 +27,14 @@ from flexdt.protocol import (
     Notification,
     ProtocolError,
     Role,
+    RpcError,
 )
+from flexdt.twin import long_work
 
 READ_BYTES: Final = 1 << 18
+PING: Final = "session.ping"
+ASK_AFTER_S: Final = 2.0
+"""Time without an answer after which a server is asked what it works at, and again [s]."""
 
 
 class ConnectionLost(ConnectionError):
@@ -298,13 +303,14 @@ class Link:
         Args:
             method: name of the method.
             params: its parameters by name.
-            timeout_s: time limit for the answer [s]; None for none.
+            timeout_s: longest silence [s]; None for any. A server that says in time that it
+                works at the request is waited for.
 
         Raises:
             RpcError: the server's answer is an error.
             ConnectionLost: the connection ended; `.sent` says whether the request had been
                 sent.
-            TimeoutError: no answer in time.
+            TimeoutError: no answer, and no sign of work, in time.
         """
         if not self.alive:
             raise ConnectionLost.of(self.calls, sent=False)
@@ -320,6 +326,8 @@ class Link:
                 except Exception:
                     sent = False
                     raise
+                if timeout_s is not None and method != PING:
+                    await self._while_worked_at(method, waiter, timeout_s, limit)
                 return (await waiter).result()
         except TimeoutError:
             if not limit.expired():
@@ -328,6 +336,44 @@ class Link:
         finally:
             self.calls.abandon(request, sent=sent)
             waiter.cancel()
+
+    async def _while_worked_at(
+        self,
+        method: str,
+        waiter: asyncio.Future[Answered[Any]],
+        timeout_s: float,
+        limit: asyncio.Timeout,
+    ) -> None:
+        """Wait for an answer; ask a server that is silent whether it works at the request, and
+        put off the limit whenever it says so. What takes long is shown as the work's name.
+
+        Args:
+            method: that was called.
+            waiter: of its answer.
+            timeout_s: by which the limit is put off [s].
+            limit: of the request.
+        """
+        loop = asyncio.get_running_loop()
+        with contextlib.ExitStack() as shown:
+            told = ""
+            while True:
+                await asyncio.wait([waiter], timeout=min(ASK_AFTER_S, 0.5 * timeout_s))
+                if waiter.done():
+                    return
+                try:
+                    pong = await self.request(PING, {}, timeout_s)
+                except (RpcError, ConnectionLost, TimeoutError):
+                    return
+                # Requests of a connection are worked at one after the other.
+                if not isinstance(pong, Mapping) or not pong.get("serving"):
+                    return
+                limit.reschedule(loop.time() + timeout_s)
+                if (what := pong.get("working")) and what != told:
+                    told = str(what)
+                    shown.close()
+                    shown.enter_context(
+                        long_work.during(f"waiting for {method}: the projector is {told}")
+                    )
 
     async def ended(self) -> None:
         """Wait until the connection has ended."""

@@ -112,6 +112,10 @@ class Pong(Result):
 
     time: float
     """the twin's clock [s]"""
+    serving: list[str] | None = None
+    """methods that this connection has called and that are being worked at"""
+    working: str | None = None
+    """what takes long now, such as kernels that compile"""
 
 
 SESSION_HELLO = read(

@@ -85,24 +85,32 @@ def _fit() -> None:
 
 
 def _reconstruction() -> None:
-    """Compile the kernels of FDK by reconstructing eight tiny views, and those of part
-    layout, truncation and warping by a call each.
+    """Compile the kernels of FDK by reconstructing eight tiny views, and that of warping by
+    a call.
     """
-    from flexdt.twin.projection.kernels import layout_kernels
     from flexdt.twin.reconstruction import fdk
-    from flexdt.twin.reconstruction.kernels import fdk_kernels, truncation_kernels
+    from flexdt.twin.reconstruction.kernels import fdk_kernels
 
     scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
     images = np.ones((8, 4, 6), np.float32)
     fdk(
         images, scan, Grid((2, 3, 4), 0.5).blank()
     )  # which go on beyond the panel's edges
-    layout_kernels.unfit_parts(images.reshape(-1).view(np.uint32))
+    fdk_kernels.warp(images, np.ones((8, 3, 3)), fdk_kernels.lanczos(), images.copy())
+
+
+def _truncation() -> None:
+    """Compile the fit of a prism to what a panel cuts off, and the search for parts that do
+    not fit into a layout, by a call each.
+    """
+    from flexdt.twin.projection.kernels import layout_kernels
+    from flexdt.twin.reconstruction.kernels import truncation_kernels
+
+    layout_kernels.unfit_parts(np.zeros(8, np.uint32))
     one = np.ones((1, 1))
     six = np.zeros(truncation_kernels.PARAMETERS)
     ray = np.ones((1, 1, 2))
     truncation_kernels.fit_prism(ray[0], ray, one, one, six - 1.0, six + 1.0, 1.0, six)
-    fdk_kernels.warp(images, np.ones((8, 3, 3)), fdk_kernels.lanczos(), images.copy())
 
 
 def _edges() -> None:
@@ -138,6 +146,10 @@ GROUPS: Final[dict[str, tuple[Callable[[], None], str]]] = {
     "edges in pixels": (_edges, "projection.kernels.within_kernels:triangles_within"),
     "smooth volumes": (_smooth, "projection.kernels.linear_kernels:spread_linear"),
     "FDK": (_reconstruction, "reconstruction.kernels.fdk_kernels:warp"),
+    "truncated panels": (
+        _truncation,
+        "reconstruction.kernels.truncation_kernels:fit_prism",
+    ),
 }
 """Group -> function that compiles it, and the entry point that it compiles last;
 the slowest first."""

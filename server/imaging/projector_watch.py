@@ -20,13 +20,21 @@ SILENT_S: Final = 1.2
 """Time after which a projector without an answer is reported [s]."""
 
 
+class Sign(Protocol):
+    """A projector's answer, as far as it is looked at."""
+
+    @property
+    def working(self) -> str | None:
+        """What takes it long now."""
+
+
 class Watched(Protocol):
     """A projector's client, as far as it is watched."""
 
     host: str
     port: int
 
-    async def health(self) -> object:
+    async def health(self) -> Sign:
         """Ask for the projector's load.
 
         Raises:
@@ -55,6 +63,12 @@ class ProjectorWatch:
     silent_s: float = SILENT_S
     problem: str | None = None
     _problems: dict[Watched, str | None] = field(default_factory=dict)
+    _working: dict[Watched, str | None] = field(default_factory=dict)
+
+    @property
+    def working(self) -> str | None:
+        """What took a projector long at its last answer, such as a kernel that compiles."""
+        return next(filter(None, self._working.values()), None)
 
     async def run(self) -> None:
         """Watch all projectors at once, until cancelled."""
@@ -85,13 +99,14 @@ class ProjectorWatch:
             client: of the projector.
         """
         answer = asyncio.ensure_future(client.health())
+        working = None
         try:
             if not (await asyncio.wait([answer], timeout=self.silent_s))[0]:
                 self._report(
                     client,
                     f"the projector at {client.host}:{client.port} does not answer",
                 )
-            await answer
+            working = (await answer).working
         except ProjectorUnavailable as error:
             self._report(client, str(error))
         except RpcError:  # an answer, too
@@ -99,6 +114,7 @@ class ProjectorWatch:
         else:
             self._report(client, None)
         finally:
+            self._working[client] = working
             answer.cancel()
 
     def _report(self, client: Watched, problem: str | None) -> None:

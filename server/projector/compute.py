@@ -10,18 +10,18 @@ is one client's batch work or one client's interactive work. A block is requeste
 one before it has been sent, and at most `MAX_IN_HAND` requests of a lane have results on
 their way: of a client that does not read no more than these is computed.
 
-`begin` sets the number of threads and compiles before the first request.
+`begin` sets the number of threads. Kernels compile when a request needs them for the first time
+on a machine; meanwhile `compiling` names them.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Final
@@ -30,9 +30,9 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.runtime.kernels import compile_ahead
+from flexdt.twin import long_work
+from flexdt.twin.long_work import Progress, Report
 from flexdt.twin.projection import Body, gpu, project_body
-from flexdt.twin.projection.analytic import warm_up_forward
 from flexdt.twin.projection.kernels.compiling import LOG
 from flexdt.twin.projection.pixel_areas import (
     Need,
@@ -42,8 +42,6 @@ from flexdt.twin.projection.pixel_areas import (
     rays_needed,
 )
 
-COMPILE_BACK_AFTER_S: Final = 60.0
-"""Delay before back projection is compiled [s], so that a first scan has all cores."""
 BLOCK_BYTES: Final = 12 * 2**20
 """Result of one turn of a job [bytes]: below a frame, and short enough to share the machine."""
 BLOCK_VIEWS: Final = 32
@@ -264,11 +262,7 @@ def views_a_block(shape: tuple[int, int]) -> int:
 
 
 def begin(threads: int) -> None:
-    """Set the thread count of this thread's kernels, and load or compile the projection
-    kernels; start the compilation of back projection.
-
-    The kernels of back projection, which few clients need, are compiled later from a
-    thread of their own.
+    """Set the thread count of this thread's kernels, and note from now on what compiles.
 
     Args:
         threads: of the kernels.
@@ -277,21 +271,31 @@ def begin(threads: int) -> None:
         ValueError: more threads than numba was started with.
     """
     numba.set_num_threads(threads)
-    LOG.setLevel(logging.ERROR)  # the supervisor reports the wait
-    warm_up_forward()
-    threading.Thread(
-        target=_compile_back, name="projector-compiling", daemon=True
-    ).start()
+    LOG.setLevel(logging.ERROR)  # whoever waits is told by `compiling`
+    long_work.during = _noted
 
 
-def _compile_back() -> None:
-    """Wait `COMPILE_BACK_AFTER_S`, then compile the back projection in another process at
-    low priority, unless it is compiled already.
-    """
-    time.sleep(COMPILE_BACK_AFTER_S)
-    os.nice(10)  # Linux: of this thread, and of the process that it starts
-    if not compile_ahead.is_compiled("back projection"):
-        compile_ahead.elsewhere("back projection")
+_COMPILING: Final[list[str]] = []
+"""Names of the works that compile now."""
+
+
+def compiling() -> str | None:
+    """Say which kernel compiles now; None where none does."""
+    return f"{_COMPILING[-1]}, once on this machine" if _COMPILING else None
+
+
+@contextmanager
+def _noted(what: str, progress: Progress = None) -> Iterator[Report]:
+    """Note work that compiles while it goes on; shows nothing."""
+    if not what.startswith(long_work.COMPILING):
+        with long_work.unseen(what, progress) as report:
+            yield report
+        return
+    _COMPILING.append(what)
+    try:
+        yield long_work.ignore
+    finally:
+        _COMPILING.remove(what)
 
 
 def backend() -> str:

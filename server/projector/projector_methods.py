@@ -28,6 +28,7 @@ from flexdt.protocol.rpc_errors import cancelled, invalid_params, too_large
 from flexdt.server.projector.compute import (
     ComputeJob,
     Step,
+    compiling,
     marking_steps,
     projection_steps,
     views_a_block,
@@ -331,8 +332,8 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
     """Return figures about the server as a dict, by the names of the wire.
 
     They are instance, version, backend and threads, uptime [s], clients, waiting, views,
-    superseded, volumes, and memory used, allowed and evictable [bytes]. `client`, `id`
-    and `p` are ignored.
+    superseded, volumes, memory used, allowed and evictable [bytes], and the kernel that
+    compiles. `client`, `id` and `p` are ignored.
 
     Args:
         context: of the server.
@@ -353,6 +354,7 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
         "memory_used": context.store.used,
         "memory_limit": context.store.limit,
         "memory_evictable": context.store.evictable,
+        "working": compiling(),
     }
 
 

@@ -62,6 +62,8 @@ class TwinSession:
         client = self._client
         twin.control.heard(client.name)
         REQUESTER.set(self._requester)
+        client.serving.append(method.name)
+        twin.in_service += 1
         try:
             if method.control:
                 self._take_control(method.name)
@@ -78,6 +80,9 @@ class TwinSession:
             if is_user_error(error):
                 raise explain(error, twin.root) from None
             raise
+        finally:
+            client.serving.remove(method.name)
+            twin.in_service -= 1
 
     def close(self) -> None:
         """End the session of a closed connection: drop its subscriptions, release its

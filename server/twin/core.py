@@ -198,6 +198,9 @@ class TwinServer:
             watch.
     """
 
+    in_service = 0
+    """Number of calls that are being worked at."""
+
     def __init__(
         self,
         machine: Machine,
@@ -344,7 +347,7 @@ class TwinServer:
         )
         self.projector_watch = projector_watch
         if projector_watch is not None:
-            projector_watch.asks = lambda: self.hub.wanted("state")
+            projector_watch.asks = lambda: self.in_service > 0 or self.hub.wanted("state")
             projector_watch.changed = self.feed.changed
         self.failed = asyncio.Event()
         """Set when a part of the twin has failed for good; the process should end."""

@@ -6,6 +6,7 @@ import asyncio
 import random
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Literal
 
 import pytest
@@ -26,8 +27,9 @@ class Standin:
     how: How = "answers"
     host: str = "lab"
     asked: int = 0
+    working: str | None = None
 
-    async def health(self) -> object:
+    async def health(self) -> SimpleNamespace:
         self.asked += 1
         while self.how == "hangs":
             await asyncio.sleep(0.05)
@@ -37,7 +39,7 @@ class Standin:
             )
         if self.how == "errs":
             raise RpcError(Code.INTERNAL, "no figures")
-        return {}
+        return SimpleNamespace(working=self.working)
 
 
 def watched(
@@ -68,6 +70,24 @@ def test_two_seconds_later_the_problem_is_that_of_the_projectors(seed: int) -> N
             assert (watch.problem is not None) == dead, [client.how for client in clients]
             if dead:
                 assert "lab:0" in str(watch.problem)
+
+    watched(clients, story)
+
+
+def test_what_takes_any_projector_long_is_known_while_it_says_so() -> None:
+    clients = [Standin(0), Standin(1)]
+
+    async def story(watch: ProjectorWatch) -> None:
+        for client in clients:
+            client.working = f"compiling kernel {client.port}"
+            await asyncio.sleep(1.0)
+            assert watch.working == client.working
+            if client.port:
+                client.how = "refuses"
+            else:
+                client.working = None
+            await asyncio.sleep(1.0)
+            assert watch.working is None
 
     watched(clients, story)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import copy
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias, TypeVar
 
 from flexdt.protocol import Method
@@ -47,10 +47,12 @@ class Client:
     Attributes:
         peer: where events go; its name is the connection's.
         program: the client's own name.
+        serving: methods that it has called and that are being worked at.
     """
 
     peer: Peer
     program: str = ""
+    serving: list[str] = field(default_factory=list)
 
     @property
     def name(self) -> str:

@@ -93,8 +93,13 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlRes
 
 @answers(p.SESSION_PING)
 def ping(twin: TwinServer, client: Client, params: Empty) -> p.Pong:
-    """Return a sign of life."""
-    return p.Pong(time=twin.clock.now())
+    """Return a sign of life, and what is being worked at for the client."""
+    watch = twin.projector_watch
+    return p.Pong(
+        time=twin.clock.now(),
+        serving=[name for name in client.serving if name != p.SESSION_PING.name],
+        working=None if watch is None else watch.working,
+    )
 
 
 @answers(p.STATE_GET)

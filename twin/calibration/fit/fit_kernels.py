@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import FloatArray
-from flexdt.twin.projection.kernels.compiling import linked, serial
+from flexdt.twin.projection.kernels.compiling import maker, serial
 
 OFFSETS = 17
 PARAMETERS = 28
@@ -63,30 +63,30 @@ IMAGINARY_STEP = 1e-30
 """Imaginary part of a parameter for its derivative: its square is negligible."""
 
 
-@linked(forceinline=True)
+@maker(forceinline=True)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@linked(forceinline=True)
+@maker(forceinline=True)
 def _cross(a, b):  # type: ignore[no-untyped-def]
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@linked(forceinline=True)
+@maker(forceinline=True)
 def _wave(angle):  # type: ignore[no-untyped-def]
     """Return cosine and sine of an angle with a small imaginary part."""
     c, s = math.cos(angle.real), math.sin(angle.real)
     return complex(c, -s * angle.imag), complex(s, c * angle.imag)
 
 
-@linked(forceinline=True)
+@maker(forceinline=True)
 def _unit(a):  # type: ignore[no-untyped-def]
     scale = 1.0 / cmath.sqrt(_dot(a, a))
     return a[0] * scale, a[1] * scale, a[2] * scale
 
 
-@linked
+@maker
 def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
     """Turn `vector` (x, y, z) about the direction `axis`, of any length, by `angle`
     [rad], right-handed (Rodrigues); returns a tuple of three complex numbers.
@@ -102,7 +102,15 @@ def _turned(vector, axis, angle):  # type: ignore[no-untyped-def]
     )
 
 
-@linked
+@maker
+def _clear(table):  # type: ignore[no-untyped-def]
+    """Set all elements of a table (m, n) to 0."""
+    for r in range(table.shape[0]):
+        for c in range(table.shape[1]):
+            table[r, c] = 0.0
+
+
+@maker
 def panel_rows(p, geo, rows, steps):  # type: ignore[no-untyped-def]
     """Compute the rows of a frame, which take a place, from the source, to column, row and 1,
     times its depth [mm].
@@ -144,7 +152,7 @@ def panel_rows(p, geo, rows, steps):  # type: ignore[no-untyped-def]
             steps[r, c] = step[c] * scale
 
 
-@linked
+@maker
 def object_columns(p, geo, pivot, columns):  # type: ignore[no-untyped-def]
     """Compute the columns of a frame: a bead (x, y, z, 1) is at the sum of their products,
     from the source [mm].
@@ -177,7 +185,7 @@ def object_columns(p, geo, pivot, columns):  # type: ignore[no-untyped-def]
             columns[c, a] = column[a]
 
 
-@linked
+@maker
 def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped-def]
     """Compute the derivatives of a frame's columns by a parameter.
 
@@ -187,7 +195,7 @@ def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped
         columns: (4, 3) of it.
         slopes: (4, 3) written.
     """
-    slopes[:] = 0.0
+    _clear(slopes)
     x, y, z = columns[0], columns[1], columns[2]
     bx, by = geo[MOUNT] - p[TAU_X], geo[MOUNT + 1] - p[TAU_Z]
     if i == DO_X:
@@ -201,10 +209,12 @@ def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped
     elif i == DS_Y:
         slopes[3, 2] = -1.0
     elif i == TAU_X:
-        slopes[3] = -x
+        for a in range(3):
+            slopes[3, a] = -x[a]
         slopes[3, 0] += pivot
     elif i == TAU_Z:
-        slopes[3] = -y
+        for a in range(3):
+            slopes[3, a] = -y[a]
         slopes[3, 1] += pivot
     elif i in (ALPHA, ANGLE_SCALE):
         amount = 1.0
@@ -237,18 +247,19 @@ def object_slopes(i, p, geo, pivot, columns, slopes):  # type: ignore[no-untyped
             slopes[3, a] = slopes[0, a] * bx + slopes[1, a] * by
 
 
-@linked
-def panel_slopes(i, p, geo, steps, rows, slopes):  # type: ignore[no-untyped-def]
+@maker
+def panel_slopes(i, p, geo, steps, rows, turned_steps, slopes):  # type: ignore[no-untyped-def]
     """Compute the derivatives of a frame's rows by a parameter.
 
     Args:
         i: number of the parameter.
-        p, geo: as of `panel_rows`.
+        p, geo: as of `panel_rows`; p is the same again afterwards.
         steps: (2, 3) of it, real.
         rows: (3, 3) complex, for intermediate results.
+        turned_steps: (2, 3) likewise.
         slopes: (3, 3) written.
     """
-    slopes[:] = 0.0
+    _clear(slopes)
     away = 0.0, 0.0, 0.0  # how the panel's centre moves from the source
     if i == DD_X:
         away = 1.0, 0.0, 0.0
@@ -267,10 +278,14 @@ def panel_slopes(i, p, geo, steps, rows, slopes):  # type: ignore[no-untyped-def
     elif i == PANEL_TRAVEL + 2:
         away = 0.0, geo[PANEL_WAY + 1].real, 0.0
     elif i in (ROLL, PITCH, YAW, PIXEL):
-        turned = p.copy()
+        turned = p
+        value = turned[i]
         turned[i] += IMAGINARY_STEP * 1j
-        panel_rows(turned, geo, rows, np.empty((2, 3), np.complex128))
-        slopes[:] = rows.imag / IMAGINARY_STEP
+        panel_rows(turned, geo, rows, turned_steps)
+        turned[i] = value
+        for r in range(3):
+            for c in range(3):
+                slopes[r, c] = rows[r, c].imag / IMAGINARY_STEP
         return
     across, along = _cross(steps[1], away), _cross(away, steps[0])
     for c in range(3):
@@ -312,7 +327,7 @@ class Data(NamedTuple):
     terms: FloatArray
 
 
-@serial
+@serial(error_model="numpy")
 def evaluate(  # type: ignore[no-untyped-def]
     data, params, beads, panel, use, huber, want, predicted, norms, jac, hess, grad
 ):
@@ -356,25 +371,30 @@ def evaluate(  # type: ignore[no-untyped-def]
     rows, rows_slope = np.zeros((3, 3)), np.zeros((3, 3))
     columns, columns_slope = np.zeros((4, 3)), np.zeros((4, 3))
     steps = np.zeros((2, 3))
-    turned, turned_steps = (
-        np.zeros((3, 3), np.complex128),
-        np.zeros((2, 3), np.complex128),
-    )
+    complex_values = np.zeros(PARAMETERS, np.complex128)
+    complex_geo = np.zeros(GEOMETRY, np.complex128)
+    turned = np.zeros((3, 3), np.complex128)
+    turned_steps = np.zeros((2, 3), np.complex128)
     now, at = np.zeros((3, 4)), np.zeros(3)
     slope, slide = np.zeros((most, 3, 4)), np.zeros((most, 3))
     cols = np.empty(most + len(panel), np.int64)
     da, db = np.empty(len(cols)), np.empty(len(cols))
     total = 0.0
-    hess[:] = 0.0
-    grad[:] = 0.0
+    _clear(hess)
+    for i in range(len(grad)):
+        grad[i] = 0.0
     for f in range(n_frames):
         values, geo = params[group[f]], geometry[f]
-        complex_values, complex_geo = (
-            values.astype(np.complex128),
-            geo.astype(np.complex128),
-        )
+        for i in range(PARAMETERS):
+            complex_values[i] = values[i]
+        for i in range(GEOMETRY):
+            complex_geo[i] = geo[i]
         panel_rows(complex_values, complex_geo, turned, turned_steps)
-        rows[:], steps[:] = turned.real, turned_steps.real
+        for c in range(3):
+            for r in range(3):
+                rows[r, c] = turned[r, c].real
+            for r in range(2):
+                steps[r, c] = turned_steps[r, c].real
         object_columns(values, geo, pivot, columns)
         grown = 1.0 + values[PHANTOM]
         for r in range(3):
@@ -391,7 +411,15 @@ def evaluate(  # type: ignore[no-untyped-def]
         for i in active:
             if want > 0 and colmap[group[f], i] >= 0:
                 object_slopes(i, values, geo, pivot, columns, columns_slope)
-                panel_slopes(i, complex_values, complex_geo, steps, turned, rows_slope)
+                panel_slopes(
+                    i,
+                    complex_values,
+                    complex_geo,
+                    steps,
+                    turned,
+                    turned_steps,
+                    rows_slope,
+                )
                 for r in range(3):
                     slide[own, r] = _dot(rows_slope[r], rows[2]) + _dot(
                         rows[r], rows_slope[2]
@@ -411,12 +439,13 @@ def evaluate(  # type: ignore[no-untyped-def]
                 cols[own] = colmap[group[f], i]
                 own += 1
         if bead_col >= 0:
-            slope[own : own + 3] = 0.0
-            slide[own : own + 3] = 0.0
             for i in range(3):
-                # A bead's x changes its place by the column of x, wherever it is: a slope of
-                # the constant.
-                slope[own + i, :, 3] = now[:, i]
+                _clear(slope[own + i])
+                for r in range(3):
+                    slide[own + i, r] = 0.0
+                    # A bead's x changes its place by the column of x, wherever it is: a slope
+                    # of the constant.
+                    slope[own + i, r, 3] = now[r, i]
         for k in range(n_beads):
             x, y, z = beads[k]
             depth = now[2, 0] * x + now[2, 1] * y + now[2, 2] * z + now[2, 3]

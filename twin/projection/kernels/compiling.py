@@ -18,6 +18,7 @@ has none of its parent's threads. The look is part of the compiled code: one ker
 from __future__ import annotations
 
 import ctypes
+import gc
 import hashlib
 import inspect
 import logging
@@ -36,8 +37,9 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, CompileResult
+from numba.core.compiler import Compiler, CompileResult, Flags
 from numba.core.serialize import dumps
+from numba.core.targetconfig import TargetConfig
 from numba.extending import intrinsic
 
 from flexdt.twin import kernel_store, kernel_threads, long_work
@@ -127,13 +129,60 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
         ).value
 
 
+def _same_flags(one: Flags, other: object) -> bool:
+    """Compare as numba does, but only the options that either has set."""
+    if not isinstance(other, Flags):
+        return NotImplemented
+    set_here, set_there = one._values, other._values
+    return bool(set_here == set_there) or all(
+        getattr(one, name) == getattr(other, name) for name in {*set_here, *set_there}
+    )
+
+
+FLAGS_HASH = hash(tuple(sorted(Flags.options)))
+"""What numba computes as the hash of any flags, anew each time."""
+
+
 @contextmanager
-def _linking(codegen: Any) -> Iterator[None]:
+def _quick_flags() -> Iterator[None]:
+    """Compare and hash flags quickly within the context, with numba's own results: a tenth of
+    the time that kernels compile goes there, as the caches of types ask.
+    """
+    numbas = TargetConfig.__eq__, TargetConfig.__hash__
+    Flags.__eq__ = _same_flags
+    Flags.__hash__ = lambda flags: FLAGS_HASH
+    try:
+        yield
+    finally:
+        Flags.__eq__, Flags.__hash__ = numbas
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Collect no cycles within the context: among millions of objects that live until the
+    kernel is compiled there are none worth the time.
+    """
+    collected = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collected:
+            gc.enable()
+
+
+@contextmanager
+def _linking(context: Any) -> Iterator[None]:
     """Link all libraries made within the context to one another; within another such
     context this one changes nothing.
 
-    The global of an environment is set only where the engine has it already.
+    The global of an environment is set only where the engine has it already. Functions that are
+    linked get no wrapper for callers in C.
+
+    Args:
+        context: numba's target.
     """
+    codegen = context.codegen()
     if "_library_class" in vars(codegen):
         yield
         return
@@ -144,15 +193,17 @@ def _linking(codegen: Any) -> Iterator[None]:
 
     codegen._library_class = _LinkedLibrary
     codegen.set_env = set_env
+    context.create_cfunc_wrapper = lambda *args: None
     try:
-        yield
+        with _quick_flags(), _uncollected():
+            yield
     finally:
-        del codegen._library_class, codegen.set_env
+        del codegen._library_class, codegen.set_env, context.create_cfunc_wrapper
 
 
 class _Linked(Compiler):  # type: ignore[misc]
     def _compile_core(self) -> Any:
-        with _linking(self.state.targetctx.codegen()):
+        with _linking(self.state.targetctx):
             return super()._compile_core()
 
 

@@ -325,7 +325,8 @@ def _entry_points(key: int):  # type: ignore[no-untyped-def]
                 )
                 for job in range(units[unit, 0], units[unit, 1]):
                     view, first, last = jobs[job]
-                    g[:] = views[view]
+                    for i in range(12):
+                        g[i] = views[view, i]
                     g[2] -= low  # the source, seen from the piece
                     work_on(
                         piece,

@@ -240,7 +240,8 @@ def spread_rays(box, views, chosen, values, slices, marks, first_column, last_co
         for column in range(first_column, last_column):
             view = chosen[column // cols]
             c = column % cols
-            g[:] = views[view]
+            for i in range(12):
+                g[i] = views[view, i]
             g[2] -= z0
             for r in range(rows):
                 if values[view, r, c] != np.float32(0):

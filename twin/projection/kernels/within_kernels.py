@@ -494,7 +494,8 @@ def mark_block(
     # Along a curve on which each square's quarters follow one another: a square that needs no
     # rays is passed over, of others the quarters are next, and of cells the pixels. Squares
     # before them are done.
-    k, size = 0, BLOCK
+    # Not literals, for which `bends` would be compiled a second time.
+    k, size = np.int64(0), np.int64(BLOCK)
     while k < BLOCK * BLOCK:
         i, j = top + odd_bits(k >> 1), left + odd_bits(k)
         half = 0.5 * (size - 1)
@@ -511,7 +512,7 @@ def mark_block(
             cell_ranges(curved, near, few, room, g, i, j, weight, error, lane)
             mark_cell(i, j, r0, r1, c0, c1, lane, filled, error, counts, marks)
         k += size * size
-        size = CELL
+        size = np.int64(CELL)
         while k % (4 * size * size) == 0 and size < BLOCK:
             size *= 2
 

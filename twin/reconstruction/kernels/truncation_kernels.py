@@ -220,7 +220,7 @@ def continue_rows(
         high = np.float32(up[view, r])
         part = share[r]
         other = cols - edge
-        low = _edge_mean(line, before, 0, edge, lower, upper, part, flat, high)
+        low = _edge_mean(line, before, np.int64(0), edge, lower, upper, part, flat, high)
         top = _edge_mean(line, before, other, cols, lower, upper, part, flat, high)
         row = out[view, r]
         weights = factors[view]
@@ -246,7 +246,7 @@ def continue_rows(
                 inside[c] = line[c]
         _continue_side(
             row[after:wide],
-            (0, end - after),
+            (np.int64(0), end - after),
             lower[after:],
             upper[after:],
             part,
@@ -478,7 +478,8 @@ def fit_prism(source, rays, length, seen, least, most, scale, x):
             other = _cost(trial, source, rays, length, seen, scale)
         if other < cost:
             gain = cost - other
-            x[:] = trial
+            for a in range(PARAMETERS):
+                x[a] = trial[a]
             cost = other
             fresh = False
             # Towards Gauss and Newton's step after a fall, towards a short one down the slope
