@@ -19,7 +19,14 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import (
+    Callable,
+    Generator,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -33,7 +40,12 @@ import numpy as np
 import zarr
 
 from flexdt.extending import volume_writer
-from flexdt.library.reconstruction.reconstruct import ScanFrames, VolumeRequest
+from flexdt.library.reconstruction.reconstruct import (
+    ScanFrames,
+    VolumeRequest,
+    about_volume,
+)
+from flexdt.library.reconstruction.volume_formats import VoxelPlaces
 from flexdt.measuring import gpu
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -42,6 +54,7 @@ from flexdt.twin.projection import Grid
 from flexdt.twin.reconstruction import Truncation, fdk_parts
 
 Sink = Callable[[Float32Array], None]
+Places = Grid | VoxelPlaces
 CHUNK: Final = 64
 """Number of voxels along each side of a chunk."""
 ROWS: Final = 4 * CHUNK
@@ -68,7 +81,7 @@ def move(made: Path, path: Path) -> None:
     os.replace(made, path)
 
 
-def slabs(grid: Grid) -> list[tuple[int, int]]:
+def slabs(grid: Places) -> list[tuple[int, int]]:
     """List the layers (first, end) of each slab of a volume; a slab has a power of two of
     layers, the last one perhaps fewer.
 
@@ -82,7 +95,7 @@ def slabs(grid: Grid) -> list[tuple[int, int]]:
     return [(first, min(first + each, nz)) for first in range(0, nz, each)]
 
 
-def levels(grid: Grid) -> list[tuple[int, int, int]]:
+def levels(grid: Places) -> list[tuple[int, int, int]]:
     """List the shape (z, y, x) of each resolution, finest first, halved (rounded up) from
     one to the next, until all sides are at most `COARSEST` or a slab has no layer
     left.
@@ -96,7 +109,7 @@ def levels(grid: Grid) -> list[tuple[int, int, int]]:
     return shapes
 
 
-def create(path: Path, grid: Grid) -> Any:
+def create(path: Path, grid: Places) -> Any:
     """Create the group with its empty arrays, one for each resolution.
 
     An existing group is overwritten; all voxels are nan until written. Its metadata are
@@ -139,7 +152,7 @@ def create(path: Path, grid: Grid) -> Any:
     return group
 
 
-def put(group: Any, grid: Grid, slab: int, values: Float32Array) -> None:
+def put(group: Any, grid: Places, slab: int, values: Float32Array) -> None:
     """Write a slab of a volume into its store, at each resolution.
 
     Each level halves the values of the one before.
@@ -211,7 +224,7 @@ class VolumeFormat:
     """`.zarr` for flexdt (entry point `zarr`)."""
 
     @staticmethod
-    def write(part: Path, path: Path, grid: Grid) -> Iterator[Sink]:
+    def write(part: Path, path: Path, grid: VoxelPlaces) -> Iterator[Sink]:
         """Yield a function that takes the layers in order; at the end `part` is complete
         and becomes `path`.
 
@@ -220,9 +233,11 @@ class VolumeFormat:
         Args:
             part: temporary path.
             path: of the volume.
-            grid: of the volume.
+            grid: of the volume, and of what it is.
         """
         group = create(part, grid)
+        if grid.about:
+            group.attrs["about"] = dict(grid.about)
         todo = list(enumerate(slabs(grid)))
         held: list[Float32Array] = []
 
@@ -385,7 +400,7 @@ def fdk_on_workers(
         for done, on_device in enumerate(made, 1):
             kinds.add(on_device)
             tell(done, len(missing))
-    _finish(store, out, grid)
+    _finish(store, out, grid, about_volume(views, request))
     shutil.rmtree(home, ignore_errors=True)
     if len(kinds) > 1:
         return [
@@ -437,14 +452,15 @@ def same_version(made_by: str) -> None:
         )
 
 
-def _finish(store: Path, out: Path, grid: Grid) -> None:
+def _finish(store: Path, out: Path, grid: Grid, about: Mapping[str, str]) -> None:
     """Move a complete store to `out` if that is .zarr; else copy its finest volume into a
     file of the other format, slab by slab.
     """
     if out.suffix.lower() == ".zarr":
+        zarr.open_group(store, mode="r+").attrs["about"] = dict(about)
         move(store, out)
         return
     values = opened(store)["0"]
-    with volume_writer(out, grid) as write:
+    with volume_writer(out, grid, about) as write:
         for first, last in slabs(grid):
             write(values[first:last])

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import flexdt as fx
+from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_dataset
 from flexdt.library.reconstruction.volume_files import volume_writer
+from flexdt.twin.dataset.scan_settings import ScanSettings
 
 NEEDS = {".nii.gz": "nibabel", ".h5": "h5py"}
 ENDINGS = [".tif", ".nrrd", ".mha", ".nii.gz", ".h5"]
@@ -98,6 +101,68 @@ def test_slabs_one_after_the_other_are_the_whole(ending: str, tmp_path: Path) ->
         for first in (0, 2, 4):
             write(DATA[first : first + 2])
     assert_array_equal(fx.Volume.load(file).data, DATA)
+
+
+ABOUT = {"sample": "Größe 3: \n a = b; c", "software": "flexdt", "comment": 300 * "long "}
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_file_says_of_what_it_is(ending: str, tmp_path: Path) -> None:
+    """Readers of others find it; values and place come back in spite of it."""
+    if ending in NEEDS:
+        pytest.importorskip(NEEDS[ending], reason="the extra `io`")
+    file = tmp_path / f"v{ending}"
+    grid = fx.Grid(VOLUME.shape, 0.25, VOLUME.center_mm)
+    with volume_writer(file, grid, ABOUT) as write:
+        write(DATA)
+    back = fx.Volume.load(file)
+    assert_array_equal(back.data, DATA)
+    assert_allclose(back.center_mm, VOLUME.center_mm)
+    if ending == ".h5":
+        h5py = importlib.import_module("h5py")
+        with h5py.File(file) as held:
+            assert held["volume"].attrs["sample"] == ABOUT["sample"]
+    elif ending == ".nii.gz":
+        told = importlib.import_module("nibabel").load(file).header["descrip"]
+        assert bytes(told.item()).startswith(rb"Gr\xf6\xdfe 3: a = b; c; flexdt; long")
+    elif ending != ".tif":
+        head = file.read_bytes().partition(b"ElementDataFile")[0][:1800].decode("latin1")
+        assert r"Gr\xf6\xdfe 3: a = b; c" in head
+
+
+def test_a_reconstruction_says_whose_sample_it_is(tmp_path: Path) -> None:
+    scan = fx.ConeVec.circular(sod=100, sdd=200, angles=24, shape=(4, 9), pixel=1)
+    counts, flat = np.full((24, 4, 9), 500), np.full((4, 9), 1000)
+    data = fx.DataSet.from_arrays(counts, scan, flat=flat, name="tray 3")
+    data = replace(data, settings=ScanSettings(sample_name="bone 7", kV=90.0))
+    request = VolumeRequest("sirt", iterations=1)
+    reconstruct_dataset(data, tmp_path / "v.nrrd", request)
+    head = (tmp_path / "v.nrrd").read_bytes().partition(b"\n\n")[0].decode().splitlines()
+    told = dict(line.split(":=") for line in head if ":=" in line)
+    assert told.pop("software").startswith("flexdt ")
+    assert told == {
+        "sample": "bone 7",
+        "kV": "90",
+        "data_set": "tray 3",
+        "frames": "24",
+        "algorithm": "sirt",
+        "values": "attenuation [1/mm]",
+    }
+
+
+def test_imagej_sees_a_stack_with_its_scale(tmp_path: Path) -> None:
+    """By tifffile's reader of ImageJ's lines: layers, mm, the edges of a voxel."""
+    import tifffile
+
+    volume = fx.Volume(DATA, (0.25, 0.5, 0.125), (1.5, -2.0, 3.0))
+    volume.save(tmp_path / "v.tif")
+    with tifffile.TiffFile(tmp_path / "v.tif") as file:
+        told = file.imagej_metadata
+        x, y = (file.pages.first.tags[f"{k}Resolution"].value for k in "XY")
+        assert file.series[0].axes == "ZYX"
+    assert told is not None
+    assert (told["slices"], told["unit"], told["spacing"]) == (5, "mm", 0.125)
+    assert (x[1] / x[0], y[1] / y[0]) == pytest.approx((0.25, 0.5))
 
 
 def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
@@ -238,11 +303,12 @@ def places_by_definition(file: Path) -> tuple[list[float], list[float]]:
         import tifffile
 
         with tifffile.TiffFile(file) as held:
-            about = json.loads(held.pages[0].description)
+            lines = held.pages[0].description.splitlines()
+            about = json.loads(lines[-1].removeprefix("flexdt="))
             nz, (ny, nx) = len(held.pages), held.pages[0].shape
-            per_cm = [held.pages[0].tags[code].value for code in (282, 283)]
+            per_mm = [held.pages[0].tags[code].value for code in (282, 283)]
         steps = np.diag(np.broadcast_to(about["voxel_mm"], 3))
-        assert_allclose([10 * b / a for a, b in per_cm], np.diag(steps)[:2], rtol=1e-6)
+        assert_allclose([b / a for a, b in per_mm], np.diag(steps)[:2], rtol=1e-6)
         low = np.array(about["center_mm"]) - (np.array([nx, ny, nz]) - 1) / 2 * np.diag(
             steps
         )

@@ -18,6 +18,7 @@ from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 from typing import TYPE_CHECKING, Any, Final
@@ -511,6 +512,40 @@ def reconstruct_dataset(
     }
 
 
+def about_volume(views: ScanFrames, request: VolumeRequest) -> dict[str, str]:
+    """Say of what a volume is and how it was made, for the file: word -> one line.
+
+    Args:
+        views: the frames.
+        request: the volume.
+    """
+    data, used = views.dataset, views.dataset.settings
+    steps = [request.algorithm]
+    if request.algorithm == DEFAULT:
+        steps.append(f"window {request.ramp_window}")
+    if request.rings:
+        steps.append("rings subtracted")
+    for what, of in (
+        ("beam hardening", request.material),
+        ("scatter", request.scatter_correction),
+    ):
+        if of is not None:
+            names = (of,) if isinstance(of, str) else of
+            steps.append(f"corrected for {what} of {', '.join(names)}")
+    words = {
+        "sample": None if used is None else used.sample_name,
+        "owner": None if used is None else used.sample_owner,
+        "comment": None if used is None else used.comment,
+        "kV": None if used is None or used.kV is None else f"{used.kV:g}",
+        "data_set": data.name,
+        "frames": f"{len(views.indices)}",
+        "algorithm": ", ".join(steps),
+        "software": f"flexdt {version('flexdt')}",
+        "values": "attenuation [1/mm]",
+    }
+    return {word: line for word, line in words.items() if line}
+
+
 def _untold(done: float, total: float) -> None:
     """Ignore progress."""
 
@@ -563,7 +598,7 @@ def _reconstruct_in_process(
     _require_room_for_images(folder, plan, grid.bytes)
     with (
         _reading_once(task, plan, folder, tell) as (kept_images, work),
-        volume_writer(out, grid) as write,
+        volume_writer(out, grid, about_volume(task.views, task.request)) as write,
     ):
         views = _apply_corrections(replace(task.views, kept=kept_images), task.request)
         if not task.direct:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -38,7 +39,9 @@ NO_PLACE: Final = (
 
 
 @contextmanager
-def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
+def volume_writer(
+    path: Path, grid: Grid | VoxelPlaces, about: Mapping[str, str] | None = None
+) -> Iterator[Sink]:
     """Open `path` for a volume on `grid`, and yield the function that takes its slabs;
     the ending chooses the format.
 
@@ -47,6 +50,7 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
     Args:
         path: of the file.
         grid: of the volume.
+        about: what it is of and how it was made, as far as the format has room: word -> one line.
 
     Raises:
         LimitError: another ending, a missing folder, or too little room on the disk for a
@@ -59,6 +63,8 @@ def volume_writer(path: Path, grid: Grid | VoxelPlaces) -> Iterator[Sink]:
         places = VoxelPlaces.of(grid)
     else:
         places = grid
+    if about:
+        places = replace(places, about=about)
     if not form.packed:
         require_bytes(path, 4 * math.prod(places.shape))
     part = path.with_name(f".{path.name}.part{path.suffix}")

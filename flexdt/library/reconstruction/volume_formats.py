@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
@@ -79,6 +79,12 @@ FIELDS_OF_OTHER_VALUES: Final = (
     "datafile",
 )
 """Fields of either header that change the values or their place."""
+TIFF_LINE: Final = "flexdt="
+"""Begins the line of a TIFF's description that has voxel, place and what the volume is of."""
+NIFTI_WORDS: Final = 79
+"""Longest text in a NIfTI-1 header [bytes]."""
+MHA_WORDS: Final = 200
+"""Longest text in MetaImage's header: older readers hold 255 bytes."""
 MAX_ASIDE: Final = 1e-6
 """Largest component of an axis along another, relative to the longest edge: rounding."""
 
@@ -101,11 +107,13 @@ class VoxelPlaces:
         shape: (nz, ny, nx).
         edges_mm: of a voxel, (x, y, z) [mm].
         center_mm: (x, y, z) of the middle [mm].
+        about: word -> of what the volume is and how it was made, one line each.
     """
 
     shape: tuple[int, int, int]
     edges_mm: tuple[float, float, float]
     center_mm: tuple[float, float, float]
+    about: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, grid: Grid | Volume) -> VoxelPlaces:
@@ -223,7 +231,8 @@ def _blocks(slab: Float32Array) -> Iterator[Float32Array]:
 
 
 def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
-    """Write a page for each layer, with voxel and place in the first page's description.
+    """Write a page for each layer, with voxel and place in the first page's description: in
+    lines that ImageJ, Fiji and tifffile read, then in one of ours.
 
     Yields the function that takes the slabs, lowest first; BigTIFF above
     `BIG_TIFF_BYTES`.
@@ -239,8 +248,18 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
         "axes": "zyx",
         "voxel_mm": places.voxel_mm,
         "center_mm": list(places.center_mm),
+        "about": dict(places.about),
     }
-    per_cm = 10.0 / places.edges_mm[0], 10.0 / places.edges_mm[1]
+    layers = places.shape[0]
+    lines = [
+        "ImageJ=1.11a",
+        f"images={layers}",
+        f"slices={layers}",
+        "unit=mm",
+        f"spacing={places.edges_mm[2]!r}",
+        "loop=false",
+        TIFF_LINE + json.dumps(about),
+    ]
     with tifffile.TiffWriter(part, bigtiff=places.bytes > BIG_TIFF_BYTES) as tiff:
         first = True
 
@@ -254,14 +273,21 @@ def _write_tiff(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
                     layer,
                     contiguous=True,
                     photometric="minisblack",
-                    resolution=per_cm,
-                    resolutionunit="CENTIMETER",
-                    description=json.dumps(about) if first else None,
+                    # Of the description's unit, as ImageJ writes it.
+                    resolution=(1.0 / places.edges_mm[0], 1.0 / places.edges_mm[1]),
+                    resolutionunit="NONE",
+                    description="\n".join(lines) + "\n" if first else None,
                     metadata=None,
                 )
                 first = False
 
         yield write
+
+
+def _plain(words: str, most: int) -> str:
+    """Return words as at most so many ASCII characters of one line, others as ``\\xe9``."""
+    line = " ".join(words.split())
+    return line.encode("ascii", "backslashreplace")[:most].decode("ascii")
 
 
 def _nrrd_header(places: VoxelPlaces) -> bytes:
@@ -276,14 +302,17 @@ def _nrrd_header(places: VoxelPlaces) -> bytes:
         "space directions": f"({x},0,0) (0,{y},0) (0,0,{z})",
         "space origin": "({:.9g},{:.9g},{:.9g})".format(*places.first_mm),
     }
-    lines = ("NRRD0004", *(f"{key}: {value}" for key, value in fields.items()))
+    about = (f"{key}:={_plain(value, 500)}" for key, value in places.about.items())
+    lines = ("NRRD0004", *(f"{key}: {value}" for key, value in fields.items()), *about)
     return ("\n".join(lines) + "\n\n").encode("ascii")
 
 
 def _mha_header(places: VoxelPlaces) -> bytes:
     """Make MetaImage's header, of a file with header and data; its physical point is ours."""
     nz, ny, nx = places.shape
-    fields = dict(MHA_FIELDS) | {
+    said = "; ".join(f"{key}: {value}" for key, value in places.about.items())
+    fields = ({"Comment": _plain(said, MHA_WORDS)} if said else {}) | dict(MHA_FIELDS)
+    fields |= {
         "Offset": " ".join(repr(float(place)) for place in places.first_mm),
         "ElementSpacing": " ".join(repr(float(edge)) for edge in places.edges_mm),
         "DimSize": f"{nx} {ny} {nz}",
@@ -309,6 +338,7 @@ def _nifti_header(places: VoxelPlaces) -> bytes:
     header.set_xyzt_units("mm")
     header["vox_offset"] = NIFTI_DATA_BYTE
     header["magic"] = b"n+1"
+    header["descrip"] = _plain("; ".join(places.about.values()), NIFTI_WORDS).encode()
     block: bytes = header.binaryblock
     return block + bytes(NIFTI_DATA_BYTE - len(block))
 
@@ -333,6 +363,7 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
             axes="zyx",
             voxel_mm=places.voxel_mm,
             center_mm=places.center_mm,
+            **places.about,
         )
         done = 0
 
@@ -421,7 +452,9 @@ def _read_tiff(path: Path) -> Stored:
     import tifffile
 
     with tifffile.TiffFile(path) as file:
-        about = json.loads(file.pages.first.description)
+        said = file.pages.first.description
+    # Files up to version 0.4 have nothing else.
+    about = json.loads(said.partition(TIFF_LINE)[2] or said)
     values = np.asarray(tifffile.imread(path), dtype=np.float32)
     return values, about["voxel_mm"], about["center_mm"], False
 
