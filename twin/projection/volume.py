@@ -63,6 +63,8 @@ NOT_BOUNDED: Final = (
 )
 MIN_DOUBLED_SIGMAS: Final = 2.0
 """Standard errors from which on edges are said to be doubled."""
+MIN_TWO_EDGES_PX: Final = 1.0
+"""Distance from which on doubled edges are warned of [pixels]: a volume shows two edges."""
 MIN_DOUBLED_VOXELS: Final = 0.2
 """Least distance of doubled edges that is told [voxels]: less widens no edge."""
 Vector3 = tuple[float, float, float]
@@ -86,6 +88,7 @@ class Accuracy:
         figure: size of the cause with its standard error, where the images tell one.
         taken: what is taken as stated, because the images do not decide it.
         next: the next of the errors that images tell, with its size; "" without one.
+        doubled: distance at which those errors double edges [pixels, as seen by a view].
     """
 
     half: float
@@ -95,6 +98,7 @@ class Accuracy:
     figure: str = ""
     taken: tuple[str, ...] = ()
     next: str = ""
+    doubled: float = 0.0
 
     def __str__(self) -> str:
         """Return the accuracy sentence: largest errors [%] in nine of ten and in half of
@@ -120,10 +124,13 @@ class Accuracy:
 
     @property
     def warnings(self) -> list[str]:
-        """A warning if a tenth of the regions may deviate by more than some per cent,
-        else empty.
+        """A warning if a tenth of the regions may deviate by more than some per cent, or an
+        edge is two, else empty.
         """
-        return [f"values may be off; {self}"] * (self.most > WARNING_BOUND)
+        doubts = ["values may be off"] * (self.most > WARNING_BOUND)
+        if self.doubled >= MIN_TWO_EDGES_PX and not self.cut_off:
+            doubts.append(f"edges are doubled by {self.doubled:.2g} pixels")
+        return [f"{' and '.join(doubts)}; {self}"] * bool(doubts)
 
 
 @public

@@ -3,10 +3,11 @@
 A coarse volume of the object is projected and reconstructed on a ladder of scans: from
 one without a flaw (parallel rays from everywhere, a panel that sees all) to the one at
 hand, one flaw a rung. The difference of two rungs is the effect of that flaw on such an
-object. Two flaws show in the images alone, and get a reconstruction each: what lies beyond
-the panel's edges,
-continued in another way, and the drift of the flat, which is seen beside the object. A
-voxel's bound is what all of them come to about it.
+object, as far as its nodes show it: what a copy of half as many nodes shows less, or more, is
+expected once more of the finest nodes, and may be wrong by as much (Richardson's extrapolation to
+the first order, that of edges between nodes). Two flaws show in the images alone, and get a
+reconstruction each: what lies beyond the panel's edges, continued in another way, and the drift of
+the flat, which is seen beside the object. A voxel's bound is what all of them come to about it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
-from flexdt.twin.projection.volume import CAUSES, Accuracy, Residuals
+from flexdt.twin.projection.volume import (
+    CAUSES,
+    MIN_DOUBLED_VOXELS,
+    Accuracy,
+    Residuals,
+)
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import (
     FINE_NODES,
@@ -40,6 +46,7 @@ from flexdt.twin.reconstruction.consistency.agreement import (
     looked_at,
 )
 from flexdt.twin.reconstruction.consistency.cause_table import Finding
+from flexdt.twin.reconstruction.consistency.doubled_edges import doubled_px
 from flexdt.twin.reconstruction.consistency.suspects import SIDES, suspects
 from flexdt.twin.reconstruction.consistency.view_pairs import sampling_error
 from flexdt.twin.reconstruction.feldkamp.fdk_plan import plan_fdk
@@ -61,9 +68,6 @@ OTHERWISE_FACTOR: Final = 3.0
 the figures of cut-off objects are no bounds)."""
 SIGMAS: Final = 2.0
 """Standard deviations of the errors that a bound holds."""
-COARSE_FACTOR: Final = 1.6
-"""Errors over what the coarse copy shows of them, in nine of ten scans
-(`tests/studies/accuracy_rank.py`, seed 8877: without it 15 of 23 claims were true)."""
 PRISM_ERROR_SHARE: Final = 0.15
 """Share of a prism's part beyond the edges that may be wrong if it explains the
 images."""
@@ -107,6 +111,7 @@ class Bias:
             bounded.
         figures: cause -> its size, in words.
         taken: what is taken as stated, because the images do not decide it.
+        doubled: cause -> distance at which it doubles edges [pixels], of errors that images tell.
     """
 
     found: Volume
@@ -117,6 +122,7 @@ class Bias:
     figures: Mapping[str, str] = field(default_factory=dict)
     taken: tuple[str, ...] = ()
     shifts: frozenset[str] = SHIFTS
+    doubled: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def shift(self) -> FloatArray:
@@ -182,11 +188,7 @@ class Bias:
         if not inside.any():
             return None
         off = {cause: flaw[inside] / value[inside] for cause, flaw in self.causes.items()}
-        # Sampling is drawn, not seen in the coarse copy.
-        drawn = np.square(self.causes.get("sampling", np.zeros(self.found.shape)))
-        seen = np.square(COARSE_FACTOR) * (np.square(self.spread) - drawn)
-        spread = np.sqrt(seen + drawn)[inside] / value[inside]
-        errors = self.shift[inside] / value[inside], spread
+        errors = self.shift[inside] / value[inside], self.spread[inside] / value[inside]
         half, most = (_within(share, *errors) for share in (0.5, 0.9))
         worst = max(off, key=lambda cause: float(np.percentile(off[cause], 90.0)))
         told = {
@@ -195,11 +197,20 @@ class Bias:
             if cause in off and cause != worst
         }
         following = max(told, key=lambda cause: told[cause], default="")
+        doubling = max(self.doubled, key=lambda cause: self.doubled[cause], default="")
+        doubled = self.doubled.get(doubling, 0.0)
+        if doubled > MIN_DOUBLED_VOXELS and doubling in told:
+            following = doubling  # it may hardly change values
+        elif following and told[following] <= FLOOR:
+            following = ""
         further = ""
-        if following and told[following] > FLOOR:
+        if following:
             further = f"{CAUSES[following]} ({self.figures[following]})"
         figure = self.figures.get(worst, "")
-        return Accuracy(half, most, worst, "beyond" in off, figure, self.taken, further)
+        cut_off = "beyond" in off
+        return Accuracy(
+            half, most, worst, cut_off, figure, self.taken, further, round(doubled, 2)
+        )
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong: a contradiction, or large errors."""
@@ -306,13 +317,13 @@ class BiasOnDemand:
         """The errors, cause by cause.
 
         If the images fit another geometry better, nothing is bounded. The coarse volume's
-        change by each flaw is the standard deviation of its error: missing angles, the rungs
-        of `ladder`, and pixels that stand for what is between them ("sampling"). Another
-        continuation of truncated rows ("beyond"), or for complete rows their level beside the
-        object ("drift"), errors that the images tell and a known spectrum ("hardening") shift
-        values. Standard errors of those, and of what the images leave open, scatter them
-        together ("geometry"); but what may change the volume by more than all that is taken as
-        stated, and named.
+        change by each flaw, extrapolated (`_extrapolated`), is the standard deviation of its
+        error: missing angles, the rungs of `ladder`, and pixels that stand for what is
+        between them ("sampling"). Another continuation of truncated rows ("beyond"), or for
+        complete rows their level beside the object ("drift"), errors that the images tell and
+        a known spectrum ("hardening") shift values. Standard errors of those, and of what the
+        images leave open, scatter them together ("geometry"); but what may change the volume
+        by more than all that is taken as stated, and named.
         """
         bounded = self._told
         if bounded.contradiction is not None:
@@ -403,8 +414,11 @@ class BiasOnDemand:
         figures = dict(bounded.figures)
         shifts = set(bounded.shifts)
         squares = np.zeros(bounded.found.shape)
+        doubled: dict[str, float] = {}
         for one in found.findings:
             if one.told:
+                name = one.cause.name
+                doubled[name] = max(doubled.get(name, 0.0), self._doubled(one))
                 change = _about(self._changed(one, one.size), bounded.even)
                 squares += np.square(one.sigma / one.size * change)
                 name = one.cause.name
@@ -416,7 +430,30 @@ class BiasOnDemand:
             causes["images"] = found.unexplained * np.abs(bounded.found.data)
         if squares.any():
             causes["geometry"] = np.sqrt(squares)
-        return replace(bounded, causes=causes, figures=figures, shifts=frozenset(shifts))
+        return replace(
+            bounded,
+            causes=causes,
+            figures=figures,
+            shifts=frozenset(shifts),
+            doubled=doubled,
+        )
+
+    def _doubled(self, one: Finding) -> float:
+        """Compute by how much an error doubles edges [pixels of the panel]."""
+        scan = self._copied(NODES)
+        if one.cause.views is None:
+            return 0.0
+        sizes = one.size / one.cause.whole_unit(scan.binned) * one.course(scan.share)
+        centre = np.append(scan.circle.centre, scan.grid.center_mm[2])
+        pixels = doubled_px(
+            scan.cone_vec,
+            one.cause.views(scan.cone_vec, sizes),
+            (scan.images.shape[1], scan.images.shape[2]),
+            centre,
+            0.5 * max(scan.ends),
+            0.25 * scan.grid.size_mm[2],
+        )
+        return pixels * scan.binned[1]
 
     def _sampling(self, bounded: Bias) -> FloatArray:
         """Compute what the pixels' sampling does to the coarse volume: a line integral that
@@ -490,8 +527,7 @@ class BiasOnDemand:
         for one in self._agreement.findings:
             if one.told or one.cause.nuisance or one.cause.name == "distance":
                 continue
-            more, less = (self._changed(one, sign * one.sigma) for sign in (1.0, -1.0))
-            change = np.asarray(0.5 * (more - less), np.float32)
+            change = self._changed(one, one.sigma)
             moved = SIGMAS * _smooth_about(change, bounded.even)
             if nodes.change(nodes.found + moved.astype(np.float32)) > claimed:
                 taken.append(STATED.get(one.cause.name, one.cause.name))
@@ -545,13 +581,18 @@ class BiasOfIterations(BiasOnDemand):
         """The errors, but for what the comparison adds."""
         scan = self._copied(NODES)
         nodes = UniformNodes.of(scan.volume, scan.rim)
+        causes = _extrapolated(scan, nodes, self._left_out)
+        found = scan.grid.like(nodes.found)
+        return self._of_beam(Bias(found, nodes.even, nodes.inside, causes))
+
+    def _left_out(self, scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
+        """Compute what the iterations leave out of the smooth volume of a copy."""
         shape = (scan.images.shape[1], scan.images.shape[2])
         images = scan.projected(nodes.found, scan.cone_vec, shape)
         again = self._run(images, scan.cone_vec, scan.grid).data
-        change = np.nan_to_num(again) - nodes.found
-        causes = {self._cause: _scatter_about(change, nodes.even)}
-        found = scan.grid.like(nodes.found)
-        return self._of_beam(Bias(found, nodes.even, nodes.inside, causes))
+        return {
+            self._cause: Flaw(self._cause, np.nan_to_num(again) - nodes.found, nodes.even)
+        }
 
 
 def bias_of(
@@ -612,23 +653,75 @@ def _bounded(scan: CoarseScan, *, angles_alone: bool = False) -> Bias:
         angles_alone: look for what few views do, and nothing else.
     """
     nodes = UniformNodes.of(scan.volume, scan.rim)
-    causes = _angles(scan, nodes)
+    causes = _extrapolated(scan, nodes, _angles if angles_alone else _flaws)
     if not angles_alone:
-        _add(causes, _causes(scan, nodes, np.nan_to_num(scan.volume)))
+        causes |= _beside(scan, nodes)
     return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
 
 
-def _add(causes: dict[str, FloatArray], more: dict[str, FloatArray]) -> None:
-    """Add errors to those of the same causes."""
-    for cause, one in more.items():
-        causes[cause] = causes.get(cause, 0.0) + one
+@dataclass(frozen=True, eq=False)
+class Flaw:
+    """What a flaw of the scan does to a coarse volume.
+
+    Attributes:
+        cause: of `flexdt.twin.projection.volume.CAUSES`.
+        change: of the volume, (nz, ny, nx) [1/mm].
+        weights: of its nodes, (nz, ny, nx), above 0.
+    """
+
+    cause: str
+    change: Float32Array
+    weights: FloatArray
 
 
-def _angles(scan: CoarseScan, nodes: UniformNodes) -> dict[str, FloatArray]:
+Flaws = Callable[[CoarseScan, UniformNodes], dict[str, Flaw]]
+"""Finds the flaws of a coarse copy and its nodes, by a name that copies of one scan share."""
+
+
+def _extrapolated(
+    scan: CoarseScan, nodes: UniformNodes, flaws: Flaws
+) -> dict[str, FloatArray]:
+    """Compute how far flaws scatter values, from a coarse copy and one of half its nodes.
+
+    What flaws do between nodes is not in a copy. If it falls with their distance, the finest
+    nodes show as much more than these as these show more than half as many; that estimate may be
+    wrong by as much. Without the coarser copy's the flaw's own size is that error.
+
+    Args:
+        scan: the copy.
+        nodes: of its volume.
+        flaws: finds what is to be extrapolated.
+
+    Returns:
+        Cause -> standard deviation at each node, (nz, ny, nx) [1/mm].
+    """
+    found = flaws(scan, nodes)
+    if not found:
+        return {}
+    half = scan.halved
+    try:
+        coarser = flaws(half, UniformNodes.of(half.volume, half.rim))
+    except GeometryError:  # such as an axis within half a column of the panel's edge
+        coarser = {}
+    squares: dict[str, FloatArray] = {}
+    for name, one in found.items():
+        more, whole = one.change, one.change
+        if name in coarser:
+            known = half.grid.like(np.asarray(coarser[name].change, np.float32))
+            more = one.change - interpolated(known, scan.grid)
+            whole = one.change + more
+        square = squares.get(one.cause, np.zeros(scan.grid.shape))
+        for part in (whole, more):
+            square = square + np.square(_scatter_about(part, one.weights))
+        squares[one.cause] = square
+    return {cause: np.sqrt(square) for cause, square in squares.items()}
+
+
+def _angles(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
     """Compute what few views do, if they are few; streaks come from edges.
 
     Args:
-        scan: the coarse copy.
+        scan: a coarse copy.
         nodes: of its volume.
     """
     if not scan.sparse:
@@ -637,33 +730,41 @@ def _angles(scan: CoarseScan, nodes: UniformNodes) -> dict[str, FloatArray]:
     best, ours = (
         scan.seen(nodes.sharp, scan.parallel("", wide, t)) for t in (None, scan.angles)
     )
-    return {"angles": _scatter_about(ours - best, nodes.even)}
+    return {"streaks": Flaw("angles", ours - best, nodes.even)}
 
 
-def _causes(
-    scan: CoarseScan, nodes: UniformNodes, data: Float32Array
-) -> dict[str, FloatArray]:
-    """Compute the errors of a coarse volume, by cause (`BiasOnDemand.bias`), but for what few
-    views do.
+def _flaws(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
+    """Compute what the flaws of a scan do: few views, and the rungs of its ladder.
 
     Args:
-        scan: the coarse copy.
+        scan: a coarse copy.
         nodes: of its volume.
-        data: that volume, its unreconstructed voxels 0, (nz, ny, nx).
-
-    Returns:
-        Cause -> error at each node, (nz, ny, nx) [1/mm].
     """
-    causes: dict[str, FloatArray] = {}
+    found = _angles(scan, nodes)
     rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in scan.ladder()]
     for (_, before), (flaw, after) in pairwise(rungs):
         # Ends that few rays see blur no edge: they count as the middle does.
         weights = np.where(nodes.inside, 1.0, 1e-3)
-        _add(causes, {flaw: _scatter_about(after - before, weights)})
+        name = "fan" if flaw in ("cone", "angles") else flaw
+        found[name] = Flaw(flaw, after - before, weights)
+    return found
+
+
+def _beside(scan: CoarseScan, nodes: UniformNodes) -> dict[str, FloatArray]:
+    """Compute by how much the drift of the flat shifts values, or what is beyond the panel's
+    edges.
+
+    Args:
+        scan: the coarse copy.
+        nodes: of its volume.
+
+    Returns:
+        Cause -> error at each node, (nz, ny, nx) [1/mm].
+    """
     truncation = scan.truncation
     if truncation is None or not truncation.cut_off.any():
         level = np.nan_to_num(scan.fdk(_drift(scan.images), scan.cone_vec))
-        return {**causes, "drift": _about(level, nodes.even)}
+        return {"drift": _about(level, nodes.even)}
     ways = [(truncation.otherwise, OTHERWISE_FACTOR)]
     if truncation.explained:
         # Prisms explain the rows, but their residual at the edges is as unknown as ever.
@@ -671,10 +772,12 @@ def _causes(
             (truncation.otherwise, PRISM_ERROR_SHARE),
             (truncation.later, OTHERWISE_FACTOR),
         ]
+    beyond = np.zeros(scan.grid.shape)
+    data = np.nan_to_num(scan.volume)
     for way, share in ways:
         other = np.nan_to_num(scan.fdk(scan.images, scan.cone_vec, way))
-        _add(causes, {"beyond": share * _about(other - data, nodes.even)})
-    return causes
+        beyond += share * _about(other - data, nodes.even)
+    return {"beyond": beyond}
 
 
 def _drift(images: Float32Array) -> Float32Array:

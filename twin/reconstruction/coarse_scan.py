@@ -206,6 +206,13 @@ class CoarseScan:
             rest=((ends[0] - rows) / down, (ends[1] - cols) / across),
         )
 
+    @cached_property
+    def halved(self) -> CoarseScan:
+        """The same views of half as many rows, columns and nodes."""
+        rows = max(self.images.shape[1] // 2, 1)
+        half = self.thinned(all_views=True, least_rows=rows, across=2)
+        return replace(half, nodes=self.nodes // 2)
+
     @property
     def complete(self) -> Truncation | None:
         """The truncation of an object that the panel sees completely; not None where rays

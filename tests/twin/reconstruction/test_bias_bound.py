@@ -237,8 +237,7 @@ def test_what_no_image_shows_is_said_with_the_figures() -> None:
 
 @pytest.mark.slow
 def test_the_stated_accuracy_holds_and_ranks_scans() -> None:
-    """Errors of nine of ten regions. `COARSE_FACTOR` was chosen by these scans; their order was
-    not."""
+    """Errors of nine of ten regions; of these scans nothing was chosen."""
     found = [one for k in range(30) if (one := accuracy_rank.judged(8877, k)) is not None]
     stated, true = (
         np.array([getattr(one, name)[1] for one in found]) for name in ("stated", "true")

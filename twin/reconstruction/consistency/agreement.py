@@ -42,6 +42,8 @@ one (assumed)."""
 VARIANCE_KNOWN: Final = 0.1
 """Relative error of the variances, about, so that smaller differences of surprise say nothing
 (assumed)."""
+LEAST: Final = 0.01
+"""Surprise below which arcs agree perfectly: a hundredth of the usual one."""
 EXCLUDED: Final = 0.05
 """Probability with which a right geometry is excluded beside the stated one."""
 
@@ -116,7 +118,8 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
         scan: coarse.
         sides_known: beads have told the direction of rotation and mirrored images.
     """
-    if looked_at(scan) is None:
+    first = looked_at(scan)
+    if first is None:
         return Agreement()
     some, share = _some(scan)
     images = _without_level(scan.images[some])
@@ -127,24 +130,30 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
         return Agreement()
     told, table = found
     told = [_of_panel(one, scan.binned) for one in told]
-    stated = table.surprise()
+    there, base = scan, table
+    if not first.doubtful and not any(one.told for one in told):
+        # What images leave open is seen as well with fewer pixels.
+        fewer = looked_at(scan.halved)
+        if fewer is not None and fewer.counts.keys() == table.counts.keys():
+            there, base = scan.halved, fewer
+    stated = base.surprise()
     better: list[tuple[float, float, Suspect]] = []
     undecided = []
-    for one in suspects(scan):
-        rival = _table(scan, one.images, one)
+    for one in suspects(there):
+        rival = _table(there, one.images, one)
         if (sides_known and one.kind in SIDES) or rival is None:
             continue
         # A span of few opposed rays is not confirmed as the stated one is by its own.
         surprise = {
             kind: value
             for kind, value in rival.surprise().items()
-            if rival.counts[kind] >= CONFIRMING * table.counts.get(kind, 0)
+            if rival.counts[kind] >= CONFIRMING * base.counts.get(kind, 0)
         }
         confirmed = len(surprise) >= len(stated)
-        if not confirmed and not table.doubtful:
+        if not confirmed and not first.doubtful:
             continue
         gain, evidence = _evidence(stated, surprise)
-        alike = abs(gain) < VARIANCE_KNOWN * table.surprises
+        alike = abs(gain) < VARIANCE_KNOWN * base.surprises
         if confirmed and (alike or evidence > -quantile(2.0 * EXCLUDED)):
             undecided.append(one.kind)
         better.append((evidence, gain, one))
@@ -154,7 +163,7 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
     least = 0.5 * table.surprises
     fitting = [one for one in better if one[0] > bar and one[1] > least]
     fitting.sort(key=lambda one: -one[1])
-    if not fitting or not table.doubtful:
+    if not fitting or not first.doubtful:
         return Agreement(None, told, left, tuple(dict.fromkeys(undecided)), compared=True)
     most = fitting[0][1]
     named = [one for one in fitting if one[1] > LIKE_THE_BEST * most]
@@ -201,12 +210,31 @@ def _without_level(images: Float32Array) -> Float32Array:
 def _evidence(
     stated: dict[str, FloatArray], rival: dict[str, FloatArray]
 ) -> tuple[float, float]:
-    """Compare surprises by arcs: how much less the rival has, and in standard errors."""
-    less = np.mean(
-        [stated[kind] - rival.get(kind, stated[kind]) for kind in stated], axis=0
-    )
-    spread = max(float(less.std(ddof=1)), 1e-12)
-    return float(less.mean()), float(less.mean()) * np.sqrt(ARCS) / spread
+    """Compare surprises by arcs: how much less the rival has, and in standard errors of `ARCS`
+    clusters that are as improbable, by the logarithms of arcs, which differ by far.
+
+    Kinds of rows count alike, each by the arcs where both geometries have such rows.
+    """
+    from scipy.special import stdtr, stdtrit
+
+    gain, ratio, square, freedom = 0.0, 0.0, 0.0, 0.0
+    for kind, one in stated.items():
+        other = rival.get(kind, one)
+        both = np.isfinite(one) & np.isfinite(other)
+        if both.sum() < 2:
+            continue
+        gain += float((one - other)[both].mean()) / len(stated)
+        less = np.log(np.maximum(one[both], LEAST) / np.maximum(other[both], LEAST))
+        part = float(less.var(ddof=1)) / len(less)
+        ratio += float(less.mean())
+        square += part
+        freedom += part * part / (len(less) - 1.0)
+    if square <= 0.0:
+        return gain, 0.0
+    ratio /= np.sqrt(square)
+    chance = float(stdtr(square * square / freedom, -abs(ratio)))  # Welch, Satterthwaite
+    evidence = -float(stdtrit(ARCS - 1.0, max(chance, 1e-30)))
+    return gain, float(np.copysign(evidence, ratio))
 
 
 def _probability(evidence: float) -> float:

@@ -5,7 +5,8 @@ noise and error of sampling. Columns are derivatives by the errors of `causes`. 
 in, the one that explains most first, while they are significant. Standard errors are those of
 clusters: differences that share an arc of views are not taken as independent (Cameron, Gelbach and
 Miller, J. Bus. Econ. Stat. 29 (2011) 238), so that they hold whatever the object's shape does to
-sampling.
+sampling. What sampling does to all arcs alike shows in a table of half as many pixels: by how much
+its estimates differ is part of their standard error.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.acquisition.rectify import window
 from flexdt.twin.reconstruction.acquisition.trajectory import Circle
 from flexdt.twin.reconstruction.consistency.causes import (
     Cause,
@@ -43,12 +46,10 @@ MOST_STEPS: Final = 4
 """Corrections in images of one smoothing."""
 TRIED: Final = 8
 """Errors that are tried in a table, those that explain most."""
-SHARED: Final = 0.05
-"""Share of the sampling's and noise's standard deviation that may be the same in all
-differences, as an object's shape may make it (`tests/studies/claims.py --table`, seed 11)."""
 SHARED_OF_PIXELS: Final = 1.0
-"""The same of errors that all images have alike: so has the error of sampling a shadow, and all of
-it may look like them."""
+"""Least share of the sampling's and noise's standard deviation that errors of the images, which all
+views have alike, may show: so has the error of sampling a shadow, and all of it may look like
+them, whatever the pixels."""
 FREEDOM: Final = 4.0
 """Degrees of freedom of Student's distribution of a difference over its standard deviation: an edge
 that is parallel to a ray differs by far more than usual."""
@@ -65,6 +66,7 @@ class CauseTable:
         share: (n,) of the scan before each view.
         rows: of `ViewPairs` and `OpposedRays`, with their conditions.
         blur: standard deviation of the images' smoothing [pixels].
+        sharp: the images before it.
     """
 
     images: Float32Array
@@ -73,6 +75,7 @@ class CauseTable:
     share: FloatArray
     rows: list[tuple[ViewPairs | OpposedRays, Condition]]
     blur: float
+    sharp: Float32Array
 
     @classmethod
     def of(
@@ -109,7 +112,27 @@ class CauseTable:
         if rays is not None:
             kept *= min(1.0, 0.28 / blur)
             rows.append((rays, rays.condition(smooth, cone_vec, noise * kept)))
-        return cls(smooth, cone_vec, circle, share, rows, blur) if rows else None
+        made = cls(smooth, cone_vec, circle, share, rows, blur, images)
+        return made if rows else None
+
+    @cached_property
+    def _binned(self) -> tuple[int, int]:
+        """Rows and columns of a pixel of the `_coarser` table."""
+        return min(2, self.sharp.shape[1]), 2
+
+    @cached_property
+    def _coarser(self) -> CauseTable | None:
+        """The table of half as many rows and columns, by the same smoothing; None without."""
+        _, rows, cols = self.sharp.shape
+        down, across = self._binned
+        rows, cols = rows - rows % down, cols - cols % across
+        part = window(self.cone_vec, self.sharp.shape[1:], (0, rows), (0, cols))
+        views = ConeVec.from_vectors(
+            part.source, part.detector, across * part.u, down * part.v
+        )
+        images = binned_mean(self.sharp[:, :rows, :cols], self._binned)
+        images = np.ascontiguousarray(images, np.float32)
+        return CauseTable.of(images, views, self.circle, self.share, 0.5 * self.blur)
 
     @cached_property
     def differences(self) -> FloatArray:
@@ -128,13 +151,16 @@ class CauseTable:
         return np.asarray(views * ARCS // len(self.cone_vec), np.intp)
 
     def _by_arcs(self, values: FloatArray) -> dict[str, FloatArray]:
-        """Average values (m,) over each kind of rows, by the first view's arc, (ARCS,)."""
-        found, first = {}, 0
+        """Average values (m,) over each kind of rows, by the first view's arc, (ARCS,); NaN in
+        arcs without rows: a short scan has opposed rays at its ends alone."""
+        found: dict[str, FloatArray] = {}
+        first = 0
         for kind, one in self.rows:
             some = slice(first, first + len(one.first))
             arc = self.arcs[some, 0]
-            count = np.maximum(np.bincount(arc, minlength=ARCS), 1)
-            found[type(kind).__name__] = np.bincount(arc, values[some], ARCS) / count
+            count = np.bincount(arc, minlength=ARCS)
+            total = np.where(count, np.bincount(arc, values[some], ARCS), np.nan)
+            found[type(kind).__name__] = total / np.maximum(count, 1)
             first += len(one.first)
         return found
 
@@ -164,16 +190,25 @@ class CauseTable:
         left = self.differences
         for error, size in zip(errors, sizes, strict=True):
             left = left - size * self.columns[error]
-        return float(np.mean([one.mean() for one in self.surprise(left).values()]))
+        return float(np.mean([np.nanmean(one) for one in self.surprise(left).values()]))
 
-    @property
+    @cached_property
     def doubtful(self) -> bool:
         """True if differences of some kind are larger than noise and sampling explain:
-        their mean square, over its variance, is above 1 by the scatter of the arcs.
+        their mean squares in the arcs, over the variance, are above 1 by the scatter of their
+        logarithms.
         """
+        from scipy.special import stdtrit
+
         ratio = self._by_arcs(np.square(self.differences) / self.variance)
-        bar = quantile(2.0 * FALSE_ALARMS) / np.sqrt(ARCS)
-        return any(one.mean() - 1.0 > bar * one.std(ddof=1) for one in ratio.values())
+        for one in ratio.values():
+            logs = np.log(one[one > 0.0])  # not of arcs without rows
+            if len(logs) < 2:
+                continue
+            bar = float(stdtrit(len(logs) - 1.0, 1.0 - FALSE_ALARMS))
+            if logs.mean() > bar * logs.std(ddof=1) / np.sqrt(len(logs)):
+                return True
+        return False
 
     def unexplained(self) -> float:
         """Compute by how much the numbers differ that should agree, beyond noise and sampling,
@@ -182,17 +217,20 @@ class CauseTable:
         beyond = self._by_arcs(np.square(self.differences) - self.variance)
         parts = zip(beyond.values(), self.rows, strict=True)
         return max(
-            float(np.sqrt(max(one.mean(), 0.0))) / max(row.scale, 1e-30)
+            float(np.sqrt(max(float(np.nanmean(one)), 0.0))) / max(row.scale, 1e-30)
             for one, (_, row) in parts
         )
 
     def most_telling(self, told: list[Error]) -> Error | None:
-        """Find the significant error that explains most beside those that are told; None
-        without one.
+        """Find the error that explains most beside those that are told, of those that exceed
+        the scatter of the arcs; None without one.
+
+        Where differences are doubtful, what sampling does to all arcs is looked at later:
+        with a large error estimates from other pixels differ because they are not linear in it.
         """
-        weights = self._weights(self.differences)
-        for error in self._by_gain(weights, told):
-            size, sigma = self.fit([error, *told], weights)[0]
+        for error in self._by_gain(told):
+            sampling = not self.doubtful
+            size, sigma = self.fit([error, *told], sampling=sampling)[0]
             if self.bar * sigma < abs(size) <= error[0].most:
                 return error
         return None
@@ -203,37 +241,81 @@ class CauseTable:
         return quantile(FALSE_ALARMS / max(len(self.columns), 1))
 
     def fit(
-        self, errors: list[Error], weights: FloatArray | None = None
+        self, errors: list[Error], *, sampling: bool = True
     ) -> list[tuple[float, float]]:
         """Fit errors together, beside those that are nuisances: size and standard error of
-        each."""
+        each, with or without what sampling does to all arcs alike."""
         if not errors:
             return []
-        if weights is None:
-            weights = self._weights(self.differences)
         nuisances = [one for one in self.columns if one[0].nuisance and one not in errors]
         listed = [self.columns[one] for one in (*errors, *nuisances)]
-        sizes, covariance = self._fit(listed, weights)
-        deviation = np.sqrt(self.variance)
+        sizes, covariance = self._fit(listed)
+        own, part = np.zeros(len(errors)), 0.0
+        if sampling:
+            own, part = self._of_sampling(errors)
         found = []
-        for place, column in enumerate(listed[: len(errors)]):
-            power = float((weights * np.square(column)).sum())
-            shared = float((weights * np.abs(column) * deviation).sum()) / max(
-                power, 1e-300
-            )
+        for place in range(len(errors)):
             spread = max(float(covariance[place, place]), 0.0)
-            alike = SHARED
             cause, course = errors[place]
-            if cause.images is not None and course.kind == "constant":
-                alike = SHARED_OF_PIXELS
-            found.append(
-                (float(sizes[place]), float(np.hypot(np.sqrt(spread), alike * shared)))
-            )
+            share = part
+            if sampling and cause.images is not None and course.kind == "constant":
+                share = max(part, SHARED_OF_PIXELS)
+            alike = np.hypot(own[place], share * self._products.shared[errors[place]])
+            found.append((float(sizes[place]), float(np.hypot(np.sqrt(spread), alike))))
         return found
 
-    def _by_gain(self, weights: FloatArray, told: list[Error]) -> list[Error]:
+    @cached_property
+    def _products(self) -> Products:
+        """What the columns have in common, weighted."""
+        matrix = np.array([*self.columns.values()]).reshape(-1, len(self.differences))
+        normal = (matrix * self.weights) @ matrix.T
+        power = matrix @ (self.weights * self.differences)
+        alike = np.abs(matrix) @ (self.weights * np.sqrt(self.variance))
+        alike /= np.maximum(np.diag(normal), 1e-300)
+        place = {one: k for k, one in enumerate(self.columns)}
+        shared = {one: float(alike[k]) for one, k in place.items()}
+        return Products(normal, power, place, shared)
+
+    def _of_sampling(self, errors: list[Error]) -> tuple[FloatArray, float]:
+        """Compare estimates with those of half as many pixels.
+
+        Returns:
+            By how much those of the errors differ, (k,); and the median of errors of all
+            kinds, fitted beside these, over `Products.shared`. 0 and 1 without a coarser table.
+        """
+        half = self._coarser
+        told = [] if half is None else _again(half, {_key(one): 0.0 for one in errors})
+        if half is None or len(told) < len(errors):
+            return np.zeros(len(errors)), 1.0
+        usual = {_key(one): one for one in half.columns if _is_usual(one)}
+        both = [one for one in self.columns if _is_usual(one) and _key(one) in usual]
+        both = [one for one in both if _key(one) not in map(_key, errors)]
+        fine = self._beside(errors, both)
+        coarse = half._beside(told, [usual[_key(one)] for one in both])
+        units = np.array([one[0].whole_unit(self._binned) for one in (*errors, *both)])
+        off = np.abs(fine - units * coarse)
+        if not both:
+            return off[: len(errors)], 1.0
+        shared = np.array([self._products.shared[one] for one in both])
+        return off[: len(errors)], float(np.median(off[len(errors) :] / shared))
+
+    def _beside(self, errors: list[Error], others: list[Error]) -> FloatArray:
+        """Fit errors together, and each of the others beside them, all of them beside the
+        nuisances: sizes, (k,)."""
+        base = [*errors]
+        base += [one for one in self.columns if one[0].nuisance and one not in errors]
+        sizes = self._products.fitted(base)
+        found = [*sizes[: len(errors)]]
+        for one in others:
+            if one in base:
+                found.append(sizes[base.index(one)])
+            else:
+                found.append(self._products.fitted([*base, one])[-1])
+        return np.array(found)
+
+    def _by_gain(self, told: list[Error]) -> list[Error]:
         """Order the errors that are not told by how much they explain beside the others."""
-        root = np.sqrt(weights)
+        root = np.sqrt(self.weights)
         base = [one for one in self.columns if one[0].nuisance or one in told]
         rest = self.differences * root
         coarse = self.blur > FINE_BLUR
@@ -256,19 +338,19 @@ class CauseTable:
         gain = np.square(matrix @ rest) / np.maximum(own, 1e-6 * power + 1e-300)
         return [listed[k] for k in np.argsort(-gain)[:TRIED]]
 
-    def _weights(self, left: FloatArray) -> FloatArray:
-        """Weigh differences by Student's distribution, of a scale that lets those of an error
-        of some views count, too."""
-        ratio = np.square(left) / self.variance
+    @cached_property
+    def weights(self) -> FloatArray:
+        """Weights of the differences, (m,), by Student's distribution, of a scale that lets
+        those of an error of some views count, too."""
+        ratio = np.square(self.differences) / self.variance
         usual = max(float(ratio.mean()), 1e-12)
         return np.asarray(
             (FREEDOM + 1.0) / (FREEDOM + ratio / usual) / (self.variance * usual)
         )
 
-    def _fit(
-        self, columns: list[FloatArray], weights: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _fit(self, columns: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         """Fit columns: sizes (k,), and their covariance by clusters, (k, k)."""
+        weights = self.weights
         matrix = np.array(columns).T
         normal = (matrix.T * weights) @ matrix
         size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -334,6 +416,32 @@ class CauseTable:
 
 
 @dataclass(frozen=True, eq=False)
+class Products:
+    """Weighted products of a table's k columns, from which sizes follow without its rows.
+
+    Attributes:
+        normal: of two columns, (k, k).
+        power: of a column and the differences, (k,).
+        places: error -> its place.
+        shared: error -> its size that all differences would show together, each by its
+            standard deviation and as the column has it.
+    """
+
+    normal: FloatArray
+    power: FloatArray
+    places: dict[Error, int]
+    shared: dict[Error, float]
+
+    def fitted(self, errors: list[Error]) -> FloatArray:
+        """Fit errors together: sizes, (k,)."""
+        at = [self.places[one] for one in errors]
+        normal = self.normal[np.ix_(at, at)]
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.pinv(normal / np.outer(size, size), 1e-9, hermitian=True)
+        return np.asarray(inverse @ (self.power[at] / size) / size)
+
+
+@dataclass(frozen=True, eq=False)
 class Finding:
     """An error, or the range in which it may be.
 
@@ -365,7 +473,7 @@ class Finding:
     def figure(self) -> str:
         """Its size with the standard error, in words."""
         where = ""
-        if self.course.kind in ("line", "wave"):
+        if self.course.kind in ("line", "wave", "sine"):
             where = " in the course of the scan"
         if self.course.kind == "step":
             where = f" from {100.0 * self.course.number:.0f} % of the scan on"
@@ -378,7 +486,7 @@ def findings(
     """Find the errors of a scan, one after the other, and the ranges of the others.
 
     The images, or the geometry, are corrected by each error before the next is looked for:
-    first in smooth images (`BLURS`).
+    first in smooth images (`BLURS`), unless the differences are as noise and sampling make them.
 
     Args:
         images, cone_vec, circle, share: see `CauseTable.of`.
@@ -388,9 +496,12 @@ def findings(
         scan. None where no two views compare.
     """
     sizes: dict[Key, float] = {}
-    table = None
+    table = CauseTable.of(images, cone_vec, circle, share, FINE_BLUR)
     for blur in BLURS:
-        table = CauseTable.of(images, cone_vec, circle, share, blur)
+        if blur != FINE_BLUR and (table is None or not table.doubtful):
+            continue  # no large error
+        if table is None or table.blur != blur:
+            table = CauseTable.of(images, cone_vec, circle, share, blur)
         for _ in range(MOST_STEPS):
             if table is None:
                 return None
@@ -400,7 +511,7 @@ def findings(
                 break
             # What is known already is fitted anew: errors are not quite linear.
             chosen = [error, *known]
-            steps = [size for size, _ in table.fit(chosen)]
+            steps = [size for size, _ in table.fit(chosen, sampling=False)]
             there = images, cone_vec
             for (cause, course), size in zip(chosen, steps, strict=True):
                 there = cause.corrected(*there, size * course(share))
@@ -430,8 +541,10 @@ def _findings(table: CauseTable, sizes: dict[Key, float]) -> list[Finding]:
     found = []
     for error, (size, sigma) in zip(told, table.fit(told), strict=True):
         whole = sizes[_key(error)] + size
-        if table.bar * sigma < abs(whole) <= error[0].most:
-            found.append(Finding(*error, whole, sigma, told=True))
+        clear = table.bar * sigma < abs(whole) <= error[0].most
+        # What is taken off the scan, and may be nothing, is open.
+        spread = sigma if clear else float(np.hypot(sigma, whole))
+        found.append(Finding(*error, whole, spread, told=clear))
     named = {one.cause.name for one in found}
     for error in table.columns:
         cause, course = error
@@ -440,6 +553,11 @@ def _findings(table: CauseTable, sizes: dict[Key, float]) -> list[Finding]:
             size, sigma = table.fit([error, *told])[0]
             found.append(Finding(cause, course, size, sigma, told=False))
     return found
+
+
+def _is_usual(error: Error) -> bool:
+    """Return whether an error is one of the geometry, the same in all views."""
+    return error[0].views is not None and error[1].kind == "constant"
 
 
 def _key(error: Error) -> Key:

@@ -78,7 +78,7 @@ class Course:
     """How the size of an error goes through the scan.
 
     Attributes:
-        kind: "constant", "line", "wave" or "step".
+        kind: "constant", "line", "wave", "sine" or "step".
         number: half waves, or the share of the scan before the step.
     """
 
@@ -92,6 +92,8 @@ class Course:
             return share - 0.5
         if self.kind == "wave":
             return np.asarray(np.cos(np.pi * self.number * share))
+        if self.kind == "sine":  # a wave of any phase
+            return np.asarray(np.sin(np.pi * self.number * share))
         if self.kind == "step":
             return np.asarray(share >= self.number, np.float64) - (1.0 - self.number)
         return np.ones_like(share)
@@ -102,7 +104,8 @@ def courses(cause: Cause) -> list[Course]:
     found = [Course()] * cause.constant
     if cause.course:
         found.append(Course("line"))
-        found += [Course("wave", float(k)) for k in range(2, WAVES + 1)]
+        for kind, first in (("wave", 2), ("sine", 1)):
+            found += [Course(kind, float(k)) for k in range(first, WAVES + 1)]
         found += [Course("step", k / (STEPS + 1.0)) for k in range(1, STEPS + 1)]
     return found
 

@@ -151,7 +151,10 @@ def _orders(scan: CoarseScan) -> Iterator[Suspect]:
         yield Suspect(kind, scan.images, views, figure)
     run = np.unwrap(angle) - angle[0]
     span = float(np.ptp(run)) * count / max(count - 1, 1)
-    for times in (0.5, 2.0):
+    turns = [
+        times for times in (2.0 * np.pi / span, np.pi / span) if abs(times - 1) > 0.1
+    ]
+    for times in dict.fromkeys([0.5, 2.0, *turns]):
         figure = f"{np.rad2deg(times * span):.0f} and not {np.rad2deg(span):.0f} degrees"
         turn = (times - 1.0) * run[scan.numbers]
         yield Suspect("span", scan.images, turned(scan, turn), figure)
