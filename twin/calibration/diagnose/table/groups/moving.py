@@ -57,7 +57,7 @@ JITTERS: Final = ("dO_x", "dO_y", "dO_z", "alpha")
 FOLLOWED: Final = ("dO_x", "dO_y", "dO_z", "alpha")
 """Parameters that are advised to differ between frames where something moves."""
 LEAST_FRAMES: Final = 3
-MOST_WAVES: Final = 120
+MOST_WAVES: Final = 60
 """Half waves in a scan, of a wander."""
 MOST_JUMPS: Final = 60
 """Frames before which a jump is looked for."""
