@@ -129,7 +129,7 @@ class Accuracy:
         """
         doubts = ["values may be off"] * (self.most > WARNING_BOUND)
         if self.doubled >= MIN_TWO_EDGES_PX and not self.cut_off:
-            doubts.append(f"edges are doubled by {self.doubled:.2g} pixels")
+            doubts.append(f"edges doubled by {self.doubled:.2g} pixels")
         return [f"{' and '.join(doubts)}; {self}"] * bool(doubts)
 
 

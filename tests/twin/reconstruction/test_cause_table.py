@@ -173,7 +173,7 @@ def test_an_axis_half_a_pixel_off_doubles_edges_and_is_doubted_at_first_sight() 
     assert accuracy.doubled == pytest.approx(1.2, abs=0.1)
     assert "the axis offset (-0.59" in str(accuracy)
     (doubt,) = bias.warnings(bias.found)
-    assert "edges are doubled by 1.2 pixels" in doubt
+    assert doubt.startswith("edges doubled by 1.2 pixels; ")
     right = BiasOnDemand(copied(scan()))
     assert right.warnings(right.found) == []
     assert right.accuracy(right.found).doubled < 0.1  # type: ignore[union-attr]
