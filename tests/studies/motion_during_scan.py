@@ -7,7 +7,8 @@ um, every frame by itself), or nothing; by tracks with 0.02 px noise, and by rad
 and images are those of the rays, planes and balls of `prior_coverage`; nothing of the fit's
 model is in them.
 
-For each kind: the beads' distance from where the geometry has them before and after [px rms],
+For each kind: the beads' distance from where the geometry has them without its motion and with it
+[px rms],
 the error of the deviations [um rms] without the part that turns once with the table (an object
 beside the axis does the same), errors over sigmas of the six parameters and of the deviations, and
 how often a parameter at rest was reported to move.
@@ -26,9 +27,12 @@ from prior_coverage import NOISE_PX, PIXEL, REACH, SDD, SHAPE, SOD, pixels, radi
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import BeadModel
+from flexdt.twin.calibration.diagnose.table.explained import explained
+from flexdt.twin.calibration.diagnose.table.followed import frame_motions
+from flexdt.twin.calibration.diagnose.table.group import Known
 from flexdt.twin.calibration.fit.fit import estimate_geometry
-from flexdt.twin.calibration.fit.fitted_motion import MotionFit, aware, follow_motion
 from flexdt.twin.calibration.fit.priors import exact
+from flexdt.twin.calibration.fit.problem import UNSTRAINED
 from flexdt.twin.calibration.frame_source import ArrayFrames
 from flexdt.twin.calibration.pipeline import CalibrationRequest, Scan, calibrate
 from flexdt.twin.geometry.offsets import Offsets, to_internal
@@ -122,29 +126,22 @@ def one(seed: int, kind: str, images: bool) -> dict[str, Any]:
             for i, t in enumerate(frames)
         ]
         scan = Scan(ArrayFrames(shown, SHAPE), poses, priors=exact(SIX))
-        still = calibrate([scan], model, CalibrationRequest(priors=exact(SIX)))
         found = calibrate(
             [scan], model, CalibrationRequest(priors=exact(SIX), per_frame=names)
         )
         if found.fit is None or not found.motions:
             return {"kind": kind, "refused": [f.code for f in found.findings]}
-        before = still.fit.certificate.rms_px if still.fit else np.nan
         fit, motion, certificate = found.fit, found.motions[0], found.fit.certificate
     else:
         tracks = seen + NOISE_PX * rng.normal(size=seen.shape)
-
-        def fitted(motion: MotionFit | None = None) -> Any:
-            """Fit the tracks, with a motion applied to the poses if one is given."""
-            moving = motion.motions[0].applied(poses) if motion else poses
-            start = Offsets.from_edge({n: truth[n] for n in SIX})
-            return estimate_geometry(tracks, model, moving, shape=SHAPE, start=start)
-
-        first = fitted()
-        before = first.certificate.rms_px
-        fit, held = follow_motion(first, names, fitted)
-        motion, certificate = held.motions[0], aware(fit, held).certificate
+        start = Offsets.from_edge({n: truth[n] for n in SIX})
+        first = estimate_geometry(tracks, model, poses, shape=SHAPE, start=start)
+        what = explained(first, Known(UNSTRAINED, 0.0, 1e-4, asked=names))
+        fit, certificate = what.fit, what.fit.certificate
+        (motion,) = frame_motions(what, names)
     cone = motion.applied(poses).cone_vec(fit.parameters)
     after = cone.project_points(beads, SHAPE) - seen
+    before = poses.cone_vec(fit.parameters).project_points(beads, SHAPE) - seen
     once = np.stack([np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], axis=1)
     error = motion.values[:, 0] - deviation
     beyond = error - once @ np.linalg.lstsq(once, error, rcond=None)[0]
@@ -153,7 +150,7 @@ def one(seed: int, kind: str, images: bool) -> dict[str, Any]:
     off["alpha"] = (off["alpha"] + 180.0) % 360.0 - 180.0
     return {
         "kind": kind,
-        "before_px": float(before),
+        "before_px": float(np.sqrt(np.mean(before**2))),
         "after_px": float(np.sqrt(np.mean(after**2))),
         "error_um": 1e3 * float(np.sqrt(np.mean(beyond**2))),
         "pulls": [off[n] / certificate.estimates[n].sigma for n in SIX],

@@ -13,10 +13,6 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
 )
 from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX
 from flexdt.twin.calibration.fit.fit import FitResult, Solver, estimate_geometry
-from flexdt.twin.calibration.fit.fitted_motion import (
-    MotionFit,
-    aware,
-)
 from flexdt.twin.calibration.fit.problem import (
     SIX,
     Strain,
@@ -114,9 +110,6 @@ def fit_scans(
         strain: prior of the phantom's strains; None: the usual one.
         arc: whether an exposure lasts a part of the step.
         rows: whether a part of the step passes from a frame's first row to its last.
-
-    Returns:
-        The fit; with motion, its sigmas contain the motion's uncertainty.
     """
     if bead_tolerance_mm is None:
         tolerance = request.bead_tolerance_mm
@@ -126,7 +119,7 @@ def fit_scans(
     weighed = positions_weighed(state)
     frames = [len(scan.poses) for scan in state.scans]
     sizes = np.array([scan.frames.shape for scan in state.scans], dtype=np.float64)
-    fit = estimate_geometry(
+    return estimate_geometry(
         np.concatenate([s.tracks for s in seen]),
         state.model,
         Poses.concatenate([s.poses for s in state.scans]),
@@ -151,9 +144,6 @@ def fit_scans(
         arc=arc,
         rows=rows,
     )
-    if state.motion is None:
-        return fit
-    return aware(fit, state.motion)
 
 
 def _common(state: Calibration) -> FloatArray | None:
@@ -177,7 +167,6 @@ def refit_scans(
     fit: FitResult,
     *,
     extra: tuple[str, ...] = (),
-    motion: MotionFit | None = None,
     bead_tolerance_mm: float | None = None,
     start: Sequence[Offsets] | None = None,
     panel: PanelModel | None = None,
@@ -193,8 +182,6 @@ def refit_scans(
         request: the parameters free otherwise.
         fit: the last one, whose distortion, strain, arc and rows are kept.
         extra: parameters that are free too.
-        motion: of the scans, applied to their poses first; None: none besides that in
-            `state`.
         bead_tolerance_mm: prior of the beads' places; None: the request's, not the last
             fit's.
         start: offsets of each scan; None: those of the last fit.
@@ -203,10 +190,6 @@ def refit_scans(
         arc: whether an exposure lasts a part of the step; None: as in the last fit.
         rows: whether rows are read one after another; None: as in the last fit.
     """
-    if motion is not None:
-        scans = zip(state.scans, motion.motions, strict=True)
-        moved = tuple(replace(s, poses=m.applied(s.poses)) for s, m in scans)
-        state = replace(state, scans=moved)
     begin = fit.group_parameters if start is None else start
     freed = replace(request, free=tuple(dict.fromkeys((*request.free, *extra))))
     columns = fit.problem.layout

@@ -29,7 +29,6 @@ from flexdt.twin.calibration.diagnose.table.group import Known
 from flexdt.twin.calibration.diagnose.table.verdict import judged
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, Solver
-from flexdt.twin.calibration.fit.fitted_motion import aware
 from flexdt.twin.calibration.fit.priors import ASSUMED, FIXED, gives_room, known
 from flexdt.twin.calibration.fit.problem import (
     SIX,
@@ -87,17 +86,14 @@ def explain(
         _arc_left(state),
         max((m.sampling_px for m in state.measured), default=0.0),
         _limits(state, request),
+        frozenset(
+            name
+            for name, width in stated_priors(state.scans, request, state.model).items()
+            if width == 0
+        ),
+        request.per_frame,
     )
-    better, found = judged(
-        fit,
-        known,
-        followed=state.motion is not None,
-        sigmas_known=weighed,
-        misfit_px=request.misfit_px,
-    )
-    if state.motion is not None:
-        better = aware(better, state.motion)
-    return better, found
+    return judged(fit, known, sigmas_known=weighed, misfit_px=request.misfit_px)
 
 
 def without_groups(state: Calibration, fit: FitResult) -> Calibration:

@@ -220,6 +220,20 @@ def require_scans(scans: Sequence[Scan]) -> None:
         require_seen_from_source(scan)
 
 
+def require_frames_that_move(scans: Sequence[Scan]) -> None:
+    """Check that every scan has enough frames for a motion: three.
+
+    Raises:
+        TwinError: says how many frames the shortest has.
+    """
+    least = min((len(scan.poses) for scan in scans), default=3)
+    if least < 3:
+        raise TwinError(
+            f"motion in a scan of {least} frames; allowed: 3 or more",
+            {"asked": least, "allowed": 3},
+        )
+
+
 def require_seen_from_source(scan: Scan) -> None:
     """Check in each view that rows are counted downwards (v does not point up), and
     columns from left to right as seen from the source.

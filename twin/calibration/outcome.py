@@ -11,9 +11,6 @@ from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.fit.fit import FitResult
-from flexdt.twin.calibration.fit.fitted_motion import (
-    MotionFit,
-)
 from flexdt.twin.calibration.frame_source import (
     FrameSpots,
     Scan,
@@ -36,7 +33,7 @@ class Calibration:
         measured: positions of the second measurement of each scan; empty without one.
         scans: that were calibrated, with the motion found in their poses.
         model: the phantom's beads.
-        motion: that was found; None if it was not requested.
+        motions: of each scan, in their poses; empty if none was requested.
         lags: of the camera in each scan, removed from the measurements.
         missing_light: in the images of each scan, given back in the measurements.
     """
@@ -48,16 +45,9 @@ class Calibration:
     measured: tuple[Refined, ...]
     scans: tuple[Scan, ...]
     model: BeadModel
-    motion: MotionFit | None = None
+    motions: tuple[Motion, ...] = ()
     lags: tuple[Lag, ...] = ()
     missing_light: tuple[MissingLight, ...] = ()
-
-    @property
-    def motions(self) -> tuple[Motion, ...]:
-        """The motion of each scan; empty if it was not requested."""
-        if self.motion is None:
-            return ()
-        return self.motion.motions
 
     @property
     def panel(self) -> Panel | None:
@@ -84,6 +74,17 @@ class Calibration:
     def identifiable(self) -> bool:
         """There is a fit, it determines every parameter, and nothing forbids using it."""
         return self.fit is not None and self.fit.identifiable and not self.errors
+
+    def moved(self, motions: tuple[Motion, ...]) -> Calibration:
+        """Return the calibration with motions in its scans' poses, in place of those in them."""
+        scans = self.scans
+        for some, sign in ((self.motions, -1.0), (motions, 1.0)):
+            if some:
+                scans = tuple(
+                    replace(scan, poses=motion.applied(scan.poses, sign))
+                    for scan, motion in zip(scans, some, strict=True)
+                )
+        return replace(self, scans=scans, motions=motions)
 
     def with_findings(self, *more: Finding) -> Calibration:
         """Add findings."""

@@ -20,7 +20,6 @@ from flexdt.twin.calibration.detect.bead_contrast import detector_for
 from flexdt.twin.calibration.detect.detection import SpotFinder
 from flexdt.twin.calibration.diagnose import (
     OF_MOTION,
-    OF_RESIDUALS,
     CalibrationCode,
     listed,
 )
@@ -38,21 +37,17 @@ from flexdt.twin.calibration.diagnose.measured_spots import (
 )
 from flexdt.twin.calibration.fit.fit import FitResult, with_start
 from flexdt.twin.calibration.fit.problem import SIX, usual_step
-from flexdt.twin.calibration.fits_of_scans import fit_scans
+from flexdt.twin.calibration.fits_of_scans import fit_scans, refit_scans
 from flexdt.twin.calibration.fixed_check import check_fixed, explain
 from flexdt.twin.calibration.frame_source import (
     FrameState,
     Scan,
     require_different,
+    require_frames_that_move,
     require_scans,
     without_repeats,
 )
 from flexdt.twin.calibration.identified_scans import identify_scans
-from flexdt.twin.calibration.motion_of_scans import (
-    explained_with_motion,
-    fit_with_motion,
-    settle_motion,
-)
 from flexdt.twin.calibration.outcome import Calibration
 from flexdt.twin.calibration.recognise.recognised import judge_emptiness
 from flexdt.twin.calibration.recognise.rivals import asked_of, with_rivals
@@ -141,6 +136,8 @@ def calibrate(
     else:
         solids = scene
     require_scans(scans)
+    if asked.per_frame:
+        require_frames_that_move(scans)
     model = with_contrast(bead_model(phantom), solids)
     asked = with_stated(asked, model)
     state = _detected(scans, model, detector)
@@ -207,8 +204,9 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
     """Fit to the detected spots: with all six main parameters free if they are
     determined, else with the requested ones.
 
-    Adds the motion of single frames if requested, and findings on bead sizes if these are
-    known and the fit is not singular.
+    The motion of single frames, if requested, is put into the poses, so that spots are looked
+    for where they are. Adds findings on bead sizes if these are known and the fit is not
+    singular.
 
     Args:
         state: scans with identified spots.
@@ -222,8 +220,10 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
     if not fit.determined:
         request = asked
         fit = fit_scans(state, request)
-    if request.per_frame:
-        state, fit = fit_with_motion(state, request, fit)
+    if request.per_frame and request.second_look:
+        better, _ = explain(state, request, fit)
+        state = state.moved(better.motions)
+        fit = refit_scans(state, request, fit)
     if request.known_sizes and not fit.certificate.spectrum.singular:
         state = state.with_findings(*judge_first_sizes(state, request, fit))
     return Fitted(state, request, fit, fit.iterations)
@@ -231,7 +231,7 @@ def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
 
 def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
     """Measure the spots a second time, fit to them, and judge sizes (if known), body, lag and
-    missing light; with motion if it is requested.
+    missing light.
 
     Args:
         fitted: the first fit.
@@ -255,17 +255,14 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
     for scan, measured in zip(state.scans, state.measured, strict=True):
         step = usual_step(scan.poses.angle)
         state = state.with_findings(*listed(judge_smear(measured.smear, step)))
-    if request.per_frame:
-        state, fit = fit_with_motion(state, request, fit)
     return Fitted(state, request, fit, fitted.iterations + iterations)
 
 
 def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
-    """Explain the residuals, check the parameters that were not estimated, settle the
-    motion if there is one, and add findings.
+    """Explain the residuals, check the parameters that were not estimated, and add findings.
 
-    With motion, vibration is reported only if it forbids the fit; where light is missing, it
-    is a rival of a phantom of another shape.
+    A motion that is requested is put into the poses at the end. Where light is missing, it is
+    a rival of a phantom of another shape.
 
     Args:
         fitted: the last fit.
@@ -275,23 +272,17 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
         The calibration, its fit relative to the caller's start and with the iterations of
         all fits.
     """
-    state, fit, explained = explained_with_motion(
-        fitted.state, fitted.request, fitted.fit
-    )
+    state, request, fit = fitted.state, fitted.request, fitted.fit
+    if state.motions:
+        state = state.moved(())
+        fit = refit_scans(state, request, fit)
+    fit, explained = explain(state, request, fit)
     state = _judged_places(state, fit, explained)
-    state, fit, explained = _fixed_as_asked(state, asked, fitted.request, fit, explained)
-    if state.motion is not None:
-        state, unsettled = settle_motion(state, fitted.request, fit)
-        state = state.with_findings(*unsettled)
-        # A deviation in every frame takes up part of what its beads share, and the rest looks
-        # shared, too: the sigmas stay wide, but nothing vibrates. What explains a misfit stays.
-        explained = [
-            f for f in explained if f.code is not CalibrationCode.VIBRATION or f.forbids
-        ]
+    fit, explained = check_fixed(state, asked, request, fit, explained)
     if any(light.seen for light in state.missing_light):
         explained = [beside_missing_light(f) for f in explained]
     fit = with_rivals(state, asked, with_start(fit, asked.start, fitted.iterations))
-    return replace(state, fit=fit).with_findings(*explained)
+    return replace(state.moved(fit.motions), fit=fit).with_findings(*explained)
 
 
 def _judged_places(
@@ -315,36 +306,3 @@ def _judged_places(
         state = state.with_findings(*judge_places(fit, state.looks))
     # Spots beside the phantom's are those of a bead that is displaced.
     return replace(state, findings=state.findings.unexplained_by(explained))
-
-
-def _fixed_as_asked(
-    state: Calibration,
-    asked: CalibrationRequest,
-    free: CalibrationRequest,
-    fit: FitResult,
-    explained: list[Finding],
-) -> tuple[Calibration, FitResult, list[Finding]]:
-    """Fix the parameters that were not requested, if they agree with the data; see
-    `check_fixed`.
-
-    If that changed the free parameters and nothing forbids the fit, a motion is fitted
-    again and residuals explained again.
-
-    Args:
-        state: the scans and their measurements.
-        asked: the user's request.
-        free: the request with which `fit` was made.
-        fit: the last fit.
-        explained: findings on its residuals.
-
-    Returns:
-        State, fit and findings.
-    """
-    fixed, explained = check_fixed(state, asked, free, fit, explained)
-    narrower = list(fixed.values) != list(fit.values)
-    if state.motion is None or not narrower or any(f.forbids for f in explained):
-        return state, fixed, explained
-    # Motion took up what is fixed now, or the other way round.
-    state, fixed = fit_with_motion(state, asked, fixed)
-    fixed, again = explain(state, asked, fixed)
-    return state, fixed, [*again, *Findings(explained).without(*OF_RESIDUALS)]

@@ -52,7 +52,7 @@ class CalibrationRequest:
         bound: sigma [mm, deg] beyond which the result is not identifiable.
         known_sizes: the beads' radii are known; else they were taken from the spots.
         misfit_px: residual up to which a fit is used, whatever its positions scatter.
-        per_frame: those that may also differ from frame to frame, see `fit.fitted_motion`.
+        per_frame: those that may also differ from frame to frame, see `diagnose.table.followed`.
 
     Raises:
         UnknownNameError: a name that is no parameter, or cannot differ from frame to frame.

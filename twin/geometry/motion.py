@@ -1,7 +1,7 @@
 """Motion of scanner or sample during a scan: how frames differ from one another.
 
 It is put into `Poses`, so whatever takes one geometry a view takes it: formats,
-reconstruction. `calibration.fit.fitted_motion` finds it.
+reconstruction. `calibration.diagnose.table.followed` finds it.
 """
 
 from __future__ import annotations

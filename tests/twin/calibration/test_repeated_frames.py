@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers
-from flexdt.twin.calibration.diagnose.named_motion import named_turn
+from flexdt.twin.calibration.diagnose.frame_numbers import FrameNumbers, named_turn
 from flexdt.twin.calibration.repeated_frames import find_repeated
 
 ROWS, COLUMNS = 24, 48

@@ -9,10 +9,7 @@ import pytest
 from causes_named import calibrated, worst_error
 from faults_drawn import drawn
 
-from flexdt.twin.calibration.fit import fitted_motion
 from flexdt.twin.calibration.fit.fit import image_quantities
-from flexdt.twin.calibration.fit.fitted_motion import _averaged
-from flexdt.twin.calibration.fit.motion_model import Answer
 from flexdt.twin.calibration.pipeline import Calibration
 
 OBJECT = ("dO_x", "dO_y", "dO_z", "alpha")
@@ -21,6 +18,11 @@ OBJECT = ("dO_x", "dO_y", "dO_z", "alpha")
 def moving(result: Calibration) -> set[str]:
     (motion,) = result.motions
     return {n for n, v in zip(motion.names, motion.values.T, strict=True) if v.any()}
+
+
+def slanted(moves: set[str]) -> set[str]:
+    """Add what a way along the beam may have aside, which moves with it."""
+    return moves | {"dO_x", "dO_y"} if "dO_z" in moves else moves
 
 
 def codes(result: Calibration) -> list[str]:
@@ -65,7 +67,7 @@ def test_what_jumps_is_followed_and_not_what_was_asked_for(
     scan = drawn(kind, seed)
     result = calibrated(scan, asked)
     assert result.identifiable, result.findings
-    assert moving(result) == moves
+    assert moves <= moving(result) <= slanted(moves)
     assert worst_error(result, scan)[0] < 4.0
 
 
@@ -77,7 +79,10 @@ def test_an_object_that_jumps_twice_is_no_object_and_panel_that_jump(
     scan = drawn("object_jumps_twice", 2)
     result = calibrated(scan, asked)
     assert result.identifiable, result.findings
-    assert moving(result) == {"dO_x"}
+    if moving(result) != {"dO_x"}:
+        assert asked == ("dS_x",)
+        (said,) = (f.text for f in result.findings if f.code == "motion_open")
+        assert "or otherwise: the object moves aside" in said
     assert worst_error(result, scan)[0] < 4.0
 
 
@@ -93,35 +98,6 @@ def test_what_is_open_is_in_the_sigmas_of_every_frame() -> None:
     assert np.abs(moved / sigma).max() < 2.0
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.25, 4.0])
-def test_a_mixture_has_the_variances_and_the_differences_of_its_parts(
-    weight: float,
-) -> None:
-    """Moments about one part, from draws of the mixture."""
-    rng = np.random.default_rng(5)
-    one, other = (
-        Answer(
-            rng.normal(size=(4, 2)),
-            rng.uniform(0.5, 1.0, size=(4, 2)),
-            np.diag(rng.uniform(0.5, 1.0, size=3)),
-            1.0,
-            rng.normal(size=3),
-        )
-        for _ in range(2)
-    )
-    sigma, added = _averaged(one, [(other, weight)])
-    second = rng.random(400_000) < weight / (1.0 + weight)
-    for i in range(3):
-        means = np.where(second, other.columns[i] - one.columns[i], 0.0)
-        widths = np.where(second, other.added[i, i], one.added[i, i]) ** 0.5
-        drawn_off = means + widths * rng.normal(size=len(second))
-        assert added[i, i] == pytest.approx(np.mean(drawn_off**2), rel=0.02)
-    means = np.where(second, other.values[2, 1] - one.values[2, 1], 0.0)
-    widths = np.where(second, other.sigma[2, 1], one.sigma[2, 1])
-    drawn_off = means + widths * rng.normal(size=len(second))
-    assert sigma[2, 1] ** 2 == pytest.approx(np.mean(drawn_off**2), rel=0.02)
-
-
 def test_the_column_of_a_scan_with_motion_is_that_of_its_mean() -> None:
     """It was that of the first frame, with the sigma of the mean: 210 sigmas off."""
     scan = drawn("source_jumps", 9304)
@@ -131,20 +107,6 @@ def test_the_column_of_a_scan_with_motion_is_that_of_its_mean() -> None:
     low, high = scan.image_ends["axis_column"]
     assert high - low > 1.0
     assert column.value == pytest.approx(scan.image["axis_column"], abs=4 * column.sigma)
-
-
-@pytest.mark.slow
-@pytest.mark.campaign(1)
-def test_a_misfit_named_a_vibration_is_not_dropped_with_a_motion(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """What was asked for does not move here, and the shaking is still there."""
-    monkeypatch.setattr(fitted_motion, "MOVABLE", ())
-    scan = drawn("vibration", 3)
-    told = {"vibration", "misfit"}
-    assert told & {f.code for f in calibrated(scan).findings}
-    result = calibrated(scan, ("alpha",))
-    assert not result.identifiable, result.findings
 
 
 def test_what_is_stated_exactly_is_doubted_by_evidence_alone() -> None:

@@ -99,12 +99,6 @@ class CalibrationCode(FindingCode):
         "another motion than the asked one was followed",
     )
     MOTION_OPEN = "motion_open", WARNING, "motions that the images do not tell apart"
-    MOTION_UNSETTLED = "motion_unsettled", WARNING, "a motion whose search did not settle"
-    MOTION_HIDES = (
-        "motion_hides",
-        ERROR,
-        "a motion that takes up a parameter that was asked for",
-    )
     PHANTOM_STRAINED = (
         "phantom_strained",
         WARNING,

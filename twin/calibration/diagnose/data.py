@@ -18,7 +18,7 @@ import numpy.typing as npt
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections, SpotFinder
 from flexdt.twin.calibration.diagnose import OF_MOTION, CalibrationCode
-from flexdt.twin.calibration.diagnose.named_motion import named_turn
+from flexdt.twin.calibration.diagnose.frame_numbers import named_turn
 from flexdt.twin.calibration.diagnose.table.group import Known
 from flexdt.twin.calibration.diagnose.table.verdict import judged
 from flexdt.twin.calibration.fit.fit import Solver, estimate_geometry

@@ -258,3 +258,29 @@ def _likeliest(costs: FloatArray) -> npt.NDArray[np.intp]:
     for i in range(n - 1, 0, -1):
         path[i - 1] = came[i, path[i]]
     return path
+
+
+def named_turn(turn_deg: float, angles: FloatArray) -> tuple[CalibrationCode, str]:
+    """Name the likely cause where an object turns further or less far than stated: lost or
+    doubled frames if by a whole number of steps (within 0.05 step), else a slip.
+
+    Args:
+        turn_deg: the turn beyond the stated one, in the sense of the angles.
+        angles: stated angles of the frames [rad].
+
+    Returns:
+        Code of the finding, `frame_numbers` or `angle_step`, and its words.
+    """
+    step = math.degrees(float(np.median(np.diff(angles))))
+    whole = round(turn_deg / step) if step else 0
+    if whole and abs(turn_deg - whole * step) < 0.05 * abs(step):
+        count = "1 frame is" if abs(whole) == 1 else f"{abs(whole)} frames are"
+        what = "lost" if whole > 0 else "doubled"
+        return CalibrationCode.FRAME_NUMBERS, (
+            f"the object turns by {turn_deg:+.3f} deg beyond what is stated: {count} {what} "
+            "there, or the frames' numbers are wrong"
+        )
+    return CalibrationCode.ANGLE_STEP, (
+        f"the object turns by {turn_deg:+.3f} deg beyond what is stated: it slipped, or frames "
+        "are missing there"
+    )

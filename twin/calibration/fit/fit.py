@@ -406,7 +406,8 @@ class FitResult:
         bead_prior_mm: standard deviation of the prior on bead positions; 0 if they were fixed.
         strain_prior: that of the phantom's stretches and shears; 0 if it has its stated shape.
         rival_pitch: pixel pitch that is in the covariance; None: no such pitch.
-        motions: deviations of single frames in the poses, of each group; empty: none.
+        motions: deviations of single frames from the geometry, which is that of their mean, of
+            each group; empty: they were not asked for.
     """
 
     parameters: Offsets
@@ -819,11 +820,6 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     """
     t = float(stdtrit(fit.certificate.dof, 0.975))
     problem = fit.problem
-    if fit.motions:
-        deviations = replace(
-            fit.motions[0], values=np.concatenate([m.values for m in fit.motions])
-        )
-        problem = replace(problem, poses=deviations.applied(problem.poses, -1.0))
     out = []
     for group in range(len(fit.group_parameters)):
         here, rows = image_slopes(problem, fit.solution.x, group)

@@ -23,7 +23,7 @@ SHIFT_ROUNDS: Final = 3
 PRIOR_WEIGHT: Final = 1e-6
 """Weight that keeps shifts near 0 in directions that the images do not determine."""
 MIN_EVIDENCE: Final = 6.0
-"""Gain in log likelihood from which frames count as moving, as in `fitted_motion`."""
+"""Gain in log likelihood from which frames count as moving."""
 ERROR_FACTOR: Final = 1.5
 """Factor on the errors estimated from disagreements and noise (assumed)."""
 MIN_SQUARE_RATIO: Final = 5.0

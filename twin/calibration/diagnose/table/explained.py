@@ -68,6 +68,8 @@ class Explained:
         moves_px: group -> root mean square of the shift that it makes, less what the geometry
             would take up of it [px].
         held: groups of the best model that are assumed.
+        search: of the last table.
+        state: what the best model makes of it.
     """
 
     fit: FitResult
@@ -76,7 +78,9 @@ class Explained:
     weights: dict[Group, FloatArray]
     strain: tuple[FloatArray, FloatArray] | None
     moves_px: dict[Group, float]
-    held: frozenset[Group] = frozenset()
+    held: frozenset[Group]
+    search: Search
+    state: State
 
     def of(self, cause: str) -> list[Group]:
         """List the groups of a cause that the best model has."""
@@ -92,13 +96,12 @@ class Explained:
         return np.asarray(own @ self.weights[group])
 
 
-def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Explained:
+def explained(fit: FitResult, known: Known) -> Explained:
     """Explain the residuals of a fit by groups of columns.
 
     Args:
         fit: determined; without groups.
         known: statements on the phantom and the positions.
-        families: causes that are left out.
     """
     plain = fit.problem
     _, x = with_every_column(plain, fit.solution.x)
@@ -109,7 +112,7 @@ def explained(fit: FitResult, known: Known, families: Sequence[str] = ()) -> Exp
     before: tuple[frozenset[str], int] | None = None
     for turn in range(MOST_TABLES):
         table = Linearised(plain, state, known.floor)
-        some = [f for f in every_family(table, known) if f.cause not in families]
+        some = every_family(table, known)
         search = Search(table, some, plain.expected_spread)
         at = {
             name: (i, g)
@@ -313,7 +316,7 @@ def _made(
     )
     return Explained(
         made, posterior, table, weights, _strain(search, posterior),
-        {g: _effect(search, best, g, weights[g]) for g in groups}, held,
+        {g: _effect(search, best, g, weights[g]) for g in groups}, held, search, state,
     )  # fmt: skip
 
 

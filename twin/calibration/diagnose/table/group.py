@@ -60,6 +60,8 @@ class Known:
             not measured.
         sampling_px: standard deviation of errors that follow a spot's place in the pixel grid.
         limits: largest standard deviation of causes (`stated_causes`), 0: excluded.
+        exact: parameters that are stated to be exactly known.
+        asked: parameters that may differ from frame to frame.
     """
 
     strain: Strain
@@ -69,6 +71,8 @@ class Known:
     arc_left: float | None = None
     sampling_px: float = 0.0
     limits: Mapping[str, float] = field(default_factory=dict)
+    exact: frozenset[str] = frozenset()
+    asked: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,12 +173,17 @@ class Found:
         open: words on causes that are neither shown nor excluded.
         strain: of the phantom, (10,) in the order of STRAINS, and its covariance; None: its
             shape is exact.
+        asked: parameters that are followed from frame to frame, with what else moves; empty:
+            nothing is.
+        movers: probability of each set of what moves.
     """
 
     fit: FitResult
     seen: tuple[Seen, ...]
     open: tuple[str, ...]
     strain: tuple[FloatArray, FloatArray] | None
+    asked: tuple[str, ...] = ()
+    movers: Mapping[frozenset[str], float] = field(default_factory=dict)
 
     def of(self, cause: str) -> list[Seen]:
         """List the groups of a cause that are there, beyond doubt."""

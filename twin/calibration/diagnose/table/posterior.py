@@ -88,14 +88,19 @@ class Part:
 
     Attributes:
         weight: its probability.
-        groups: that are there.
+        widths: variance of the weights of each group that is there.
         mean, covariance: of the geometry's columns.
     """
 
     weight: float
-    groups: frozenset[Group]
+    widths: Mapping[Group, float]
     mean: FloatArray
     covariance: FloatArray
+
+    @property
+    def groups(self) -> frozenset[Group]:
+        """The groups that are there."""
+        return frozenset(self.widths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -511,18 +516,17 @@ class Search:
             further: what further groups would add to it. Groups that are held are in all.
         """
         count = self.table.parameters
-        parts: list[tuple[float, frozenset[Group], FloatArray, FloatArray]] = []
+        parts: list[tuple[float, Mapping[Group, float], FloatArray, FloatArray]] = []
 
         def take(one: Model, log_weight: float) -> None:
             parts.append(
-                (log_weight, frozenset(one.widths), one.solved.mean[:count],
+                (log_weight, one.widths, one.solved.mean[:count],
                  one.solved.covariance[:count, :count])
             )  # fmt: skip
 
         def take_further(
             one: Model, some: Mapping[int, Further], log_weight: float
         ) -> None:
-            own = frozenset(one.widths)
             mean = one.solved.mean[:count]
             covariance = one.solved.covariance[:count, :count]
             for f, more in some.items():
@@ -536,7 +540,7 @@ class Search:
                     parts.append(
                         (
                             float(weight[g, w]),
-                            own | {(f, g)},
+                            {**one.widths, (f, g): one.noise2 * GRID[w] ** 2},
                             mean + off,
                             covariance + wide,
                         )
@@ -563,8 +567,8 @@ class Search:
         chances = np.exp(logs - logs.max())
         chances /= chances.sum()
         kept = [
-            Part(float(c), groups, mean, covariance)
-            for c, (_, groups, mean, covariance) in zip(chances, parts, strict=True)
+            Part(float(c), widths, mean, covariance)
+            for c, (_, widths, mean, covariance) in zip(chances, parts, strict=True)
         ]
         return Posterior(
             model, tuple(kept), self.products.families, tuple(self.products.units)

@@ -18,6 +18,10 @@ from scipy.special import chdtri
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.frame_places import MOST_LEFT_OUT
 from flexdt.twin.calibration.diagnose.table.explained import Explained, explained
+from flexdt.twin.calibration.diagnose.table.followed import (
+    frame_motions,
+    sets_of_movers,
+)
 from flexdt.twin.calibration.diagnose.table.group import (
     NAMED_LOG_ODDS,
     OPEN_LOG_ODDS,
@@ -29,7 +33,6 @@ from flexdt.twin.calibration.diagnose.table.groups import (
     CAUSES,
     bead_places,
     bend,
-    growth,
     moving,
     positions,
     rows,
@@ -48,7 +51,6 @@ NOISE_SIGMAS: Final = 1.5
 LEAST_BEADS: Final = 3
 MOST_LOST: Final = 0.35
 """Part of the positions that may be left out."""
-OF_MOTION: Final = (moving.NAME, growth.NAME)
 
 
 class Use(enum.Enum):
@@ -95,7 +97,6 @@ def judged(
     fit: FitResult,
     known: Known,
     *,
-    followed: bool = False,
     sigmas_known: bool,
     misfit_px: float = 0.0,
 ) -> tuple[FitResult, list[Finding]]:
@@ -104,29 +105,35 @@ def judged(
     Args:
         fit: to be judged; nothing is judged if it is not determined.
         known: statements on the phantom and the positions.
-        followed: whether the motion of its frames is in its poses already.
         sigmas_known: the positions' sigmas were measured, and are no more than compared.
         misfit_px: residual up to which the fit is used, whatever its positions scatter.
 
     Returns:
         The fit to be reported, with the groups that explain its residuals and with the
-        posterior's sigmas, and the findings.
+        posterior's sigmas, and with the motion if any is asked; and the findings.
     """
     if not fit.determined:
         return fit, []
-    what = explained(fit, known, OF_MOTION if followed else ())
-    found = found_in(what)
+    what = explained(fit, known)
+    found = found_in(what, known.asked)
     told = [finding for cause in CAUSES for finding in cause.told(found)]
     told += _open(found, told)
     fit = what.fit
+    if known.asked:
+        fit = replace(fit, motions=frame_motions(what, known.asked))
     lost = _lost_beads(fit, told)
     if _misfits(what, sigmas_known, misfit_px):
         told = [_misfit(fit)] if not any(_withheld(f) for f in told) else told
     return fit, [*lost, *map(_by_policy, told)]
 
 
-def found_in(what: Explained) -> Found:
-    """Collect what a table has found, for sentences."""
+def found_in(what: Explained, asked: tuple[str, ...] = ()) -> Found:
+    """Collect what a table has found, for sentences.
+
+    Args:
+        what: was found.
+        asked: parameters that are followed from frame to frame.
+    """
     posterior = what.posterior
     certificate = what.fit.certificate
     px = certificate.rms_px / certificate.noise if certificate.noise > 0 else 1.0
@@ -154,7 +161,8 @@ def found_in(what: Explained) -> Found:
         if cause.name not in (positions.NAME, spots.NAME)
         and (cause.name in there or posterior.cause_odds(cause.name) > -OPEN_LOG_ODDS)
     )
-    return Found(what.fit, tuple(seen), rivals, what.strain)
+    movers = sets_of_movers(what) if asked else {}
+    return Found(what.fit, tuple(seen), rivals, what.strain, asked, movers)
 
 
 def _told_odds(posterior: Posterior, cause: str) -> float:
@@ -166,8 +174,10 @@ def _open(found: Found, told: list[Finding]) -> list[Finding]:
     """Tell causes together that are likely, but not beyond doubt; a strained phantom's
     rivals are in its own finding.
     """
+    # Of a motion that is followed its own sentence says what is open.
+    others = (spots.NAME, moving.NAME) if found.asked else (spots.NAME,)
     doubtful = [
-        s for s in found.seen if s.odds <= NAMED_LOG_ODDS and s.cause != spots.NAME
+        s for s in found.seen if s.odds <= NAMED_LOG_ODDS and s.cause not in others
     ]
     if not doubtful or any(f.code is CalibrationCode.PHANTOM_STRAINED for f in told):
         return []

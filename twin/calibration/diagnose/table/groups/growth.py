@@ -26,7 +26,11 @@ MOST_WAVES: Final = 6
 
 
 def families(table: Linearised, known: Known) -> Iterator[Family]:
-    """Make a growth over each scan: evenly, and as half waves that fade with their number."""
+    """Make a growth over each scan: evenly, and as half waves that fade with their number; none
+    where what looks alike is followed from frame to frame, as no geometry of a frame grows.
+    """
+    if "dO_z" in known.asked:
+        return
     for number, frames in enumerate(table.scans):
         if len(frames) < 3:
             continue

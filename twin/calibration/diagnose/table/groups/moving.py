@@ -10,7 +10,7 @@ for that; of what is seen to move aside, that part is left open (`confused`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple, cast
 
@@ -18,14 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.calibration.diagnose import CalibrationCode
-from flexdt.twin.calibration.diagnose.named_motion import (
-    ALIKE_MOTION,
-    MOTION_WORDS,
-    named_turn,
-)
+from flexdt.twin.calibration.diagnose.frame_numbers import named_turn
 from flexdt.twin.calibration.diagnose.table.group import (
     LOG_CHANCE,
     NEVER,
+    OPEN_LOG_ODDS,
     Acts,
     Family,
     Found,
@@ -56,6 +53,29 @@ JITTERS: Final = ("dO_x", "dO_y", "dO_z", "alpha")
 """What may differ from frame to frame by itself: of others this looks like the object's."""
 FOLLOWED: Final = ("dO_x", "dO_y", "dO_z", "alpha")
 """Parameters that are advised to differ between frames where something moves."""
+EXACT: Final = math.log(1e-3)
+"""Logarithm of the probability that what is stated to be exactly known moves; assumed."""
+NOT_ASKED: Final = -math.log(2.0)
+"""Logarithm of the odds that something else moves than what is asked for; assumed."""
+MOTION_WORDS: Final = {
+    "dO_x": "the object moves aside",
+    "dO_y": "the object moves up or down",
+    "dO_z": "the object moves along the beam",
+    "alpha": "the object turns",
+    "dS_x": "the source moves aside",
+    "dS_y": "the source moves up or down",
+    "dS_z": "the source moves along the beam",
+    "dD_x": "the panel moves aside",
+    "dD_y": "the panel moves up or down",
+    "dD_z": "the panel moves along the beam",
+}
+"""Parameter -> words on its motion."""
+ALIKE_MOTION: Final = {
+    "dO_x": ("the source moves aside, the other way",),
+    "dO_y": ("the source moves up or down, the other way",),
+    "dO_z": ("the phantom grows or shrinks",),
+}
+"""Parameter -> other motions that look like this motion of the object."""
 LEAST_FRAMES: Final = 3
 MOST_WAVES: Final = 60
 """Half waves in a scan, of a wander."""
@@ -71,6 +91,7 @@ TURNING: Final = ("swings", "wanders", "ramps")
 LEAVING: Final = ("jumps", "wanders", "ramps")
 """Ways of motion after which a thing is elsewhere than before."""
 DIFFERS: Final = "differs between scans"
+ASLANT: Final = "aside"
 ALONG: Final = ("dO_z", "dD_z")
 ASIDE: Final = ("dO_x", "dO_y")
 SLANT: Final = 1.0
@@ -93,6 +114,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     scan.
     """
     yield from _aside(table)
+    movers = tuple(dict.fromkeys((*MOVERS, *known.asked)))
     many = len(table.scans) > 1
     for number, frames in enumerate(table.scans):
         count = len(frames)
@@ -120,14 +142,16 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         ):
             if how == "swings" and count < LEAST_SWINGING:
                 continue
-            some = JITTERS if how == "jitters" else tuple(MOVERS)
+            some = movers
+            if how == "jitters":
+                some = tuple(dict.fromkeys((*JITTERS, *known.asked)))
             if how == "ramps":
                 # Of even angles this is a factor on them.
-                some = tuple(what for what in MOVERS if what != "alpha")
+                some = tuple(what for what in movers if what != "alpha")
             for names in _alike(some):
                 yield _family(
                     table, [Moves(name, how, number) for name in names], where,
-                    np.stack([_in(table.n, frames, course)]), chance,
+                    np.stack([_in(table.n, frames, course)]), chance + _doubt(names, known),
                 )  # fmt: skip
         # Never chosen: held open beside what moves.
         once = swing[:, [0, HARMONICS]]
@@ -143,11 +167,12 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             [_in(table.n, frames, late[:, i : i + 1]) for i in range(len(jumps))]
         )
         chance = LOG_CHANCE - math.log(KINDS * len(jumps))
-        for names in _alike(tuple(MOVERS)):
+        for names in _alike(movers):
             moves = [
                 Moves(m, "jumps", number, int(frames[at])) for at in jumps for m in names
             ]
-            yield _family(table, moves, where, courses, chance)
+            each = chance + np.tile(_doubt(names, known), len(jumps))
+            yield _family(table, moves, where, courses, each)
     if many:
         group = table.problem.group
         differs = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
@@ -178,7 +203,7 @@ def _aside(table: Linearised) -> Iterator[Family]:
         for i in range(len(ASIDE)):
             courses[0, i, :, i] = course - course.mean()
         yield Family(
-            NAME, (f"aside with {name}",), Acts.FRAMES, ((ASIDE, Moves("dO_x", "aside", -1)),),
+            NAME, (f"aside with {name}",), Acts.FRAMES, ((ASIDE, Moves("dO_x", ASLANT, -1)),),
             0.0, slopes=np.array([[PER_FRAME.index(p) for p in ASIDE]]), courses=courses,
             always=SLANT,
         )  # fmt: skip
@@ -219,6 +244,13 @@ def apart(courses: Iterable[tuple[object, FloatArray]]) -> dict[str, float]:
     return out
 
 
+def mover(place: object) -> str:
+    """Return what a group moves, of its place; "" where it is no motion, or is never shown."""
+    if isinstance(place, tuple) and len(place) > 1 and isinstance(place[1], Moves):
+        return "" if place[1].how in (ONCE, ASLANT) else place[1].what
+    return ""
+
+
 def _alike(names: tuple[str, ...]) -> list[list[str]]:
     """Group movers by the number of their parameters, the angle by itself."""
     kinds = sorted({_kind(name) for name in names})
@@ -226,7 +258,23 @@ def _alike(names: tuple[str, ...]) -> list[list[str]]:
 
 
 def _kind(name: str) -> tuple[int, bool]:
-    return len(MOVERS[name]), name == "alpha"
+    return len(_parts(name)), name == "alpha"
+
+
+def _parts(name: str) -> dict[str, float]:
+    """Return the parameters of a frame that stand for what moves, with their factors."""
+    return MOVERS.get(name, {name: 1.0})
+
+
+def _doubt(names: Sequence[str], known: Known) -> FloatArray:
+    """Return the logarithm of the odds of movers against others, (names,): of what is stated to
+    be exactly known, and of what is not asked for where others are.
+    """
+    exact = known.exact - set(known.asked)
+    out = np.array([0.0 if exact.isdisjoint(_parts(name)) else EXACT for name in names])
+    if known.asked:
+        out += [0.0 if name in known.asked else NOT_ASKED for name in names]
+    return out
 
 
 def _in(n: int, frames: npt.NDArray[np.intp], course: FloatArray) -> FloatArray:
@@ -251,7 +299,7 @@ def _family(
         courses: (m, n, c) of the frames, each with all movers.
         chance: of each.
     """
-    parts = [MOVERS[move.what] for move in moves]
+    parts = [_parts(move.what) for move in moves]
     first = parts[: len(parts) // len(courses)]
     (factors,) = {tuple(part.values()) for part in first}
     names = tuple(
@@ -272,6 +320,8 @@ def told(found: Found) -> list[Finding]:
     """Tell what moves, how, and by how much: the geometry is that of the mean. A turn that is
     whole steps, or a jump of the angle, is an error.
     """
+    if found.asked:
+        return _followed(found)
     seen = found.of(NAME)
     out = []
     turned = [s for s in seen if _moves(s).what == "alpha"]
@@ -283,6 +333,50 @@ def told(found: Found) -> list[Finding]:
     if moved:
         out.append(_moved(moved, found))
     return out
+
+
+def _followed(found: Found) -> list[Finding]:
+    """Tell what moves beside what was asked for, and what may move instead of it: both are
+    followed, so that the motion itself is no fault.
+    """
+    moving = {_moves(s).what: None for s in found.seen if s.cause == NAME}
+    others = [name for name in moving if name not in found.asked]
+    out = []
+    if others:
+        how = "instead of" if set(moving).isdisjoint(found.asked) else "beside"
+        out.append(
+            warning(
+                CalibrationCode.OTHER_MOTION,
+                f"{_in_words(others)} ({', '.join(others)}) {how} {', '.join(found.asked)}: "
+                "that explains the images far better, and was followed",
+            )
+        )
+    if alike := _instead(frozenset(moving), found.movers):
+        out.append(
+            warning(
+                CalibrationCode.MOTION_OPEN,
+                f"the images do not tell for certain what moves, {', '.join(moving) or 'nothing'} "
+                f"or otherwise: {' or '.join(alike)}; the intervals contain what they differ by",
+            )
+        )
+    return out
+
+
+def _instead(moving: frozenset[str], movers: Mapping[frozenset[str], float]) -> list[str]:
+    """List words on what may move in place of what was found to, the most probable first; sets
+    that only have more are left out.
+    """
+    least = math.exp(-OPEN_LOG_ODDS) * movers.get(moving, 0.0)
+    sets: list[frozenset[str]] = []
+    for some in sorted(movers, key=lambda s: -movers[s]):
+        more = moving <= some or any(less <= some for less in sets)
+        if movers[some] >= least and not more:
+            sets.append(some)
+    return [_in_words(sorted(some)) for some in sets]
+
+
+def _in_words(movers: Sequence[str]) -> str:
+    return " and ".join(MOTION_WORDS[name] for name in movers) or "nothing moves"
 
 
 def _moves(seen: Seen) -> Moves:

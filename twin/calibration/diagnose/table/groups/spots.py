@@ -63,6 +63,10 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     # Chebyshev's polynomials: of a circle these are the harmonics that are even about its ends.
     along = chebvander((column - middle) / reach, HARMONICS) * size
     along = np.repeat(along.transpose(1, 0, 2), 2, axis=0)
+    problem = table.problem
+    enlarged = float(np.median(problem.poses.sdd / problem.poses.sod))
+    pixel = float(np.median(np.linalg.norm(problem.poses.u, axis=1)))
+    radius = enlarged * float(np.median(problem.model.bead_radius_mm)) / pixel
     slopes = table.spot_slopes[None]
     count = slopes.shape[1]
     for how, each in (
@@ -78,6 +82,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             LOG_CHANCE_OF_ERRORS - math.log(KINDS),
             slopes=slopes,
             courses=_each_by_itself(each)[None],
+            widest=radius,  # A spot is not found beside its ball.
         )
 
 
