@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from flexdt.twin.calibration.diagnose import (
-    OF_MOTION,
     OF_RESIDUALS,
     CalibrationCode,
     listed,
@@ -24,8 +23,8 @@ from flexdt.twin.calibration.diagnose.fixed_parameters import (
     loosened,
     narrow_priors,
 )
-from flexdt.twin.calibration.diagnose.pixel_pitch import with_rival_pitch
 from flexdt.twin.calibration.diagnose.table.group import Known
+from flexdt.twin.calibration.diagnose.table.groups.told import DISTANCE, pitch_beside
 from flexdt.twin.calibration.diagnose.table.verdict import judged
 from flexdt.twin.calibration.fit.certificate import widened
 from flexdt.twin.calibration.fit.fit import FitResult, Solver
@@ -78,7 +77,8 @@ def explain(
         The fit to be reported, and its findings.
     """
     weighed = positions_weighed(state)
-    known = Known(
+    scanners = known((), None, (scan.priors for scan in state.scans))
+    stated = Known(
         strain_prior(state.model, request),
         request.bead_tolerance_mm,
         (MEASURED if weighed else Solver()).floor_px,
@@ -92,8 +92,9 @@ def explain(
             if width == 0
         ),
         request.per_frame,
+        pitch_beside(fit, scanners[DISTANCE]),
     )
-    return judged(fit, known, sigmas_known=weighed, misfit_px=request.misfit_px)
+    return judged(fit, stated, sigmas_known=weighed, misfit_px=request.misfit_px)
 
 
 def without_groups(state: Calibration, fit: FitResult) -> Calibration:
@@ -171,7 +172,7 @@ def check_fixed(
     checked. Then the priors of other offsets are compared with the images: where they
     contradict, findings say so; where they are a little too narrow, they are widened and
     the fit repeated. Intervals are widened where fixed values are doubtful; parameters
-    stated as exact are judged, and so is a rival pixel pitch.
+    stated as exact are judged.
 
     Args:
         state: the scans and their measurements.
@@ -225,12 +226,7 @@ def check_fixed(
         alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
         return refit_scans(state, alone, fit)
 
-    fit, pitch = with_rival_pitch(
-        doubtful(fit, verdict, without), known((), None, (s.priors for s in state.scans))
-    )
-    if _moves(explained):  # What moves looks like other pixels in part.
-        return fit, [*explained, *found]
-    return fit, [*explained, *found, *listed(pitch)]
+    return doubtful(fit, verdict, without), [*explained, *found]
 
 
 def _exact_judged(
@@ -343,11 +339,6 @@ def _left_by_priors(
     if loose_fit.bead_prior_mm:
         moved = Findings(explained).of(CalibrationCode.BEAD_TOLERANCE)
     return [*Findings(left).without(CalibrationCode.MISFIT), *moved]
-
-
-def _moves(findings: Sequence[Finding]) -> bool:
-    """Check whether something moves."""
-    return bool(Findings(findings).of(*OF_MOTION))
 
 
 def _doubted(

@@ -25,6 +25,7 @@ from flexdt.twin.calibration.diagnose.table.linearised import (
     State,
     with_every_column,
 )
+from flexdt.twin.calibration.diagnose.table.posterior import Search
 from flexdt.twin.calibration.diagnose.table.products import Products
 from flexdt.twin.calibration.fit.certificate import SOURCES
 from flexdt.twin.calibration.fit.fit import FitResult, estimate_geometry
@@ -168,3 +169,32 @@ def test_a_tile_is_found_beside_beads_that_are_out_of_place(fit: FitResult) -> N
     assert causes >= {"beads", "tiles"}, causes
     assert found.fit.problem.panel is not None
     assert found.fit.problem.panel.borders
+
+
+@pytest.mark.parametrize("cause", ["angle scale", "rows", "panel", "spots"])
+def test_evidence_differs_as_densities_do(fit: FitResult, cause: str) -> None:
+    """Of a model with a group and of one without: the normal densities of the values, written
+    out, in directions that columns without a prior leave alone."""
+    table = table_of(fit)
+    some = [f for f in every_family(table, KNOWN) if f.cause == cause]
+    search = Search(table, some, 0.0)
+    group = (0, 0)
+    noise2 = NOISE_PX**2
+    flat = table.precision == 0.0
+    left = np.linalg.svd(table.geometry[:, flat])[0][:, flat.sum() :]
+    rest = table.geometry[:, ~flat]
+    off = left.T @ (table.values - rest @ table.mean[~flat])
+    stated = left.T @ rest / np.sqrt(table.precision[~flat])
+    own = left.T @ search.products.rows(*group) / search.products.units[0][0]
+
+    def density(width2: float) -> float:
+        covariance = noise2 * np.eye(len(off)) + stated @ stated.T + width2 * own @ own.T
+        square = off @ np.linalg.solve(covariance, off)
+        return float(-0.5 * (np.linalg.slogdet(covariance)[1] + square))
+
+    without, beside = (
+        search._evidence(search.solve(widths, noise2, 0), noise2)
+        for widths in ({}, {group: noise2})
+    )
+    gain = density(noise2) - density(0.0)
+    assert beside - without == pytest.approx(gain, rel=1e-5, abs=1e-5)

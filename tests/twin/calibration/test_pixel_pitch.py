@@ -11,14 +11,16 @@ from causes_named import calibrated, worst_error
 from faults_drawn import World, drawn, phantom, shadows
 
 from flexdt.twin.calibration.bead_model import BeadModel
-from flexdt.twin.calibration.diagnose.pixel_pitch import rival_pitch
+from flexdt.twin.calibration.diagnose.table.explained import explained
+from flexdt.twin.calibration.diagnose.table.group import Known
+from flexdt.twin.calibration.diagnose.table.groups.told import pitch_beside
 from flexdt.twin.calibration.fit.fit import (
     FitResult,
     estimate_geometry,
     image_quantities,
 )
 from flexdt.twin.calibration.fit.priors import ASSUMED
-from flexdt.twin.calibration.fit.problem import SIX, Centre
+from flexdt.twin.calibration.fit.problem import SIX, UNSTRAINED, Centre
 from flexdt.twin.geometry.poses import Poses
 
 FREED = ("dD_z",)
@@ -48,8 +50,8 @@ def test_a_freed_distance_near_its_place_is_as_certain_as_before(seed: int) -> N
     assert result.identifiable
     assert not [f for f in result.findings if f.code == "pixel_pitch"]
     assert result.fit is not None
-    assert result.fit.rival_pitch is not None
-    assert result.fit.rival_pitch.share < 0.1
+    estimates = result.fit.certificate.estimates
+    assert estimates["pixel"].sigma * 700.0 < estimates["dD_z"].sigma < 2.0
 
 
 def two_distances(elsewhere_mm: float, pitch: float) -> FitResult:
@@ -87,12 +89,19 @@ def two_distances(elsewhere_mm: float, pitch: float) -> FitResult:
     )  # fmt: skip
 
 
+def distance_of(fit: FitResult) -> tuple[float, float]:
+    """The panel's distance with its sigma, beside all that residuals show."""
+    certificate = explained(fit, Known(UNSTRAINED, 0.0, 1e-3)).fit.certificate
+    estimate = certificate.estimates["dD_z"]
+    return estimate.value, estimate.sigma
+
+
 def test_two_distances_of_the_panel_tell_the_pitch() -> None:
-    """Both ways: a panel elsewhere has no rival there, a wrong pitch is one."""
-    right = rival_pitch(two_distances(25.0, 1.0), ASSUMED)
-    assert right is not None
-    assert right.share < 1e-6
-    wrong = rival_pitch(two_distances(0.0, 1.03), ASSUMED)
-    assert wrong is not None
-    assert wrong.share > 0.999
-    assert wrong.growth == pytest.approx(0.03, abs=0.005)
+    """A panel elsewhere has no rival there. A wrong pitch has one, a panel whose way is wrong,
+    too."""
+    right = two_distances(25.0, 1.0)
+    assert pitch_beside(right, ASSUMED["dD_z"]) is None
+    value, sigma = distance_of(right)
+    assert abs(value - 25.0) < 4.0 * sigma < 2.0
+    value, sigma = distance_of(two_distances(0.0, 1.03))
+    assert abs(value) < 4.0 * sigma

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from flexdt.twin.calibration.detect.windows import Windows, distances2
-from flexdt.twin.calibration.fit.evidence import LOG_CHANCE, NAMED_LOG_ODDS
+from flexdt.twin.calibration.fit.priors import LOG_CHANCE, NAMED_LOG_ODDS
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 
 SMEAR_SAMPLE = 64

@@ -364,29 +364,6 @@ def cost_at(problem: FitProblem, x: FloatArray, use: npt.NDArray[np.bool_]) -> f
     return float(0.5 * np.sum(norms[use] ** 2))
 
 
-@dataclass(frozen=True)
-class RivalPitch:
-    """A pixel pitch that explains a fit as well as its distance of the panel.
-
-    Attributes:
-        growth: true pitch over the stated one, less 1.
-        change: parameter -> its change where that is the cause, edge units.
-        share: probability that it is the cause.
-    """
-
-    growth: float
-    change: Mapping[str, float]
-    share: float
-
-    @property
-    def open_change(self) -> dict[str, float]:
-        """Parameter -> standard deviation, with its sign, that the pitch adds to it: its
-        change times the root of the probability.
-        """
-        part = math.sqrt(self.share)
-        return {name: part * change for name, change in self.change.items()}
-
-
 @dataclass(frozen=True, eq=False)
 class FitResult:
     """A fitted geometry.
@@ -405,7 +382,6 @@ class FitResult:
         solution: column values.
         bead_prior_mm: standard deviation of the prior on bead positions; 0 if they were fixed.
         strain_prior: that of the phantom's stretches and shears; 0 if it has its stated shape.
-        rival_pitch: pixel pitch that is in the covariance; None: no such pitch.
         motions: deviations of single frames from the geometry, which is that of their mean, of
             each group; empty: they were not asked for.
     """
@@ -423,7 +399,6 @@ class FitResult:
     solution: Solution
     bead_prior_mm: float = 0.0
     strain_prior: Strain = UNSTRAINED
-    rival_pitch: RivalPitch | None = None
     motions: tuple[Motion, ...] = ()
 
     @property
@@ -807,7 +782,7 @@ def _log_likelihood(problem: FitProblem, solution: Solution, noise: float) -> fl
 
 def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     """Compute the quantities of IN_IMAGES, in the first frame of each group of frames, to
-    first order; a rival pixel pitch adds to the variance.
+    first order.
 
     Where frames deviate, those of their mean are meant: the sigmas are of it.
 
@@ -824,8 +799,6 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
     for group in range(len(fit.group_parameters)):
         here, rows = image_slopes(problem, fit.solution.x, group)
         variance = np.einsum("qi,ij,qj->q", rows, fit.covariance, rows)
-        if fit.rival_pitch is not None:
-            variance += _pitch_variance(fit, fit.rival_pitch, group, here[0], rows)
         sigma = np.sqrt(np.maximum(variance, 0.0))
         out.append(
             {
@@ -836,33 +809,6 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
             }
         )
     return tuple(out)
-
-
-def _pitch_variance(
-    fit: FitResult, pitch: RivalPitch, group: int, column: float, rows: FloatArray
-) -> FloatArray:
-    """Compute the addition of another pixel pitch to the variances of the quantities of
-    IN_IMAGES beyond its part of the covariance.
-
-    A column in pixels is nearer to the panel's centre where pixels are wider; the other
-    two quantities get 0.
-
-    Args:
-        fit: with the pitch in its covariance.
-        pitch: the pitch.
-        group: of frames.
-        column: of the axis [px].
-        rows: (3, p) derivatives of the quantities by the parameters, edge units.
-
-    Returns:
-        (3,), may be negative.
-    """
-    change = np.array([pitch.change.get(n, 0.0) for n in fit.values])
-    alone = rows @ change
-    frame = int(np.flatnonzero(fit.problem.group == group)[0])
-    beside = alone.copy()
-    beside[0] -= pitch.growth * (column - fit.problem.origin[frame, 0])
-    return np.asarray(pitch.share * (beside**2 - alone**2))
 
 
 def image_slopes(

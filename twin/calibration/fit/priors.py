@@ -38,7 +38,7 @@ lead screw (Dover, Motion Control Handbook), has 18 um."""
 PITCH: Final = 3e-6
 """Standard deviation of the pixel pitch over the told one; assumed: panels are made by
 photolithography, to 1 um in 0.3 m. A pitch that is told wrong is another cause
-(`diagnose.pixel_pitch`)."""
+(`groups.told`)."""
 OFFSETS: Final[Mapping[str, float]] = {
     "dD_x": 2.0,
     "dD_y": 2.0,
@@ -73,6 +73,12 @@ NOISE_PX: Final = 0.1
 """Assumed: standard deviation of a detected coordinate in forecasts [px]. Images of a
 good exposure determine it twenty times better, which priors hide in the offsets and which
 shows in the image."""
+NAMED_LOG_ODDS: Final = math.log(1e4)
+"""Logarithm of the odds from which a cause is named."""
+OPEN_LOG_ODDS: Final = math.log(100.0)
+"""Logarithm of the odds against a cause up to which it is left open."""
+LOG_CHANCE: Final = math.log(0.1)
+"""Logarithm of the probability that a scan has a cause, before it is seen; assumed."""
 Given = Mapping[str, float] | Literal["none"]
 """Widths that a user states in place of others [mm, deg, 1]; "none": all is exactly known."""
 

@@ -48,20 +48,6 @@ class Residuals:
         return np.asarray(np.flatnonzero(self.keep) // (2 * self.problem.seen.shape[1]))
 
 
-def with_lost_frames(
-    seen: npt.NDArray[np.bool_], use: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
-    """Mark the used positions, and all seen ones of a frame whose positions were mostly
-    left out, (n, k).
-
-    Single beads left out are outliers, all of them together are motion.
-    """
-    out = use.copy()
-    lost = (seen & ~use).sum(axis=1) > 0.5 * seen.sum(axis=1)
-    out[lost] = seen[lost]
-    return out
-
-
 def larger(a: FloatArray, b: FloatArray) -> FloatArray:
     """Compute the smallest covariance of a's shape that is at least as wide as both in
     every direction.

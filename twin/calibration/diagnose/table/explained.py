@@ -17,6 +17,7 @@ from flexdt.twin.calibration.diagnose.table.groups import (
     spots,
     strain,
     tiles,
+    told,
 )
 from flexdt.twin.calibration.diagnose.table.linearised import (
     Linearised,
@@ -103,7 +104,7 @@ def explained(fit: FitResult, known: Known) -> Explained:
         fit: determined; without groups.
         known: statements on the phantom and the positions.
     """
-    plain = fit.problem
+    plain = told.with_pitch(fit.problem, known.pitch)
     _, x = with_every_column(plain, fit.solution.x)
     state = State(x, {}, np.zeros((*plain.seen.shape, 2)))
     widths: dict[str, float] = {}
@@ -299,7 +300,7 @@ def _made(
     certificate = _stated(
         replace(certificate, dof=freedom, enlargement=1.0),
         np.asarray(wide),
-        best.solved.covariance[:count, :count] * unit,
+        told.at_told_pitch(best.solved.covariance[:count, :count], problem, known) * unit,
         rivals,
     )
     groups_at = problem.parameters(solution.x)

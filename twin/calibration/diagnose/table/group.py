@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.calibration.fit.evidence import (
+from flexdt.twin.calibration.fit.fit import FitResult
+from flexdt.twin.calibration.fit.priors import (
     LOG_CHANCE,
     NAMED_LOG_ODDS,
     OPEN_LOG_ODDS,
 )
-from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.fit.problem import Strain
 from flexdt.twin.geometry.conventions import FloatArray
 
@@ -44,6 +44,21 @@ class Acts(enum.Enum):
     IMAGE = "places in the image"
 
 
+@dataclass(frozen=True)
+class Pitch:
+    """A pixel pitch that a freed distance of the panel may hide.
+
+    Attributes:
+        share: probability that it is wrong.
+        sigma: standard deviation of it over the told one, with that probability.
+        distance_mm: standard deviation of the distance by the scanners.
+    """
+
+    share: float
+    sigma: float
+    distance_mm: float
+
+
 @dataclass(frozen=True, eq=False)
 class Known:
     """Statements on the phantom and the positions.
@@ -62,6 +77,7 @@ class Known:
         limits: largest standard deviation of causes (`stated_causes`), 0: excluded.
         exact: parameters that are stated to be exactly known.
         asked: parameters that may differ from frame to frame.
+        pitch: of the pixels, that a freed distance hides; None: there is none.
     """
 
     strain: Strain
@@ -73,6 +89,7 @@ class Known:
     limits: Mapping[str, float] = field(default_factory=dict)
     exact: frozenset[str] = frozenset()
     asked: tuple[str, ...] = ()
+    pitch: Pitch | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,16 +190,15 @@ class Found:
         open: words on causes that are neither shown nor excluded.
         strain: of the phantom, (10,) in the order of STRAINS, and its covariance; None: its
             shape is exact.
-        asked: parameters that are followed from frame to frame, with what else moves; empty:
-            nothing is.
-        movers: probability of each set of what moves.
+        known: with what the table was made.
+        movers: probability of each set of what moves, where motion is followed.
     """
 
     fit: FitResult
     seen: tuple[Seen, ...]
     open: tuple[str, ...]
     strain: tuple[FloatArray, FloatArray] | None
-    asked: tuple[str, ...] = ()
+    known: Known
     movers: Mapping[frozenset[str], float] = field(default_factory=dict)
 
     def of(self, cause: str) -> list[Seen]:

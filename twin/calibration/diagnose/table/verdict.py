@@ -115,7 +115,7 @@ def judged(
     if not fit.determined:
         return fit, []
     what = explained(fit, known)
-    found = found_in(what, known.asked)
+    found = found_in(what, known)
     told = [finding for cause in CAUSES for finding in cause.told(found)]
     told += _open(found, told)
     fit = what.fit
@@ -127,12 +127,12 @@ def judged(
     return fit, [*lost, *map(_by_policy, told)]
 
 
-def found_in(what: Explained, asked: tuple[str, ...] = ()) -> Found:
+def found_in(what: Explained, known: Known) -> Found:
     """Collect what a table has found, for sentences.
 
     Args:
         what: was found.
-        asked: parameters that are followed from frame to frame.
+        known: with what it was made.
     """
     posterior = what.posterior
     certificate = what.fit.certificate
@@ -161,8 +161,8 @@ def found_in(what: Explained, asked: tuple[str, ...] = ()) -> Found:
         if cause.name not in (positions.NAME, spots.NAME)
         and (cause.name in there or posterior.cause_odds(cause.name) > -OPEN_LOG_ODDS)
     )
-    movers = sets_of_movers(what) if asked else {}
-    return Found(what.fit, tuple(seen), rivals, what.strain, asked, movers)
+    movers = sets_of_movers(what) if known.asked else {}
+    return Found(what.fit, tuple(seen), rivals, what.strain, known, movers)
 
 
 def _told_odds(posterior: Posterior, cause: str) -> float:
@@ -175,7 +175,7 @@ def _open(found: Found, told: list[Finding]) -> list[Finding]:
     rivals are in its own finding.
     """
     # Of a motion that is followed its own sentence says what is open.
-    others = (spots.NAME, moving.NAME) if found.asked else (spots.NAME,)
+    others = (spots.NAME, moving.NAME) if found.known.asked else (spots.NAME,)
     doubtful = [
         s for s in found.seen if s.odds <= NAMED_LOG_ODDS and s.cause not in others
     ]

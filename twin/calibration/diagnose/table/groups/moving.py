@@ -320,7 +320,7 @@ def told(found: Found) -> list[Finding]:
     """Tell what moves, how, and by how much: the geometry is that of the mean. A turn that is
     whole steps, or a jump of the angle, is an error.
     """
-    if found.asked:
+    if found.known.asked:
         return _followed(found)
     seen = found.of(NAME)
     out = []
@@ -340,14 +340,14 @@ def _followed(found: Found) -> list[Finding]:
     followed, so that the motion itself is no fault.
     """
     moving = {_moves(s).what: None for s in found.seen if s.cause == NAME}
-    others = [name for name in moving if name not in found.asked]
+    others = [name for name in moving if name not in found.known.asked]
     out = []
     if others:
-        how = "instead of" if set(moving).isdisjoint(found.asked) else "beside"
+        how = "instead of" if set(moving).isdisjoint(found.known.asked) else "beside"
         out.append(
             warning(
                 CalibrationCode.OTHER_MOTION,
-                f"{_in_words(others)} ({', '.join(others)}) {how} {', '.join(found.asked)}: "
+                f"{_in_words(others)} ({', '.join(others)}) {how} {', '.join(found.known.asked)}: "
                 "that explains the images far better, and was followed",
             )
         )
