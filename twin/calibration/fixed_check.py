@@ -331,14 +331,15 @@ def _left_by_priors(
             frees beads.
 
     Returns:
-        Findings without "misfit".
+        Findings without "misfit", and without what a wide prior of the distance hides.
     """
     priors = loosened({**usual.priors, **priors_of(state.scans, usual, state.model)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
     moved = Findings()
     if loose_fit.bead_prior_mm:
         moved = Findings(explained).of(CalibrationCode.BEAD_TOLERANCE)
-    return [*Findings(left).without(CalibrationCode.MISFIT), *moved]
+    others = Findings(left).without(CalibrationCode.MISFIT, CalibrationCode.PIXEL_PITCH)
+    return [*others, *moved]
 
 
 def _doubted(
