@@ -121,3 +121,14 @@ def test_what_is_stated_exactly_is_doubted_by_evidence_alone() -> None:
     far = drawn("source_jumps", 9304)
     exact = replace(far.believed, priors={"dS_x": 0.0})
     assert moving(calibrated(replace(far, believed=exact), ("dO_x",))) == {"dS_x"}
+
+
+def test_what_shakes_is_followed_beside_what_was_asked_for() -> None:
+    """A phantom that shrinks towards the source took its shaking up, in the columns of frames
+    that differ."""
+    scan = drawn("vibration", 3)
+    result = calibrated(scan, ("alpha",))
+    assert result.identifiable, result.findings
+    assert {"dO_x", "dO_y"} <= moving(result)
+    assert "other_motion" in codes(result)
+    assert worst_error(result, scan)[0] < 4.0
