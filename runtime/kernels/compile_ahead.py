@@ -59,6 +59,7 @@ def _fit() -> None:
         np.zeros((0, fit_kernels.GEOMETRY)),
         ints[:0],
         1.0,
+        np.zeros(3),
         radii,
         views,
         np.zeros((0, 1, 2)),
