@@ -129,7 +129,7 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
         ).value
 
 
-def _same_flags(one: Flags, other: object) -> bool:
+def _same_flags(one: Flags, other: object) -> object:
     """Compare as numba does, but only the options that either has set."""
     if not isinstance(other, Flags):
         return NotImplemented
