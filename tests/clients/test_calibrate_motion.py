@@ -132,7 +132,8 @@ def test_what_is_held_is_not_taken_for_motion(tmp_path: Path) -> None:
     assert [f.code for f in found.calibration.findings] == ["held_unchecked"]
     motion = found.calibration.motions[0]
     pulls = (motion.values[:, 0] - deviation) / motion.sigma[:, 0]
-    assert 0.5 < np.sqrt(np.mean(pulls**2)) < 1.6
+    # Of the stated sigmas, 25 times the noise here, three degrees of freedom count.
+    assert 0.4 < np.sqrt(np.mean(pulls**2)) < 1.6
     for name in ("dO_x", "dO_y", "dO_z", "alpha"):
         p = found.parameters[name]
         assert abs(p["value"] - truth[name]) < 4.5 * p["sigma"]  # type: ignore[operator]

@@ -214,7 +214,7 @@ def check_fixed(
         fit = _with_stated_priors(fit, before)
     fit = _doubted(fit, free_fit, fixed)
     if exact:
-        found += listed(_exact_judged(state, usual, fit, exact))
+        found += listed(_exact_judged(whole, state, usual, fit, exact))
     if Findings(explained).errors.without(CalibrationCode.MISFIT):
         # What spoils the fit moves it as a scanner elsewhere would.
         return fit, [*explained, *(f for f in found if f.forbids)]
@@ -230,18 +230,28 @@ def check_fixed(
 
 
 def _exact_judged(
+    whole: Calibration,
     state: Calibration,
     usual: CalibrationRequest,
     fit: FitResult,
     exact: Mapping[str, float],
 ) -> Finding | None:
-    """Judge the parameters stated as exact by a fit with their usual priors; an error only
-    stands with the sigmas of causes left open.
+    """Judge the parameters stated as exact by a fit with their usual priors.
+
+    An error only stands with the sigmas of causes left open, of positions with all that moves:
+    of what was taken out with the parameters held, a part is theirs.
+
+    Args:
+        whole: the scans and their measurements.
+        state: the same without what moves.
+        usual: the request with usual priors.
+        fit: with the exact values.
+        exact: parameter -> value, edge units.
     """
-    freed = refit_scans(state, usual, fit)
-    judged = judge_exact(fit, freed, exact)
+    judged = judge_exact(fit, refit_scans(state, usual, fit), exact)
     if judged is not None and judged.forbids:
-        return judge_exact(fit, explain(state, usual, freed)[0], exact)
+        freed = explain(whole, usual, refit_scans(whole, usual, fit))[0]
+        return judge_exact(fit, freed, exact)
     return judged
 
 

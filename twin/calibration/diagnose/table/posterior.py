@@ -496,7 +496,7 @@ class Search:
         f, g = group
         gain = further[f].gain[g]
         open_ = GRID[gain >= max(float(gain.max()), 0.0) - OPEN_LOG_ODDS]
-        width2 = model.noise2 * float(open_.max()) ** 2
+        width2 = model.noise2 * float(open_.max(initial=GRID[0])) ** 2
         if width > 0.0:
             width2 = (width * float(self.products.units[f][g])) ** 2
         widths = {**model.widths, group: width2}
