@@ -120,9 +120,11 @@ def _breathing(draft: Draft, rng: np.random.Generator) -> Draft:
 
 
 def _growing(draft: Draft, rng: np.random.Generator) -> Draft:
+    """It is held below, above or within."""
     course = _relaxing(_place(draft), rng)
     size = 1.0 + _log(rng, 5e-4, 1e-2) * (course - course.mean())
-    return replace(draft, world=replace(draft.world, size=size))
+    draft = replace(draft, world=replace(draft.world, size=size))
+    return _moved(draft, "dO_y", rng.uniform(-25.0, 25.0) * (size - 1.0))
 
 
 def _focal_walk(draft: Draft, rng: np.random.Generator) -> Draft:

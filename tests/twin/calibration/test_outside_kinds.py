@@ -95,6 +95,16 @@ def test_what_moves_along_the_beam_does_not_say_where_the_beam_is(seed: int) -> 
     assert found.worst < FAR_SIGMAS, found.where
 
 
+@pytest.mark.daily(1)
+@pytest.mark.parametrize("seed", [1, 2, 8, 10])
+def test_a_phantom_that_grows_is_held_somewhere_in_it(seed: int) -> None:
+    """Where it is held off the middle of its beads, something else was said to rise with it."""
+    found = scored("growing", seed)
+    assert found.offered, found.said
+    assert any("grows or shrinks" in words for words in found.said), found.said
+    assert not any("_y by" in words for words in found.said), found.said
+
+
 @pytest.mark.slow
 def test_eigenvalues_that_lapack_does_not_find_are_found() -> None:
     """Its divide and conquer does not converge for the slow errors of these spots."""

@@ -234,6 +234,12 @@ class Linearised:
         first = self.growth_slope + 1 + 2 * self.k
         return first + np.arange(3 * len(self.upper_beads)).reshape(-1, 3)
 
+    @property
+    def place_slopes(self) -> npt.NDArray[np.intp]:
+        """Numbers of the slopes of the phantom's place, (3,)."""
+        first = self.growth_slope + 1 + 2 * self.k
+        return first + 3 * len(self.upper_beads) + np.arange(3)
+
     def _slopes(self, x: FloatArray) -> FloatArray:
         """Compute the slopes, weighted (s, n, 2 k)."""
         n, k = self.n, self.k
@@ -256,7 +262,8 @@ class Linearised:
         spots[np.arange(2 * k), :, np.arange(2 * k)] = share.T
         each_bead = bead.reshape(k, 3, n, 2 * k)
         upper = [each_bead[some].sum(axis=0) for some in self.upper_beads]
-        return np.concatenate([moved_, bead, grown[None], spots, *upper])
+        whole = each_bead.sum(axis=0)
+        return np.concatenate([moved_, bead, grown[None], spots, *upper, whole])
 
     def _whitened(self, shift: FloatArray) -> FloatArray:
         """Whiten shifts of the positions, (n, k, 2, ...) [px]."""

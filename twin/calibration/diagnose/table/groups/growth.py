@@ -28,9 +28,14 @@ MOST_WAVES: Final = 6
 def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make a growth over each scan: evenly, and as half waves that fade with their number; none
     where what looks alike is followed from frame to frame, as no geometry of a frame grows.
+
+    It grows about the point where it is held, somewhere in it: the middle of its beads moves along
+    by as much of their distance to the middle.
     """
     if "dO_z" in known.asked:
         return
+    size_mm = math.sqrt(np.square(table.problem.model.about_middle).sum() / table.k / 3)
+    scale = np.array([1.0, size_mm, size_mm, size_mm])
     for number, frames in enumerate(table.scans):
         if len(frames) < 3:
             continue
@@ -40,15 +45,18 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             ("evenly", (place - 0.5)[:, None]),
             ("in waves", np.cos(math.pi * place[:, None] * waves) / waves),
         ):
-            courses = np.zeros((1, 1, table.n, course.shape[1]))
-            courses[0, 0, frames] = course
+            each = (
+                scale[:, None, None, None] * course[:, None] * np.eye(4)[:, None, :, None]
+            )
+            courses = np.zeros((1, 4, table.n, 4 * course.shape[1]))
+            courses[0][:, frames] = each.reshape(4, len(frames), -1)
             yield Family(
                 NAME,
                 (f"grows {how} {number}",),
                 Acts.IMAGE,
                 ((how, number),),
                 LOG_CHANCE - math.log(2),
-                slopes=np.array([[table.growth_slope]]),
+                slopes=np.array([[table.growth_slope, *table.place_slopes]]),
                 courses=courses,
             )
 
