@@ -124,7 +124,13 @@ SESSION_HELLO = read(
 SESSION_CONTROL = Method(
     "session.control", Control, ControlResult, "acquire, release or force control"
 )
-SESSION_PING = read("session.ping", Empty, Pong, "a heartbeat", urgent=True)
+SESSION_PING = read(
+    "session.ping",
+    Empty,
+    Pong,
+    "a heartbeat, and what is being worked at for the connection",
+    urgent=True,
+)
 STATE_GET = read("state.get", Empty, State, "everything, as one snapshot")
 STATE_SUBSCRIBE = read(
     "state.subscribe", Subscribe, Nothing, "send events of these topics"
