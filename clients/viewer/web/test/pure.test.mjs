@@ -212,8 +212,8 @@ test("a scan's end names who asked and what stands elsewhere", () => {
     error: null, frames_done: 4, frames_total: 8, elapsed_s: 61, speed_up: 1, line: null, what: "",
   };
   const state = { axes, tube: { on: false }, projector: null };
-  assert.equal(job.stateWords(ended, "Bert #2"), "aborted by Anna #3");
-  assert.equal(job.stateWords(ended, "Anna #3"), "aborted by you");
+  assert.equal(job.stateWords(ended, () => false), "aborted by Anna #3");
+  assert.equal(job.stateWords(ended, (name) => name === "Anna #3"), "aborted by you");
   assert.equal(job.whatWords(ended, state), "X-rays are off · rot_obj at 123.46°, began at 0.00°");
   assert.deepEqual(job.moved(ended, axes), [{ motor: "rot_obj", now: 123.456, start: 0 }]);
   assert.equal(job.timeLeft(ended, null), "1 min 01 s");
