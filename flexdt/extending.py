@@ -31,6 +31,7 @@ from flexdt.clients.cli.options import (
 from flexdt.library.failure import CommandError
 from flexdt.library.optional.extras import package
 from flexdt.library.reconstruction.volume_files import volume_writer
+from flexdt.library.reconstruction.volume_formats import VoxelPlaces
 from flexdt.message_words import problem_words, reason_of
 from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.runtime.files.whole_files import free_bytes, write_whole
@@ -46,6 +47,7 @@ __all__ = [
     "ProfileName",
     "Scheduler",
     "Twin",
+    "VoxelPlaces",
     "argument",
     "assignments",
     "become",

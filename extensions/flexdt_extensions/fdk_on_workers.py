@@ -39,13 +39,12 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import zarr
 
-from flexdt.extending import volume_writer
+from flexdt.extending import VoxelPlaces, volume_writer
 from flexdt.library.reconstruction.reconstruct import (
     ScanFrames,
     VolumeRequest,
     about_volume,
 )
-from flexdt.library.reconstruction.volume_formats import VoxelPlaces
 from flexdt.measuring import gpu
 from flexdt.twin.errors import LimitError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
