@@ -21,7 +21,7 @@ FOLDERS = (
     "examples", "extensions",
 )  # fmt: skip
 PAGES = ("docs/phantoms.md", "docs/exchange.md", "docs/command-line.md", "docs/reconstruction.md",
-         "docs/other-scanners.md", "docs/install.md",
+         "docs/other-scanners.md", "docs/install.md", "docs/coming-from",
          "docs/_ext/format_pages.py")  # fmt: skip
 QUICK = "not slow and not browser"
 """Marks of the tests that `make test` runs."""
