@@ -5,9 +5,9 @@ for each material. A mesh is a value: vertices and outward-turning triangles; on
 close is an error, because its path lengths mean nothing. `project_body` chooses the projection
 that suits solids, voxels or a mesh.
 
-`warm_up` compiles (or loads from the disk cache) the kernels that programs usually run. A
-server calls `warm_up_forward` before it prints `ready`. The kernels of meshes, of FDK and of
-`back` into given memory compile at their first use.
+`warm_up` compiles (or loads from the disk cache) the kernels that programs usually run; a
+server compiles at a kernel's first use. So do the kernels of meshes, of FDK and of `back` into
+given memory.
 """
 
 from __future__ import annotations
