@@ -34,7 +34,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     """
     if "dO_z" in known.asked:
         return
-    size_mm = math.sqrt(np.square(table.problem.model.about_middle).sum() / table.k / 3)
+    size_mm = table.problem.model.reach / math.sqrt(3.0)
     scale = np.array([1.0, size_mm, size_mm, size_mm])
     for number, frames in enumerate(table.scans):
         if len(frames) < 3:
