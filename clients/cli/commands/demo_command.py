@@ -137,7 +137,7 @@ def run_demo(
         path = truth_file or running.enter_context(_drawn_truth())
         truth = hidden.read(path)
         tell(
-            "starting the servers; the very first start compiles the projector's kernels"
+            "starting the servers; a new installation compiles what the first image needs"
         )
         # Kernels of calibration and reconstruction compile during the servers' start and the
         # scan.
