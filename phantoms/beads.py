@@ -238,20 +238,12 @@ def cuboid_with_beads(
     A bead's solid has its material's attenuation less the body's, as attenuation adds up;
     overlaps are not checked.
 
-    Args:
-        name: the phantom's name.
-        size_mm: width, breadth, height [mm].
-        beads: (k, 3) centres [mm].
-        radii_mm: (k,) or one for all [mm].
-        body_material: None leaves the beads in air.
-        bead_materials: one for each bead.
-        description: one line for people.
-        assumed: facts without a source.
-
-    Raises:
-        LimitError: a bead sticks out of the body; names the first. Beads in air are not
-            checked.
-        UnknownNameError: an unknown material.
+    `name`: the phantom's name; `size_mm`: width, breadth, height [mm]; `beads`: (k, 3) centres
+    [mm]; `radii_mm`: (k,) or one for all [mm]; `body_material`: None leaves the beads in air;
+    `bead_materials`: one for each bead; `description`: one line for people; `assumed`: facts
+    without a source.
+    Raises LimitError: a bead sticks out of the body; names the first. Beads in air are not
+    checked; UnknownNameError: an unknown material.
     """
     centers = np.asarray(beads, dtype=np.float64).reshape(-1, 3)
     radii = np.broadcast_to(np.asarray(radii_mm, dtype=np.float64), (len(centers),))
@@ -306,8 +298,7 @@ def _check_inside(centers: FloatArray, radii: FloatArray, size_mm: Vector) -> No
         radii: (k,) [mm].
         size_mm: of the body, about the origin.
 
-    Raises:
-        LimitError: names the first bead that sticks out.
+    Raises LimitError: names the first bead that sticks out.
     """
     room = np.asarray(size_mm) / 2.0 - np.abs(centers) - radii[:, None]
     if (room < -1e-9).any():

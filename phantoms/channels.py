@@ -206,18 +206,12 @@ def _exact(surface: Surface) -> TriangleMesh | None:
 
 
 def _mesh(phantom: Phantom, surface: Surface, made_of: Material) -> Body:
-    """Convert a surface to the body of its material, 1 where it has the material's own
-    density.
+    """Convert a surface to the body of its material, 1 where it has the material's own density.
 
-    Args:
-        phantom: gives size and voxel of the grid.
-        surface: triangles with their attenuation.
-        made_of: the material.
-
-    Returns:
-        A mesh; voxels of the amount where the mesh is not exact, or the surface's
-        attenuation differs from the material's by more than `ATTENUATION_TOLERANCE` of
-        it.
+    `phantom`: gives size and voxel of the grid; `surface`: triangles with their attenuation;
+    `made_of`: the material.
+    Returns a mesh; voxels of the amount where the mesh is not exact, or the surface's
+    attenuation differs from the material's by more than `ATTENUATION_TOLERANCE` of it.
     """
     mesh = _exact(surface)
     if (
@@ -356,8 +350,7 @@ def _overlaps(fine: Volume, coarse: Volume, axis: int) -> FloatArray:
         coarse: grid of the coarse ones, in the same frame.
         axis: 0 for x, 1 for y, 2 for z.
 
-    Returns:
-        float64 (coarse voxels, fine voxels): shares of the coarse edge, 0 to 1.
+    Returns float64 (coarse voxels, fine voxels): shares of the coarse edge, 0 to 1.
     """
 
     def planes(volume: Volume) -> FloatArray:

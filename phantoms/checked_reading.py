@@ -57,8 +57,7 @@ def wrong(value: object, where: str, allowed: str) -> PhantomError:
     """Make the error for a value that is not what is `allowed` at key path `where`;
     returned, not raised.
 
-    The value is shown with at most 80 characters.
-    """
+    The value is shown with at most 80 characters."""
     shown = repr(value)
     if len(shown) > 80:
         shown = shown[:77] + "..."
@@ -90,18 +89,11 @@ def fields(
 ) -> dict[str, Any]:
     """Read the fields of an object; a key without a reader is an error.
 
-    Args:
-        value: the object.
-        where: its key path.
-        needed: name -> reader of a field that must be there.
-        others: name -> reader of a field that may be left out.
-
-    Returns:
-        Name -> result of its reader; fields that are left out have no entry.
-
-    Raises:
-        PhantomError: no object, a missing or unknown key, or an error of a reader; names
-            the key path.
+    `value`: the object; `where`: its key path; `needed`: name -> reader of a field that must be
+    there; `others`: name -> reader of a field that may be left out.
+    Returns name -> result of its reader; fields that are left out have no entry.
+    Raises PhantomError: no object, a missing or unknown key, or an error of a reader; names the
+    key path.
     """
     readers = {**needed, **others}
     for key in mapping(value, where):
@@ -371,16 +363,12 @@ def _solid(document: object, where: str) -> analytic.Solid:
 
 
 def shape_from_dict(document: object, where: str) -> analytic.Shape:
-    """Make a shape from a document `{kind, ...}`, whose other keys are the fields of the
-    shape's class.
+    """Make a shape from a document `{kind, ...}`, whose other keys are the fields of the shape's
+    class.
 
-    Args:
-        document: of one shape; axis and axes may be left out.
-        where: its key path.
-
-    Raises:
-        PhantomError: an unknown kind, a missing or unknown field, or a wrong value; names
-            the key path.
+    `document`: of one shape; axis and axes may be left out. `where`: its key path.
+    Raises PhantomError: an unknown kind, a missing or unknown field, or a wrong value; names the
+    key path.
     """
     kind = get(document, "kind", where)
     if not isinstance(kind, str) or kind not in _KINDS:

@@ -442,9 +442,7 @@ def _plan_of(
 ) -> ScanPlan:
     """Compose a script for a request and plan it.
 
-    Raises:
-        LimitError: distances or speeds that the machine does not have.
-    """
+    Raises LimitError: distances or speeds that the machine does not have."""
     offsets = profile or profile_of(machine)
     text = compose_script(request, machine, offsets)
     return plan_script(text, machine, offsets, start=start)
@@ -599,15 +597,12 @@ class _SeenDetail:
         return high
 
     def unsaturated(self, layer: str, asked: ExposureSettings) -> ExposureSettings:
-        """Split a setting's time into as many read-outs as keep the open beam below
-        saturation.
+        """Split a setting's time into as many read-outs as keep the open beam below saturation.
 
-        Without detail and sample, at the brightest pixel, up to `BRIGHTEST_FILL` of
-        saturation; the averages become as many.
+        Without detail and sample, at the brightest pixel, up to `BRIGHTEST_FILL` of saturation;
+        the averages become as many.
 
-        Args:
-            layer: name of the filter.
-            asked: the setting; its total time stays.
+        `layer`: name of the filter. `asked`: the setting; its total time stays.
         """
         time_ms = asked.exposure_ms * asked.averages
         whole = replace(asked, exposure_ms=time_ms, averages=1)
@@ -621,12 +616,9 @@ class _SeenDetail:
 def exposure_problems(plan: ScanPlan, phantom: Phantom) -> Findings:
     """Warn of a plan's projections whose pixels will be saturated or starved.
 
-    Without scatter, by the machine's detector and tube. Problems that the open beam has
-    already are left out; () without problems.
-
-    Args:
-        plan: of the scan.
-        phantom: on the stage, about the axis.
+    Without scatter, by the machine's detector and tube. Problems that the open beam has already
+    are left out; () without problems.
+    `plan`: of the scan; `phantom`: on the stage, about the axis.
     """
     parts = channels(phantom)
     scanner = plan.machine
@@ -655,19 +647,13 @@ def _views(
     cone: ConeVec,
     lit: ExposureSettings,
 ) -> tuple[Float32Array, npt.NDArray[Any], float, float]:
-    """Simulate views: paths (k, n, rows, cols), transmission (n, rows, cols), saturated
-    and starved parts.
+    """Simulate views: paths (k, n, rows, cols), transmission (n, rows, cols), saturated and
+    starved parts.
 
-    Without noise, with X-rays on. Paths are by material [mm]. Both parts are shares of
-    all pixels, 0 to 1; starved pixels have less than `FEW_COUNTS` above dark.
-
-    Args:
-        parts: the sample's k channels.
-        chain: of the machine.
-        camera: mode and region.
-        cone: n views.
-        lit: tube and time.
-    """
+    Without noise, with X-rays on. Paths are by material [mm]. Both parts are shares of all
+    pixels, 0 to 1; starved pixels have less than `FEW_COUNTS` above dark.
+    `parts`: the sample's k channels; `chain`: of the machine; `camera`: mode and region; `cone`:
+    n views; `lit`: tube and time."""
     paths = np.stack([project_body(part.body, cone, camera.shape) for part in parts])
     images = radiographs(chain, paths, cone.rows, [lit] * len(cone))
     through = np.exp(-np.stack([image.integrals for image in images]))

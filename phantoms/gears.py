@@ -130,19 +130,14 @@ def _teeth(
     levels_mm: tuple[float, ...],
     slant_deg: float,
 ) -> list[Ring]:
-    """Compute the rings of a gear's outer surface from its bottom to its top, turned by
-    the slant towards the middle.
+    """Compute the rings of a gear's outer surface from its bottom to its top, turned by the
+    slant towards the middle.
 
     The first and last ring are not turned; 2 `RINGS_A_HALF` + 1 rings.
 
-    Args:
-        teeth: number of teeth.
-        radii_mm: at the teeth's foot and tip.
-        levels_mm: bottom and top.
-        slant_deg: by which the ring at half the height is turned.
-
-    Returns:
-        Rings (n, 3) [mm], counter-clockwise seen from above.
+    `teeth`: number of teeth; `radii_mm`: at the teeth's foot and tip; `levels_mm`: bottom and
+    top; `slant_deg`: by which the ring at half the height is turned.
+    Returns rings (n, 3) [mm], counter-clockwise seen from above.
     """
     foot, tip = radii_mm
     angle = _angles()
@@ -158,16 +153,14 @@ def _teeth(
 
 
 def _closed(rings: Sequence[Ring]) -> tuple[FloatArray, npt.NDArray[np.int32]]:
-    """Build a closed surface through rings, each joined to the next and the last to the
-    first.
+    """Build a closed surface through rings, each joined to the next and the last to the first.
 
     All rings have as many points.
 
     Args:
         rings: (n, 3) each, counter-clockwise seen from above; up outside, down inside.
 
-    Returns:
-        Vertices (v, 3) [mm] and faces (f, 3), outward.
+    Returns vertices (v, 3) [mm] and faces (f, 3), outward.
     """
     n = len(rings[0])
     k = np.arange(n)

@@ -163,19 +163,14 @@ class Phantom(ArrayValue):
     def volume(self, voxel_mm: float | None = None, *, oversample: int = 2) -> Volume:
         """Convert to voxels for X-rays.
 
-        Nothing is cached. A phantom that came as voxels is returned on its own grid,
-        without use of the arguments.
+        Nothing is cached. A phantom that came as voxels is returned on its own grid, without use
+        of the arguments.
 
-        Args:
-            voxel_mm: voxel edge [mm]; default: 256 voxels along the longest side.
-            oversample: samples per voxel along each side.
-
-        Returns:
-            Volume of attenuation [1/mm], data [z, y, x], about the origin (voxels: about
-            their own centre).
-
-        Raises:
-            PhantomError: voxels together with other parts, or as `voxelise`.
+        `voxel_mm`: voxel edge [mm]; default: 256 voxels along the longest side. `oversample`:
+        samples per voxel along each side.
+        Returns volume of attenuation [1/mm], data [z, y, x], about the origin (voxels: about
+        their own centre).
+        Raises PhantomError: voxels together with other parts, or as `voxelise`.
         """
         if self.voxels is not None:
             if not self.is_voxels:

@@ -131,14 +131,11 @@ def boxes(
 def size_about_origin(
     scene: analytic.Scene, surfaces: Sequence[Surface] = ()
 ) -> analytic.Vector:
-    """Compute the full extent along x, y, z [mm] of the box about the origin
-    that contains everything.
+    """Compute the full extent along x, y, z [mm] of the box about the origin that contains
+    everything.
 
     Voxels are not looked at.
-
-    Raises:
-        PhantomError: there is nothing.
-    """
+    Raises PhantomError: there is nothing."""
     corners = boxes(scene, surfaces)
     if not corners:
         raise PhantomError("a phantom needs at least one solid or mesh")

@@ -125,8 +125,7 @@ def phantom_names() -> tuple[str, ...]:
 
     Example:
         >>> "lego" in phantom_names()
-        True
-    """
+        True"""
     return (*CUBOIDS_MM, *_MAKERS)
 
 
@@ -135,8 +134,7 @@ def is_shipped(name: str) -> bool:
 
     Example:
         >>> is_shipped("normal-7"), is_shipped("apple")
-        (True, False)
-    """
+        (True, False)"""
     match = _CUBOID.fullmatch(name)
     return name in phantom_names() or (match is not None and match[1] in CUBOIDS_MM)
 
@@ -395,15 +393,10 @@ def _labelled(
 
 
 def _mesh(mesh: Any, material: str | None) -> Phantom:
-    """Make the phantom of an object with vertices [mm] and faces, filled with one
-    material.
+    """Make the phantom of an object with vertices [mm] and faces, filled with one material.
 
-    Args:
-        mesh: has (n, 3) vertices and (m, 3) faces; not changed.
-        material: None is `abs`.
-
-    Raises:
-        PhantomError: it is not closed, or its size is 0 or too large.
+    `mesh`: has (n, 3) vertices and (m, 3) faces; not changed. `material`: None is `abs`.
+    Raises PhantomError: it is not closed, or its size is 0 or too large.
     """
     import trimesh
 

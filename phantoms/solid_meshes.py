@@ -90,11 +90,8 @@ def joined(parts: Sequence[SurfacePart]) -> trimesh.Trimesh:
 
     Parts that overlap are not united.
 
-    Args:
-        parts: meshes [mm] with their marks for holes.
-
-    Raises:
-        PhantomError: there is nothing to join.
+    `parts`: meshes [mm] with their marks for holes.
+    Raises PhantomError: there is nothing to join.
     """
     import trimesh
 

@@ -40,19 +40,12 @@ def voxelise(
     The grid is rounded up to whole voxels, at least one along each axis. Overlaps add up;
     negative solids take away.
 
-    Args:
-        scene: analytic solids, added up.
-        surfaces: triangle meshes to add.
-        size_mm: content of the grid, along x, y, z [mm].
-        voxel_mm: voxel edge [mm].
-        oversample: sub-columns per voxel along x and along y, 1 to 16.
-
-    Returns:
-        Volume, data float32 [z, y, x].
-
-    Raises:
-        PhantomError: another oversample, an edge that is not above 0 and finite, a grid
-            of more than `MAX_VOXELS`, or a mesh that is not closed.
+    `scene`: analytic solids, added up; `surfaces`: triangle meshes to add; `size_mm`: content of
+    the grid, along x, y, z [mm]; `voxel_mm`: voxel edge [mm]; `oversample`: sub-columns per
+    voxel along x and along y, 1 to 16.
+    Returns volume, data float32 [z, y, x].
+    Raises PhantomError: another oversample, an edge that is not above 0 and finite, a grid of
+    more than `MAX_VOXELS`, or a mesh that is not closed.
     """
     if not (math.isfinite(voxel_mm) and voxel_mm > 0.0):
         raise PhantomError(f"voxel size is {voxel_mm} mm; allowed: above 0")
@@ -183,13 +176,8 @@ def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
 def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
     """Compute the lowest and highest z of a shape above each (x, y); exact, not sampled.
 
-    Args:
-        shape: convex.
-        x: of the columns, broadcast with y [mm].
-        y: of the columns [mm].
-
-    Returns:
-        Lower and upper end [mm]; lower > upper where the column misses the shape.
+    `shape`: convex; `x`: of the columns, broadcast with y [mm]; `y`: of the columns [mm].
+    Returns lower and upper end [mm]; lower > upper where the column misses the shape.
     """
     one = as_convex(shape)
     bottom, top = _between_slabs(one.slabs, x, y)
@@ -203,8 +191,8 @@ def _columns(shape: Shape, x: FloatArray, y: FloatArray) -> _Interval:
 def _quadric(
     to_unit: FloatArray, center: FloatArray, x: FloatArray, y: FloatArray
 ) -> _Interval:
-    """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded
-    in an upright cylinder.
+    """Solve for the interval where |to_unit (p - center)| <= 1 along z; unbounded in an upright
+    cylinder.
 
     Columns that only touch miss.
 
@@ -214,8 +202,7 @@ def _quadric(
         x: of the columns, broadcast with y [mm].
         y: of the columns [mm].
 
-    Returns:
-        Lower and upper end [mm]; an empty interval ends before it begins.
+    Returns lower and upper end [mm]; an empty interval ends before it begins.
     """
     cx, cy, cz = center
     direction = to_unit[:, 2]

@@ -70,22 +70,14 @@ def add_convex(data, low, high, x0, y0, oversample, value):
 
 @linked
 def _side(ax, ay, bx, by, px, py):
-    """Compute the signed crossing of the ray from (px, py) towards +x with the edge a ->
-    b.
+    """Compute the signed crossing of the ray from (px, py) towards +x with the edge a -> b.
 
-    The end points are put in a fixed order first, so both triangles on an edge get the
-    same answer to the last bit and no column slips through or counts twice.
-
-    Args:
-        ax: x of the edge's first end; likewise the other places.
-        ay: y of the edge's first end.
-        bx: x of its last end.
-        by: y of its last end.
-        px: x of the ray's origin.
-        py: y of the ray's origin.
-
-    Returns:
-        +1 for an edge that rises, -1 for one that falls, 0 without a crossing.
+    The end points are put in a fixed order first, so both triangles on an edge get the same
+    answer to the last bit and no column slips through or counts twice.
+    `ax`: x of the edge's first end; likewise the other places. `ay`: y of the edge's first end.
+    `bx`: x of its last end. `by`: y of its last end. `px`: x of the ray's origin. `py`: y of the
+    ray's origin.
+    Returns +1 for an edge that rises, -1 for one that falls, 0 without a crossing.
     """
     if (ay > py) == (by > py):
         return 0

@@ -121,8 +121,7 @@ class AcquilaEvent:
         Example:
             >>> a, b = (AcquilaEvent("tube", "xrayon", uuid=u) for u in (2**63 + 1, float(2**63)))
             >>> a.key == b.key, a.uuid == b.uuid
-            (True, False)
-        """
+            (True, False)"""
         if self.anonymous:
             return f"{self.component} {self.command}"
         if isinstance(self.uuid, str) and re.fullmatch(r"-?\d+", self.uuid) is None:
@@ -134,10 +133,8 @@ class AcquilaEvent:
     ) -> AcquilaEvent:
         """Make the event that replies to this one: all fields the same but those given.
 
-        Args:
-            reply_type: RCV, FDB, ACK or ERR.
-            reply: text for the sender of the command.
-            comp_type: of the component that replies; left empty, that of this event.
+        `reply_type`: RCV, FDB, ACK or ERR. `reply`: text for the sender of the command.
+        `comp_type`: of the component that replies; left empty, that of this event.
         """
         return replace(
             self,
@@ -249,19 +246,15 @@ def _attribute(name: str) -> str:
 
 
 def _text(content: Mapping[str, object], name: str) -> str:
-    """Read one text field of an event; a number becomes its text, a truth value TRUE or
-    FALSE.
+    """Read one text field of an event; a number becomes its text, a truth value TRUE or FALSE.
 
     Args:
         content: the event's JSON object.
         name: of the field; missing or null gives "".
 
-    Returns:
-        The text, checked by `_plain`.
-
-    Raises:
-        AcquilaError: a list or an object, or a text that is too long or has characters
-            that no event can carry.
+    Returns the text, checked by `_plain`.
+    Raises AcquilaError: a list or an object, or a text that is too long or has characters that
+    no event can carry.
     """
     value = content.get(name, "")
     match value:

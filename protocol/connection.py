@@ -206,11 +206,10 @@ class Connection:
     def receive_end(self) -> None:
         """End reception: the peer has ended the stream.
 
-        The connection is closed in any case, and messages not taken out are discarded. If
-        it was closed before, nothing happens.
+        The connection is closed in any case, and messages not taken out are discarded. If it was
+        closed before, nothing happens.
 
-        Raises:
-            ProtocolError: it ended inside a message, so that message is lost.
+        Raises ProtocolError: it ended inside a message, so that message is lost.
         """
         inside = self.mid_message and not self.closed
         held = self.pending
@@ -533,10 +532,8 @@ class Connection:
     def send(self, message: Message | Prepared) -> bytes:
         """Encode a message, framing included; as JSON until the codec is known.
 
-        Raises:
-            ValueError, TypeError: the message holds a value that cannot be encoded.
-            RpcError: -32008, a MessagePack frame of 16 MiB or more.
-        """
+        Raises ValueError, TypeError: the message holds a value that cannot be encoded; RpcError:
+        -32008, a MessagePack frame of 16 MiB or more."""
         pieces = self.pieces(message)
         if len(pieces) == 1:
             return pieces[0]
@@ -603,8 +600,7 @@ def _foreign_opening(begun: bytes | bytearray) -> str | None:
 
     A frame holds a map or an array; none of their heads is 0 or the ASCII bracket of JSON.
 
-    Returns:
-        The sentence about it; None for a frame.
+    Returns the sentence about it; None for a frame.
     """
     (size,) = _size(begun, 0)
     if begun[4:5] in _OPENED and size >= 2:
@@ -640,8 +636,7 @@ def _escape_of(names: tuple[bytes, ...]) -> re.Pattern[bytes]:
 
 
 def _joined(messages: Iterable[bytes | Malformed]) -> bytes:
-    """Join the messages to be examined into one piece for a search (10^4 take a
-    millisecond)."""
+    """Join the messages to be examined into one piece for a search (10^4 take a millisecond)."""
     return b"\n".join(filter(_examined, messages))
 
 
@@ -660,20 +655,10 @@ def encoded(result: object, codec: Codec) -> Encoded:
 
 
 def _body(codec: Codec, message: Message) -> list[bytes]:
-    """Encode a message without framing; an `Encoded` result is inserted as it is.
-
-    The pieces of an `Encoded` result must be of this codec.
-
-    Args:
-        codec: of the connection.
-        message: an answer, a call or a batch.
-
-    Returns:
-        The parts of the message in order, as bytes.
-
-    Raises:
-        ValueError, TypeError, OverflowError: a value that the codec cannot hold.
-    """
+    """Encode a message without framing; an `Encoded` result is inserted as it is. The pieces of
+    an `Encoded` result must be of this codec. `codec`: of the connection; `message`: an answer,
+    a call or a batch. Returns the parts of the message in order, as bytes. Raises ValueError,
+    TypeError, OverflowError: a value that the codec cannot hold."""
     match message:
         case Response(id, Encoded(pieces)):
             return _around(codec, id, pieces)
@@ -738,31 +723,26 @@ def _array_head(count: int) -> bytes:
 def frame_head(size: int) -> bytes:
     """Return the length prefix of a MessagePack frame of `size` bytes.
 
-    Raises:
-        RpcError: -32008, 16 MiB or more.
-    """
+    Raises RpcError: -32008, 16 MiB or more."""
     if size > MAX_FRAME:
         raise too_large("a MessagePack frame", size, MAX_FRAME)
     return struct.pack(">I", size)
 
 
 def pack(message: Message) -> tuple[bytes, memoryview | None]:
-    """Encode a message as a frame: its length and head, and the payload that follows
-    without a copy.
+    """Encode a message as a frame: its length and head, and the payload that follows without a
+    copy.
 
-    Large is above `MAX_COPIED_BYTES`. Only `data` as the last member at each level
-    counts. The message is the same afterwards.
+    Large is above `MAX_COPIED_BYTES`. Only `data` as the last member at each level counts. The
+    message is the same afterwards.
 
     Args:
         message: its innermost `data` may be bytes of any size.
 
-    Returns:
-        The first bytes of the frame, and a large `data` as a view; None where the first
-        bytes are the whole frame.
-
-    Raises:
-        RpcError: -32008, a frame of 16 MiB or more.
-        ValueError, TypeError, OverflowError: something that MessagePack cannot hold.
+    Returns the first bytes of the frame, and a large `data` as a view; None where the first
+    bytes are the whole frame.
+    Raises RpcError: -32008, a frame of 16 MiB or more; ValueError, TypeError, OverflowError:
+    something that MessagePack cannot hold.
     """
     document = to_plain(message)
     inner = _innermost(document)
@@ -791,8 +771,7 @@ def unpack(body: memoryview) -> Message:
     that are no message `Malformed` as `from_plain`.
 
     In a body above `MAX_COPIED_BYTES` whose last member is a large `data`, the data
-    becomes a view into `body`, without a copy.
-    """
+    becomes a view into `body`, without a copy."""
     try:
         document = None
         if len(body) > MAX_COPIED_BYTES:
@@ -855,9 +834,8 @@ def _with_payload(head: bytes, payload: memoryview) -> object | None:
         head: MessagePack up to the type byte of `data`.
         payload: the bytes of `data`.
 
-    Returns:
-        The document; None if `head` with an empty `data` is no MessagePack, or `data` is
-        not its last member.
+    Returns the document; None if `head` with an empty `data` is no MessagePack, or `data` is not
+    its last member.
     """
     try:
         document = codecs.read_msgpack(head + _EMPTY_BIN)

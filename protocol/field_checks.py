@@ -41,12 +41,10 @@ def few(most: int) -> BeforeValidator:
 
 
 def payload(value: object) -> object:
-    """Convert binary data to bytes: base64 text is decoded, bytes, bytearray and
-    memoryview are copied.
+    """Convert binary data to bytes: base64 text is decoded, bytes, bytearray and memoryview are
+    copied.
 
-    Raises:
-        ValueError: anything else.
-    """
+    Raises ValueError: anything else."""
     try:
         return bytes(image.payload(value))
     except RpcError as error:
@@ -65,8 +63,7 @@ def no_truth(value: object) -> object:
 def whole(value: object) -> object:
     """Convert a number without a fraction to an int; return any other value unchanged.
 
-    JSON has one kind of number, and some languages write all of theirs as 8.0.
-    """
+    JSON has one kind of number, and some languages write all of theirs as 8.0."""
     if isinstance(value, float) and value.is_integer():
         return int(value)
     return value

@@ -26,16 +26,10 @@ DTYPES: tuple[str, ...] = get_args(Dtype)
 def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
     """Convert an array to an image value.
 
-    `data` is a view of the array; a copy only where it is not little-endian and
-    C-contiguous.
-
-    Returns:
-        {"dtype": name, "shape": sizes, "data": read-only memoryview of the little-endian
-        bytes in C order}.
-
-    Raises:
-        ValueError: a dtype that is not in `DTYPES`.
-    """
+    `data` is a view of the array; a copy only where it is not little-endian and C-contiguous.
+    Returns {"dtype": name, "shape": sizes, "data": read-only memoryview of the little-endian
+    bytes in C order}.
+    Raises ValueError: a dtype that is not in `DTYPES`."""
     name = array.dtype.newbyteorder("=").name
     if name not in DTYPES:
         raise ValueError(f"dtype {name} cannot travel; allowed: {', '.join(DTYPES)}")
@@ -45,8 +39,7 @@ def encode(array: npt.NDArray[np.generic]) -> dict[str, object]:
 
 
 def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
-    """Convert an image value to an array, read-only, without a copy where `data` is
-    bytes.
+    """Convert an image value to an array, read-only, without a copy where `data` is bytes.
 
     Base64 text is decoded to a copy.
 
@@ -54,9 +47,8 @@ def decode(value: Mapping[str, object]) -> npt.NDArray[np.generic]:
         value: a mapping with dtype (one of `DTYPES`), shape (up to four sizes) and data
             (bytes, or base64 text); other members are ignored.
 
-    Raises:
-        RpcError: -32602: a member is missing, an unknown dtype, an invalid shape, or data
-            of another size or type; the message names the member.
+    Raises RpcError: -32602: a member is missing, an unknown dtype, an invalid shape, or data of
+    another size or type; the message names the member.
     """
     try:
         dtype = value["dtype"]

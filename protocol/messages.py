@@ -182,13 +182,9 @@ def finite(data: object) -> object:
 def from_plain(document: object, max_batch: int = 1000) -> Message:
     """Convert a decoded document to a message; raises nothing.
 
-    Args:
-        document: plain data.
-        max_batch: largest number of messages in a batch.
-
-    Returns:
-        A message; a `Batch` for a list, whose items may be `Malformed`; `Malformed` for
-        an empty or too long list, or for a document that is no message.
+    `document`: plain data; `max_batch`: largest number of messages in a batch.
+    Returns a message; a `Batch` for a list, whose items may be `Malformed`; `Malformed` for an
+    empty or too long list, or for a document that is no message.
     """
     if not isinstance(document, list):
         return _single(document)
@@ -281,13 +277,9 @@ def _request(document: dict[object, object], id: Id) -> Single:
 def _failure(id: Id, error: object) -> Single:
     """Convert the answer to a failed request to `Failure`; its `data` may be missing.
 
-    Args:
-        id: of the request, valid.
-        error: the member of this name.
-
-    Returns:
-        `Failure`; `Malformed` with the id unless `error` is an object with a whole `code`
-        and a text `message`.
+    `id`: of the request, valid; `error`: the member of this name.
+    Returns `Failure`; `Malformed` with the id unless `error` is an object with a whole `code`
+    and a text `message`.
     """
     if isinstance(error, dict):
         code = error.get("code")
@@ -330,9 +322,7 @@ class Answered(Generic[_W]):
     def result(self) -> object:
         """Return the result of the request.
 
-        Raises:
-            RpcError: the answer is an error.
-        """
+        Raises RpcError: the answer is an error."""
         if isinstance(self.answer, Failure):
             raise self.answer.error
         return self.answer.result
@@ -401,14 +391,9 @@ class Correlation(Generic[_W]):
         return Request(id, method, dict(params))
 
     def abandon(self, request: Request, *, sent: bool = True) -> None:
-        """Stop waiting for an answer; one that still comes is dropped. A request that is
-        not open is ignored.
-
-        Args:
-            request: made by `request`.
-            sent: False if no byte of it was sent: it is forgotten, and an answer to it
-                would be a violation.
-        """
+        """Stop waiting for an answer; one that still comes is dropped. A request that is not
+        open is ignored. `request`: made by `request`; `sent`: False if no byte of it was sent:
+        it is forgotten, and an answer to it would be a violation."""
         if not sent:
             self._open_requests.pop(request.id, None)
         elif request.id in self._open_requests:
@@ -432,17 +417,12 @@ class Correlation(Generic[_W]):
         return self._owed_answers[id] > 0
 
     def answer(self, answer: Response | Failure) -> Response | Failure:
-        """Check that an answer belongs to an open request of the client, and close that
-        request.
+        """Check that an answer belongs to an open request of the client, and close that request.
 
-        Of two requests with one id, one is closed. An error without id is about the
-        connection and always allowed; it closes none.
-
-        Returns:
-            The answer, unchanged.
-
-        Raises:
-            LookupError: no open request has this id.
+        Of two requests with one id, one is closed. An error without id is about the connection
+        and always allowed; it closes none.
+        Returns the answer, unchanged.
+        Raises LookupError: no open request has this id.
         """
         if isinstance(answer, Response) or answer.id is not None:
             if not self._owed_answers[answer.id]:
@@ -567,12 +547,9 @@ class Correlation(Generic[_W]):
         Args:
             message: of a client; not a batch.
 
-        Returns:
-            The request or notification; an empty list for a malformed message, whose id
-            is owed an answer all the same.
-
-        Raises:
-            ProtocolError: an answer instead of a call; recorded as the violation.
+        Returns the request or notification; an empty list for a malformed message, whose id is
+        owed an answer all the same.
+        Raises ProtocolError: an answer instead of a call; recorded as the violation.
         """
         match message:
             case Request(id):
@@ -587,8 +564,7 @@ class Correlation(Generic[_W]):
 
     def _violated(self, what: str) -> ProtocolError:
         """Record a violation of the protocol, which later `receive` calls raise, and return
-        its error.
-        """
+        its error."""
         self.violation = ProtocolError(what)
         return self.violation
 
@@ -596,13 +572,8 @@ class Correlation(Generic[_W]):
 def hello_params(client: str, token: str | None) -> dict[str, object]:
     """Make the parameters of `session.hello`, with which a client begins.
 
-    Args:
-        client: name of the program, for people who look at the server.
-        token: where the server requires one.
-
-    Returns:
-        {"protocol": version, "client": name}, and "token" if there is one.
-    """
+    `client`: name of the program, for people who look at the server; `token`: where the server
+    requires one. Returns {"protocol": version, "client": name}, and "token" if there is one."""
     params: dict[str, object] = {"protocol": PROTOCOL, "client": client}
     if token is None:
         return params
@@ -610,8 +581,7 @@ def hello_params(client: str, token: str | None) -> dict[str, object]:
 
 
 def _require_text_names(value: object, where: str) -> None:
-    """Check that all names in nested data are text: JSON would silently turn numbers into
-    text.
+    """Check that all names in nested data are text: JSON would silently turn numbers into text.
 
     Mappings, lists and tuples are searched at all levels; other values pass.
 
@@ -619,8 +589,7 @@ def _require_text_names(value: object, where: str) -> None:
         value: parameters of a call.
         where: path of `value`, for the message.
 
-    Raises:
-        TypeError: a name of another type; names the first, with its place.
+    Raises TypeError: a name of another type; names the first, with its place.
     """
     if isinstance(value, Mapping):
         for name, inner in value.items():

@@ -75,8 +75,7 @@ def require_compatible(protocol: str) -> None:
 
     A compatible one passes without a result.
 
-    Raises:
-        RpcError: -32602, with the version of this server.
+    Raises RpcError: -32602, with the version of this server.
     """
     if not compatible(protocol):
         raise invalid_params(
@@ -91,19 +90,16 @@ def parse_params(
 ) -> _P:
     """Validate the parameters of a call, given by name, by position, or not at all.
 
-    Missing parameters take their defaults. A name that the model does not have is a
-    problem if the model forbids it.
+    Missing parameters take their defaults. A name that the model does not have is a problem if
+    the model forbids it.
 
     Args:
         method: the called method.
         given: names and values, or values in the order of the method's fields, or None.
 
-    Returns:
-        The model of the method's parameters, with defaults filled in.
-
-    Raises:
-        RpcError: -32602, too many values, or every problem (at most 50) with its path and
-            value.
+    Returns the model of the method's parameters, with defaults filled in.
+    Raises RpcError: -32602, too many values, or every problem (at most 50) with its path and
+    value.
     """
     fields = method.params.model_fields
     if isinstance(given, list):

@@ -96,16 +96,10 @@ def method_not_found(asked: str, allowed: Iterable[str]) -> RpcError:
 def invalid_params(
     message: str, problems: Sequence[Mapping[str, object]] = (), allowed: object = None
 ) -> RpcError:
-    """Make the error -32602 for parameters that do not fit; returned, not raised.
-
-    Args:
-        message: for people.
-        problems: made by `problem`, for the data.
-        allowed: the values that would fit; None leaves it out.
-
-    Returns:
-        The error; its data has the keys problems (a list) and, if given, allowed.
-    """
+    """Make the error -32602 for parameters that do not fit; returned, not raised. `message`: for
+    people. `problems`: made by `problem`, for the data. `allowed`: the values that would fit;
+    None leaves it out. Returns the error; its data has the keys problems (a list) and, if given,
+    allowed."""
     data: dict[str, object] = {"problems": [dict(p) for p in problems]}
     if allowed is not None:
         data["allowed"] = allowed
@@ -113,8 +107,7 @@ def invalid_params(
 
 
 def problem(path: str, message: str, asked: object) -> dict[str, object]:
-    """Make one entry of `invalid_params`: the parameter's path, the problem,
-    the value given."""
+    """Make one entry of `invalid_params`: the parameter's path, the problem, the value given."""
     return {"path": path, "message": message, "asked": asked}
 
 
@@ -143,15 +136,9 @@ def too_large(
 ) -> RpcError:
     """Make the error -32008 for something above its allowed size; returned, not raised.
 
-    Args:
-        what: the thing, with its article.
-        asked: its size, in `unit`.
-        allowed: largest size, in `unit`.
-        unit: unit of both.
-
-    Returns:
-        The error; its data has the four arguments by name.
-    """
+    `what`: the thing, with its article; `asked`: its size, in `unit`; `allowed`: largest size,
+    in `unit`; `unit`: unit of both.
+    Returns the error; its data has the four arguments by name."""
     return RpcError(
         Code.TOO_LARGE,
         f"{what} of {asked} {unit} is too large; at most {allowed} {unit}",
@@ -181,10 +168,8 @@ def clip(value: object, limit: int = 200) -> str:
 
     Lone surrogates are escaped before the cut.
 
-    Args:
-        value: a text is taken as it is; other plain data are formatted as by `repr`, no
-            more of them than needed.
-        limit: number of characters.
+    `value`: a text is taken as it is; other plain data are formatted as by `repr`, no more of
+    them than needed. `limit`: number of characters.
     """
     if isinstance(value, str):
         text = value[: limit + 1]

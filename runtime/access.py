@@ -228,15 +228,14 @@ class PublicAddress:
 
 
 def check_bind(host: str, token: str | None) -> None:
-    """Check that a token has at least 16 characters, and that an address that others can
-    reach has one.
+    """Check that a token has at least 16 characters, and that an address that others can reach
+    has one.
 
     Args:
         host: where a server is to listen.
         token: that clients must bring; None for none.
 
-    Raises:
-        AccessError: no token for a non-loopback address, or one too short.
+    Raises AccessError: no token for a non-loopback address, or one too short.
     """
     if token is not None and len(token) < 16:
         raise AccessError(
@@ -286,17 +285,14 @@ def read_token(file: Path | None) -> str | None:
 def client_tls(
     authority: Path | None, *, any_name: bool = False
 ) -> ssl.SSLContext | None:
-    """Make a client's TLS context that trusts the certificates of a PEM file alone; None
-    without one.
+    """Make a client's TLS context that trusts the certificates of a PEM file alone; None without
+    one.
 
     TLS 1.2 or newer; the system's own authorities are not trusted.
 
-    Args:
-        authority: the file.
-        any_name: do not compare the server's name with that in its certificate.
-
-    Raises:
-        AccessFileError: the file is missing or holds no certificates.
+    `authority`: the file; `any_name`: do not compare the server's name with that in its
+    certificate.
+    Raises AccessFileError: the file is missing or holds no certificates.
     """
     if authority is None:
         return None
@@ -318,12 +314,9 @@ def server_tls(certificate: Path | None, key: Path | None) -> ssl.SSLContext | N
     Args:
         certificate, key: the files; both or none.
 
-    Returns:
-        The context; None if no files are given.
-
-    Raises:
-        AccessError: only one of the two is given.
-        AccessFileError: a file is missing or invalid.
+    Returns the context; None if no files are given.
+    Raises AccessError: only one of the two is given; AccessFileError: a file is missing or
+    invalid.
     """
     if certificate is None and key is None:
         return None

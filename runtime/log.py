@@ -119,8 +119,7 @@ class Apart(QueueHandler):
 
     def close(self) -> None:
         """Write the queued records and end the thread; a reader that blocks for seconds is
-        abandoned.
-        """
+        abandoned."""
         self._listener.stop()
         super().close()
 
@@ -152,12 +151,8 @@ def log(
 ) -> None:
     """Write one log line, with the trace in force.
 
-    Args:
-        event: name of the event.
-        level: of `logging`.
-        error: add the traceback of the exception being handled.
-        facts: further members of the line.
-    """
+    `event`: name of the event; `level`: of `logging`; `error`: add the traceback of the
+    exception being handled; `facts`: further members of the line."""
     trace = current()
     if trace:
         facts.setdefault("trace", trace)
@@ -227,16 +222,13 @@ class Sparing:
 def set_up(
     stream: TextIO = sys.stderr, level: int = logging.INFO, *, apart: bool = False
 ) -> None:
-    """Send this program's log to `stream` as JSON lines, in place of its earlier handlers
-    (for a process's main).
+    """Send this program's log to `stream` as JSON lines, in place of its earlier handlers (for a
+    process's main).
 
     The root logger's handlers get these lines no longer.
 
-    Args:
-        stream: target.
-        level: least level that is written.
-        apart: write from a thread of its own, and send warnings and lines of `LIBRARIES`
-            there, too (a server's main).
+    `stream`: target; `level`: least level that is written; `apart`: write from a thread of its
+    own, and send warnings and lines of `LIBRARIES` there, too (a server's main).
     """
     handler: logging.Handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonLines())

@@ -55,11 +55,9 @@ BUCKETS_S = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 1.0, 5.0)
 
 
 def durations(name: str, help: str, labels: Sequence[str] = ()) -> Histogram:
-    """Make a histogram of durations [s] with the limits `BUCKETS_S`, which is not
-    registered.
+    """Make a histogram of durations [s] with the limits `BUCKETS_S`, which is not registered.
 
-    The "created" series of all metrics of the process are switched off.
-    """
+    The "created" series of all metrics of the process are switched off."""
     from prometheus_client import Histogram, disable_created_metrics
 
     disable_created_metrics()  # type: ignore[no-untyped-call]
@@ -194,14 +192,10 @@ class ListeningServer:
 
         At most one connection is accepted in a turn of the loop.
 
-        Args:
-            made: makes the protocol of a connection.
-            host, port: address to take; port 0 is any free one.
-            ssl: for TLS, whose handshake may take `TLS_HANDSHAKE_S`; None: none.
-            serving: False lets connections wait until `serve`.
-
-        Raises:
-            OSError: the address is taken or not ours.
+        `made`: makes the protocol of a connection. `host` and `port`: address to take; port 0 is
+        any free one. `ssl`: for TLS, whose handshake may take `TLS_HANDSHAKE_S`; None: none.
+        `serving`: False lets connections wait until `serve`.
+        Raises OSError: the address is taken or not ours.
         """
         self.server = await asyncio.get_running_loop().create_server(
             made,
@@ -227,8 +221,7 @@ def one_at_a_time(server: asyncio.Server) -> None:
     asyncio tries to accept `backlog` connections in one go, and when descriptors run out
     it schedules a new attempt for each that failed, so that attempts multiply a
     hundredfold every second. With one at a time there is a single attempt. New
-    connections also alternate with requests that way.
-    """
+    connections also alternate with requests that way."""
     for listening in server.sockets:
         with listening.dup() as same:
             same.listen(BACKLOG)
@@ -329,13 +322,11 @@ async def first_of(*events: asyncio.Event) -> None:
 def announce(server: str, facts: Mapping[str, object], out: TextIO | None = None) -> None:
     """Print the JSON line of a ready server: `ready`, `facts`, and the process id.
 
-    In a `ServerLoop` garbage is collected and the remaining objects are frozen first, and
-    the measurement of the loop's turns begins anew.
+    In a `ServerLoop` garbage is collected and the remaining objects are frozen first, and the
+    measurement of the loop's turns begins anew.
 
-    Args:
-        server: its kind, the value of `ready`.
-        facts: further members of the line.
-        out: file; None: standard output.
+    `server`: its kind, the value of `ready`. `facts`: further members of the line. `out`: file;
+    None: standard output.
     """
     loop = asyncio.get_running_loop()
     if isinstance(loop, ServerLoop):
@@ -422,10 +413,7 @@ def _allow_descriptors() -> None:
 def read_if_there(file: Path | None, parse: Callable[[str, str], T]) -> T | None:
     """Read and parse a machine's or profile's file; None if there is no such file.
 
-    Args:
-        file: to read.
-        parse: takes the text and the file's name for its errors.
-    """
+    `file`: to read; `parse`: takes the text and the file's name for its errors."""
     if file is None or not file.exists():
         return None
     return parse(file.read_text(encoding="utf-8"), str(file))
@@ -435,8 +423,7 @@ def process_seconds(pid: int) -> float | None:
     """Return the processor time of a process so far, with its children that have ended [s].
 
     A busy machine gives a process less of its processors, not less to do: the limit of
-    work is the time that the work itself has used. None if the system does not report it.
-    """
+    work is the time that the work itself has used. None if the system does not report it."""
     words = _words(str(pid))
     return _seconds(words) if words else None
 

@@ -97,9 +97,7 @@ def address(text: str) -> Address:
 def addresses(text: str | None) -> tuple[Address, ...]:
     """Parse HOST:PORT,HOST:PORT...; none of None.
 
-    Raises:
-        typer.BadParameter: as `address`.
-    """
+    Raises typer.BadParameter: as `address`."""
     if text is None:
         return ()
     return tuple(address(word) for word in text.split(","))
@@ -112,14 +110,12 @@ def several(text: str) -> str:
 
 
 def memory_size(text: str) -> int:
-    """Parse a size such as "4GiB", "512M" or "1000000", and return it rounded down to
-    whole bytes.
+    """Parse a size such as "4GiB", "512M" or "1000000", and return it rounded down to whole
+    bytes.
 
-    Units are powers of 1024 whatever their spelling (K, KB, KiB, up to T; case does not
-    count).
+    Units are powers of 1024 whatever their spelling (K, KB, KiB, up to T; case does not count).
 
-    Raises:
-        typer.BadParameter: not a size of at least one byte.
+    Raises typer.BadParameter: not a size of at least one byte.
     """
     match = re.fullmatch(r"(\d+\.?\d*)\s*([kmgt]?)i?b?", text.strip().lower())
     size = 0

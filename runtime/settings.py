@@ -90,9 +90,7 @@ def described(thing: object) -> tuple[str, dict[str, str]]:
     """Split a docstring into its text and its arguments or attributes.
 
     Sections of results and errors are left out.
-
-    Returns:
-        The text before the sections, and name -> description on one line.
+    Returns the text before the sections, and name -> description on one line.
     """
     whole = inspect.getdoc(thing) or ""
     whole = re.sub(r"\n\n(?:Yields|Returns|Raises):\n(?: +\S.*\n?)+", "", whole)

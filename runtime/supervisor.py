@@ -89,8 +89,7 @@ class Ends:
         The first end in a row has no pause; then it doubles from `FIRST_PAUSE_S` to
         `LONGEST_PAUSE_S`. A service ready for `STEADY_S` begins a new row.
 
-        Args:
-            steady_s: for how long the service had been ready.
+        `steady_s`: for how long the service had been ready.
         """
         if steady_s >= STEADY_S:
             self.row = 1
@@ -341,8 +340,7 @@ class Supervisor:
         """Kill the remaining processes of a service's group, which may hold its port or
         its files, and forget its process.
 
-        Nothing happens if none is recorded.
-        """
+        Nothing happens if none is recorded."""
         # It led its session, so that its number is the group's, also after its own end.
         process = self._running.pop(service.name, None)
         if process is not None:
@@ -380,8 +378,7 @@ class _Ended(Exception):
 
     def __init__(self, how: str, returncode: int | None = None) -> None:
         """Make the exception with how a service ended; the return code is None if it did not
-        exit.
-        """
+        exit."""
         super().__init__(how)
         self.returncode = returncode
 

@@ -40,10 +40,7 @@ def send_parts(channel: socket.socket, parts: Parts) -> None:
 def receive_parts(channel: socket.socket) -> list[bytes]:
     """Receive a list sent by `send_parts`.
 
-    Raises:
-        EOFError: the other end is gone.
-        TimeoutError: of the socket.
-    """
+    Raises EOFError: the other end is gone; TimeoutError: of the socket."""
     (count,) = struct.unpack("<I", _receive_exactly(channel, 4))
     sizes = struct.unpack(f"<{count}Q", _receive_exactly(channel, 8 * count))
     return [bytes(_receive_exactly(channel, size)) for size in sizes]
@@ -67,12 +64,10 @@ def _receive_exactly(channel: socket.socket, size: int) -> bytearray:
 
 
 def limit(what: str, most: int) -> None:
-    """Set the soft limit of one resource of this process to `most`, or to the hard limit
-    if that is lower.
+    """Set the soft limit of one resource of this process to `most`, or to the hard limit if that
+    is lower.
 
-    Args:
-        what: name of the resource, such as RLIMIT_CPU.
-        most: in the resource's unit.
+    `what`: name of the resource, such as RLIMIT_CPU; `most`: in the resource's unit.
     """
     number = getattr(resource, what)
     hard = resource.getrlimit(number)[1]
@@ -136,8 +131,7 @@ def document(read: Callable[..., Any], how: Mapping[str, str], raw: bytes) -> li
     """Read untrusted bytes by `read` in the worker, and return JSON; no file may be written.
 
     Here, and not beside the server's store, so that the process loads only the modules of
-    `read`.
-    """
+    `read`."""
     limit("RLIMIT_FSIZE", 0)
     return [json.dumps(read(raw, **how).to_dict()).encode()]
 
@@ -168,13 +162,11 @@ def main() -> int:
 
 
 def _end_with_parent(number: int) -> None:
-    """Wait until the parent closes its end of the socket, then exit the process at once
-    with code 0.
+    """Wait until the parent closes its end of the socket, then exit the process at once with
+    code 0.
 
     On systems that cannot poll for that it returns at once.
-
-    Args:
-        number: descriptor of the socket.
+    `number`: descriptor of the socket.
     """
     if not hasattr(select, "POLLRDHUP"):
         return

@@ -11,11 +11,10 @@ OWN_PACKAGES: Final = ("flexdt", "flexdt_extensions")
 
 
 def warn_caller(text: str, category: type[Warning] = UserWarning) -> None:
-    """Warn about a call, at the innermost line of the stack that is not of
-    `OWN_PACKAGES`.
+    """Warn about a call, at the innermost line of the stack that is not of `OWN_PACKAGES`.
 
-    Without such a line it is the outermost one. Python's filters decide whether it is
-    shown, as for any warning.
+    Without such a line it is the outermost one. Python's filters decide whether it is shown, as
+    for any warning.
 
     Args:
         text: of the warning.

@@ -223,9 +223,8 @@ def _projections(command: c.TakeSequence | c.SaveImage, frames: int | None) -> i
 
     Names of dark and flat images, and paths without a name, count 0.
 
-    Args:
-        command: saves a sequence or an image.
-        frames: number of images of a sequence; None or 0 is one.
+    `command`: saves a sequence or an image. `frames`: number of images of a sequence; None or 0
+    is one.
     """
     if isinstance(command, c.TakeSequence):
         names: Sequence[str | None] = sequence_names(
@@ -283,9 +282,7 @@ def _shared(limits: Mapping[str, tuple[float, float]], machine: Machine) -> int:
 
     Names are translated to the machine's own; unknown ones do not count.
 
-    Args:
-        limits: motor -> (lower, upper).
-        machine: to compare with.
+    `limits`: motor -> (lower, upper); `machine`: to compare with.
     """
     axes = {name: machine.axes.get(own_name(name, machine.axes)) for name in limits}
     return sum(
@@ -538,8 +535,7 @@ def _of_machine(machine: Machine) -> Iterator[tuple[str, Any]]:
 
 def _limits(axis: Axis | MotorReply) -> tuple[float, ...]:
     """Return lower and upper limit, largest speed and largest acceleration of an axis or a
-    reply.
-    """
+    reply."""
     return axis.lower, axis.upper, axis.max_speed, axis.max_acceleration
 
 
@@ -662,10 +658,8 @@ class _AlignedScans(NamedTuple):
     def line(self, fit: _Fit, i: int, before: float) -> Line:
         """Make the line of a fitted offset.
 
-        Args:
-            fit: of the offset.
-            i: number of the offset in it; the first one has the drift.
-            before: value to which the fit is a correction.
+        `fit`: of the offset. `i`: number of the offset in it; the first one has the drift.
+        `before`: value to which the fit is a correction.
         """
         sigmas = np.sqrt(np.diag(fit.covariance)).tolist()
         line = Line(before + float(fit.at[i]), sigmas[i], scans=len(self.scans))

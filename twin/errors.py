@@ -21,8 +21,7 @@ def shape_words(shape: Sequence[int | str]) -> str:
 
     Example:
         >>> shape_words(()), shape_words((3,)), shape_words(("n", 12))
-        ('a single number', '3', 'n x 12')
-    """
+        ('a single number', '3', 'n x 12')"""
     return " x ".join(map(str, shape)) or "a single number"
 
 
@@ -85,8 +84,7 @@ class TwinError(ValueError):
 
         Example:
             >>> print(TwinError.of_shape("points", (4, 2), ("...", 3), " [mm]"))
-            points of shape 4 x 2; allowed: ... x 3 [mm]
-        """
+            points of shape 4 x 2; allowed: ... x 3 [mm]"""
         return cls(
             f"{what} of shape {shape_words(got)}; allowed: {shape_words(allowed)}{more}",
             {"asked": list(got), "allowed": list(allowed)},
@@ -212,8 +210,7 @@ def words_of(error: BaseException) -> str:
 
     Example:
         >>> words_of(OSError("no such\\n  file")), words_of(KeyError())
-        ('no such file', 'KeyError')
-    """
+        ('no such file', 'KeyError')"""
     said = " ".join(str(error).split())
     return said[:MAX_REPEATED_CHARACTERS] or type(error).__name__
 
@@ -260,8 +257,7 @@ class UnknownNameError(TwinError):
 
         Example:
             >>> print(UnknownNameError.among("no axis 'w'; there are", "w", ["x", "y"]))
-            no axis 'w'; there are: x, y
-        """
+            no axis 'w'; there are: x, y"""
         names = list(allowed)
         return cls(
             f"{problem}: {', '.join(names)}{more}", {"asked": asked, "allowed": names}

@@ -249,8 +249,7 @@ class Findings(tuple[Finding, ...]):
 
     def unexplained_by(self, others: Iterable[Finding]) -> Findings:
         """Leave out the findings that one of `others` at the same place explains (`explains`
-        of its code).
-        """
+        of its code)."""
         known = {(code, one.place) for one in others for code in one.code.explains}
         return Findings(one for one in self if (one.code, one.place) not in known)
 

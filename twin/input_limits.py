@@ -125,16 +125,12 @@ def require_parts(form: str, count: int, file: str) -> None:
 
 
 def require_strips(counts: Sequence[int], size: int, file: str) -> None:
-    """Check the strips or tiles of a TIFF: their number, and that together they are no
-    longer than the file, so that none is read twice.
+    """Check the strips or tiles of a TIFF: their number, and that together they are no longer
+    than the file, so that none is read twice.
 
-    Args:
-        counts: bytes of each in the file, as its head states them.
-        size: of the file [bytes].
-        file: name for the message.
-
-    Raises:
-        InputLimitError: too many, or longer.
+    `counts`: bytes of each in the file, as its head states them; `size`: of the file [bytes];
+    `file`: name for the message.
+    Raises InputLimitError: too many, or longer.
     """
     require_parts("tiff", len(counts), file)
     claimed = sum(counts)
@@ -150,9 +146,7 @@ def read_limited(stream: BinaryIO, form: str, file: str) -> bytes:
 
     Devices and pipes, whose size nothing states, end there, too.
 
-    Raises:
-        InputLimitError: it has more.
-        OSError: it cannot be read.
+    Raises InputLimitError: it has more; OSError: it cannot be read.
     """
     most = LIMITS[form].file_bytes
     raw = stream.read(most + 1)

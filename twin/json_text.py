@@ -21,16 +21,10 @@ def parse_json(
 
     `kind` is called with each object's list of (name, value) pairs.
 
-    Args:
-        text: that is parsed.
-        kind: dict, or a class of it.
-        file: name for the message about its size.
-        form: row of the table of input limits.
-
-    Raises:
-        InputLimitError: it is too long or has too many values.
-        ValueError: with the reason: no JSON (JSONDecodeError), nested too deep, or a
-            whole number of thousands of digits.
+    `text`: that is parsed; `kind`: dict, or a class of it; `file`: name for the message about
+    its size; `form`: row of the table of input limits.
+    Raises InputLimitError: it is too long or has too many values; ValueError: with the reason:
+    no JSON (JSONDecodeError), nested too deep, or a whole number of thousands of digits.
     """
     require_json(text, file, form)
     try:

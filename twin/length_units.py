@@ -52,8 +52,7 @@ def length_mm(unit: str) -> float | None:
 
     Example:
         >>> length_mm("Millimetres"), length_mm("\\u00b5m"), length_mm("pixel")
-        (1.0, 0.001, None)
-    """
+        (1.0, 0.001, None)"""
     name = _plain(unit)
     written_out = METRE.fullmatch(name)
     if written_out:
@@ -68,8 +67,7 @@ def angle_rad(unit: str) -> float | None:
 
     Example:
         >>> angle_rad("Radians"), angle_rad("gon")
-        (1.0, None)
-    """
+        (1.0, None)"""
     return UNITS_RAD.get(_plain(unit))
 
 

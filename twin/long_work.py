@@ -279,8 +279,7 @@ class Rhythm:
 
     def after(self, begun_s: float) -> Rhythm:
         """Go on with work of the same name that follows this one's: a thousand short works
-        write as few lines as a long one.
-        """
+        write as few lines as a long one."""
         return Rhythm(max(self.due_s, begun_s + LINE_INTERVALS_S[0]), self.lines)
 
     def write(self, now_s: float) -> bool:
@@ -347,8 +346,7 @@ class Course:
             >>> for step in (1, 2, 3):
             ...     course.report(step / 8, f"{step} of 8 images", now_s=40.0 * step)
             >>> course.times(now_s=130.0)
-            '3 of 8 images, 37 %, 2 min 10 s, about 3 min 10 s left'
-        """
+            '3 of 8 images, 37 %, 2 min 10 s, about 3 min 10 s left'"""
         words = [self.detail]
         if self.percent is not None:
             words.append(f"{self.percent} %")

@@ -264,8 +264,7 @@ def _type(value: Any) -> Any:
 @lru_cache(MAX_KNOWN_TYPES)
 def _has_content(kind: type) -> bool:
     """Return whether values of a type are mappings, lists, tuples or texts, whose content
-    decides; asking abstract classes at every call would cost more than all else here.
-    """
+    decides; asking abstract classes at every call would cost more than all else here."""
     return issubclass(kind, Mapping | list | tuple | str)
 
 
@@ -595,8 +594,7 @@ _FORMS: Final[Mapping[Any, Callable[[Sequence[Any]], Kind | None]]] = {
 
 def _is_number(value: Any) -> bool:
     """Return whether a value is one real number: a scalar (or array of no dimension) with
-    `__float__` that is no truth value.
-    """
+    `__float__` that is no truth value."""
     alone = getattr(value, "ndim", 0) == 0 and hasattr(value, "__float__")
     return alone and not isinstance(value, bool) and getattr(value, "dtype", "") != "bool"
 

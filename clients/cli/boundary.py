@@ -169,12 +169,10 @@ def _wire_error(error: RpcError) -> tuple[str, ...]:
 
 
 def wire_code(error: RpcError) -> int:
-    """Determine the exit code of an error reply: of a rejected script that of its
-    problems (errors only), else that of the error's kind; INVALID for an unknown one.
+    """Determine the exit code of an error reply: of a rejected script that of its problems
+    (errors only), else that of the error's kind; INVALID for an unknown one.
 
-    A rejected script is error -32005 with a list; without errors in it the code is
-    INVALID.
-    """
+    A rejected script is error -32005 with a list; without errors in it the code is INVALID."""
     if error.code == -32005 and isinstance(error.data, Sequence):
         wrong = [p for p in error.data if p.get("severity", "error") == "error"]
         return verdict(str(p.get("code")) for p in wrong) or INVALID

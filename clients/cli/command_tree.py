@@ -279,8 +279,7 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         token_file: TokenFile = None,
         verbose: Verbose = None,
     ) -> None:
-        """Take the options before a command; `completed` commands read them from the
-        context."""
+        """Take the options before a command; `completed` commands read them from the context."""
         speak(quiet=verbose is False, verbose=verbose is True)
 
     for name, command in COMMANDS.items():
@@ -303,12 +302,9 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
 
 
 def found(name: str) -> Callable[..., Any] | None:
-    """Load the function of a command that an installed distribution offers; None if none
-    does.
-
-    `name` is a word or two, e.g. "job watch". An extension that cannot be imported raises
-    its error.
-    """
+    """Load the function of a command that an installed distribution offers; None if none does.
+    `name` is a word or two, e.g. "job watch". An extension that cannot be imported raises its
+    error."""
     from flexdt.library.optional.extras import offered
 
     function: Callable[..., Any] | None = offered(name.replace(" ", "."), GROUP)
@@ -401,15 +397,8 @@ REMOVED_COMMANDS = ("backup", "restore")
 def run(argv: Sequence[str]) -> int:
     """Run one command line.
 
-    Ctrl-C, or an aborted prompt, gives INTERRUPTED. Other errors are printed and give
-    their exit code, as `_run` has it.
-
-    Args:
-        argv: words after the program's name.
-
-    Returns:
-        The exit code.
-    """
+    Ctrl-C, or an aborted prompt, gives INTERRUPTED. Other errors are printed and give their exit
+    code, as `_run` has it. `argv`: words after the program's name. Returns the exit code."""
     try:
         return _run(argv)
     except (KeyboardInterrupt, typer.Abort):

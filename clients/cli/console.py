@@ -32,12 +32,10 @@ SERVERS: Final = ("up", *PROCESS_COMMANDS)
 def speak(quiet: bool, verbose: bool) -> None:
     """Set the amount of output on standard error in addition to warnings and errors.
 
-    Neither changes nothing but the state of a former call; with both, `quiet` silences
-    slow steps. Only `verbose` makes libraries log, at the level INFO.
+    Neither changes nothing but the state of a former call; with both, `quiet` silences slow
+    steps. Only `verbose` makes libraries log, at the level INFO.
 
-    Args:
-        quiet: no progress.
-        verbose: slow steps with their duration, and messages of libraries.
+    `quiet`: no progress; `verbose`: slow steps with their duration, and messages of libraries.
     """
     if quiet or verbose:
         import logging
@@ -50,11 +48,9 @@ def speak(quiet: bool, verbose: bool) -> None:
 
 
 def printable() -> None:
-    """Set the terminal's streams to write unknown characters as escapes, without an
-    error.
+    """Set the terminal's streams to write unknown characters as escapes, without an error.
 
-    Only streams of the text kind are changed, standard output and standard error.
-    """
+    Only streams of the text kind are changed, standard output and standard error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -132,10 +128,8 @@ def note(text: str) -> None:
 
 
 def warn(texts: Iterable[str], about: object = None) -> None:
-    """Write warnings to standard error, each after its subject.
-
-    `about` is the subject, e.g. a file; None leaves it out. No texts, no output.
-    """
+    """Write warnings to standard error, each after its subject. `about` is the subject, e.g. a
+    file; None leaves it out. No texts, no output."""
     for text in texts:
         note(f"warning: {text}" if about is None else f"{about}: warning: {text}")
 
@@ -190,8 +184,7 @@ def duration(seconds: float) -> str:
     finite.
 
     From 60 s on in whole seconds, from an hour on in whole minutes. Negative times are
-    formatted as seconds.
-    """
+    formatted as seconds."""
     if not math.isfinite(seconds):
         return "unknown"
     if seconds < 60:

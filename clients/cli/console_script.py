@@ -49,11 +49,8 @@ _heard = 0
 
 def leave(*_: object) -> None:
     """End the process at once with a line on standard error and the exit code of an interrupt;
-    printed lines stay.
-
-    Arguments (of a signal handler) are ignored. It does not return; exit functions are
-    not called.
-    """
+    printed lines stay. Arguments (of a signal handler) are ignored. It does not return; exit
+    functions are not called."""
     try:
         os.write(2, LINE)
     finally:
@@ -215,8 +212,7 @@ def _text(file: str) -> str:
 def _not_lost(unraisable: object) -> None:
     """End the process at a KeyboardInterrupt that no code gets, as in a finaliser.
 
-    Other exceptions are reported by Python's own hook.
-    """
+    Other exceptions are reported by Python's own hook."""
     if unraisable.exc_type is KeyboardInterrupt:  # type: ignore[attr-defined]
         leave()
     sys.__unraisablehook__(unraisable)  # type: ignore[arg-type]

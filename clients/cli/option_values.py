@@ -67,17 +67,10 @@ def assignments(words: Iterable[str]) -> dict[str, float]:
 def span(word: str, what: str) -> tuple[float, float]:
     """Read LOWER:UPPER, or one number for both.
 
-    Args:
-        word: as given.
-        what: names the value in the error.
-
-    Returns:
-        (lower, upper), equal ones for one number.
-
-    Raises:
-        typer.BadParameter: another form, an end that is no finite number, or the lower is
-            above the upper.
-    """
+    `word`: as given; `what`: names the value in the error.
+    Returns (lower, upper), equal ones for one number.
+    Raises typer.BadParameter: another form, an end that is no finite number, or the lower is
+    above the upper."""
     ends = [number(part, what) for part in word.split(":")]
     if len(ends) > 2 or ends[0] > ends[-1]:
         raise typer.BadParameter(
@@ -141,10 +134,7 @@ def require_ending(file: Path, *allowed: str) -> None:
     """Check a file's ending.
 
     `allowed` are endings with their dot, lower case; the file's may be of any case.
-
-    Raises:
-        typer.BadParameter: another one.
-    """
+    Raises typer.BadParameter: another one."""
     if file.suffix.lower() not in allowed:
         raise typer.BadParameter(
             f"{file.name}: the ending must be {' or '.join(allowed)}"
@@ -152,14 +142,9 @@ def require_ending(file: Path, *allowed: str) -> None:
 
 
 def require_folder(*files: Path | None) -> None:
-    """Check that files can be written where they are to be.
-
-    Only the parent folder is looked at; files that are None are skipped. The first
-    failing file raises.
-
-    Raises:
-        CommandError: a folder does not exist.
-    """
+    """Check that files can be written where they are to be. Only the parent folder is looked at;
+    files that are None are skipped. The first failing file raises. Raises CommandError: a folder
+    does not exist."""
     for file in files:
         if file is not None and not file.absolute().parent.is_dir():
             raise CommandError(f"{file}: the folder does not exist")

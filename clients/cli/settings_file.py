@@ -206,17 +206,9 @@ def _require_known(
     """Check the keys of a table, or those outside all tables.
 
     The first unknown key raises. The error also suggests a similar key.
-
-    Args:
-        where: beginning of the message.
-        given: keys.
-        known: the allowed ones.
-        tables: names of tables, which the error lists beside `known`; as keys they are
-            refused.
-
-    Raises:
-        CommandError: an unknown key; lists keys and tables.
-    """
+    `where`: beginning of the message. `given`: keys. `known`: the allowed ones. `tables`: names
+    of tables, which the error lists beside `known`; as keys they are refused.
+    Raises CommandError: an unknown key; lists keys and tables."""
     for key in given:
         if key not in known:
             from flexdt.twin.errors import UnknownNameError
@@ -266,11 +258,9 @@ def _problem(error: Any) -> str:
 
 
 def chosen(kind: type[S]) -> S:
-    """Read the settings of a command from its table of the file; errors as
-    `settings_of`.
+    """Read the settings of a command from its table of the file; errors as `settings_of`.
 
-    Never None.
-    """
+    Never None."""
     found = settings_of(kind)
     assert found is not None
     return found
@@ -282,8 +272,7 @@ def home_of(command: str, flag: str) -> str | None:
 
     The words are "`key` in [table] of FILE"; the table is that of the command. `command`
     is the whole path, e.g. "flexdt twin"; `flag` may begin with dashes. The file need not
-    exist.
-    """
+    exist."""
     name = "_".join(command.split()[1:])
     table = SHARED_TABLES.get(name, name)
     key = flag.lstrip("-").replace("-", "_")

@@ -52,8 +52,7 @@ def back_off(first_s: float = FIRST_PAUSE_S) -> Iterator[float]:
     """Yield pauses between attempts to connect [s], for ever: each twice the one before,
     at most `LONGEST_PAUSE_S`.
 
-    The first is `first_s`, whatever its size; it never ends and waits for nothing itself.
-    """
+    The first is `first_s`, whatever its size; it never ends and waits for nothing itself."""
     pause = first_s
     while True:
         yield pause
@@ -225,8 +224,7 @@ class Core:
         """End the connection, if there is one; another may be made, with the same
         subscriptions.
 
-        Waits for the end; `hello` is kept.
-        """
+        Waits for the end; `hello` is kept."""
         link = self.link
         self.link = None
         if link is not None:
@@ -341,16 +339,12 @@ def _require_same(
 ) -> None:
     """Check that a topic is followed as before: its rate, and a projection's kind and binning.
 
-    The rate is compared for every topic, kind and binning only for "projection"; None
-    counts as a value.
+    The rate is compared for every topic, kind and binning only for "projection"; None counts as
+    a value.
 
-    Args:
-        topic: that is subscribed to again.
-        asked: parameters of the new subscription.
-        known: those of the earlier one.
-
-    Raises:
-        ValueError: they differ.
+    `topic`: that is subscribed to again; `asked`: parameters of the new subscription; `known`:
+    those of the earlier one.
+    Raises ValueError: they differ.
     """
     view: tuple[str, ...]
     if topic == "projection":
@@ -608,11 +602,8 @@ class AsyncTwinClient(SharedMethods):
 @functools.cache
 def _loop() -> asyncio.AbstractEventLoop:
     """Start the event loop of all synchronous clients in a thread of its own; it ends with the
-    process.
-
-    Cached: all calls return the same loop. At Python's exit `_end_links` runs; a forked
-    process starts its own.
-    """
+    process. Cached: all calls return the same loop. At Python's exit `_end_links` runs; a forked
+    process starts its own."""
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="flexdt-clients", daemon=True).start()
     atexit.register(_end_links)

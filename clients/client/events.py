@@ -172,8 +172,7 @@ class AsyncSubscription:
         keep_alive: Callable[[], Awaitable[object]],
         cancel: Callable[[AsyncSubscription], Awaitable[object]],
     ) -> None:
-        """Store the subscription's parameters; nothing is sent before it is entered or
-        awaited.
+        """Store the subscription's parameters; nothing is sent before it is entered or awaited.
 
         Args:
             topics: names of the topics.

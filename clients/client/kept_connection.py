@@ -114,8 +114,7 @@ class KeptConnection:
         """Change rate and view of the subscription, now and after each later connection; its
         topics stay.
 
-        Without a connection the next one begins with it; a refusal is ignored.
-        """
+        Without a connection the next one begins with it; a refusal is ignored."""
         self._client.core.follow(self, subscription)
         if self.connected:
             with contextlib.suppress(ConnectionLost, RpcError):

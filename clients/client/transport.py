@@ -123,15 +123,9 @@ class TcpTransport:
     ) -> None:
         """Store where and how to connect; nothing is opened before `open`.
 
-        Args:
-            host: name or address.
-            port: from 1 to 65535.
-            codec: of the messages.
-            timeout_s: limit of the time to connect.
-            ssl: for TLS; the server's certificate must name `host`.
-
-        Raises:
-            ValueError: another port.
+        `host`: name or address. `port`: from 1 to 65535. `codec`: of the messages. `timeout_s`:
+        limit of the time to connect. `ssl`: for TLS; the server's certificate must name `host`.
+        Raises ValueError: another port.
         """
         if type(port) is not int or not 1 <= port <= 65535:
             raise ValueError(f"port {port!r} is not a number from 1 to 65535")
@@ -277,13 +271,10 @@ class Link:
         on_event: Callable[[Mapping[str, object]], None],
         on_end: Callable[[], None],
     ) -> None:
-        """Start a task in the running event loop that reads messages from an open
-        transport.
+        """Start a task in the running event loop that reads messages from an open transport.
 
-        Args:
-            transport: open.
-            on_event: called with the parameters of each event.
-            on_end: called when the connection has ended.
+        `transport`: open; `on_event`: called with the parameters of each event; `on_end`: called
+        when the connection has ended.
         """
         self._transport = transport
         self._on_event = on_event

@@ -60,8 +60,7 @@ def control(action: session.ControlAction) -> Flow[session.ControlResult]:
 
     Example:
         >>> twin.control("acquire").yours
-        True
-    """
+        True"""
     return ask(session.SESSION_CONTROL, action=action)
 
 
@@ -70,8 +69,7 @@ def ping() -> Flow[float]:
 
     Example:
         >>> twin.ping() <= twin.ping()  # the twin's clock [s]
-        True
-    """
+        True"""
     return (yield from ask(session.SESSION_PING)).time
 
 
@@ -80,8 +78,7 @@ def discover() -> Flow[dict[str, Any]]:
 
     Example:
         >>> "axes.move" in [method["name"] for method in twin.discover()["methods"]]
-        True
-    """
+        True"""
     return (yield from ask(documents.RPC_DISCOVER)).model_dump(mode="python")
 
 
@@ -93,8 +90,7 @@ def state() -> Flow[s.State]:
 
     Example:
         >>> twin.state().axes["rot_obj"].unit
-        'deg'
-    """
+        'deg'"""
     return ask(session.STATE_GET)
 
 
@@ -143,8 +139,7 @@ def jog(axis: str, velocity: float, lease_s: float = 0.5) -> Flow[scanner.MoveRe
 
     Example:
         >>> twin.jog("rot_obj", 5.0, lease_s=0.2).warnings
-        []
-    """
+        []"""
     return ask(scanner.AXES_JOG, axis=axis, velocity=velocity, lease_s=lease_s)
 
 
@@ -155,8 +150,7 @@ def set_axis(
 
     Example:
         >>> twin.set_axis("rot_obj", speed=10.0).speed
-        10.0
-    """
+        10.0"""
     return ask(scanner.AXES_SET, axis=axis, speed=speed, acceleration=acceleration)
 
 
@@ -165,8 +159,7 @@ def stop() -> Flow[s.Stopped]:
 
     Example:
         >>> twin.stop().safety.estop
-        False
-    """
+        False"""
     return ask(scanner.AXES_STOP)
 
 
@@ -175,8 +168,7 @@ def estop() -> Flow[s.Stopped]:
 
     Example:
         >>> twin.estop().safety.estop, twin.reset().safety.estop
-        (True, False)
-    """
+        (True, False)"""
     return ask(scanner.SAFETY_ESTOP)
 
 
@@ -205,8 +197,7 @@ def set_clock(speed_up: SpeedUp) -> Flow[s.ClockState]:
 
     Example:
         >>> twin.set_clock("max").speed_up
-        'max'
-    """
+        'max'"""
     return ask(scanner.CLOCK_SET, speed_up=speed_up)
 
 
@@ -218,8 +209,7 @@ def set_tube(
     Example:
         >>> tube = twin.set_tube(kV=80.0, power_W=20.0)
         >>> tube.kV, tube.power_W
-        (80.0, 20.0)
-    """
+        (80.0, 20.0)"""
     return ask(scanner.TUBE_SET, kV=kV, power_W=power_W, on=on)
 
 
@@ -297,8 +287,7 @@ def delete_sample(name: str) -> Flow[scanner.SampleDeleteResult]:
         >>> import numpy as np
         >>> sent = twin.upload_voxels(np.full((2, 2, 2), 0.02), 0.5, "grain")
         >>> twin.delete_sample("grain").bytes
-        32
-    """
+        32"""
     return ask(scanner.SAMPLE_DELETE, name=name)
 
 
@@ -466,11 +455,8 @@ def _upload(
         data: content of the file.
         progress: called with the bytes received and all.
 
-    Returns:
-        The answer to the last part.
-
-    Raises:
-        ValueError: there are no data.
+    Returns the answer to the last part.
+    Raises ValueError: there are no data.
     """
     total = len(data)
     done = None
@@ -554,8 +540,7 @@ def geometry() -> Flow[s.GeometryResult]:
 
     Example:
         >>> len(twin.geometry().cone_vec)
-        12
-    """
+        12"""
     return ask(images.GEOMETRY_GET)
 
 
@@ -621,8 +606,7 @@ def check_script(script: str | bytes, name: str | None = None) -> Flow[scans.Che
     Example:
         >>> script = "camera\\tset exposure\\t100\\t\\tACK\\t\\t\\r\\n"
         >>> twin.check_script(script).ok
-        True
-    """
+        True"""
     return ask(scans.SCRIPT_CHECK, **_script(script), name=name)
 
 
@@ -673,8 +657,7 @@ def check_trajectory(
     Example:
         >>> poses = [{"rot_obj": 0.0}, {"rot_obj": 90.0}]
         >>> twin.check_trajectory(poses, 100.0).frames
-        2
-    """
+        2"""
     return ask(
         scans.TRAJECTORY_CHECK,
         poses=[dict(p) for p in poses],
@@ -752,8 +735,7 @@ def job_status(job: Job | None = None) -> Flow[s.JobStatus]:
         >>> twin.job_status(job).frames_total
         20
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
-        True
-    """
+        True"""
     return ask(scans.JOB_STATUS, job=_name_of(job))
 
 
@@ -767,8 +749,7 @@ def pause_job(job: Job | None = None) -> Flow[s.JobStatus]:
         >>> twin.pause_job(job).state in ("running", "paused")
         True
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
-        True
-    """
+        True"""
     return ask(scans.JOB_PAUSE, job=_name_of(job))
 
 
@@ -782,8 +763,7 @@ def resume_job(job: Job | None = None) -> Flow[s.JobStatus]:
         >>> twin.pause_job(job).job == twin.resume_job(job).job == job
         True
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
-        True
-    """
+        True"""
     return ask(scans.JOB_RESUME, job=_name_of(job))
 
 
@@ -801,8 +781,7 @@ def step_job(job: Job | None = None) -> Flow[s.JobStatus]:
         >>> twin.step_job(job).job == job
         True
         >>> twin.wait_job(twin.abort_job(job).job).state in FINAL_STATES
-        True
-    """
+        True"""
     return ask(scans.JOB_STEP, job=_name_of(job))
 
 
@@ -812,8 +791,7 @@ def abort_job(job: Job | None = None, reason: str | None = None) -> Flow[s.JobSt
     Example:
         >>> job = twin.submit_trajectory([{"rot_obj": 0.0}] * 20, 9000.0, speed_up=1.0).job
         >>> twin.wait_job(twin.abort_job(job).job).state
-        'aborted'
-    """
+        'aborted'"""
     return ask(scans.JOB_ABORT, job=_name_of(job), reason=reason)
 
 
@@ -827,8 +805,7 @@ def forget_job(
         >>> twin.wait_job(job).state
         'done'
         >>> twin.forget_job(job).jobs == [job]
-        True
-    """
+        True"""
     return ask(scans.JOB_FORGET, job=_name_of(job), days=days)
 
 
@@ -984,8 +961,7 @@ def apply_calibration(
         >>> twin.apply_calibration({"det_roll": 0.1}, "rolled").correction.name
         'rolled'
         >>> twin.revert_calibration().correction is None
-        True
-    """
+        True"""
     return ask(
         corrections.CALIBRATION_APPLY,
         parameters=dict(parameters),
@@ -1002,8 +978,7 @@ def calibration(name: str | None = None) -> Flow[s.Correction | None]:
 
     Example:
         >>> twin.calibration() is None  # none is in force
-        True
-    """
+        True"""
     return (yield from ask(corrections.CALIBRATION_GET, name=name)).correction
 
 
@@ -1012,8 +987,7 @@ def calibrations() -> Flow[corrections.CorrectionListResult]:
 
     Example:
         >>> twin.calibrations().current is None
-        True
-    """
+        True"""
     return ask(corrections.CALIBRATION_LIST)
 
 
@@ -1024,8 +998,7 @@ def revert_calibration() -> Flow[corrections.CorrectionResult]:
         >>> twin.apply_calibration({"det_roll": 0.2}, "second").correction.name
         'second'
         >>> twin.revert_calibration().correction is None
-        True
-    """
+        True"""
     return ask(corrections.CALIBRATION_REVERT)
 
 
@@ -1038,8 +1011,7 @@ def delete_calibration(name: str) -> Flow[corrections.CorrectionDeleted]:
         >>> twin.revert_calibration().correction is None
         True
         >>> twin.delete_calibration("slip").name
-        'slip'
-    """
+        'slip'"""
     return ask(corrections.CALIBRATION_DELETE, name=name)
 
 
@@ -1140,8 +1112,7 @@ def save_scene(name: str | None = None) -> Flow[dict[str, Any]]:
 
     Example:
         >>> sorted(twin.save_scene("mine"))[:3]
-        ['accelerations', 'camera', 'correction']
-    """
+        ['accelerations', 'camera', 'correction']"""
     return dict((yield from ask(documents.SCENE_SAVE, name=name)).document)
 
 
@@ -1150,8 +1121,7 @@ def load_scene(document: Mapping[str, Any]) -> Flow[s.State]:
 
     Example:
         >>> twin.load_scene(twin.save_scene()).safety.state
-        'ok'
-    """
+        'ok'"""
     return ask(documents.SCENE_LOAD, document=dict(document))
 
 

@@ -107,17 +107,14 @@ class FramesBeside:
 
 
 def line_integrals(path: Path, shape: tuple[int, int]) -> tuple[Float32Array, str]:
-    """Convert a frame to line integrals (rows, cols) of `shape`, with a description of
-    the white level.
+    """Convert a frame to line integrals (rows, cols) of `shape`, with a description of the white
+    level.
 
-    The means of the folder's dark and flat images are used if it has both; otherwise dark
-    is 0 and white is the frame's 99.5 % percentile.
+    The means of the folder's dark and flat images are used if it has both; otherwise dark is 0
+    and white is the frame's 99.5 % percentile.
 
-    Returns:
-        The line integrals, and a description of the white level.
-
-    Raises:
-        TwinError: no readable image, or of another shape.
+    Returns the line integrals, and a description of the white level.
+    Raises TwinError: no readable image, or of another shape.
     """
     counts = read_image(path, shape).astype(np.float32)
     folder = list_folder(path.parent)
@@ -142,8 +139,7 @@ def shift(virtual: Float32Array, real: Float32Array) -> tuple[float, float]:
         >>> image[10:20, 15:25] = 1.0
         >>> columns, rows = shift(image, np.roll(image, (2, -3), axis=(0, 1)))
         >>> round(columns, 1), round(rows, 1)
-        (-3.0, 2.0)
-    """
+        (-3.0, 2.0)"""
     import cv2
 
     (columns, rows), _ = cv2.phaseCorrelate(

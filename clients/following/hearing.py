@@ -17,19 +17,14 @@ def heard(data: bytes, axes: Collection[str], stamp: str, late_s: float = 0.0) -
     """Decode one message of the scanner to a follower's message (`Heard`), with its typed
     command or question.
 
-    Bytes before the first "{" are skipped. Bytes that are no event in UTF-8 are tried
-    once more as Latin-1. The component's name is replaced by the axis's own spelling; an
-    event without a reply type becomes "SEND".
-
-    Args:
-        data: bytes of the message; UTF-8, or one byte for each character where a cluster
-            is not UTF-8. A prefix of the object, such as a topic, is left out.
-        axes: motors and virtual axes of the machine.
-        stamp: time of day, hh:mm:ss.mmm.
-        late_s: uncertainty of the time: it may have come so much earlier [s].
-
-    Raises:
-        AcquilaError: the bytes are no event.
+    Bytes before the first "{" are skipped. Bytes that are no event in UTF-8 are tried once more
+    as Latin-1. The component's name is replaced by the axis's own spelling; an event without a
+    reply type becomes "SEND".
+    `data`: bytes of the message; UTF-8, or one byte for each character where a cluster is not
+    UTF-8. A prefix of the object, such as a topic, is left out. `axes`: motors and virtual axes
+    of the machine. `stamp`: time of day, hh:mm:ss.mmm. `late_s`: uncertainty of the time: it may
+    have come so much earlier [s].
+    Raises AcquilaError: the bytes are no event.
     """
     data = data[max(0, data.find(b"{")) :]
     try:

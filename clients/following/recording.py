@@ -56,8 +56,7 @@ def time_of_day(seconds: float, digits: int = 3) -> str:
 
 def format_recorded(message: Recorded) -> bytes:
     """Encode a message as `[hh:mm:ss.ffffff LATE] DATA` and a line end (bytes), LATE in
-    seconds; the day is lost.
-    """
+    seconds; the day is lost."""
     head = f"[{time_of_day(message.at_s, 6)} {message.late_s:.6f}] "
     return head.encode() + message.data + b"\n"
 
@@ -73,8 +72,7 @@ def read_recording(data: bytes) -> Iterator[Recorded]:
     Example:
         >>> recording = b"[23:59:59] {}\\n[00:00:01.5 0.002] {}\\n"
         >>> [(m.at_s, m.late_s) for m in read_recording(recording)]
-        [(0.0, 1.0), (1.5, 0.002)]
-    """
+        [(0.0, 1.0), (1.5, 0.002)]"""
     stamps = list(STAMP.finditer(data))
     last = 0.0
     for stamp, end in zip(

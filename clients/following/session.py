@@ -110,11 +110,9 @@ class FollowSession:
             self.executed(line)
 
     def link(self, connected: bool, why: str) -> None:
-        """Record that the connection was made or lost, update the mirror and report new
-        alarms.
+        """Record that the connection was made or lost, update the mirror and report new alarms.
 
-        `connected` is whether it was made, `why` the reason of a loss, for people.
-        """
+        `connected` is whether it was made, `why` the reason of a loss, for people."""
         now = self.clock()
         self._keep(UP if connected else LINK + why.encode(), now, 0.0)
         self._take(self.follower.linked(self.mirror, connected, now, why))
@@ -148,15 +146,11 @@ class FollowSession:
         self.changed(mirror)
 
     async def run(self, address: str) -> None:
-        """Listen to the scanner at `address` and check ahead of its script, until
-        cancelled.
+        """Listen to the scanner at `address` and check ahead of its script, until cancelled.
 
         Two tasks: listen for messages, and look ahead; an error in one ends both.
-
-        Raises:
-            ExceptionGroup: with the error of a task, such as the ValueError or
-                zmq.ZMQError of an address that cannot be connected to.
-        """
+        Raises ExceptionGroup: with the error of a task, such as the ValueError or zmq.ZMQError
+        of an address that cannot be connected to."""
         from flexdt.clients.following.listening import listen  # pyzmq is an extra
 
         async with asyncio.TaskGroup() as tasks:

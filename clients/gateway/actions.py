@@ -74,9 +74,7 @@ async def write_settings(
     """Write the present motor positions into the recording's settings texts; return "".
 
     Before the first saved image they are only stored, for later texts.
-
-    Raises:
-        Refusal: they cannot be written, or the twin does not answer.
+    Raises Refusal: they cannot be written, or the twin does not answer.
     """
     try:
         twin.record().write_settings(await twin.state())
@@ -90,22 +88,17 @@ def setting(
 ) -> Action:
     """Make the action of a command that only sets a value.
 
-    Args:
-        method: of the twin.
-        params: its parameters, from the command.
-        reply: the text of ACK, from the command.
-
-    Returns:
-        The action: it sends the request, waits for the answer and returns the reply;
-        errors of the twin become Refusal.
+    `method`: of the twin; `params`: its parameters, from the command; `reply`: the text of ACK,
+    from the command.
+    Returns the action: it sends the request, waits for the answer and returns the reply; errors
+    of the twin become Refusal.
     """
 
     async def send(
         twin: ConnectedTwin, command: c.Command, progress: CommandProgress
     ) -> str:
         """Send the command's parameters to the twin and return the reply; raises Refusal
-        if the twin rejects them.
-        """
+        if the twin rejects them."""
         await twin.ask(method, params(command))
         return reply(command)
 
@@ -144,18 +137,13 @@ async def wait_ready(
 async def take_image(
     twin: ConnectedTwin, command: c.TakeImage, progress: CommandProgress
 ) -> str:
-    """Take an image at the present pose and settings, and wait for its exposure on the
-    twin's clock.
+    """Take an image at the present pose and settings, and wait for its exposure on the twin's
+    clock.
 
-    The camera keeps it in place of the one before; nothing is saved. The exposure is
-    exposure time times averages.
-
-    Returns:
-        "columns x rows, mean" of its counts.
-
-    Raises:
-        Refusal: the twin refuses, or does not answer.
-    """
+    The camera keeps it in place of the one before; nothing is saved. The exposure is exposure
+    time times averages.
+    Returns "columns x rows, mean" of its counts.
+    Raises Refusal: the twin refuses, or does not answer."""
     state = await twin.state()
     counts = np.asarray((await twin.run(m.projection("counts"))).image, dtype=np.uint16)
     twin.image = Image(counts, state)
@@ -197,19 +185,16 @@ async def move(
 ) -> str:
     """Move to a position and wait for arrival.
 
-    With a trigger position, the move waits for an image sequence and is then a part of
-    its job. Where none takes the armed move within ARMED_S, it is made without.
+    With a trigger position, the move waits for an image sequence and is then a part of its job.
+    Where none takes the armed move within ARMED_S, it is made without.
 
     Args:
         twin: state and requests.
         command: axis, target [mm, deg] and, if any, trigger position.
         progress: its text is the position under way.
 
-    Returns:
-        The motor's reply, see `ConnectedTwin.motor_text`.
-
-    Raises:
-        Refusal: the move was refused or ended elsewhere, or its sequence failed.
+    Returns the motor's reply, see `ConnectedTwin.motor_text`.
+    Raises Refusal: the move was refused or ended elsewhere, or its sequence failed.
     """
     if command.trigger is None:
         return await _go(twin, command.component, command.target, progress)
@@ -233,8 +218,8 @@ async def _go(
 ) -> str:
     """Move an axis, report its position while it moves, and check that it arrived.
 
-    It looks every `POLL_S` seconds. The request's errors are Refusals, too. Arrived is
-    within 1e-9 of the target and not sent elsewhere.
+    It looks every `POLL_S` seconds. The request's errors are Refusals, too. Arrived is within
+    1e-9 of the target and not sent elsewhere.
 
     Args:
         twin: state and requests.
@@ -242,11 +227,8 @@ async def _go(
         target: [mm, deg]; beyond a limit it is clamped where the machine does so.
         progress: its text is the position under way.
 
-    Returns:
-        The motor's reply, see `ConnectedTwin.motor_text`.
-
-    Raises:
-        Refusal: the axis was stopped or sent elsewhere.
+    Returns the motor's reply, see `ConnectedTwin.motor_text`.
+    Raises Refusal: the axis was stopped or sent elsewhere.
     """
     await twin.ask(
         "axes.move", {"targets": {axis: await _at_limit_switch(twin, axis, target)}}
@@ -269,17 +251,16 @@ async def _go(
 async def _at_limit_switch(twin: ConnectedTwin, axis: str, target: float) -> float:
     """Clamp a target beyond a limit to the limit, where the machine does so.
 
-    Unchanged also where the machine does not have the axis, the target is within the
-    limits, or the machine refuses instead of clamping. A virtual axis gets its reading
-    when its motors are at the clamped targets.
+    Unchanged also where the machine does not have the axis, the target is within the limits, or
+    the machine refuses instead of clamping. A virtual axis gets its reading when its motors are
+    at the clamped targets.
 
     Args:
         twin: connection and machine.
         axis: that moves, also a virtual one.
         target: of the command.
 
-    Returns:
-        The target that the twin gets; unchanged without a machine.
+    Returns the target that the twin gets; unchanged without a machine.
     """
     machine = twin.machine
     if machine is None or not machine.has(axis):
@@ -342,8 +323,7 @@ def _why(state: State) -> str:
     """Return the reason of the safety state in brackets, with a leading blank; empty if all is
     well.
 
-    The message of the safety state, or its name if there is none.
-    """
+    The message of the safety state, or its name if there is none."""
     safety = state.safety
     if safety.state != "ok":
         return f" ({safety.message or safety.state})"
@@ -464,12 +444,8 @@ async def abort_script(
 ) -> str:
     """Abort the job that this gateway started, without waiting for its end.
 
-    Returns:
-        Its name.
-
-    Raises:
-        Refusal: none is running, or the twin refuses.
-    """
+    Returns its name.
+    Raises Refusal: none is running, or the twin refuses."""
     if twin.job is None:
         raise Refusal("no script or sequence of this gateway is running")
     await twin.ask("job.abort", {"job": twin.job})
@@ -538,12 +514,9 @@ def _name_taken(refusal: Refusal) -> bool:
 async def _adopt(twin: ConnectedTwin, folder: str, state: State) -> str:
     """Add the frames in a data set's folder to this session's recording.
 
-    Returns:
-        How many, and the recording's folder; `folder` itself, with nothing added, if this
-        machine's disk lacks it.
-
-    Raises:
-        Refusal: they cannot be added.
+    Returns how many, and the recording's folder; `folder` itself, with nothing added, if this
+    machine's disk lacks it.
+    Raises Refusal: they cannot be added.
     """
     if not folder or not Path(folder).is_dir():
         return folder

@@ -105,15 +105,11 @@ class ConnectedTwin:
         self._news = asyncio.Event()
 
     def heard(self, topic: str, params: Mapping[str, object]) -> None:
-        """Take an event of the twin: keep the status of a job, and wake `news`, whatever
-        the topic.
+        """Take an event of the twin: keep the status of a job, and wake `news`, whatever the
+        topic.
 
         The end of a job that was not kept before is not kept.
-
-        Args:
-            topic: other topics than "job" only wake.
-            params: of the event, with `data`.
-        """
+        `topic`: other topics than "job" only wake; `params`: of the event, with `data`."""
         if topic == "job":
             status = JobStatus.model_validate(params["data"])
             if status.state not in FINAL_STATES or status.job in self.jobs:
@@ -121,13 +117,11 @@ class ConnectedTwin:
         self._news.set()
 
     def told_jobs(self, state: State) -> list[JobStatus]:
-        """Return the newest status of each job whose progress is to be sent; drop ended
-        ones.
+        """Return the newest status of each job whose progress is to be sent; drop ended ones.
 
         Jobs that have ended are returned this once; the order is that of their first status.
 
-        Args:
-            state: of the twin; its job is added.
+        `state`: of the twin; its job is added.
         """
         now = state.job
         if now is not None and self.jobs.get(now.job, now).state not in FINAL_STATES:
@@ -190,16 +184,10 @@ class ConnectedTwin:
     async def until(self, seconds: float, progress: CommandProgress, what: str) -> None:
         """Wait for `seconds` of the twin's clock, reporting the time left in `progress`.
 
-        At speed-up "max" it returns at once. A change of the speed-up takes effect within
-        0.2 s.
-
-        Args:
-            seconds: on the twin's clock.
-            progress: its text becomes "WHAT: N s left".
-            what: is waited for.
-
-        Raises:
-            Refusal: as `ask`.
+        At speed-up "max" it returns at once. A change of the speed-up takes effect within 0.2 s.
+        `seconds`: on the twin's clock; `progress`: its text becomes "WHAT: N s left"; `what`: is
+        waited for.
+        Raises Refusal: as `ask`.
         """
         state = await self.state()
         end = state.time + seconds

@@ -39,8 +39,7 @@ def script_lines(script: bytes) -> tuple[ScriptLine, ...]:
 
     Example:
         >>> script_lines(b"tube\\txrayon\\t\\t\\tACK\\t\\t")
-        (ScriptLine(words=('tube', 'xrayon', '', ''), waits=True),)
-    """
+        (ScriptLine(words=('tube', 'xrayon', '', ''), waits=True),)"""
     made = {row.line: row for row in rows(script)}
     found = []
     for command in read_script(script)[0].commands:
@@ -206,16 +205,12 @@ class Echoes:
     ) -> tuple[Exchange, AcquilaEvent, AcquilaEvent]:
         """Make the exchange of a command that somebody else gave.
 
-        An unknown component has the kind "other". The command gets a random number and
-        the time [ms] modulo 2^32.
+        An unknown component has the kind "other". The command gets a random number and the time
+        [ms] modulo 2^32.
 
-        Args:
-            words: component, command and two arguments.
-            state: of the twin, which names its axes.
-            now: time [s].
-
-        Returns:
-            The exchange, the command's event and that of its reception.
+        `words`: component, command and two arguments; `state`: of the twin, which names its
+        axes; `now`: time [s].
+        Returns the exchange, the command's event and that of its reception.
         """
         kind = component_type(words[0], state.axes) or "other"
         uuid = self.uuids.getrandbits(52) + 1

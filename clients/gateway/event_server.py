@@ -386,11 +386,8 @@ class Gateway:
 
     def _send(self, event: AcquilaEvent) -> None:
         """Format an event, remember its hash (of the last 256) to recognise its echo, and
-        publish it without waiting.
-
-        A subscriber that is too slow does not get it; characters outside UTF-8 are
-        replaced.
-        """
+        publish it without waiting. A subscriber that is too slow does not get it; characters
+        outside UTF-8 are replaced."""
         text = format_event(event)
         self._recent.append(hash(text))
         # A PUB socket never blocks: it drops messages that a slow subscriber does not take.

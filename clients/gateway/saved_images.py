@@ -107,11 +107,9 @@ class Recording:
         return self._folder.path
 
     def suggest(self, path: str) -> None:
-        """Name the folder after the last folder in a file's path, while no output path
-        was set and no image saved.
-
-        A path without a usable folder changes nothing; slashes and backslashes separate.
-        """
+        """Name the folder after the last folder in a file's path, while no output path was set
+        and no image saved. A path without a usable folder changes nothing; slashes and
+        backslashes separate."""
         parts = [part for part in re.split(r"[\\/]", path)[:-1] if bare_name(part)]
         if self._folder is None and self.name == UNNAMED and parts:
             self.name = bare_name(parts[-1])
@@ -147,24 +145,16 @@ class Recording:
             return files.path / file
 
     def adopt(self, folder: Path, state: State) -> int:
-        """Add the images of a data set that the twin made, flat and dark ones too, and
-        rewrite the texts.
+        """Add the images of a data set that the twin made, flat and dark ones too, and rewrite
+        the texts.
 
-        Files are linked or copied under their own names; frames that are no file of the
-        folder are copied. Blocks begin at the time of `state` minus the set's duration. A
-        document without frames adds none.
-
-        Args:
-            folder: of the data set.
-            state: of the twin, after the data set was made.
-
-        Returns:
-            The number of images.
-
-        Raises:
-            DatasetError, OSError: the data set cannot be read, a name is taken, no room,
-                or the recording was closed meanwhile.
-        """
+        Files are linked or copied under their own names; frames that are no file of the folder
+        are copied. Blocks begin at the time of `state` minus the set's duration. A document
+        without frames adds none.
+        `folder`: of the data set; `state`: of the twin, after the data set was made.
+        Returns the number of images.
+        Raises DatasetError, OSError: the data set cannot be read, a name is taken, no room, or
+        the recording was closed meanwhile."""
         source = Directory(folder.parent).folder(folder.name)
         document = read_document(source)
         with self._turn:
@@ -177,12 +167,10 @@ class Recording:
         return len(document.frames)
 
     def write_settings(self, state: State) -> None:
-        """Store a state whose motor positions the settings texts show from now on;
-        rewrite the texts if the folder has images.
+        """Store a state whose motor positions the settings texts show from now on; rewrite the
+        texts if the folder has images.
 
-        Raises:
-            DatasetError: the texts cannot be written; the state is stored.
-        """
+        Raises DatasetError: the texts cannot be written; the state is stored."""
         with self._turn:
             self._settings = state
             if self._folder is not None and self._blocks:
@@ -322,16 +310,10 @@ def kind_of_file(file: str) -> FrameKind:
 
 
 def _same_file(name: str, source: Directory, files: Directory, *, linked: bool) -> None:
-    """Link an image file into another folder, or copy its bytes where links are not
-    possible.
+    """Link an image file into another folder, or copy its bytes where links are not possible.
 
     A link is tried only if `linked`. Errors of the copy are raised.
-
-    Args:
-        name: of the file.
-        source: folder.
-        files: the other folder.
-        linked: try a link.
+    `name`: of the file; `source`: folder; `files`: the other folder; `linked`: try a link.
     """
     with suppress(OSError, NotImplementedError):
         if linked:

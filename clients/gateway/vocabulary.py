@@ -129,15 +129,11 @@ def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
 def _extra(event: AcquilaEvent, name: str) -> c.Command:
     """Read a command that the grammar of scripts does not have.
 
-    Letter case and repeated blanks do not matter. A component without a table of its own
-    (an axis) takes the general one.
+    Letter case and repeated blanks do not matter. A component without a table of its own (an
+    axis) takes the general one.
 
-    Args:
-        event: the command.
-        name: of the component, as the twin calls it.
-
-    Raises:
-        Refusal: the component does not know it; the message lists the known ones.
+    `event`: the command; `name`: of the component, as the twin calls it.
+    Raises Refusal: the component does not know it; the message lists the known ones.
     """
     table = _EXTRA.get(name, _EXTRA[""])
     asked = " ".join(event.command.lower().split())

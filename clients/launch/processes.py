@@ -85,10 +85,7 @@ class Servers:
 
         Ports are free ones unless `options` name them.
 
-        Args:
-            options: of `flexdt up`.
-            log: file of their log.
-            viewer: start the viewer, too.
+        `options`: of `flexdt up`; `log`: file of their log; `viewer`: start the viewer, too.
         """
         ports = {"port": 0, "projector-port": 0, "viewer-port": 0}
         self._words = words({**ports, **options, "no-viewer": not viewer})
@@ -186,8 +183,7 @@ class Servers:
         be read.
 
         `lines` is how many, at most; without line ends, oldest first, undecodable bytes
-        replaced.
-        """
+        replaced."""
         try:
             text = self._log_path.read_text(encoding="utf-8", errors="replace")
         except OSError:

@@ -26,11 +26,8 @@ RANGES: Final[Mapping[str, float]] = {
 
 
 def draw() -> dict[str, float]:
-    """Draw a misalignment from the operating system's entropy.
-
-    Returns:
-        Parameter -> value [mm, deg] of an edge, to four decimals, within `RANGES`.
-    """
+    """Draw a misalignment from the operating system's entropy. Returns parameter -> value [mm,
+    deg] of an edge, to four decimals, within `RANGES`."""
     entropy = random.SystemRandom()
     return {name: round(entropy.uniform(-most, most), 4) for name, most in RANGES.items()}
 

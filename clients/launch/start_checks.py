@@ -49,9 +49,7 @@ def _require_folder(folder: Path) -> None:
     """Check that a folder can be written, or made.
 
     A path that exists but is no folder raises NotADirectoryError.
-
-    Raises:
-        OSError: it cannot; names the folder.
+    Raises OSError: it cannot; names the folder.
     """
     from flexdt.runtime.files.writable import require_writable
 
@@ -70,10 +68,7 @@ def _require_sample(name: str) -> None:
     """Check that a sample ships.
 
     "" and the empty stage are always allowed.
-
-    Raises:
-        UnknownNameError: it does not; lists those that do.
-    """
+    Raises UnknownNameError: it does not; lists those that do."""
     from flexdt.phantoms import load_phantom
     from flexdt.twin.scanner.state import EMPTY_STAGE
 

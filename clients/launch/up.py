@@ -149,13 +149,10 @@ def port_of(name: str, asked: int, known: Addresses) -> int:
 def port_problem(option: str, host: str, port: int) -> str | None:
     """Say why a port cannot be listened on; None if it can.
 
-    The port is bound for a moment and freed again. The problem names the address, the
-    system's reason and the option to change.
+    The port is bound for a moment and freed again. The problem names the address, the system's
+    reason and the option to change.
 
-    Args:
-        option: that chooses the port.
-        host: address to listen on.
-        port: 0 means any free one.
+    `option`: that chooses the port; `host`: address to listen on; `port`: 0 means any free one.
     """
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
@@ -173,18 +170,14 @@ def ready_line(
     secure: bool = False,
     public: PublicAddress | None = None,
 ) -> str:
-    """Format the supervisor's `ready` line: the twin's address, and every process's by
-    name (one JSON object, no line end).
+    """Format the supervisor's `ready` line: the twin's address, and every process's by name (one
+    JSON object, no line end).
 
     The viewer has a URL too, and the gateway its inbound port (one above its port).
 
-    Args:
-        addresses: of the processes.
-        secure: the viewer's URL is https.
-        public: the viewer's address behind a proxy, which its URL is then.
-
-    Returns:
-        JSON with ready, host, port, and an object for each process.
+    `addresses`: of the processes; `secure`: the viewer's URL is https; `public`: the viewer's
+    address behind a proxy, which its URL is then.
+    Returns JSON with ready, host, port, and an object for each process.
     """
     twin = addresses["twin"]
     document: dict[str, object] = {"ready": "up", "host": twin.host, "port": twin.port}

@@ -65,8 +65,7 @@ class BrowserConnection(ServerConnection):
         network address.
 
         Socket options are set as for all servers; with too many such connections one
-        gives way.
-        """
+        gives way."""
         super().connection_made(transport)
         peer = transport.get_extra_info("peername") or ("?", 0)
         self.address = neighbourhood(str(peer[0]))
@@ -128,8 +127,7 @@ class BrowserConnection(ServerConnection):
         """Free the place of an ended connection among those that are counted, and the
         bytes it held.
 
-        Called once, by asyncio.
-        """
+        Called once, by asyncio."""
         self._hold(0)
         self._admission.strangers.leave(self)
         self._admission.answered.leave(self)

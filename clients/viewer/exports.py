@@ -43,14 +43,9 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
 
     Translucent pixels are blended with `LIGHT` or `DARK`.
 
-    Args:
-        client: one open view, whose browser renders it.
-        width: [px].
-        height: [px].
-        dark: the page's colours.
-
-    Raises:
-        RuntimeError, TimeoutError: the browser does not answer within 30 s.
+    `client`: one open view, whose browser renders it; `width`: [px]; `height`: [px]; `dark`: the
+    page's colours.
+    Raises RuntimeError, TimeoutError: the browser does not answer within 30 s.
     """
     rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(
         np.float32
@@ -72,11 +67,8 @@ def scene_file(
     form: Form,
     dark: bool,
 ) -> bytes:
-    """Export the live scene as the page shows it to a file: an HTML page with `beside`
-    over it, or viser's own format.
-
-    See `_file`; `camera` is the first view, `nodes` are those shown.
-    """
+    """Export the live scene as the page shows it to a file: an HTML page with `beside` over it,
+    or viser's own format. See `_file`; `camera` is the first view, `nodes` are those shown."""
     serializer = server.get_scene_serializer()
     look_from(serializer, camera, nodes)
     return _file(serializer, form, dark, title, beside)
@@ -130,12 +122,8 @@ def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "")
 
     Only html has colours, title and `beside`. The title is escaped, `beside` is not.
 
-    Args:
-        serializer: viser's, of the scene.
-        form: "html" or "viser".
-        dark: the page's colours.
-        title: of the page.
-        beside: HTML at its end.
+    `serializer`: viser's, of the scene; `form`: "html" or "viser"; `dark`: the page's colours;
+    `title`: of the page; `beside`: HTML at its end.
     """
     match form:
         case "viser":

@@ -167,12 +167,7 @@ class Page:
         """Run work in a task that is cancelled when the page closes.
 
         Returns the task; a failure is logged, not raised.
-
-        Args:
-            work: to run.
-            what: word for the log if it fails.
-            died: called if it fails.
-        """
+        `work`: to run; `what`: word for the log if it fails; `died`: called if it fails."""
         task = watched(work, what, died)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -199,11 +194,7 @@ class Page:
         """Send something that must arrive, in order; it is converted to JSON now.
 
         A page with more than `MAX_NOTES` unsent is closed.
-
-        Args:
-            kind: type of the message.
-            content: its fields.
-        """
+        `kind`: type of the message; `content`: its fields."""
         self._notes.append(json.dumps({"type": kind, **content}))
         if len(self._notes) > MAX_NOTES:
             self._over.set()

@@ -135,13 +135,11 @@ class SceneClients:
     def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
         """Set the nodes of a page's frames, from one thread only.
 
-        Only nodes that differ from those in the frame are sent. `built` is also
-        compared with the number at the last call: nodes built since are compared with
-        `plain` as well.
+        Only nodes that differ from those in the frame are sent. `built` is also compared with
+        the number at the last call: nodes built since are compared with `plain` as well.
 
         Args:
-            page: its frames; a frame that has not received all nodes yet is left for
-                later.
+            page: its frames; a frame that has not received all nodes yet is left for later.
             nodes, plain: as wanted, and as built.
             built: number of messages to all clients when they were built (`Scenes.said`).
         """

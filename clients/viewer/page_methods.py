@@ -152,9 +152,7 @@ class Window(Params):
         """Check that both ends or none are given, the lower first.
 
         Returns the window itself; equal ends are wrong, too.
-
-        Raises:
-            ValueError: they are not.
+        Raises ValueError: they are not.
         """
         if (self.low is None) != (self.high is None):
             raise ValueError("give both low and high, or neither")
@@ -293,8 +291,7 @@ async def theme(viewer: Viewer, page: Page, params: Theme) -> object:
     """Set light or dark, plain or fine, for this page's scenes, also for later ones;
     returns {}.
 
-    If no page is fine, states are drawn less often.
-    """
+    If no page is fine, states are drawn less often."""
     page.dark = params.dark
     page.fine = params.fine
     viewer.clients.theme(page.id, page.dark, params.fine)
@@ -320,8 +317,7 @@ async def preset(viewer: Viewer, page: Page, params: Preset) -> object:
     """Return the first camera of a view in a pane of this page; empty where it is not
     known.
 
-    The fields are those of `Standpoint`. The beam's eye and unknown views have none.
-    """
+    The fields are those of `Standpoint`. The beam's eye and unknown views have none."""
     fitted = viewer.clients.cameras.get(params.view)
     if fitted is None:
         return {}
@@ -356,16 +352,10 @@ async def ray(viewer: Viewer, page: Page, params: Ray) -> object:
 
     Without a pixel, or before the twin's state is known, the ray is hidden.
 
-    Args:
-        viewer, page: of the request.
-        params: `pixel` (column, row) or None.
-
-    Returns:
-        The twin's path lengths through materials, and `length_mm` of the ray from source
-        to pixel; {} if it is hidden.
-
-    Raises:
-        RpcError: the twin refuses, or there is no scene yet.
+    `viewer` and `page`: of the request; `params`: `pixel` (column, row) or None.
+    Returns the twin's path lengths through materials, and `length_mm` of the ray from source to
+    pixel; {} if it is hidden.
+    Raises RpcError: the twin refuses, or there is no scene yet.
     """
     lab = _lab(viewer)
     world = viewer.world
@@ -569,18 +559,9 @@ def _readout(
 async def _virtual(page: Page, told: Mapping[str, Any]) -> tuple[Any, Any]:
     """Predict the virtual image at a recorded one's pose and exposure.
 
-    Tube and camera settings that were not recorded are the present ones.
-
-    Args:
-        page: whose connection asks the twin.
-        told: the recorded image's entries.
-
-    Returns:
-        Pixels, and origin or None.
-
-    Raises:
-        RpcError: the twin refuses.
-    """
+    Tube and camera settings that were not recorded are the present ones. `page`: whose
+    connection asks the twin; `told`: the recorded image's entries. Returns pixels, and origin or
+    None. Raises RpcError: the twin refuses."""
     asked = {name: told[name] for name in ("kind", "positions")}
     for what in ("tube", "camera"):  # unknown settings are the present ones
         asked[what] = {k: v for k, v in told[what].items() if v is not None}
@@ -613,8 +594,8 @@ async def thumbnail(viewer: Viewer, page: Page, params: Thumbnail) -> object:
 
 
 async def live(viewer: Viewer, page: Page, params: Live) -> object:
-    """Start to grow a volume of a data set from its images so far, for all pages that
-    want one; without a name, end that for this page. Returns {}.
+    """Start to grow a volume of a data set from its images so far, for all pages that want one;
+    without a name, end that for this page. Returns {}.
 
     If the same volume is growing already, its newest line is sent again.
 
@@ -623,9 +604,7 @@ async def live(viewer: Viewer, page: Page, params: Live) -> object:
         params: `name` of the data set or None, `side` of the volume, and `past`, which
             requests the complete one.
 
-    Raises:
-        RpcError: there is no such data set (links do not count), or the viewer has no
-            --data.
+    Raises RpcError: there is no such data set (links do not count), or the viewer has no --data.
     """
     page.live = page.volume = None
     page.ghost = False
@@ -654,18 +633,9 @@ async def ghost(viewer: Viewer, page: Page, params: Ghost) -> object:
 async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, bytes]:
     """Send a request to the volume's process.
 
-    Args:
-        viewer: the viewer.
-        params: name the volume.
-        *words: of the request.
-
-    Returns:
-        A head and bytes; ({}, b"") where the process has another volume by now, or none.
-
-    Raises:
-        RpcError: the viewer has no --data.
-        DatasetNameError: the data set's name is not a plain one.
-    """
+    `viewer`: the viewer; `params`: name the volume; `*words`: of the request. Returns a head and
+    bytes; ({}, b"") where the process has another volume by now, or none. Raises RpcError: the
+    viewer has no --data; DatasetNameError: the data set's name is not a plain one."""
     folder = _data(viewer) / plain_name(params.name or "", "data set")
     return await viewer.grower.ask(wish(folder, params.side, params.past), *words) or (
         {},
@@ -677,16 +647,9 @@ async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
     """Offer a part of a reconstructed volume to a page.
 
     A part offered before that was not fetched is dropped.
-
-    Args:
-        viewer, page: of the request.
-        params: name the volume, and the part: `what`.
-
-    Returns:
-        Its head, and url, name and size of the codes to download; {} while there is none.
-
-    Raises:
-        RpcError: the viewer has no --data.
+    `viewer` and `page`: of the request; `params`: name the volume, and the part: `what`.
+    Returns its head, and url, name and size of the codes to download; {} while there is none.
+    Raises RpcError: the viewer has no --data.
     """
     head, codes = await _of_volume(viewer, params, "block", params.what)
     if not codes:
@@ -698,8 +661,7 @@ async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
 
 
 async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
-    """Read exact values of a voxel by the names of the volumes; None where no data
-    cover."""
+    """Read exact values of a voxel by the names of the volumes; None where no data cover."""
     return (await _of_volume(viewer, params, "voxel", *map(str, params.at)))[0]
 
 
@@ -723,20 +685,13 @@ async def volume_compare(viewer: Viewer, page: Page, params: Live) -> object:
 async def compose(viewer: Viewer, page: Page, params: Compose) -> object:
     """Compose a script for the requested scan, from the present positions.
 
-    Distances are those of the motors alone: a script moves motors, and the correction in
-    force, in which SOD and SDD are a little different, may not lead beyond their travel.
+    Distances are those of the motors alone: a script moves motors, and the correction in force,
+    in which SOD and SDD are a little different, may not lead beyond their travel.
 
-    Args:
-        viewer, page: of the request.
-        params: the scan; axes in `keep` stay where they are.
-
-    Returns:
-        `text`, and `moved`: axis -> its present position and the script's, without axes
-        in `keep`; empty without a known state.
-
-    Raises:
-        RpcError: there is no scene yet.
-        TwinError: the machine cannot make that scan.
+    `viewer` and `page`: of the request. `params`: the scan; axes in `keep` stay where they are.
+    Returns `text`, and `moved`: axis -> its present position and the script's, without axes in
+    `keep`; empty without a known state.
+    Raises RpcError: there is no scene yet; TwinError: the machine cannot make that scan.
     """
     lab = _lab(viewer)
     state = viewer.state
@@ -852,8 +807,7 @@ async def correct(viewer: Viewer, page: Page, params: Correct) -> object:
 
 
 async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
-    """Draw, for this page alone, a ghost of the machine where the plan has it at
-    `time_s`.
+    """Draw, for this page alone, a ghost of the machine where the plan has it at `time_s`.
 
     Times beyond the plan's ends give its first or last positions.
 
@@ -861,11 +815,8 @@ async def scrub(viewer: Viewer, page: Page, params: Scrub) -> object:
         viewer, page: of the request.
         params: `time_s`; None removes the ghost.
 
-    Returns:
-        `positions` of the plan; None after removing.
-
-    Raises:
-        RpcError: the page has no plan, or there is no scene yet.
+    Returns `positions` of the plan; None after removing.
+    Raises RpcError: the page has no plan, or there is no scene yet.
     """
     lab = _lab(viewer)
     time_s = params.time_s
@@ -1038,18 +989,10 @@ async def serve(
 ) -> object:
     """Answer one request of a page: check its parameters and call the method.
 
-    Args:
-        name: of METHODS.
-        viewer: the viewer.
-        page: that calls.
-        given: parameters.
-
-    Returns:
-        The method's result.
-
-    Raises:
-        RpcError: -32602 with every problem of the parameters, or the method's refusal;
-            its TwinErrors are converted.
+    `name`: of METHODS; `viewer`: the viewer; `page`: that calls; `given`: parameters.
+    Returns the method's result.
+    Raises RpcError: -32602 with every problem of the parameters, or the method's refusal; its
+    TwinErrors are converted.
     """
     model, answer = METHODS[name]
     try:

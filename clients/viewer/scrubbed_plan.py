@@ -150,10 +150,7 @@ def plan_text(
     """Plan a script from the twin's positions on, or from the machine's start without a state.
 
     Only positions are taken from the state, not rates or settings.
-
-    Raises:
-        ScriptError: it does not parse.
-    """
+    Raises ScriptError: it does not parse."""
     start = StartState.of(machine)
     if state is not None:
         start = replace(start, positions={**start.positions, **motors(machine, state)})
@@ -208,8 +205,7 @@ def document(plan: ScanPlan) -> dict[str, Any]:
 def projection_positions(plan: ScanPlan) -> dict[str, FloatArray]:
     """Return axis -> (n,) positions at the projections of a plan.
 
-    Order is that of the images; dark and flat images are left out.
-    """
+    Order is that of the images; dark and flat images are left out."""
     kinds = [group.kind for group in plan.groups for _ in range(len(group))]
     taken = np.array(kinds, dtype=str) == "projection"
     return {name: values[taken] for name, values in plan.image_positions.items()}
@@ -220,18 +216,10 @@ def source_path(
 ) -> FloatArray:
     """Compute the focal spot's path in the sample's frame.
 
-    Empty (0, 3) without positions. Every k-th is taken, so up to twice as many may
-    remain.
-
-    Args:
-        at: axis -> positions (n,) [mm, deg].
-        machine: its machine.
-        profile: its profile.
-        state: gives camera and correction.
-
-    Returns:
-        (m, 3) [mm], about ORBIT_POINTS of the n.
-    """
+    Empty (0, 3) without positions. Every k-th is taken, so up to twice as many may remain.
+    `at`: axis -> positions (n,) [mm, deg]; `machine`: its machine; `profile`: its profile;
+    `state`: gives camera and correction.
+    Returns (m, 3) [mm], about ORBIT_POINTS of the n."""
     count = len(next(iter(at.values()), ()))
     if not count:
         return np.zeros((0, 3))

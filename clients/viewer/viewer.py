@@ -757,8 +757,7 @@ class Viewer:
         """Draw a page's plan path in its new view; nothing without a path. Called in one
         of viser's threads.
 
-        An unknown page is ignored.
-        """
+        An unknown page is ignored."""
         page = self.pages.get(id)
         lab = self.lab
         if page is not None and page.orbit is not None and lab is not None:

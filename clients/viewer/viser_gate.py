@@ -110,20 +110,14 @@ class Scenes:
     async def connect(
         self, path: str, subprotocol: Subprotocol | None
     ) -> AsyncIterator[ClientConnection]:
-        """Connect a browser's frame to viser's socket, uncompressed, and close the
-        connection at the end.
+        """Connect a browser's frame to viser's socket, uncompressed, and close the connection at
+        the end.
 
         A message has at most `MAX_OF_VISER` bytes.
 
-        Args:
-            path: identifies the frame.
-            subprotocol: of the browser; None for none.
-
-        Yields:
-            The connection.
-
-        Raises:
-            OSError, InvalidHandshake: viser does not accept it.
+        `path`: identifies the frame. `subprotocol`: of the browser; None for none.
+        Yields the connection.
+        Raises OSError, InvalidHandshake: viser does not accept it.
         """
         async with unix_connect(
             str(self.path),
@@ -159,8 +153,7 @@ class Scenes:
         """Check that a client has been sent the first `said` messages to all clients.
 
         Messages to it alone have a queue of their own, and could overtake those. An
-        unknown client has been sent nothing.
-        """
+        unknown client has been sent nothing."""
         at = self.server._websock_server._broadcast_buffer.generator_cursors.get(
             client_id, -1
         )
@@ -197,8 +190,7 @@ def clear_left_behind(folder: Path) -> None:
 def set_nodes(client: viser.ClientHandle, nodes: Nodes) -> None:
     """Give nodes that all clients have other properties in the frame of one.
 
-    `nodes` is node -> properties; the nodes themselves are not checked.
-    """
+    `nodes` is node -> properties; the nodes themselves are not checked."""
     # In one piece: else the page may draw a frame between two of the messages.
     with client.atomic():
         for message in _changes(nodes):
@@ -225,13 +217,10 @@ def set_camera(client: viser.ClientHandle, camera: Standpoint) -> None:
     """Set up direction, place, target and field of view [rad] of a client's camera in one
     message.
 
-    It does not wait for the browser. viser's own setters also replace its record of the
-    camera, and leave out what stands in it already; here the record stays what the frame
-    has reported last, and all four are sent.
-
-    Args:
-        client: of viser, whose first report has come.
-        camera: its new one.
+    It does not wait for the browser. viser's own setters also replace its record of the camera,
+    and leave out what stands in it already; here the record stays what the frame has reported
+    last, and all four are sent.
+    `client`: of viser, whose first report has come; `camera`: its new one.
     """
     with client.atomic():
         for message in (

@@ -182,8 +182,7 @@ def rows_of(document: Mapping[str, Any]) -> list[tuple[Any, ...]]:
     images.
 
     Rows of before, after and in_force, those that the document has; None for a figure
-    that is unknown.
-    """
+    that is unknown."""
     return [
         (name, *(document[name][figure] for figure in FIGURES))
         for name in ("before", "after", "in_force")

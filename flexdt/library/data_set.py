@@ -172,8 +172,7 @@ class DataSet(ImageSet):
     ) -> Aligned[DataSet]:
         """Estimate the geometry without a phantom; see `flexdt.align`.
 
-        `data.with_correction(data.align().correction)` is the corrected data set.
-        """
+        `data.with_correction(data.align().correction)` is the corrected data set."""
         from flexdt.library.calibration.align_dataset import align_dataset
 
         with long_work.during("aligning", progress):

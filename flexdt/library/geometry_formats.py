@@ -88,11 +88,8 @@ def from_astra(geometry: Any, shape: Shape2 | None) -> ConeVec:
 
 
 def _plausible(cone_vec: ConeVec) -> ConeVec:
-    """Return a geometry of another program; warns of pixels of another unit.
-
-    Raises:
-        GeometryError: no scanner has such distances.
-    """
+    """Return a geometry of another program; warns of pixels of another unit. Raises
+    GeometryError: no scanner has such distances."""
     warn_of(geometry_findings(cone_vec, cone_vec.detector_shape), GeometryError)
     return cone_vec
 
@@ -275,8 +272,7 @@ def load(
 
     Doubts about it, and what of its file is not applied or not known, are warnings.
 
-    Args and errors as of `load_stated`.
-    """
+    Args and errors as of `load_stated`."""
     stated = load_stated(file, format, shape, pixel)
     for note in stated.notes:
         warn_caller(note)

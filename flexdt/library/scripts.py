@@ -95,12 +95,10 @@ def check(plan: ScanPlan, sample: object = None) -> CheckReport:
 
 
 def with_exposures(report: CheckReport, phantom: Phantom | None) -> CheckReport:
-    """Add warnings of projections in which the sample's pixels will be saturated or
-    starved.
+    """Add warnings of projections in which the sample's pixels will be saturated or starved.
 
-    Args:
-        report: of a dry run; one with errors is returned unchanged.
-        phantom: on the stage; None adds no warning.
+    `report`: of a dry run; one with errors is returned unchanged. `phantom`: on the stage; None
+    adds no warning.
     """
     if phantom is None or report.errors:
         return report

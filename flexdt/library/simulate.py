@@ -141,8 +141,7 @@ class Truth:
 
     def paths_mm(self, views: slice = slice(None)) -> Float32Array:
         """Compute the path of the ray to each pixel's centre through each material,
-        float32 (materials, n, rows, cols) [mm].
-        """
+        float32 (materials, n, rows, cols) [mm]."""
         return self._paths(self.geometry[views])
 
     def _paths(self, cone: ConeVec) -> Float32Array:
@@ -223,15 +222,13 @@ class Truth:
 
     def read(self, number: int, expected: Expected, lit: ExposureSettings) -> Counts:
         """Read out an expected image as counts, with the noise of image `number` unless
-        noise is off.
-        """
+        noise is off."""
         rng = None if self.seed is None else frame_rng(self.seed, number)
         return read_out(self.chain.panel, expected, self.camera, lit, rng)
 
     def line_integrals(self) -> Float32Array:
         """Compute -log of the noise-free signal over the open beam's, float32 (n, rows,
-        cols).
-        """
+        cols)."""
         return np.stack([image.integrals for image in self.radiographs()])
 
 
@@ -466,14 +463,9 @@ def _of_scenario(
 ) -> DataSet:
     """Simulate a CTSimU scenario, which `flexdt-extensions` does.
 
-    Args:
-        sample: path of the scenario.
-        noise: seed; None for none.
-        rays: along each side of a pixel.
-        alone: whether nothing else was given, which the scenario states.
-
-    Raises:
-        GeometryError: it is no path, or not alone.
+    `sample`: path of the scenario. `noise`: seed; None for none. `rays`: along each side of a
+    pixel. `alone`: whether nothing else was given, which the scenario states.
+    Raises GeometryError: it is no path, or not alone.
     """
     if not isinstance(sample, str | os.PathLike) or not alone:
         raise GeometryError(

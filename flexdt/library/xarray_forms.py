@@ -38,11 +38,10 @@ def images_to_xarray(data: ImageSet) -> Any:
 
 
 def volume_to_xarray(volume: Volume) -> Any:
-    """Return a volume as a DataArray (z, y, x) with places [mm]; see `Volume.to_xarray`.
-    The values are shared.
+    """Return a volume as a DataArray (z, y, x) with places [mm]; see `Volume.to_xarray`. The
+    values are shared.
 
-    Raises:
-        TwinError: xarray is not installed.
+    Raises TwinError: xarray is not installed.
     """
     xarray = package("xarray", "to_xarray")
     places = zip("xyz", volume.centers(), strict=True)

@@ -23,8 +23,7 @@ def flexdt_twin(
     each test, and close it after the test.
 
     Arguments of `twin` come by indirect parameters:
-    `@pytest.mark.parametrize("flexdt_twin", [{"machine": "micro_ct"}], indirect=True)`.
-    """
+    `@pytest.mark.parametrize("flexdt_twin", [{"machine": "micro_ct"}], indirect=True)`."""
     with testing.twin(
         **{"data": tmp_path / "twin", **getattr(request, "param", {})}
     ) as scanner:

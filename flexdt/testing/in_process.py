@@ -86,12 +86,9 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
     def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
         """Run the loop until a future is done, and return its result.
 
-        Meanwhile a wait that no timer ends raises Deadlock; a loop that runs in another
-        way waits for real, as another thread may end the wait.
-
-        Raises:
-            Deadlock: no event is left that could complete it.
-        """
+        Meanwhile a wait that no timer ends raises Deadlock; a loop that runs in another way
+        waits for real, as another thread may end the wait.
+        Raises Deadlock: no event is left that could complete it."""
         self.alone = True
         try:
             return super().run_until_complete(future)
@@ -138,8 +135,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         """Run `func` in the loop's thread, soon; `executor` is ignored.
 
         With a random generator after a delay drawn from `THREAD_DELAYS_S` [virtual s],
-        else in the next turn. The future gets the result or the error.
-        """
+        else in the next turn. The future gets the result or the error."""
         done: asyncio.Future[Any] = self.create_future()
         later = 0.0 if self._rng is None else self._rng.choice(THREAD_DELAYS_S)
         self.call_later(later, _work, done, func, args)
@@ -206,17 +202,13 @@ class _Jumps(selectors.DefaultSelector):
         self._loop = loop
 
     def select(self, timeout: float | None = None) -> list[Any]:
-        """Look for events without waiting; if there are none, let the clock jump by
-        `timeout`.
+        """Look for events without waiting; if there are none, let the clock jump by `timeout`.
 
-        Without a time-out (None: no timer is set) it waits for real, unless the loop runs
-        until one future is done (`run_until_complete`).
+        Without a time-out (None: no timer is set) it waits for real, unless the loop runs until
+        one future is done (`run_until_complete`).
 
-        Returns:
-            Events as of the base class; [] after a jump.
-
-        Raises:
-            Deadlock: no event, no timer, and the loop runs until one future is done.
+        Returns events as of the base class; [] after a jump.
+        Raises Deadlock: no event, no timer, and the loop runs until one future is done.
         """
         if timeout is None and not self._loop.alone:
             return super().select()
@@ -334,8 +326,7 @@ class InProcessTransport(asyncio.Transport):
         """Wait for data and return the messages that it completes, at least one; [] once
         the connection has ended.
 
-        Data that complete no message are kept, and the wait goes on.
-        """
+        Data that complete no message are kept, and the wait goes on."""
         messages: list[Message] = []
         while not messages and (data := await self._inbox.get()):
             messages = self._wire.receive_data(data)
@@ -350,8 +341,7 @@ class InProcessTransport(asyncio.Transport):
         """End the connection, from either side; a second call does nothing.
 
         A waiting `receive` returns []; the server learns of the end in the loop's next
-        turn.
-        """
+        turn."""
         server, self._server = self._server, None
         if server is not None:
             self._inbox.put_nowait(b"")
@@ -409,8 +399,7 @@ class InProcessTwin:
 
     def advance(self, seconds: float) -> None:
         """Let virtual seconds of the laboratory pass, and whatever happens in them
-        happen.
-        """
+        happen."""
         self.run(asyncio.sleep(seconds))
 
     def connect(self, name: str = "flexdt.testing") -> TwinClient:
@@ -419,8 +408,7 @@ class InProcessTwin:
 
     def transport(self) -> Transport:
         """Make a connection of its own, for `AsyncTwinClient` and for Bluesky's
-        `TwinLab`.
-        """
+        `TwinLab`."""
         return InProcessTransport(self.loop, self._shell.connection)
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:

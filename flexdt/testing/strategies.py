@@ -40,8 +40,7 @@ def machines(draw: st.DrawFn) -> Machine:
     Example:
         >>> @given(machines())
         ... def test_home_is_within_travel(machine: Machine) -> None:
-        ...     assert all(a.lower <= a.home <= a.upper for a in machine.axes.values())
-    """
+        ...     assert all(a.lower <= a.home <= a.upper for a in machine.axes.values())"""
     name = draw(st.sampled_from(list(MACHINES)))
     text = f'base = "{name}"\n'
     for motor, axis in MACHINES[name].axes.items():

@@ -350,11 +350,7 @@ def _read(
 
 
 def _check_size(size: int, label: str) -> None:
-    """Check the size of a file [bytes].
-
-    Raises:
-        PhantomError: empty or too large.
-    """
+    """Check the size of a file [bytes]. Raises PhantomError: empty or too large."""
     if not 0 < size <= MAX_BYTES:
         raise PhantomError.instead(f"{label} has {size} bytes", size, f"1 to {MAX_BYTES}")
 
@@ -419,17 +415,15 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
 
 
 def _check_ply(raw: bytes) -> None:
-    """Check that a PLY header is there, small, and claims no more elements than there are
-    bytes.
+    """Check that a PLY header is there, small, and claims no more elements than there are bytes.
 
-    The header must end within `MAX_PLY_HEADER` bytes. Each element line has three words;
-    other lines are ignored.
+    The header must end within `MAX_PLY_HEADER` bytes. Each element line has three words; other
+    lines are ignored.
 
     Args:
         raw: content of the file.
 
-    Raises:
-        ValueError: names the problem.
+    Raises ValueError: names the problem.
     """
     end = raw.find(b"end_header", 0, MAX_PLY_HEADER)
     if not raw.startswith(b"ply") or end < 0:
@@ -553,16 +547,14 @@ def _corners(part: Any, accessors: Any) -> Any:
 
 
 def _check_stl(raw: bytes) -> None:
-    """Check that a binary STL file has the length that its head announces; text files
-    pass.
+    """Check that a binary STL file has the length that its head announces; text files pass.
 
     Files shorter than a head, and heads that announce 0 triangles, pass, too.
 
     Args:
         raw: content of the file.
 
-    Raises:
-        ValueError: they differ.
+    Raises ValueError: they differ.
     """
     if len(raw) < STL_HEAD_BYTES or (
         raw.lstrip()[:5] == b"solid" and b"facet" in raw[:1024]

@@ -102,18 +102,10 @@ def load_phantom_file(
 
 
 def phantom_of(document: Mapping[str, object], folder: Path | None = None) -> Phantom:
-    """Make the phantom of a document in any of the three forms.
-
-    With the key `scene` it is a phantom that `Phantom.to_dict` wrote, else with `solid`
-    or `mesh` a scene file, else a bead file.
-
-    Args:
-        document: parsed TOML or JSON.
-        folder: of the meshes that a scene file names; None: none may be named.
-
-    Raises:
-        TwinError: names key path, value and allowed values.
-    """
+    """Make the phantom of a document in any of the three forms. With the key `scene` it is a
+    phantom that `Phantom.to_dict` wrote, else with `solid` or `mesh` a scene file, else a bead
+    file. `document`: parsed TOML or JSON. `folder`: of the meshes that a scene file names; None:
+    none may be named. Raises TwinError: names key path, value and allowed values."""
     if "scene" in document:
         return Phantom.from_dict(document)
     if "solid" in document or "mesh" in document:
@@ -217,17 +209,10 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
 
     Whether the other material is there is not checked here.
 
-    Args:
-        value: entry of the document.
-        where: its place, for messages.
-
-    Returns:
-        The solid alone or, if it replaces another material, two: first the same shape with
-        minus the other's attenuation, then the solid.
-
-    Raises:
-        PhantomError, UnknownNameError: names the key path, the value and the allowed
-            ones.
+    `value`: entry of the document; `where`: its place, for messages.
+    Returns the solid alone or, if it replaces another material, two: first the same shape with
+    minus the other's attenuation, then the solid.
+    Raises PhantomError, UnknownNameError: names the key path, the value and the allowed ones.
     """
     fields = dict(reading.mapping(value, where))
     made_of = material_of(reading.string(reading.get(fields, "material", where), where))
@@ -367,12 +352,10 @@ def _body(value: object, where: str) -> tuple[Vector, str]:
 
 
 def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
-    """Read the beads of a bead file: position [mm], radius [mm], material (steel if left
-    out) of each.
+    """Read the beads of a bead file: position [mm], radius [mm], material (steel if left out) of
+    each.
 
-    Raises:
-        PhantomError: no list, a missing or another key, or a wrong value; names the key
-            path.
+    Raises PhantomError: no list, a missing or another key, or a wrong value; names the key path.
     """
 
     def read(one: object, at: str) -> tuple[Vector, float, str]:
@@ -387,16 +370,10 @@ def _beads(value: object, where: str) -> tuple[tuple[Vector, float, str], ...]:
 def _spiral(value: object, where: str) -> tuple[int, float, str]:
     """Read the spiral of a bead file.
 
-    Args:
-        value: entry of the document.
-        where: its place, for messages.
-
-    Returns:
-        Number of beads, radius [mm] (2 if left out), material (steel if left out).
-
-    Raises:
-        PhantomError: names the field, its value and the allowed ones; the number must be
-            whole and above 0, the radius above 0.
+    `value`: entry of the document; `where`: its place, for messages.
+    Returns number of beads, radius [mm] (2 if left out), material (steel if left out).
+    Raises PhantomError: names the field, its value and the allowed ones; the number must be
+    whole and above 0, the radius above 0.
     """
     others = {"radius_mm": reading.positive, "material": reading.string}
     given = reading.fields(value, where, {"beads": reading.positive}, others)

@@ -52,8 +52,7 @@ def _shells(vertices: FloatArray, faces: Faces) -> list[npt.NDArray[np.intp]]:
         vertices: (v, 3).
         faces: (f, 3).
 
-    Returns:
-        Indices of faces, ascending, an array for each surface.
+    Returns indices of faces, ascending, an array for each surface.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -35,9 +35,7 @@ METHODS: Final[Mapping[str, AnyMethod]] = {
 def find(name: str, methods: Mapping[str, AnyMethod] = METHODS) -> AnyMethod:
     """Look up the method called `name`.
 
-    Raises:
-        RpcError: -32601, listing the methods.
-    """
+    Raises RpcError: -32601, listing the methods."""
     if name not in methods:
         raise method_not_found(name, methods)
     return methods[name]

@@ -269,8 +269,7 @@ def read_image(
     path: Path, shape: tuple[int, int] | None = None, image: int | None = None
 ) -> npt.NDArray[np.uint16]:
     """Read an image of counts, uint16 (rows, cols); other whole numbers are counts, too, where
-    they are from 0 to 65535. Arguments and errors as those of `read_values`.
-    """
+    they are from 0 to 65535. Arguments and errors as those of `read_values`."""
     values, head = _read(path, shape, image)
     return as_counts(path, values, head)
 
@@ -318,8 +317,7 @@ def blank_images(folder: Folder, names: Sequence[str]) -> tuple[str, ...]:
     """List those of the images that are there and all zeros, in order; () if the last one
     that is there is not.
 
-    A stopped scan leaves such images if the files were made in advance.
-    """
+    A stopped scan leaves such images if the files were made in advance."""
     present = [name for name in names if name in folder.names]
     if not present or not _blank(folder.path / present[-1]):
         return ()
@@ -400,11 +398,10 @@ def tiff_bytes(image: npt.NDArray[np.uint16]) -> bytes:
 
 
 def free_name(root: Directory, wanted: str) -> str:
-    """Find the first of `wanted`, `wanted-2`, `wanted-3`... that is no entry of `root`;
-    it is not reserved.
+    """Find the first of `wanted`, `wanted-2`, `wanted-3`... that is no entry of `root`; it is
+    not reserved.
 
-    Raises:
-        DatasetNameError: `wanted` is not plain.
+    Raises DatasetNameError: `wanted` is not plain.
     """
     plain_name(wanted, "data set")
     candidates: Iterable[str] = (

@@ -63,12 +63,9 @@ def writing(path: Path, refused: str) -> Iterator[None]:
     """Convert an OSError within the context to `DatasetWriteError`, of a full disk to
     `DiskFullError`.
 
-    The error has the path and the system's error number. Other errors are raised as they
-    are.
+    The error has the path and the system's error number. Other errors are raised as they are.
 
-    Args:
-        path: of the written file.
-        refused: the failed operation, for the message.
+    `path`: of the written file; `refused`: the failed operation, for the message.
     """
     try:
         yield
@@ -133,8 +130,7 @@ class Directory:
     ) -> Directory:
         """Return the directory called `name` in this one, which need not exist yet.
 
-        It is opened for every call, unless it is `held`.
-        """
+        It is opened for every call, unless it is `held`."""
         return Directory(self.path / name, sync=sync, write=write, above=self)
 
     def fileno(self) -> int | None:
@@ -142,15 +138,11 @@ class Directory:
         return self._fd
 
     def held(self) -> Directory:
-        """Hold a folder below another open until `close`: whatever its name refers to
-        later, it stays this directory.
+        """Hold a folder below another open until `close`: whatever its name refers to later, it
+        stays this directory.
 
-        Returns:
-            Itself.
-
-        Raises:
-            DatasetWriteError: there is no such directory, or a link is in its place.
-        """
+        Returns itself.
+        Raises DatasetWriteError: there is no such directory, or a link is in its place."""
         assert self._above is not None
         with writing(self.path, f"cannot use folder {self.path}"):
             self._fd = self._open_below(self._above)
@@ -185,14 +177,9 @@ class Directory:
     def put(self, name: str, data: bytes | memoryview) -> None:
         """Write a file; a file or a link of that name is replaced as a whole.
 
-        Args:
-            name: plain file name, or one that begins with `BEFORE`.
-            data: its content.
-
-        Raises:
-            DatasetNameError: the name is not plain.
-            DiskFullError: no room; nothing is left behind.
-            DatasetWriteError: any other refusal of the system.
+        `name`: plain file name, or one that begins with `BEFORE`; `data`: its content.
+        Raises DatasetNameError: the name is not plain; DiskFullError: no room; nothing is left
+        behind; DatasetWriteError: any other refusal of the system.
         """
         if not name.startswith(BEFORE):
             plain_name(name)
@@ -209,17 +196,13 @@ class Directory:
         self.sync()
 
     def overwrite(self, name: str, data: bytes) -> None:
-        """Write the first bytes of an existing file in place, and flush it to the disk;
-        links are not followed.
+        """Write the first bytes of an existing file in place, and flush it to the disk; links
+        are not followed.
 
         The file keeps its further bytes, or grows to the data.
 
-        Args:
-            name: of a file that exists.
-            data: its new first bytes.
-
-        Raises:
-            OSError: there is no such regular file, or the system refuses.
+        `name`: of a file that exists; `data`: its new first bytes.
+        Raises OSError: there is no such regular file, or the system refuses.
         """
         file = self._open_in_place(name)
         try:
@@ -277,11 +260,10 @@ class Directory:
                 raise
 
     def nameless(self) -> BinaryIO:
-        """Make an open file without a name, for reading and writing, unbuffered; it is
-        gone when it is closed or its process ends.
+        """Make an open file without a name, for reading and writing, unbuffered; it is gone when
+        it is closed or its process ends.
 
-        Raises:
-            OSError: the system refuses.
+        Raises OSError: the system refuses.
         """
         with self._opened() as fd:
             name, file = self._temporary(fd, 0o600, getattr(os, "O_TEMPORARY", 0))
@@ -332,38 +314,24 @@ class Directory:
             return file.read(size)
 
     def link(self, name: str, second: str, to: Directory | None = None) -> None:
-        """Give a file a second name, here or in another directory; links are not
-        followed.
-
-        Args:
-            name: of the file.
-            second: its second name.
-            to: directory of the second name; None: this one.
-
-        Raises:
-            OSError: there is no such file, the second name is taken (FileExistsError), or
-                the system has no links.
-        """
+        """Give a file a second name, here or in another directory; links are not followed.
+        `name`: of the file. `second`: its second name. `to`: directory of the second name; None:
+        this one. Raises OSError: there is no such file, the second name is taken
+        (FileExistsError), or the system has no links."""
         target = self if to is None else to
         with self._opened() as fd, target._opened() as other:
             names = self._at(name), target._at(second)
             os.link(*names, src_dir_fd=fd, dst_dir_fd=other, follow_symlinks=False)
 
     def rename(self, name: str, new: str) -> None:
-        """Rename an entry, replacing one of the new name.
-
-        Raises:
-            OSError: there is none, or the system refuses.
-        """
+        """Rename an entry, replacing one of the new name. Raises OSError: there is none, or the
+        system refuses."""
         with self._opened() as fd:
             os.replace(self._at(name), self._at(new), src_dir_fd=fd, dst_dir_fd=fd)
 
     def unlink(self, name: str) -> None:
-        """Delete an entry that is no directory.
-
-        Raises:
-            OSError: there is none, or the system refuses.
-        """
+        """Delete an entry that is no directory. Raises OSError: there is none, or the system
+        refuses."""
         with self._opened() as fd:
             os.unlink(self._at(name), dir_fd=fd)
 
@@ -386,11 +354,8 @@ class Directory:
     def stat(self, name: str) -> os.stat_result | None:
         """Return the status of an entry, of a link itself.
 
-        Returns:
-            The status; None if there is no such entry, or no such folder.
-
-        Raises:
-            OSError: the system refuses for another reason.
+        Returns the status; None if there is no such entry, or no such folder.
+        Raises OSError: the system refuses for another reason.
         """
         try:
             with self._opened() as fd:
@@ -451,12 +416,8 @@ class Directory:
                     self.unlink(name)
 
     def sync(self) -> None:
-        """Make the names safe: before that a power cut may undo the last
-        changes of the directory.
-
-        Raises:
-            DatasetWriteError: the system refuses.
-        """
+        """Make the names safe: before that a power cut may undo the last changes of the
+        directory. Raises DatasetWriteError: the system refuses."""
         with writing(self.path, f"cannot write {self.path}"), self._opened() as fd:
             if fd is not None:
                 os.fsync(fd)
@@ -515,15 +476,9 @@ class Directory:
                 self._idle.notify_all()
 
     def _open_below(self, above: Directory) -> int | None:
-        """Open this folder's descriptor relative to the directory above, without
-        following a link; the caller closes it.
-
-        Returns:
-            The descriptor; None on a system without such descriptors.
-
-        Raises:
-            OSError: there is no such directory, or a link is in its place.
-        """
+        """Open this folder's descriptor relative to the directory above, without following a
+        link; the caller closes it. Returns the descriptor; None on a system without such
+        descriptors. Raises OSError: there is no such directory, or a link is in its place."""
         if not _RELATIVE:
             return None
         with above._opened() as fd:
@@ -533,8 +488,7 @@ class Directory:
         """Check that `name` is one component of a path, and return it for a call with a
         descriptor, or the whole path on a system without descriptors.
 
-        Raises:
-            OSError: "", ".", "..", or a name with a slash or a zero byte.
+        Raises OSError: "", ".", "..", or a name with a slash or a zero byte.
         """
         if name in ("", ".", "..") or "/" in name or "\0" in name:
             raise OSError(errno.EINVAL, "no name of an entry", name)
@@ -543,19 +497,13 @@ class Directory:
         return str(self.path / name)
 
     def _temporary(self, fd: int | None, mode: int, flags: int = 0) -> tuple[str, int]:
-        """Make a new file under an unused name that begins with `TEMPORARY`; names in use
-        are skipped.
+        """Make a new file under an unused name that begins with `TEMPORARY`; names in use are
+        skipped.
 
-        Args:
-            fd: descriptor of the folder; None where the system has none.
-            mode: permissions.
-            flags: further flags of `os.open`.
-
-        Returns:
-            The name and its open descriptor.
-
-        Raises:
-            OSError: the system refuses.
+        `fd`: descriptor of the folder; None where the system has none. `mode`: permissions.
+        `flags`: further flags of `os.open`.
+        Returns the name and its open descriptor.
+        Raises OSError: the system refuses.
         """
         while True:
             # Processes in containers may share a number, and killed ones leave files behind.
@@ -690,14 +638,12 @@ def _fields(file: Path) -> dict[str, int]:
 
 
 def open_data(root: Path) -> Directory:
-    """Open a twin's data directory, made with its parents if it is missing, and check
-    that files can be written into it.
+    """Open a twin's data directory, made with its parents if it is missing, and check that files
+    can be written into it.
 
     The caller closes it. A full disk is no error: state and jobs have room of their own
     (`spare_files`).
-
-    Raises:
-        DatasetWriteError: it cannot be made, opened or written.
+    Raises DatasetWriteError: it cannot be made, opened or written.
     """
     refused = f"the data directory {root} cannot be written"
     with writing(root, refused):

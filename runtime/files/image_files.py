@@ -185,13 +185,8 @@ def read_rows(
 
     Of a plain TIFF with the same tags as one that was read before no other row is read.
 
-    Args:
-        path: of the file.
-        shape: (rows, cols) that the image must have.
-        rows: indices of rows.
-
-    Raises:
-        DatasetError: as `read_pixels`, or another shape.
+    `path`: of the file; `shape`: (rows, cols) that the image must have; `rows`: indices of rows.
+    Raises DatasetError: as `read_pixels`, or another shape.
     """
     with opened(path) as file:
         some = tiff_images.read_tiff_rows(file, rows)

@@ -185,9 +185,7 @@ class Changes:
     def _reserved(self, folder: Directory, name: str) -> None:
         """Reserve descriptors before the first change of a file.
 
-        Raises:
-            DatasetWriteError: there are none; nothing has been written.
-        """
+        Raises DatasetWriteError: there are none; nothing has been written."""
         with writing(folder.path / name, f"cannot write {folder.path / name}"):
             while len(self._reserve) < RESERVE:
                 self._reserve.append(os.open(os.devnull, os.O_RDONLY))
@@ -288,8 +286,7 @@ def read_json(data: bytes) -> object:
 
     Of a name given twice the last value counts.
 
-    Raises:
-        ValueError: it is no such document.
+    Raises ValueError: it is no such document.
     """
     document = json.loads(
         data.decode("utf-8"), parse_float=_finite, parse_constant=_finite
@@ -305,13 +302,10 @@ def read_or_set_aside(
 ) -> T | None:
     """Read one of our files with `read`; rename and log a damaged one, see `set_aside`.
 
-    Args:
-        folder, name: of the file; an entry that is no regular file is damaged, too.
-        read: parses its bytes; whatever it raises means damage.
-        without: how the twin goes on without the file, for the log.
-
-    Returns:
-        The result of `read`, or None if there is no file or a damaged one.
+    `folder` and `name`: of the file; an entry that is no regular file is damaged, too. `read`:
+    parses its bytes; whatever it raises means damage. `without`: how the twin goes on without
+    the file, for the log.
+    Returns the result of `read`, or None if there is no file or a damaged one.
     """
     try:
         return read(folder.read(name))
@@ -323,17 +317,13 @@ def read_or_set_aside(
 
 
 def set_aside(folder: Directory, name: str, error: object, without: str) -> None:
-    """Rename a damaged file, or another entry of its name, to STEM.unreadable.SUFFIX, and
-    log an error; raises nothing.
+    """Rename a damaged file, or another entry of its name, to STEM.unreadable.SUFFIX, and log an
+    error; raises nothing.
 
-    An earlier one under that name is replaced. If it cannot be renamed, the log line has
-    the reason.
-
-    Args:
-        folder: of the file.
-        name: of the file.
-        error: why it is set aside; the log has its first 500 characters.
-        without: event of the log line.
+    An earlier one under that name is replaced. If it cannot be renamed, the log line has the
+    reason.
+    `folder`: of the file. `name`: of the file. `error`: why it is set aside; the log has its
+    first 500 characters. `without`: event of the log line.
     """
     file = folder.path / name
     aside = f"{file.stem}{ASIDE}{file.suffix}"
@@ -346,13 +336,10 @@ def set_aside(folder: Directory, name: str, error: object, without: str) -> None
 
 
 def settle(root: Directory, folders: Sequence[str]) -> None:
-    """Clean a data directory and its folders at the start: delete files of killed
-    writers, and set aside entries named like a folder that are no directory, such as
-    links.
+    """Clean a data directory and its folders at the start: delete files of killed writers, and
+    set aside entries named like a folder that are no directory, such as links.
 
-    Args:
-        root: data directory.
-        folders: names of the folders in it.
+    `root`: data directory; `folders`: names of the folders in it.
     """
     for folder in (root, *map(root.folder, folders)):
         folder.sweep()

@@ -118,8 +118,7 @@ def _head_of(shape: tuple[int, ...], stored: np.dtype[Any], facts: Any = ()) -> 
 def _text(file: BinaryIO, end: bytes, most: int = MAX_HEADER_BYTES) -> tuple[str, int]:
     """Read a header of text up to its end; the text and the offset behind it.
 
-    Raises:
-        UnreadImageError: no such end.
+    Raises UnreadImageError: no such end.
     """
     head, mark, _ = file.read(most).partition(end)
     if not mark:

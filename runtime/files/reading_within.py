@@ -48,9 +48,7 @@ def opened(path: Path) -> BinaryIO:
     """Open a file of a data set for reading; where reading is `confined`, links are not
     followed.
 
-    Raises:
-        OSError: there is none, or (confined) it is no regular file.
-    """
+    Raises OSError: there is none, or (confined) it is no regular file."""
     folder = within(path.parent)
     if folder is None:
         return path.open("rb")

@@ -96,8 +96,7 @@ _plain: dict[int, Plain] = {}
 def tiff_head(file: BinaryIO) -> ImageHead:
     """Read what a TIFF file says of its images.
 
-    Raises:
-        UnreadImageError: no TIFF, or one whose images are not read.
+    Raises UnreadImageError: no TIFF, or one whose images are not read.
     """
     import tifffile
 

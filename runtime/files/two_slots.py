@@ -168,8 +168,7 @@ def _overwrite(file: int, data: bytes, at: int) -> None:
 def _slot(number: int, data: bytes) -> bytes:
     """Encode a record with its checksum, number and length.
 
-    Raises:
-        ValueError: it is too long.
+    Raises ValueError: it is too long.
     """
     body = b"%016d %06d " % (number, len(data)) + data
     if _SUM + len(body) > SLOT_BYTES:

@@ -272,28 +272,21 @@ class Imaging:
     ) -> Float32Array:
         """Compute line integrals of `sample` at n nominal poses, in the true geometry.
 
-        With `need`, pixels that an edge reaches have the line integral of the mean signal
-        of several rays: intensities are averaged, as a panel does.
-
-        The parts (solids, meshes, voxels) are projected one after the other and added
-        up with their factors. The sample is sent to the projector where it is new
-        there. An empty stage is answered without the projector, and its geometry is not
-        checked.
+        With `need`, pixels that an edge reaches have the line integral of the mean signal of
+        several rays: intensities are averaged, as a panel does. The parts (solids, meshes,
+        voxels) are projected one after the other and added up with their factors. The sample is
+        sent to the projector where it is new there. An empty stage is answered without the
+        projector, and its geometry is not checked.
 
         Args:
             sample, poses, camera: as `Radiography.take` has them.
             truth: instead of the hidden one; None for the hidden one.
             need: what pixels need for a small error; None for one ray a pixel.
 
-        Returns:
-            float32 (n, rows, cols), dimensionless; zeros for an empty stage. The
-                projector's own read-only array if the sample is a single part of factor
-                1.
-
-        Raises:
-            ProjectorUnavailable: the projector does not answer.
-            GeometryError: a geometry no scanner can have.
-            RpcError: the projector refuses the sample.
+        Returns float32 (n, rows, cols), dimensionless; zeros for an empty stage. The projector's
+        own read-only array if the sample is a single part of factor 1.
+        Raises ProjectorUnavailable: the projector does not answer; GeometryError: a geometry no
+        scanner can have; RpcError: the projector refuses the sample.
         """
         if not sample.name:
             return np.zeros((len(poses), *camera.shape), dtype=np.float32)
@@ -331,15 +324,9 @@ class Imaging:
         """Find the pixels that need several rays for any piece, and project all pieces along
         these.
 
-        Args:
-            divided: the sample, on the projector.
-            cone: n views.
-            shape: detector (rows, cols).
-            need: what pixels need.
-            weights: of the pieces.
-
-        Returns:
-            The pixels, and float32 (pieces, rays).
+        `divided`: the sample, on the projector; `cone`: n views; `shape`: detector (rows, cols);
+        `need`: what pixels need; `weights`: of the pieces.
+        Returns the pixels, and float32 (pieces, rays).
         """
         within = Within.joined(
             [
@@ -431,18 +418,10 @@ class Imaging:
     ) -> tuple[tuple[Channel, ...], Float32Array]:
         """Project each material along rays that nothing hidden moves.
 
-        Args:
-            sample: on the stage, or that a scan is to show.
-            cone: n views with the detector's shape, in the object's frame.
-
-        Returns:
-            The materials (m), and float32 (m, n, rows, cols) [mm]; none for an empty
-            stage.
-
-        Raises:
-            ProjectorUnavailable: the projector does not answer.
-            RpcError: the projector refuses the sample.
-        """
+        `sample`: on the stage, or that a scan is to show; `cone`: n views with the detector's
+        shape, in the object's frame. Returns the materials (m), and float32 (m, n, rows, cols)
+        [mm]; none for an empty stage. Raises ProjectorUnavailable: the projector does not
+        answer; RpcError: the projector refuses the sample."""
         views, *grid = cone.shape
         if not sample.name:
             return (), np.empty((0, views, *grid), dtype=np.float32)
@@ -454,15 +433,9 @@ class Imaging:
         """Compute line integrals along rays that nothing hidden moves.
 
         Each part is projected by itself, then all are added up with their factors.
-
-        Args:
-            sample, cone: as for `nominal_paths`.
-
-        Returns:
-            float32 (n, rows, cols), dimensionless; zeros for an empty stage.
-
-        Raises:
-            ProjectorUnavailable, RpcError: as `nominal_paths`.
+        `sample` and `cone`: as for `nominal_paths`.
+        Returns float32 (n, rows, cols), dimensionless; zeros for an empty stage.
+        Raises ProjectorUnavailable, RpcError: as `nominal_paths`.
         """
         views, *grid = cone.shape
         if not sample.name:
@@ -475,13 +448,9 @@ class Imaging:
     async def _along(self, divided: _DividedSample, cone: ConeVec) -> Float32Array:
         """Project each piece of a divided sample along `cone`, one after the other.
 
-        Args:
-            divided: the sample, on the projector.
-            cone: n views in the sample's frame, with the detector's shape.
-
-        Returns:
-            float32 (pieces, n, rows, cols), without the pieces' factors.
-        """
+        `divided`: the sample, on the projector; `cone`: n views in the sample's frame, with the
+        detector's shape.
+        Returns float32 (pieces, n, rows, cols), without the pieces' factors."""
         views, *grid = cone.shape
         out = np.empty((len(divided.names), views, *grid), dtype=np.float32)
         for i, name in enumerate(divided.names):
@@ -489,19 +458,14 @@ class Imaging:
         return out
 
     async def scatterer(self, sample: Sample, voxels: int) -> Object:
-        """Sample the materials of `sample` on a grid for scatter, or return the grid kept
-        last.
+        """Sample the materials of `sample` on a grid for scatter, or return the grid kept last.
 
-        The grid of one phantom is kept: while the phantom is the same, later calls
-        return it whatever `voxels` is. The sample is sent to the projector like for
-        images. The grid is computed in a thread.
+        The grid of one phantom is kept: while the phantom is the same, later calls return it
+        whatever `voxels` is. The sample is sent to the projector like for images. The grid is
+        computed in a thread.
 
-        Args:
-            sample: on the stage; not empty.
-            voxels: approximate number of cubes of a new grid.
-
-        Returns:
-            The grid of materials.
+        `sample`: on the stage; not empty. `voxels`: approximate number of cubes of a new grid.
+        Returns the grid of materials.
         """
         async with self._on_projector(sample, "material") as divided:
             phantom = divided.phantom
@@ -552,15 +516,11 @@ class Imaging:
     def _too_large(
         self, sample: Sample, need: int, left: int, limit: int, who: str
     ) -> RpcError:
-        """Make the error -32008 for a sample that needs more memory than is left;
-        returned, not raised.
+        """Make the error -32008 for a sample that needs more memory than is left; returned, not
+        raised.
 
-        Args:
-            sample: that is too large.
-            need: its memory [bytes].
-            left: memory that is left [bytes].
-            limit: memory in all [bytes].
-            who: owner of the memory, for the message.
+        `sample`: that is too large; `need`: its memory [bytes]; `left`: memory that is left
+        [bytes]; `limit`: memory in all [bytes]; `who`: owner of the memory, for the message.
         """
         error = too_large(
             f"the sample {sample.name!r} in the memory of {who}", need, max(0, left)
@@ -573,20 +533,19 @@ class Imaging:
     async def _on_projector(
         self, sample: Sample, pieces: Pieces
     ) -> AsyncIterator[_DividedSample]:
-        """Divide a sample, send it to the projector where it is new, and keep it there
-        within the context.
+        """Divide a sample, send it to the projector where it is new, and keep it there within
+        the context.
 
-        One sample is divided and sent at a time. Old samples beyond the limits are
-        dropped, here and there (`_forget_old`); one in use is not. A sample that cannot
-        be sent raises before the context begins.
+        One sample is divided and sent at a time. Old samples beyond the limits are dropped, here
+        and there (`_forget_old`); one in use is not. A sample that cannot be sent raises before
+        the context begins.
 
         Args:
             sample: on the stage; not empty.
-            pieces: "part" for bodies that attenuate, (body, factor) each; "material"
-                for channels.
+            pieces: "part" for bodies that attenuate, (body, factor) each; "material" for
+                channels.
 
-        Yields:
-            The pieces, with their names on the projector.
+        Yields the pieces, with their names on the projector.
         """
         async with self._sending:
             divided = await self._divide(sample, pieces)
@@ -650,8 +609,7 @@ class Imaging:
 
     def _pinned_keys(self) -> set[_Key]:
         """List the keys of divided samples that must stay: those of `pinned`, divided either
-        way.
-        """
+        way."""
         names = {_name(sample) for sample in self.pinned()}
         return {key for key in self._divided if key[0] in names}
 
@@ -681,25 +639,19 @@ class Imaging:
                 del self._versions[name]
 
     async def _ensure_sent(self, name: str, body: Body) -> str:
-        """Ensure that the projector has the present version of a body; old versions are
-        removed.
+        """Ensure that the projector has the present version of a body; old versions are removed.
 
-        At most `MAX_VERSIONS` of a body stay, the present one included. A version that
-        was sent before is not sent again and counts as the newest. If the projector has
-        no room, all bodies' versions but the newest are removed, and the body is sent
-        once more.
+        At most `MAX_VERSIONS` of a body stay, the present one included. A version that was sent
+        before is not sent again and counts as the newest. If the projector has no room, all
+        bodies' versions but the newest are removed, and the body is sent once more.
 
         Args:
             name: of the body here.
             body: scene, mesh or volume.
 
-        Returns:
-            Its name on the projector, "NAME #HASH" with a hash of its content.
-
-        Raises:
-            RpcError: -32008, the projector has no room even without old versions; or
-                the projector refuses the body.
-            ProjectorUnavailable: the projector does not answer.
+        Returns its name on the projector, "NAME #HASH" with a hash of its content.
+        Raises RpcError: -32008, the projector has no room even without old versions; or the
+        projector refuses the body; ProjectorUnavailable: the projector does not answer.
         """
         named = f"{name} #{await asyncio.to_thread(digest_of, body)}"
         versions = self._versions.setdefault(name, [])

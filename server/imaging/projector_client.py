@@ -91,8 +91,7 @@ class ProjectorClient:
     async def _give(self, channel: ProjectorLink, name: str, body: Body) -> None:
         """Send a body unless this very object was sent under that name, and remember it.
 
-        It may be evicted if the server evicts volumes.
-        """
+        It may be evicted if the server evicts volumes."""
         if self._sent.get(name) is not body:
             await _send(channel, name, body, {"evictable": True} if self._evicts else {})
             self._sent[name] = body
@@ -247,16 +246,10 @@ class ProjectorClient:
 
         Connections are made one at a time, and `work` is called once.
 
-        Args:
-            method: for the message.
-            work: sends requests and awaits their answers.
-
-        Returns:
-            The value of `work`.
-
-        Raises:
-            ProjectorUnavailable: no connection, or it was lost.
-            RpcError: the answer is an error.
+        `method`: for the message; `work`: sends requests and awaits their answers.
+        Returns the value of `work`.
+        Raises ProjectorUnavailable: no connection, or it was lost; RpcError: the answer is an
+        error.
         """
         async with self._connecting:
             if self._channel is None or self._channel.lost:

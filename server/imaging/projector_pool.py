@@ -157,8 +157,7 @@ class ProjectorPool:
         """Return the memory that the largest projector can have for one sample [bytes].
 
         All are asked at once, each for at most `LATE_S`. None if no projector's is
-        known (`_room_of`).
-        """
+        known (`_room_of`)."""
         found = await asyncio.gather(*map(_room_of, self._members))
         return max((room for room in found if room is not None), default=None)
 
@@ -167,16 +166,14 @@ class ProjectorPool:
         fits.
 
         Others get it with their first request for it. It stays kept if sending fails.
-        Raises as `_request`.
-        """
+        Raises as `_request`."""
         self._values[name] = body
         await self._request(name, 0, None)
 
     async def remove(self, name: str) -> None:
         """Forget a body and have all projectors remove it; their failures are ignored.
 
-        Those that do not answer lose it when they restart.
-        """
+        Those that do not answer lose it when they restart."""
         self._values.pop(name, None)
         removals = (member.client.remove(name) for member in self._members)
         await asyncio.gather(*removals, return_exceptions=True)
@@ -186,17 +183,10 @@ class ProjectorPool:
     ) -> Float32Array:
         """Compute line integrals on one of the projectors.
 
-        Args:
-            name: of a body that `put` has kept.
-            cone_vec: n views, object frame.
-            shape: detector (rows, cols).
-
-        Returns:
-            float32 (n, rows, cols).
-
-        Raises:
-            ProjectorUnavailable, RpcError: as `_request`.
-        """
+        `name`: of a body that `put` has kept; `cone_vec`: n views, object frame; `shape`:
+        detector (rows, cols).
+        Returns float32 (n, rows, cols).
+        Raises ProjectorUnavailable, RpcError: as `_request`."""
         images: Float32Array = await self._request(
             name,
             len(cone_vec),
@@ -297,11 +287,8 @@ class ProjectorPool:
         """Ask a free projector if none is asked, or if the one asked last is late; nothing
         happens while all others are busy.
 
-        Args:
-            asked: whom the request has been sent to; changed.
-            ask: sends it.
-            views: how many it asks for.
-            now: on the loop's clock.
+        `asked`: whom the request has been sent to; changed. `ask`: sends it. `views`: how many
+        it asks for. `now`: on the loop's clock.
         """
         if asked.running and now < asked.late:
             return

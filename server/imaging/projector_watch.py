@@ -80,8 +80,7 @@ class ProjectorWatch:
         """Check one projector, wait `every_s`, and so on until cancelled; skipped while
         nobody asks.
 
-        The wait begins when the projector has answered or failed.
-        """
+        The wait begins when the projector has answered or failed."""
         while True:
             if self.asks():
                 await self._check(client)
@@ -118,18 +117,12 @@ class ProjectorWatch:
             answer.cancel()
 
     def _report(self, client: Watched, problem: str | None) -> None:
-        """Record the problem of one projector, and announce a change of the pool's
-        problem.
+        """Record the problem of one projector, and announce a change of the pool's problem.
 
-        The pool has a problem only if all its projectors have one: then `problem` is
-        that of the first projector, else None. One that has not been checked yet counts
-        as without. `changed` is called if `problem` differs from before, its text
-        included.
-
-        Args:
-            client: of the projector.
-            problem: None if it answers.
-        """
+        The pool has a problem only if all its projectors have one: then `problem` is that of the
+        first projector, else None. One that has not been checked yet counts as without.
+        `changed` is called if `problem` differs from before, its text included.
+        `client`: of the projector; `problem`: None if it answers."""
         self._problems[client] = problem
         known = [self._problems.get(each) for each in self.clients]
         now = None if None in known else known[0]

@@ -199,10 +199,8 @@ class Radiography:
         return figures | self.tube.figures()
 
     async def require_room(self, sample: Sample) -> None:
-        """Check that a scan's sample, divided as the physics needs, fits into memory.
-
-        By parts for "ideal", else by materials; raises as `Imaging.require_room`.
-        """
+        """Check that a scan's sample, divided as the physics needs, fits into memory. By parts
+        for "ideal", else by materials; raises as `Imaging.require_room`."""
         pieces: Pieces = "material" if self.photons else "part"
         await self.imaging.require_room(sample, pieces)
 
@@ -293,10 +291,8 @@ class Radiography:
     ) -> Need | None:
         """Compute what the pixels of images need; None for one ray a pixel.
 
-        Args:
-            noise: of each image's open beam, relative to its signal.
-            blur_px: standard deviation of the spot's blur [pixels].
-            points: of the spot.
+        `noise`: of each image's open beam, relative to its signal; `blur_px`: standard deviation
+        of the spot's blur [pixels]; `points`: of the spot.
         """
         if self.rays == 1:
             return None
@@ -324,16 +320,9 @@ class Radiography:
         """Simulate the scatter of each image by its own view alone, one after the other.
 
         So a scan that is resumed has the same bytes. One beam is made for each voltage.
-
-        Args:
-            thing: the sample's voxels.
-            chain: tube, materials, panel.
-            views: (n, 12) cone_vec rows [mm].
-            camera: of all images.
-            exposures: of each image, n.
-
-        Returns:
-            The scatter of each image, n.
+        `thing`: the sample's voxels; `chain`: tube, materials, panel; `views`: (n, 12) cone_vec
+        rows [mm]; `camera`: of all images; `exposures`: of each image, n.
+        Returns the scatter of each image, n.
         """
         beams = {
             kV: mc.Beam.of(chain, kV) for kV in {exposure.kV for exposure in exposures}
@@ -348,16 +337,11 @@ class Radiography:
 
         Without noise and scatter.
 
-        Args:
-            sample: that the scan is to show; nominal geometry, nothing hidden.
-            probe: setting, and the rays that are looked at.
-
-        Returns:
-            The parts of the rays' counts that are saturated and starved.
-
-        Raises:
-            ProjectorUnavailable: the projector does not answer.
-            LimitError: a voltage without a spectrum.
+        `sample`: that the scan is to show; nominal geometry, nothing hidden. `probe`: setting,
+        and the rays that are looked at.
+        Returns the parts of the rays' counts that are saturated and starved.
+        Raises ProjectorUnavailable: the projector does not answer; LimitError: a voltage without
+        a spectrum.
         """
         cone = probe.cone_vec
         if not self.photons:
@@ -402,15 +386,10 @@ class Radiography:
     def signal(
         self, radiograph: Radiograph, camera: CameraSettings, exposure: ExposureSettings
     ) -> Float32Array:
-        """Compute the expected counts above dark as if X-rays were on.
-
-        Without noise and dark counts, and not clipped at full scale; whether X-rays are
-        on in `exposure` is not used. Of physics other than "ideal" the exposure is in
-        the radiograph already.
-
-        Returns:
-            float32 (rows, cols).
-        """
+        """Compute the expected counts above dark as if X-rays were on. Without noise and dark
+        counts, and not clipped at full scale; whether X-rays are on in `exposure` is not used.
+        Of physics other than "ideal" the exposure is in the radiograph already. Returns float32
+        (rows, cols)."""
         if radiograph.expected is not None:
             return expected_counts(self.panel, camera, radiograph.expected.mean_e)
         lit = replace(exposure, xrays_on=True)
@@ -427,20 +406,14 @@ class Radiography:
     ) -> ideal.Counts:
         """Compute the counts that the camera saves of a radiograph.
 
-        For ideal physics `before` and `trapped` are not used. Earlier frames without
-        expected counts are skipped.
+        For ideal physics `before` and `trapped` are not used. Earlier frames without expected
+        counts are skipped.
 
-        Args:
-            radiograph: without noise.
-            camera: mode and region.
-            exposure: tube and time; X-rays off give a dark image, whatever the
-                radiograph.
-            rng: generator of the frame's noise; None for the expectation.
-            before: earlier frames, each with the time since its end [s].
-            trapped: electrons in traps, (rows, cols); None for none.
-
-        Returns:
-            uint16 (rows, cols).
+        `radiograph`: without noise. `camera`: mode and region. `exposure`: tube and time; X-rays
+        off give a dark image, whatever the radiograph. `rng`: generator of the frame's noise;
+        None for the expectation. `before`: earlier frames, each with the time since its end [s].
+        `trapped`: electrons in traps, (rows, cols); None for none.
+        Returns uint16 (rows, cols).
         """
         expected = radiograph.expected
         if expected is None:
@@ -566,20 +539,12 @@ def predict(
     """Answer `exposure.predict`, in the worker.
 
     The forecast's `images` are sent as `frames`, with the sample's name added. At most
-    `MAX_PROPOSALS` settings of the best; the infinite last edge of the histogram is
-    left out.
+    `MAX_PROPOSALS` settings of the best; the infinite last edge of the histogram is left out.
 
-    Args:
-        phantom: the sample.
-        machine: the twin's.
-        settings: arguments of `expose`.
-        codec: of the answer.
-
-    Returns:
-        The encoded answer, in pieces.
-
-    Raises:
-        RpcError: an argument that the machine does not allow.
+    `phantom`: the sample; `machine`: the twin's; `settings`: arguments of `expose`; `codec`: of
+    the answer.
+    Returns the encoded answer, in pieces.
+    Raises RpcError: an argument that the machine does not allow.
     """
     answer = asdict(exposure_forecast.expose(phantom, machine=machine, **settings))
     answer["transmission"]["edges"] = answer["transmission"]["edges"][

@@ -78,12 +78,10 @@ class Batch:
         """Keep the answer to the item that was taken out last; nothing for None (a
         notification).
 
-        An answer that would make the batch too large is replaced by an error, which
-        counts with the size of that answer: so the batch is full from then on.
+        An answer that would make the batch too large is replaced by an error, which counts with
+        the size of that answer: so the batch is full from then on.
 
-        Args:
-            answer: to the item.
-            encode: gives the pieces of an answer.
+        `answer`: to the item; `encode`: gives the pieces of an answer.
         """
         if answer is None:
             return

@@ -22,8 +22,7 @@ class Deadlines:
         """Start a timeout, after which `on_timeout` is called once with name and seconds.
 
         Nothing if `seconds` is None, or if a timeout of that name has been started and
-        not stopped, even one that has passed.
-        """
+        not stopped, even one that has passed."""
         if seconds is not None and name not in self._timers:
             self._timers[name] = asyncio.get_running_loop().call_later(
                 seconds, self._on_timeout, name, seconds

@@ -23,15 +23,11 @@ class LoopTurns:
         self._due = False
 
     async def take(self, who: object, lane: int) -> None:
-        """Wait for a turn of connection `who` in a lane; within a lane connections
-        alternate.
+        """Wait for a turn of connection `who` in a lane; within a lane connections alternate.
 
-        One turn is given in each round of the loop: to the lowest lane in which anybody
-        waits.
+        One turn is given in each round of the loop: to the lowest lane in which anybody waits.
 
-        Args:
-            who: the connection, hashable.
-            lane: FIRST, URGENT or ORDINARY.
+        `who`: the connection, hashable; `lane`: FIRST, URGENT or ORDINARY.
         """
         loop = asyncio.get_running_loop()
         turn = loop.create_future()

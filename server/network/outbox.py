@@ -190,11 +190,8 @@ class Outbox:
             await self.ready.wait()
 
     async def flushed(self) -> None:
-        """Wait until queue and slots have been handed to the transport, or the connection
-        has ended.
-
-        It does not wait until the transport has sent them.
-        """
+        """Wait until queue and slots have been handed to the transport, or the connection has
+        ended. It does not wait until the transport has sent them."""
         while (self.queue or self.slots) and not self.over:
             await self.ready.wait()
 

@@ -117,12 +117,9 @@ class TcpServer(ListeningServer):
         return _Link(self)
 
     def look_soon(self, link: _Link) -> None:
-        """Schedule a search for urgent requests of a connection, in turns that no flood
-        can fill.
-
-        A connection is in the list once, in the order of first calls. The search is
-        made in the loop's next round, by `_start_urgent`.
-        """
+        """Schedule a search for urgent requests of a connection, in turns that no flood can
+        fill. A connection is in the list once, in the order of first calls. The search is made
+        in the loop's next round, by `_start_urgent`."""
         self._unexamined[link] = None
         if not self._examination_due:
             self._examination_due = True
@@ -432,9 +429,7 @@ class _Link(asyncio.BufferedProtocol):
         """Note the client's end of stream; what was received is still answered.
 
         Replies may take `end_timeout_s`. The deadline of an incomplete message ends.
-
-        Returns:
-            Whether the transport stays open for them: not under TLS.
+        Returns whether the transport stays open for them: not under TLS.
         """
         self.ended = True
         self.arrived.set()
@@ -638,8 +633,7 @@ class _Link(asyncio.BufferedProtocol):
         """Send a parse error without id if the client has ended its stream inside a
         message.
 
-        Nothing if it ended between messages.
-        """
+        Nothing if it ended between messages."""
         try:
             self.wire.receive_end()
         except ProtocolError as error:
@@ -649,8 +643,7 @@ class _Link(asyncio.BufferedProtocol):
         """Return whether a large message takes little time to decode: JSON of few values,
         most of it white space or one text.
 
-        No process has to be started for it, which takes a second.
-        """
+        No process has to be started for it, which takes a second."""
         return (
             self.codec is Codec.JSON
             and sum(map(raw.count, (b",", b"[", b"{"))) <= MAX_LIGHT_VALUES
@@ -708,18 +701,16 @@ class _Link(asyncio.BufferedProtocol):
         await self._answer_batch(split.batch, waits=False)
 
     async def _decode(self, raw: bytes, *, urgent: bool = False) -> _Read:
-        """Decode a message, a large one in another process; errors become `Malformed`,
-        nothing is raised.
+        """Decode a message, a large one in another process; errors become `Malformed`, nothing
+        is raised.
 
-        Before admission a large one is refused unread. A failure of the other process is
-        logged.
+        Before admission a large one is refused unread. A failure of the other process is logged.
 
         Args:
             raw: bytes of one message.
             urgent: whether it may be urgent.
 
-        Returns:
-            The message; `Frozen` calls (a tuple for a batch) from the other process.
+        Returns the message; `Frozen` calls (a tuple for a batch) from the other process.
         """
         read = self.server.read
         if not self.let_in and len(raw) > MAX_INLINE_BYTES:
@@ -765,22 +756,16 @@ class _Link(asyncio.BufferedProtocol):
         """Serve a batch's urgent items, each in a turn of its own.
 
         `urgent_done` is set at the end, even after an error. The others follow when the
-        batch's turn comes.
-        """
+        batch's turn comes."""
         try:
             await self._serve_items(split.batch, waits=True, urgent_alone=True)
         finally:
             split.urgent_done.set()
 
     async def _answer_batch(self, batch: batches.Batch, *, waits: bool) -> None:
-        """Serve the remaining items of a batch and send all its answers together.
-
-        Nothing is sent for a batch of notifications.
-
-        Args:
-            batch: whose items are served.
-            waits: whether the first item waits for a turn, too.
-        """
+        """Serve the remaining items of a batch and send all its answers together. Nothing is
+        sent for a batch of notifications. `batch`: whose items are served; `waits`: whether the
+        first item waits for a turn, too."""
         await self._serve_items(batch, waits=waits)
         if bodies := batch.bodies():
             await self._send(self.wire.batch(bodies))
@@ -791,13 +776,10 @@ class _Link(asyncio.BufferedProtocol):
         """Serve the remaining items of a batch, each in a turn of its own, and keep their
         answers.
 
-        Once the answers are too large, ordinary items are answered with that error
-        unserved.
+        Once the answers are too large, ordinary items are answered with that error unserved.
 
-        Args:
-            batch: whose items are served.
-            waits: whether the first item waits for a turn, too.
-            urgent_alone: whether only urgent items are served.
+        `batch`: whose items are served; `waits`: whether the first item waits for a turn, too;
+        `urgent_alone`: whether only urgent items are served.
         """
         while (item := batch.next_item(urgent_alone=urgent_alone)) is not None:
             if waits:
@@ -989,8 +971,7 @@ class _Link(asyncio.BufferedProtocol):
 
         `max_waiting` messages; more than `READ_AHEAD_BYTES` (`MAX_INLINE_BYTES` before
         admission). Of an admitted client only bytes of whole messages count, so that an
-        incomplete one, which may be urgent, is completed behind others.
-        """
+        incomplete one, which may be urgent, is completed behind others."""
         if self.let_in:
             ahead, limit_bytes = self.wire.pending_whole, READ_AHEAD_BYTES
         else:
@@ -1000,8 +981,7 @@ class _Link(asyncio.BufferedProtocol):
     def _relax(self) -> None:
         """Resume reading once messages that wait, urgent ones in service included, and
         bytes of whole messages are at most half of their limits: of bytes,
-        `READ_AHEAD_BYTES`, before admission too.
-        """
+        `READ_AHEAD_BYTES`, before admission too."""
         ahead = self.wire.pending_whole
         # Half of what stops it, so that reading does not stop and go with each message.
         if self._load <= self.limits.max_waiting // 2 and ahead <= READ_AHEAD_BYTES // 2:
@@ -1011,19 +991,15 @@ class _Link(asyncio.BufferedProtocol):
         """Remove an ended task, report its error if it crashed, and resume reading if
         possible.
 
-        Reading is left alone once the connection is gone.
-        """
+        Reading is left alone once the connection is gone."""
         self.tasks.discard(task)
         self._crashed(task)
         if not self.gone.is_set():
             self._relax()
 
     def _crashed(self, task: asyncio.Task[None]) -> None:
-        """Log the failure of a task and abort the connection; nothing if it succeeded or
-        was cancelled.
-
-        Handlers' failures are answered before that.
-        """
+        """Log the failure of a task and abort the connection; nothing if it succeeded or was
+        cancelled. Handlers' failures are answered before that."""
         if not task.cancelled() and (error := task.exception()) is not None:
             self.log("connection failed", logging.ERROR, error_type=repr(error))
             self.transport.abort()

@@ -84,8 +84,7 @@ class ComputeJob:
     @property
     def waits(self) -> bool:
         """Whether a step waits for its turn; False while one is being computed, and without
-        a step.
-        """
+        a step."""
         running = self._step is not None and self._step.running()
         return self._turn is not None and not (running or self._turn.done())
 
@@ -98,15 +97,11 @@ class ComputeJob:
     async def run(self, compute: ComputeThread, step: Step) -> object:
         """Compute a step in its turn on the compute thread and return its value.
 
-        A job that has been given up raises its error at once, and one that is given up
-        meanwhile as soon as that happens.
+        A job that has been given up raises its error at once, and one that is given up meanwhile
+        as soon as that happens.
 
-        Args:
-            compute: the thread.
-            step: function without arguments.
-
-        Raises:
-            Exception: the step's, or the one that the job was given up with.
+        `compute`: the thread; `step`: function without arguments.
+        Raises Exception: the step's, or the one that the job was given up with.
         """
         if self.error is not None:
             raise self.error
@@ -185,15 +180,9 @@ def projection_steps(
 ) -> Iterator[Step]:
     """Yield functions that each project a block of views, for the compute thread.
 
-    Args:
-        body: volume, mesh or scene.
-        rows: cone_vec (n, 12).
-        shape: detector (rows, cols).
-        block: views of a step.
-
-    Yields:
-        Steps whose values are float32 (views, rows, cols).
-    """
+    `body`: volume, mesh or scene; `rows`: cone_vec (n, 12); `shape`: detector (rows, cols);
+    `block`: views of a step.
+    Yields steps whose values are float32 (views, rows, cols)."""
 
     def step(part: npt.NDArray[np.float64]) -> Step:
         """Make the step of some rows."""
@@ -212,13 +201,9 @@ def marking_steps(
 ) -> Iterator[Step]:
     """Yield functions that each find the rays that the pixels of a block of views need.
 
-    Args:
-        body, rows, shape, block: as of `projection_steps`.
-        need: and the body's weight, as of `rays_needed`.
-
-    Yields:
-        Steps whose values are uint32, see `pixel_areas.packed`.
-    """
+    `body` and `rows` and `shape` and `block`: as of `projection_steps`; `need`: and the body's
+    weight, as of `rays_needed`.
+    Yields steps whose values are uint32, see `pixel_areas.packed`."""
 
     def step(part: npt.NDArray[np.float64]) -> Step:
         """Make the step of some rows."""
@@ -241,8 +226,7 @@ def within_steps(
         body, rows, shape, block: as of `projection_steps`.
         within: pixels of all views.
 
-    Yields:
-        Steps whose values are float32 (rays,).
+    Yields steps whose values are float32 (rays,).
     """
     view = shape[0] * shape[1]
 
@@ -264,12 +248,7 @@ def views_a_block(shape: tuple[int, int]) -> int:
 def begin(threads: int) -> None:
     """Set the thread count of this thread's kernels, and note from now on what compiles.
 
-    Args:
-        threads: of the kernels.
-
-    Raises:
-        ValueError: more threads than numba was started with.
-    """
+    `threads`: of the kernels. Raises ValueError: more threads than numba was started with."""
     numba.set_num_threads(threads)
     LOG.setLevel(logging.ERROR)  # whoever waits is told by `compiling`
     long_work.during = _noted

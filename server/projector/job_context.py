@@ -118,8 +118,7 @@ class Context:
         """End this client's jobs of that key that still wait, with an error, and count
         them in `superseded`.
 
-        Jobs that are being computed go on.
-        """
+        Jobs that are being computed go on."""
         for job in client.jobs.values():
             if job.key == key and job.waits:
                 job.end(superseded(key))
@@ -128,12 +127,10 @@ class Context:
     async def send_array(
         self, client: JobClient, id: Id, array: npt.NDArray[np.generic]
     ) -> dict[str, object]:
-        """Make an array the result of a request; one that does not fit into a frame is
-        sent in parts.
+        """Make an array the result of a request; one that does not fit into a frame is sent in
+        parts.
 
-        Returns:
-            {dtype, shape, data}, or {dtype, shape, parts} with the number of parts sent.
-        """
+        Returns {dtype, shape, data}, or {dtype, shape, parts} with the number of parts sent."""
         if array.nbytes + SPARE_BYTES <= MAX_FRAME:
             return image.encode(array)
         parts = await self.send_parts(client, id, array, 0)
@@ -142,17 +139,12 @@ class Context:
     async def send_parts(
         self, client: JobClient, id: Id, array: npt.NDArray[np.generic], start: int
     ) -> int:
-        """Send an array as `part` notifications of at most `PART_BYTES`, and wait until
-        each is written.
+        """Send an array as `part` notifications of at most `PART_BYTES`, and wait until each is
+        written.
 
-        Args:
-            client: that called.
-            id: of its request.
-            array: values, sent flat in C order.
-            start: index of the array's first value in the whole result.
-
-        Returns:
-            The number of parts.
+        `client`: that called; `id`: of its request; `array`: values, sent flat in C order;
+        `start`: index of the array's first value in the whole result.
+        Returns the number of parts.
         """
         flat = np.ascontiguousarray(array).reshape(-1)
         step = PART_BYTES // flat.itemsize

@@ -52,17 +52,9 @@ async def hello(context: Context, client: JobClient, id: Id, p: Hello) -> object
 
     The protocol version is not checked here.
 
-    Args:
-        context: of the server.
-        client: that connects.
-        id: of the request.
-        p: token.
-
-    Returns:
-        A dict with the keys protocol, server, machine (empty), instance and evicts.
-
-    Raises:
-        RpcError: not authorised: a wrong or missing token.
+    `context`: of the server; `client`: that connects; `id`: of the request; `p`: token.
+    Returns a dict with the keys protocol, server, machine (empty), instance and evicts.
+    Raises RpcError: not authorised: a wrong or missing token.
     """
     await client.token_check.check(p.token, client.link.peer, client.address)
     client.let_in = True
@@ -128,18 +120,11 @@ async def volume_get(
 ) -> object:
     """Send a volume's voxels to the client.
 
-    Args:
-        context: of the server.
-        client: that calls.
-        id: of the request.
-        p: name of the volume.
-
-    Returns:
-        As `Context.send_array`: the image value, or type, shape and number of the parts
-        sent.
-
-    Raises:
-        RpcError: no such volume, or one without voxels.
+    `context`: of the server; `client`: that calls; `id`: of the request; `p`: name of the
+    volume.
+    Returns as `Context.send_array`: the image value, or type, shape and number of the parts
+    sent.
+    Raises RpcError: no such volume, or one without voxels.
     """
     volume = context.store.get(p.name)
     if not isinstance(volume, Volume):
@@ -175,22 +160,15 @@ async def volume_remove(
 async def project(context: Context, client: JobClient, id: Id, p: wire.Project) -> object:
     """Compute line integrals, one block of views after the other, and send them.
 
-    A request with a key first ends the client's waiting requests of the same key. The
-    geometry is examined before anything is computed.
+    A request with a key first ends the client's waiting requests of the same key. The geometry
+    is examined before anything is computed.
 
-    Args:
-        context: of the server.
-        client: that calls.
-        id: of the request.
-        p: name of the volume, cone_vec (n, 12), detector (rows, cols), key.
-
-    Returns:
-        The image value if all views fit into one frame; else dtype, shape and the number
-        of parts, sent before. With warnings about the geometry if there are any.
-
-    Raises:
-        RpcError: no such volume, or a view of more than `MAX_VIEW_BYTES`.
-        GeometryError: a geometry that no scanner has.
+    `context`: of the server; `client`: that calls; `id`: of the request; `p`: name of the
+    volume, cone_vec (n, 12), detector (rows, cols), key.
+    Returns the image value if all views fit into one frame; else dtype, shape and the number of
+    parts, sent before. With warnings about the geometry if there are any.
+    Raises RpcError: no such volume, or a view of more than `MAX_VIEW_BYTES`; GeometryError: a
+    geometry that no scanner has.
     """
     volume, rows, warnings = _looked_at(context, p)
     block = views_a_block(p.detector)
@@ -212,17 +190,10 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 async def rays(context: Context, client: JobClient, id: Id, p: wire.RaysNeeded) -> object:
     """Find the rays that pixels need, and send their marks (`pixel_areas.packed`).
 
-    Args:
-        context: of the server.
-        client: that calls.
-        id: of the request.
-        p: name of the volume, cone_vec (n, 12), detector, and the permitted error.
-
-    Returns:
-        As of `project`.
-
-    Raises:
-        RpcError, GeometryError: as of `project`.
+    `context`: of the server; `client`: that calls; `id`: of the request; `p`: name of the
+    volume, cone_vec (n, 12), detector, and the permitted error.
+    Returns as of `project`.
+    Raises RpcError, GeometryError: as of `project`.
     """
     volume, rows, warnings = _looked_at(context, p)
     steps = marking_steps(
@@ -295,23 +266,16 @@ async def _sent(
 async def backproject(
     context: Context, client: JobClient, id: Id, p: wire.Backproject
 ) -> object:
-    """Compute the adjoint of projections on a grid, and send it, or with `into` add it to
-    a named volume.
+    """Compute the adjoint of projections on a grid, and send it, or with `into` add it to a
+    named volume.
 
     A named volume that does not exist begins at zero; the sum replaces it.
 
-    Args:
-        context: of the server.
-        client: that calls.
-        id: of the request.
-        p: projections, cone_vec, grid, and perhaps the name of the volume.
-
-    Returns:
-        As `Context.send_array`; with `into` dtype, shape and parts 0.
-
-    Raises:
-        RpcError: -32602, other numbers of projections and views, or a named volume of
-            another shape; -32008, no memory.
+    `context`: of the server; `client`: that calls; `id`: of the request; `p`: projections,
+    cone_vec, grid, and perhaps the name of the volume.
+    Returns as `Context.send_array`; with `into` dtype, shape and parts 0.
+    Raises RpcError: -32602, other numbers of projections and views, or a named volume of another
+    shape; -32008, no memory.
     """
     if len(p.projections) != len(p.cone_vec):
         raise invalid_params(
@@ -361,8 +325,7 @@ async def health(context: Context, client: JobClient, id: Id, p: Params) -> obje
 async def cancel(context: Context, client: JobClient, id: Id, p: wire.Cancel) -> object:
     """Cancel a request of this client, which is then answered with an error.
 
-    Returns:
-        A dict with the key cancelled: whether that request was under way.
+    Returns a dict with the key cancelled: whether that request was under way.
     """
     job = client.jobs.get(p.request)
     if job is not None:
@@ -387,12 +350,8 @@ def _accumulator(
     """Look up the volume called `name`, to which a back projection is to be added.
 
     Only the shape is compared, not voxel size and place.
-
-    Returns:
-        The volume; None without a name or if there is no such volume.
-
-    Raises:
-        RpcError: -32602, it is a mesh or a scene, or has another shape than `grid`.
+    Returns the volume; None without a name or if there is no such volume.
+    Raises RpcError: -32602, it is a mesh or a scene, or has another shape than `grid`.
     """
     if name is None or name not in context.store:
         return None
@@ -411,18 +370,10 @@ def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | Tria
     """Check a volume's values and make its projection layout; blocks.
 
     Meshes are not checked.
-
-    Args:
-        volume: complete.
-        doubts: gets warnings about the values.
-
-    Returns:
-        `volume` itself.
-
-    Raises:
-        RpcError: -32602, values that are not finite.
-        GeometryError: values that are no attenuation.
-    """
+    `volume`: complete; `doubts`: gets warnings about the values.
+    Returns `volume` itself.
+    Raises RpcError: -32602, values that are not finite; GeometryError: values that are no
+    attenuation."""
     if isinstance(volume, Volume):
         if not np.isfinite(volume.data).all():
             raise invalid_params("the volume holds numbers that are not finite")
@@ -435,13 +386,9 @@ def _prepared(volume: Volume | TriangleMesh, doubts: list[str]) -> Volume | Tria
 def _backproject(p: wire.Backproject, old: Volume | None) -> Volume:
     """Compute a back projection on a grid, float32, without filter or weights; blocks.
 
-    Args:
-        p: projections, cone_vec and grid.
-        old: volume of that shape; the result is their sum, and `old` is not changed. None
-            for none.
-
-    Returns:
-        A new volume.
+    `p`: projections, cone_vec and grid. `old`: volume of that shape; the result is their sum,
+    and `old` is not changed. None for none.
+    Returns a new volume.
     """
     blank = np.broadcast_to(np.float32(0), p.grid.shape)
     volume = back(

@@ -132,9 +132,7 @@ class ProjectorServer(ListeningServer):
     def refuse(self, link: FrameLink, error: RpcError) -> None:
         """Log an error as a warning, send it without an id, and end the connection.
 
-        Args:
-            link: connection of the client.
-            error: why it is refused.
+        `link`: connection of the client; `error`: why it is refused.
         """
         self.context.lines.log(
             "refused", logging.WARNING, client=link.peer, reason=error.message

@@ -89,12 +89,8 @@ class VolumeStore:
     def get(self, name: str) -> Body:
         """Look up the volume called `name`, which becomes the most recently used.
 
-        Returns:
-            The volume, mesh or scene itself, not a copy.
-
-        Raises:
-            RpcError: -32602, there is none; as `unknown_volume`.
-        """
+        Returns the volume, mesh or scene itself, not a copy.
+        Raises RpcError: -32602, there is none; as `unknown_volume`."""
         if name not in self._held:
             raise wire.unknown_volume(name, list(self._held))
         value = self._held[name] = self._held.pop(name)
@@ -103,17 +99,11 @@ class VolumeStore:
     def put(self, name: str, value: Body, *, evictable: bool = False) -> None:
         """Store a complete volume, mesh or scene under `name`, in place of its namesake.
 
-        It becomes the most recently used. Evictable volumes are removed for it where
-        memory is needed.
-
-        Args:
-            name: of the volume.
-            value: volume, mesh or scene; not copied.
-            evictable: whether it may be forgotten where memory is needed.
-
-        Raises:
-            RpcError: -32008, above the memory limit.
-        """
+        It becomes the most recently used. Evictable volumes are removed for it where memory is
+        needed.
+        `name`: of the volume. `value`: volume, mesh or scene; not copied. `evictable`: whether
+        it may be forgotten where memory is needed.
+        Raises RpcError: -32008, above the memory limit."""
         self.reserve(f"volume {name!r}", memory_of(value), name)
         self.remove(name)
         self._held[name] = value
@@ -130,11 +120,11 @@ class VolumeStore:
         start: int,
         data: memoryview,
     ) -> tuple[int, Callable[[], Volume | TriangleMesh] | None]:
-        """Receive a chunk of voxels or of a mesh; the complete volume is not stored,
-        `put` does that.
+        """Receive a chunk of voxels or of a mesh; the complete volume is not stored, `put` does
+        that.
 
-        Chunks come in order. A chunk at 0 begins anew and reserves room for the whole,
-        beside a namesake. An empty chunk is refused unless the whole is empty.
+        Chunks come in order. A chunk at 0 begins anew and reserves room for the whole, beside a
+        namesake. An empty chunk is refused unless the whole is empty.
 
         Args:
             owner: client that sends it; each has uploads of its own.
@@ -143,13 +133,9 @@ class VolumeStore:
             start: place of the chunk [bytes].
             data: the chunk.
 
-        Returns:
-            Bytes received so far, and None, or once all have come the function that makes
-            the volume or mesh.
-
-        Raises:
-            RpcError: -32008, above the memory limit; -32602, chunks that do not fit
-                together.
+        Returns bytes received so far, and None, or once all have come the function that makes
+        the volume or mesh.
+        Raises RpcError: -32008, above the memory limit; -32602, chunks that do not fit together.
         """
         total = what.nbytes
         key = (owner, name)

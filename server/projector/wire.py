@@ -172,9 +172,7 @@ class FrameLink(asyncio.BufferedProtocol):
         """Let the transport close when the peer has closed its side; inside a frame call
         `on_broken` first.
 
-        Returns:
-            False: the transport closes.
-        """
+        Returns False: the transport closes."""
         if self.mid_frame and not self._over:
             self._over = True
             self.on_broken(self, parse_error("the stream ended inside a frame"))
@@ -184,8 +182,7 @@ class FrameLink(asyncio.BufferedProtocol):
         """Note the end of the connection, cancel its deadlines, wake whoever waits to
         write, and call `on_lost`.
 
-        `exc` is ignored.
-        """
+        `exc` is ignored."""
         self.lost = True
         self.deadlines.clear()
         self._writable.set()
@@ -193,8 +190,7 @@ class FrameLink(asyncio.BufferedProtocol):
 
     def pause_writing(self) -> None:
         """Pause sending, as the peer reads too slowly; after `send_timeout_s` the connection
-        is aborted.
-        """
+        is aborted."""
         self._writable.clear()
         self.deadlines.start("send", self.send_timeout_s)
 
@@ -214,10 +210,8 @@ class FrameLink(asyncio.BufferedProtocol):
         """Send a message; return when the transport has taken it.
 
         Messages are sent one at a time; large payloads are not copied.
-
-        Raises:
-            ConnectionResetError: the connection has ended.
-            RpcError, ValueError, TypeError: the message cannot be encoded.
+        Raises ConnectionResetError: the connection has ended; RpcError, ValueError, TypeError:
+        the message cannot be encoded.
         """
         head, payload = pack(message)
         async with self._sending:
@@ -312,13 +306,8 @@ class ProjectorLink:
     ) -> Self:
         """Connect to a server; nothing is sent yet.
 
-        Args:
-            host, port: its address.
-            ssl: TLS context of a client; None for a plain connection.
-
-        Raises:
-            OSError: no server answers.
-        """
+        `host` and `port`: its address. `ssl`: TLS context of a client; None for a plain
+        connection. Raises OSError: no server answers."""
         link = cls()
         loop = asyncio.get_running_loop()
         await loop.create_connection(lambda: link.link, host, port, ssl=ssl)
@@ -362,12 +351,9 @@ class ProjectorLink:
             dtype: of its values.
             most: whether it is flat, and `shape` is the largest that it may have.
 
-        Returns:
-            The array, read-only.
-
-        Raises:
-            RpcError: the answer is an error; -32603, it is no such array.
-            LinkLost: the connection has ended.
+        Returns the array, read-only.
+        Raises RpcError: the answer is an error; -32603, it is no such array; LinkLost: the
+        connection has ended.
         """
         answer, parts = await self._request(method, params, shape, dtype)
         if isinstance(answer, Mapping) and answer.get("data") is not None:

@@ -70,16 +70,12 @@ class Acquisition:
     async def produce(self, batch: Sequence[Exposure]) -> None:
         """Project, expose and store a batch of frames, and pass the last one to `shown`.
 
-        Files are written in a worker thread. A batch with X-rays off is dark, and not
-        shown.
+        Files are written in a worker thread. A batch with X-rays off is dark, and not shown.
 
-        Args:
-            batch: frames with files that share camera settings and X-rays on or off.
-
-        Raises:
-            ProjectorUnavailable: nothing of the batch was stored.
-            DatasetWriteError: not all of it was stored; storing again is allowed.
-            Exception: as `ensure_same`; nothing was stored.
+        `batch`: frames with files that share camera settings and X-rays on or off.
+        Raises ProjectorUnavailable: nothing of the batch was stored; DatasetWriteError: not all
+        of it was stored; storing again is allowed; Exception: as `ensure_same`; nothing was
+        stored.
         """
         if batch[0].xrays_on:
             images = await self._radiographs(batch)
@@ -116,16 +112,12 @@ class Acquisition:
     async def _earlier_images(self, frame: Exposure) -> Before:
         """Collect the images of earlier frames whose afterglow is still on the panel.
 
-        These are among the last `MEMORY_FRAMES`, with X-rays on and the same camera
-        settings, less than `MAX_MEMORY_S` before. Missing images are projected again, so
-        that a frame does not depend on which were made before it.
-
-        Args:
-            frame: that is being made.
-
-        Returns:
-            Pairs of image and time from its end to the frame's start [s], oldest first;
-            empty for a panel without lag.
+        These are among the last `MEMORY_FRAMES`, with X-rays on and the same camera settings,
+        less than `MAX_MEMORY_S` before. Missing images are projected again, so that a frame does
+        not depend on which were made before it.
+        `frame`: that is being made.
+        Returns pairs of image and time from its end to the frame's start [s], oldest first;
+        empty for a panel without lag.
         """
         if not self.radiography.remembers:
             return ()
@@ -240,15 +232,10 @@ class Acquisition:
 
         Noise depends on the seed and the frame's number; without a seed there is none.
 
-        Args:
-            batch: frames with files.
-            images: one for each frame.
-            before: earlier frames on the panel, for each frame.
-            trapped: charge in the panel's traps (rows, cols), for each frame; None
-                without traps.
-
-        Raises:
-            DatasetWriteError: as `put`; the files before are there.
+        `batch`: frames with files. `images`: one for each frame. `before`: earlier frames on the
+        panel, for each frame. `trapped`: charge in the panel's traps (rows, cols), for each
+        frame; None without traps.
+        Raises DatasetWriteError: as `put`; the files before are there.
         """
         for frame, image, earlier, traps in zip(
             batch, images, before, trapped, strict=True

@@ -103,21 +103,14 @@ class CheckInput:
         return len(self.source.poses.text) <= LIGHT_BYTES
 
     def report(self, bytes_at_most: int | None = None, swept: bool = True) -> CheckReport:
-        """Parse, plan and check the scan, with a sweep for collisions where the machine
-        has components; blocks.
+        """Parse, plan and check the scan, with a sweep for collisions where the machine has
+        components; blocks.
 
         Moves between poses go around obstacles if collisions are swept.
-
-        Args:
-            bytes_at_most: largest size of the report; None for no limit. It holds for a
-                swept report only.
-            swept: whether collisions are looked for.
-
-        Returns:
-            The dry-run report; problems of the scan are in it, not raised.
-
-        Raises:
-            RpcError: -32008, the report would be larger than that; nothing is swept then.
+        `bytes_at_most`: largest size of the report; None for no limit. It holds for a swept
+        report only. `swept`: whether collisions are looked for.
+        Returns the dry-run report; problems of the scan are in it, not raised.
+        Raises RpcError: -32008, the report would be larger than that; nothing is swept then.
         """
         report = self._report(bytes_at_most, swept)
         if report.plan.duration_s <= self.clock_left_s:
@@ -165,12 +158,8 @@ class CheckInput:
     ) -> list[dict[str, float]] | None:
         """Find moves without a contact for the machine and sample of this check.
 
-        Args:
-            start: axis -> position [mm, deg].
-            goal: axis -> target.
-
-        Returns:
-            Moves in order, each axis -> position; None if none were found.
+        `start`: axis -> position [mm, deg]; `goal`: axis -> target.
+        Returns moves in order, each axis -> position; None if none were found.
         """
         scene = build_scene(self.machine, self.profile, self.pieces, self.parameters)
         begin = self.start
@@ -216,16 +205,9 @@ class Checks:
     async def report(
         self, check_input: CheckInput, codec: Codec, seen: SampleForecast | None = None
     ) -> Sequence[bytes]:
-        """Compute the dry-run report, encoded in portions.
-
-        Args:
-            check_input: the scan and its conditions.
-            codec: of the answer.
-            seen: the pixels behind the sample on the stage.
-
-        Raises:
-            RpcError: -32008, it is larger than an answer may be or takes too long.
-        """
+        """Compute the dry-run report, encoded in portions. `check_input`: the scan and its
+        conditions; `codec`: of the answer; `seen`: the pixels behind the sample on the stage.
+        Raises RpcError: -32008, it is larger than an answer may be or takes too long."""
         if self._runs_here(check_input):
             return await self._threaded(lambda: _encoded(check_input, codec, seen))
         return await self._workers.ask(_encoded, _bare(check_input), codec, seen)
@@ -233,12 +215,9 @@ class Checks:
     async def probes(self, check_input: CheckInput) -> tuple[SampleProbe, ...]:
         """Choose the rays of a scan's projections behind which its counts are predicted.
 
-        The scan is planned, without a sweep for collisions: a light one in a thread of
-        this process, others in a worker.
-
-        Raises:
-            RpcError: -32008, planning takes too long or too much memory.
-        """
+        The scan is planned, without a sweep for collisions: a light one in a thread of this
+        process, others in a worker.
+        Raises RpcError: -32008, planning takes too long or too much memory."""
         if self._runs_here(check_input):
             return await self._threaded(lambda: probes_of(check_input))
         [packed] = await self._workers.ask(packed_probes, _bare(check_input))
@@ -306,11 +285,8 @@ class Checks:
 def planned(check_input: CheckInput) -> tuple[ScanPlan, list[str]]:
     """Check a scan and return its plan and its warnings in words; blocks.
 
-    There are at most `MAX_PROBLEMS` warnings, and then one with the number of those left
-    out.
-
-    Raises:
-        RpcError: -32005 or -32002, it may not run.
+    There are at most `MAX_PROBLEMS` warnings, and then one with the number of those left out.
+    Raises RpcError: -32005 or -32002, it may not run.
     """
     report = check_input.report()
     require_runnable(report)
@@ -388,8 +364,7 @@ def _encoded(
 def _refusing_large(
     sweep: dry_run.CollisionCheck, most: int | None
 ) -> dry_run.CollisionCheck:
-    """Wrap a sweep so that it refuses a plan, before the sweep, whose report would be too
-    large.
+    """Wrap a sweep so that it refuses a plan, before the sweep, whose report would be too large.
 
     Without a limit the sweep is only called.
 
@@ -397,8 +372,7 @@ def _refusing_large(
         sweep: finds the collisions of a plan.
         most: largest size of the report [bytes]; None for no limit.
 
-    Returns:
-        The wrapped sweep, which raises RpcError -32008 before it sweeps such a plan.
+    Returns the wrapped sweep, which raises RpcError -32008 before it sweeps such a plan.
     """
 
     def bounded(

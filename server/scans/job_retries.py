@@ -54,12 +54,8 @@ class Retry:
         """Schedule a call of `go` after a pause; nothing changes if a call is pending.
 
         The pause is `first_s`, doubles with each attempt, and is at most `longest_s`.
-
-        Args:
-            error: for which it waits: after a full disk `go` is called only once there is
-                room.
-            go: resumes the job.
-        """
+        `error`: for which it waits: after a full disk `go` is called only once there is room;
+        `go`: resumes the job."""
         if self.waits_s is None:
             pause = min(self._longest, self._first * 2.0**self._attempts)
             self._attempts += 1

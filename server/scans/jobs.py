@@ -146,8 +146,7 @@ class Jobs:
         "max".
 
         False for a paused or waiting job, and for one that waits between frames at
-        another speed.
-        """
+        another speed."""
         job = self.current
         if job is None or job.phase != "running":
             return False
@@ -346,22 +345,17 @@ class Jobs:
         """Pause a running job; one that is paused stays so.
 
         A planned retry is cancelled: only `resume` continues the job.
-
-        Raises:
-            RpcError: -32003, it neither runs nor is paused.
-        """
+        Raises RpcError: -32003, it neither runs nor is paused."""
         runner = self._runner(job, "pause", ("running", "paused"))
         self._take_over()
         runner.pause()
         self._tell(job)
 
     def resume(self, job: Job) -> None:
-        """Let a paused job go on; nothing changes for one that runs but that a planned
-        retry is cancelled.
+        """Let a paused job go on; nothing changes for one that runs but that a planned retry is
+        cancelled.
 
-        Raises:
-            RpcError: -32003, it neither runs nor is paused.
-        """
+        Raises RpcError: -32003, it neither runs nor is paused."""
         runner = self._runner(job, "resume", ("running", "paused"))
         self.retry.cancel()
         self._manual = False
@@ -370,9 +364,7 @@ class Jobs:
     def step(self, job: Job) -> None:
         """Run a paused job for one step; a planned retry is cancelled.
 
-        Raises:
-            RpcError: it is not paused.
-        """
+        Raises RpcError: it is not paused."""
         runner = self._runner(job, "step", ("paused",))
         self._take_over()
         runner.step()
@@ -405,14 +397,12 @@ class Jobs:
             self._tell(job)
 
     def interrupt(self, reason: Exception) -> None:
-        """Pause the current job after a stop from outside (stop, E-stop), also one that
-        is being opened or resumed.
+        """Pause the current job after a stop from outside (stop, E-stop), also one that is being
+        opened or resumed.
 
-        A planned retry is cancelled; only `resume` continues the job. A paused job stays
-        paused, with its reason.
-
-        Args:
-            reason: shown as the job's error.
+        A planned retry is cancelled; only `resume` continues the job. A paused job stays paused,
+        with its reason.
+        `reason`: shown as the job's error.
         """
         self._take_over()
         self._interrupted = reason
@@ -458,21 +448,14 @@ class Jobs:
         return [job for job in jobs if job.id not in forgotten]
 
     def recall(self, jobs: Sequence[JobMemory], made: int, root: Directory) -> list[Job]:
-        """Restore the jobs of an earlier server; those that had not ended are incomplete
-        now.
+        """Restore the jobs of an earlier server; those that had not ended are incomplete now.
 
-        None of them runs by itself.
+        None of them runs by itself. Changed jobs are noted for the next write, and the oldest
+        ones beyond the limits forgotten.
 
-        Changed jobs are noted for the next write, and the oldest ones beyond the limits
-        forgotten.
-
-        Args:
-            jobs: records of the jobs, oldest first.
-            made: number of jobs ever made, from which new ids continue.
-            root: data directory.
-
-        Returns:
-            The jobs that had not ended.
+        `jobs`: records of the jobs, oldest first; `made`: number of jobs ever made, from which
+        new ids continue; `root`: data directory.
+        Returns the jobs that had not ended.
         """
         self._count = max(self._count, made, *(number_of(memory.id) for memory in jobs))
         left = []
@@ -488,14 +471,10 @@ class Jobs:
     def ended(self, job: str | None, min_age: timedelta) -> list[Job]:
         """Select the ended jobs to be forgotten; nothing is removed here.
 
-        Args:
-            job: its id; None for all that ended long enough ago.
-            min_age: least time since their end; not used for a named job.
-
-        Raises:
-            UnknownNameError: there is no such job.
-            RpcError: -32003, the named one has not ended.
-        """
+        `job`: its id; None for all that ended long enough ago. `min_age`: least time since their
+        end; not used for a named job.
+        Raises UnknownNameError: there is no such job; RpcError: -32003, the named one has not
+        ended."""
         if job is None:
             return self._ended_for(min_age)
         found = self.get(job)
@@ -707,8 +686,7 @@ class Jobs:
         """Store an error in its job, log it unless a user caused it, and return the phase
         "failed".
 
-        The error is stored in the wire's form.
-        """
+        The error is stored in the wire's form."""
         if not is_user_error(error):
             log("job failed", logging.ERROR, error=True, job=job.id)
         job.error = self._error(error)
@@ -716,8 +694,7 @@ class Jobs:
 
     def _error(self, error: Exception) -> dict[str, object]:
         """Convert an error to the wire's form {code, message, data}, paths relative to the
-        data directory.
-        """
+        data directory."""
         e = explain(error, self._root)
         return {"code": e.code, "message": e.message, "data": e.data}
 
@@ -730,14 +707,10 @@ class Jobs:
         return job.runner
 
     def _phase_error(self, what: str, job: Job, phases: tuple[JobPhase, ...]) -> RpcError:
-        """Make the error -32003 for a command that a job's phase does not allow;
-        returned, not raised.
+        """Make the error -32003 for a command that a job's phase does not allow; returned, not
+        raised.
 
-        Args:
-            what: the command.
-            job: to which it was given.
-            phases: in which it is allowed.
-        """
+        `what`: the command; `job`: to which it was given; `phases`: in which it is allowed."""
         return busy(
             f"cannot {what} {job.id}: it is {job.phase}",
             {"asked": what, "state": job.phase, "allowed": list(phases)},

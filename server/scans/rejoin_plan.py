@@ -68,16 +68,14 @@ class Rejoin:
 
 
 def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Rejoin:
-    """Compute from which pose at rest, and with which run-up, a scanner joins `plan` at
-    time `tau`.
+    """Compute from which pose at rest, and with which run-up, a scanner joins `plan` at time
+    `tau`.
 
-    An axis starts behind its position at `tau` by its braking distance. The run-up lasts
-    as long as that of the slowest axis.
+    An axis starts behind its position at `tau` by its braking distance. The run-up lasts as long
+    as that of the slowest axis.
 
-    Args:
-        plan: the scan.
-        tau: time on the plan's clock [s].
-        accelerations: axis -> acceleration of its run-up [mm/s^2, deg/s^2].
+    `plan`: the scan; `tau`: time on the plan's clock [s]; `accelerations`: axis -> acceleration
+    of its run-up [mm/s^2, deg/s^2].
     """
     start = {}
     moving = {}
@@ -94,15 +92,10 @@ def rejoin(plan: ScanPlan, tau: float, accelerations: Mapping[str, float]) -> Re
 def _remaining(
     trajectories: tuple[tuple[float, Trajectory], ...], tau: float
 ) -> tuple[Trajectory, ...]:
-    """Select an axis's motion from plan time `tau` on; a trajectory under way is cut
-    there.
+    """Select an axis's motion from plan time `tau` on; a trajectory under way is cut there.
 
-    Args:
-        trajectories: pairs of start [s] and trajectory, by time.
-        tau: on the plan's clock [s].
-
-    Returns:
-        Trajectories on the plan's clock; () once all have ended.
+    `trajectories`: pairs of start [s] and trajectory, by time; `tau`: on the plan's clock [s].
+    Returns trajectories on the plan's clock; () once all have ended.
     """
     begun = [t for time, t in trajectories if time <= tau]
     later = tuple(t for time, t in trajectories if time > tau)

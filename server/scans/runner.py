@@ -169,15 +169,13 @@ class ScanRunner:
     # Control ------------------------------------------------------------------------------------
 
     def pause(self, error: Exception | None = None) -> None:
-        """Request a pause: the run stops motion at its next wait, and waits for `resume`,
-        `step` or `abort`.
+        """Request a pause: the run stops motion at its next wait, and waits for `resume`, `step`
+        or `abort`.
 
-        The settings in force are saved, to be restored then; a second pause keeps those
-        saved first. A single step is given up.
+        The settings in force are saved, to be restored then; a second pause keeps those saved
+        first. A single step is given up.
 
-        Args:
-            error: reason, shown in `progress` at once; None if a user requested the
-                pause.
+        `error`: reason, shown in `progress` at once; None if a user requested the pause.
         """
         if error is not None:
             self._set_progress(error=error)
@@ -200,8 +198,7 @@ class ScanRunner:
         a shown error is cleared.
 
         Requests before the run obeys are one step. A request while a frame waits for room
-        counts for the next frame.
-        """
+        counts for the next frame."""
         self._pause = False
         self._single_step = True
         self._steps += 1
@@ -211,8 +208,7 @@ class ScanRunner:
     def abort(self, reason: str | None = None) -> None:
         """Request the end of the run: it raises `JobAborted` at its next wait.
 
-        Args:
-            reason: for the error; None keeps an earlier one.
+        `reason`: for the error; None keeps an earlier one.
         """
         if reason is not None:
             self._end = JobAborted(reason)
@@ -445,20 +441,14 @@ class ScanRunner:
 
     def _stop(self) -> None:
         """Stop the run's motion; motion by hand during a run that cannot continue is not
-        stopped.
-        """
+        stopped."""
         if self._started_motors:
             self.scanner.stop(self.clock.now())
 
     async def _begin(self) -> None:
-        """Wait out a pause that was requested before the run began; nothing is set before
-        it may go on.
-
-        Settings saved by that pause are dropped.
-
-        Raises:
-            Exception: the run is to end (`JobAborted`).
-        """
+        """Wait out a pause that was requested before the run began; nothing is set before it may
+        go on. Settings saved by that pause are dropped. Raises Exception: the run is to end
+        (`JobAborted`)."""
         while self._has_request():
             await self._wait_for_request(0.0)
             self._set_progress(phase="running", error=None)
@@ -469,11 +459,8 @@ class ScanRunner:
 
         It returns at once if it is no longer paused.
 
-        Args:
-            tau: plan time at which it pauses [s].
-
-        Raises:
-            Exception: the run is to end (`JobAborted`).
+        `tau`: plan time at which it pauses [s].
+        Raises Exception: the run is to end (`JobAborted`).
         """
         self._stop_due = False
         if self._pause:
@@ -485,13 +472,12 @@ class ScanRunner:
             raise self._end
 
     async def _rejoin_or_pause(self, tau: float) -> None:
-        """Move to where the plan is at `tau` [s], then obey requests; a TwinError of the
-        motion pauses the run.
+        """Move to where the plan is at `tau` [s], then obey requests; a TwinError of the motion
+        pauses the run.
 
         With a request waiting (pause, abort) it does not move before that is obeyed.
 
-        Raises:
-            Exception: the run is to end (`JobAborted`).
+        Raises Exception: the run is to end (`JobAborted`).
         """
         if not self._has_request():
             try:
@@ -544,16 +530,13 @@ class ScanRunner:
         self._set_progress(tau=tau)
 
     async def _return_to(self, start: Mapping[str, float]) -> None:
-        """Move the motors to where a programme begins and wait for their rest; return
-        early on a pause or an abort.
+        """Move the motors to where a programme begins and wait for their rest; return early on a
+        pause or an abort.
 
         Nothing moves if they rest there already. The move is shown in `progress`.
 
-        Args:
-            start: axis -> position [mm, deg].
-
-        Raises:
-            CollisionError: on the way there.
+        `start`: axis -> position [mm, deg].
+        Raises CollisionError: on the way there.
         """
         now = self.clock.now()
         if self.scanner.positions(now) == start and not self.scanner.moving(now):
@@ -640,11 +623,9 @@ class _Settings:
         return cls(scanner.tube, scanner.camera, scanner.paces)
 
     def restore(self, scanner: ScannerTwin) -> None:
-        """Restore rates, camera and tube, in that order; those set before an error stay
-        set.
+        """Restore rates, camera and tube, in that order; those set before an error stay set.
 
-        Raises:
-            SafetyError: X-rays were on, and an E-stop is in force.
+        Raises SafetyError: X-rays were on, and an E-stop is in force.
         """
         for axis, (speed, acceleration) in self.paces.items():
             scanner.set_axis(axis, speed=speed, acceleration=acceleration)
@@ -655,12 +636,10 @@ class _Settings:
 def _events(
     steps: Sequence[PlanStep], frames: Sequence[Exposure]
 ) -> list[tuple[float, PlanStep | Exposure]]:
-    """Sort commands and frames by time; at equal times by their place in the plan, a
-    command before its own frames.
+    """Sort commands and frames by time; at equal times by their place in the plan, a command
+    before its own frames.
 
-    Returns:
-        Pairs of plan time [s] and command or frame.
-    """
+    Returns pairs of plan time [s] and command or frame."""
     keyed: list[tuple[tuple[float, int, int], PlanStep | Exposure]] = []
     keyed += [((s.start_s, s.index, 0), s) for s in steps]
     keyed += [((e.start_s, e.step, 1), e) for e in frames]

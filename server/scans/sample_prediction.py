@@ -45,18 +45,13 @@ class Prediction:
 async def predict_counts(
     radiography: Radiography, begin: StartConditions, plan: ScanPlan
 ) -> Prediction:
-    """Predict the counts of a scan's projections, with the physics and sample of its
-    start.
+    """Predict the counts of a scan's projections, with the physics and sample of its start.
 
     Without a sample only the open beam is judged.
 
-    Args:
-        radiography: how images are made; physics and scatter are those of `begin`.
-        begin: conditions of the scan.
-        plan: of the scan.
-
-    Returns:
-        Predicted exposures, and problems of the sample beyond those of the open beam.
+    `radiography`: how images are made; physics and scatter are those of `begin`. `begin`:
+    conditions of the scan. `plan`: of the scan.
+    Returns predicted exposures, and problems of the sample beyond those of the open beam.
     """
     chosen = replace(radiography, physics=begin.physics, scatter=begin.scatter)
     forecast = await forecast_sample(chosen, begin.sample, sample_probes(plan))

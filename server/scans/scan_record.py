@@ -155,11 +155,7 @@ class JobRecord:
     operator: str = ""
 
     def write(self, root: Directory, name: str) -> None:
-        """Keep it for the data set `name`.
-
-        Raises:
-            DatasetWriteError: the system refuses.
-        """
+        """Keep it for the data set `name`. Raises DatasetWriteError: the system refuses."""
         with Changes() as changes:
             self.keep(changes, root, name)
 
@@ -210,11 +206,8 @@ class JobRecord:
 
     @staticmethod
     def forget(changes: Changes, root: Directory, names: Sequence[str]) -> None:
-        """Delete those of data sets, among other changes.
-
-        Raises:
-            DatasetWriteError: the system refuses.
-        """
+        """Delete those of data sets, among other changes. Raises DatasetWriteError: the system
+        refuses."""
         files = [f"{file_stem(name)}.json" for name in names]
         changes.remove(root.folder(FOLDER), *files)
 

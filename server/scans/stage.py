@@ -70,17 +70,13 @@ class Stage:
     def phantom(self, sample: Sample) -> Phantom | None:
         """Load the phantom of a sample; None for an empty stage.
 
-        Raises:
-            UnknownNameError, LimitError, PhantomError: see `SampleStore.load`.
-        """
+        Raises UnknownNameError, LimitError, PhantomError: see `SampleStore.load`."""
         if sample.name:
             return self._samples.load(sample.name, sample.material)
         return None
 
     def revision(self, sample: Sample) -> str | None:
-        """Return the revision of a sample's upload, once it has been read; None for
-        others.
-        """
+        """Return the revision of a sample's upload, once it has been read; None for others."""
         return self._samples.revision(sample.name)
 
     def pieces(
@@ -144,16 +140,12 @@ class Stage:
     ) -> CollisionScene | None:
         """Build the scene of bodies that may collide, or return a remembered one.
 
-        The last `MAX_CACHED_SCENES` scenes are remembered, by content and placement of
-        the sample and by parameters.
+        The last `MAX_CACHED_SCENES` scenes are remembered, by content and placement of the
+        sample and by parameters.
 
-        Args:
-            sample: on the stage.
-            parameters: applied correction, which moves the bodies.
-            upload: as for `pieces`.
-
-        Returns:
-            The scene; None for a machine without components.
+        `sample`: on the stage; `parameters`: applied correction, which moves the bodies;
+        `upload`: as for `pieces`.
+        Returns the scene; None for a machine without components.
         """
         if not self._machine.components:
             return None
@@ -173,13 +165,9 @@ class Stage:
         parameters: Offsets = NOMINAL,
         upload: ReceivedSample | None = None,
     ) -> Guard | None:
-        """Create the guard that sweeps every motion; None for a machine without
-        components.
+        """Create the guard that sweeps every motion; None for a machine without components.
 
-        Args:
-            sample: on the stage.
-            parameters: applied correction.
-            upload: as for `pieces`.
+        `sample`: on the stage; `parameters`: applied correction; `upload`: as for `pieces`.
         """
         scene = self.scene(sample, parameters, upload)
         if scene is None:
@@ -286,16 +274,10 @@ class ObstacleMoves:
         """Plan a free way from where the motors will rest.
 
         Nothing moves. The way has a warning if it goes around something.
-
-        Args:
-            targets: axis -> target [mm, deg].
-            relative: whether targets are distances from where the motors will rest.
-            shortest: whether a rotation may take the shorter way.
-
-        Raises:
-            UnknownNameError, LimitError, SafetyError: as a move.
-            CollisionError: no free way was found; nothing moves.
-            SafetyError: another command came meanwhile; nothing moves.
+        `targets`: axis -> target [mm, deg]; `relative`: whether targets are distances from where
+        the motors will rest; `shortest`: whether a rotation may take the shorter way.
+        Raises UnknownNameError, LimitError, SafetyError: as a move; CollisionError: no free way
+        was found; nothing moves; SafetyError: another command came meanwhile; nothing moves.
         """
         commands = self._commands
         way = await self._find_way(targets, relative=relative, shortest=shortest)
@@ -430,11 +412,8 @@ async def wait_for_way(task: asyncio.Task[None]) -> list[str]:
 
     The task is not cancelled if this wait is.
 
-    Returns:
-        One warning if it was cancelled or refused a leg; [] if it arrived.
-
-    Raises:
-        Exception: any error of the task but a TwinError.
+    Returns one warning if it was cancelled or refused a leg; [] if it arrived.
+    Raises Exception: any error of the task but a TwinError.
     """
     await asyncio.wait([task])
     if task.cancelled():

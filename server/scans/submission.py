@@ -128,9 +128,8 @@ class QueueEntry:
     def take(self) -> Job:
         """Put the drafted job into the queue and return it.
 
-        Raises:
-            RpcError: the requester has lost control, or a job writes the data set of that
-                name.
+        Raises RpcError: the requester has lost control, or a job writes the data set of that
+        name.
         """
         assert self.draft is not None
         self.ensure_allowed()
@@ -176,19 +175,9 @@ class Submissions:
 
     async def check(self, source: ScanSource, codec: Codec) -> Encoded:
         """Compute the dry-run report of a scan from the scanner's present state, with a
-        prediction behind the sample; nothing moves.
-
-        Args:
-            source: script or poses.
-            codec: of the connection.
-
-        Returns:
-            The encoded report.
-
-        Raises:
-            RpcError: -32008, it takes too long, too much memory, or is too large for an
-                answer.
-        """
+        prediction behind the sample; nothing moves. `source`: script or poses; `codec`: of the
+        connection. Returns the encoded report. Raises RpcError: -32008, it takes too long, too
+        much memory, or is too large for an answer."""
         sample = self.scanner.sample
         check_input = await self._check_input(source, self.start(), sample)
         seen = await self._sample_seen(check_input, sample)
@@ -340,9 +329,8 @@ class Submissions:
     ) -> CheckedScan:
         """Check a scan completely: text, plan, collisions, disk, memory, counts.
 
-        Warnings are those of the check and of the predicted counts. For a resumed scan
-        the first ones say how many images exist, and whether another sample is on the
-        stage.
+        Warnings are those of the check and of the predicted counts. For a resumed scan the first
+        ones say how many images exist, and whether another sample is on the stage.
 
         Args:
             job_record: record of the scan.
@@ -350,8 +338,7 @@ class Submissions:
             resume: whether the data set exists and is continued.
             ensure_allowed: raises if the requester has lost control.
 
-        Raises:
-            RpcError: as `submit`.
+        Raises RpcError: as `submit`.
         """
         begin = job_record.begin
         checked = await self.checks.runnable(
@@ -452,8 +439,7 @@ class Submissions:
         self, shown: Sample, stands: Sample
     ) -> tuple[SampleSize | None, tuple[Polytope, ...]]:
         """Compute the size of the sample that is shown, and the convex pieces of the one
-        that stands there; none for a machine without components to collide with.
-        """
+        that stands there; none for a machine without components to collide with."""
         pieces = self.stage.pieces(stands) if self.scanner.machine.components else ()
         return self.stage.size(shown), pieces
 
@@ -652,12 +638,8 @@ class Submissions:
 
         Image files of the data set that are there count by their present size.
 
-        Args:
-            size: of all images [bytes].
-            name: of the data set.
-
-        Raises:
-            DiskFullError: they do not fit.
+        `size`: of all images [bytes]; `name`: of the data set.
+        Raises DiskFullError: they do not fit.
         """
         there = 0
         with suppress(FileNotFoundError), self.root.folder(name).entries() as entries:

@@ -69,12 +69,9 @@ class TwinClock:
 
         With "max" it does not flow, but jumps to awaited moments.
 
-        Args:
-            speed_up: "max", or above 0 and at most `MAX_SPEED_UP`.
-            wall: real time [s], monotonic.
-
-        Raises:
-            LimitError: another speed-up.
+        `speed_up`: "max", or above 0 and at most `MAX_SPEED_UP`; `wall`: real time [s],
+        monotonic.
+        Raises LimitError: another speed-up.
         """
         self._wall = wall
         self._speed_up = check_speed_up(speed_up)
@@ -94,14 +91,8 @@ class TwinClock:
     def set_speed_up(self, speed_up: SpeedUp) -> None:
         """Run faster or slower from now on.
 
-        The present time does not jump; the next wake-up is scheduled anew.
-
-        Args:
-            speed_up: "max", or above 0 and at most `MAX_SPEED_UP`.
-
-        Raises:
-            LimitError: another one; nothing changes.
-        """
+        The present time does not jump; the next wake-up is scheduled anew. `speed_up`: "max", or
+        above 0 and at most `MAX_SPEED_UP`. Raises LimitError: another one; nothing changes."""
         checked = check_speed_up(speed_up)
         self._rebase()
         self._speed_up = checked

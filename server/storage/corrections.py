@@ -121,8 +121,7 @@ class Corrections:
 
     def last(self, history: History) -> NamedCorrection | None:
         """Return the correction in force after `history`; None if that is empty or ends with
-        none.
-        """
+        none."""
         name = history[-1] if history else None
         return None if name is None else self._all[name]
 
@@ -130,9 +129,7 @@ class Corrections:
         """Look up the correction called `name`.
 
         It need not be in force.
-
-        Raises:
-            UnknownNameError: lists the names there are.
+        Raises UnknownNameError: lists the names there are.
         """
         if name not in self._all:
             none = "" if self._all else "none"
@@ -207,18 +204,12 @@ class Corrections:
     def store(
         self, changes: documents.Changes, correction: NamedCorrection, source: str | None
     ) -> None:
-        """Add the file of a new correction to `changes`; nothing is added for a known
-        name.
+        """Add the file of a new correction to `changes`; nothing is added for a known name.
 
         `get` and `all` do not have it before `know`.
-
-        Args:
-            changes: written together.
-            correction: to be stored.
-            source: data set or file that it came from, or None.
-
-        Raises:
-            DatasetWriteError: the system cannot write.
+        `changes`: written together; `correction`: to be stored; `source`: data set or file that
+        it came from, or None.
+        Raises DatasetWriteError: the system cannot write.
         """
         if correction.name in self._all:
             return
@@ -240,12 +231,8 @@ class Corrections:
         return history[-1:] if self.filed else history
 
     def store_history(self, changes: documents.Changes, history: History) -> None:
-        """Write the history; on a full disk it stays as it was, which costs steps
-        of `revert` only.
-
-        Raises:
-            DatasetWriteError: the system cannot write.
-        """
+        """Write the history; on a full disk it stays as it was, which costs steps of `revert`
+        only. Raises DatasetWriteError: the system cannot write."""
         with suppress(DiskFullError):
             changes.put(self._folder, HISTORY, json.dumps(history).encode())
             self._written = history
@@ -274,12 +261,9 @@ class Corrections:
         changes.remove(self._folder, self._files.get(name) or _file(self._all[name]))
 
     def forget(self, name: str, history: History) -> None:
-        """Remove a correction from memory and set the history; its file is removed by
-        `remove`.
+        """Remove a correction from memory and set the history; its file is removed by `remove`.
 
-        Args:
-            name: of the correction; it must be known.
-            history: the one without it.
+        `name`: of the correction; it must be known. `history`: the one without it.
         """
         del self._all[name]
         self._sources.pop(name, None)
@@ -308,12 +292,10 @@ def _file(correction: NamedCorrection) -> str:
 def _joined(before: History, in_force: History) -> History:
     """Join the history of the file with that of the state, whose last name is in force.
 
-    A history of none or several names in the state replaces the file's. A single name
-    cuts the file's history after its last place there, or is appended.
+    A history of none or several names in the state replaces the file's. A single name cuts the
+    file's history after its last place there, or is appended.
 
-    Args:
-        before: of the file.
-        in_force: of the state: a whole history, or the one name in force.
+    `before`: of the file; `in_force`: of the state: a whole history, or the one name in force.
     """
     if len(in_force) != 1:
         return in_force
@@ -332,12 +314,10 @@ def _read_history(data: bytes) -> History:
 
 
 def _read(data: bytes) -> tuple[NamedCorrection, str | None]:
-    """Parse a correction and its origin (or None), and check that it is plausible,
-    whatever the length of its shifts.
+    """Parse a correction and its origin (or None), and check that it is plausible, whatever the
+    length of its shifts.
 
-    Raises:
-        ValueError, TwinError: no correction, or an implausible one.
-    """
+    Raises ValueError, TwinError: no correction, or an implausible one."""
     document = CorrectionFile.model_validate(documents.read_json(data))
     correction = correction_of(document)
     require_plausible(correction.parameters, math.inf)

@@ -104,9 +104,8 @@ def align(
 def _dataset_path(root: Directory, name: str) -> Path:
     """Return the path of a data set's folder.
 
-    Raises:
-        DatasetMissingError: there is no such folder.
-        DatasetNameError: the name is no plain file name.
+    Raises DatasetMissingError: there is no such folder; DatasetNameError: the name is no plain
+    file name.
     """
     if not root.is_directory(plain_name(name, "data set")):
         raise DatasetMissingError(
@@ -118,9 +117,8 @@ def _dataset_path(root: Directory, name: str) -> Path:
 def _text(root: Directory, name: str) -> str:
     """Read the text of a phantom file of the data directory.
 
-    Raises:
-        DatasetMissingError: there is no such file.
-        DatasetNameError: the name is no plain file name.
+    Raises DatasetMissingError: there is no such file; DatasetNameError: the name is no plain
+    file name.
     """
     if plain_name(name, "phantom") not in root.names():
         raise DatasetMissingError(

@@ -143,17 +143,13 @@ class DatasetWriter:
             self._present.add(name)
 
     def finish(self, *, duration_s: float | None = None) -> None:
-        """Check that all images are there, and mark the data set complete: write its
-        texts anew, after the images are safe on the disk.
+        """Check that all images are there, and mark the data set complete: write its texts anew,
+        after the images are safe on the disk.
 
         The folder is held until `close`.
-
-        Args:
-            duration_s: of the scan as it ran [s]; None keeps the planned one.
-
-        Raises:
-            DatasetMissingError: an image is not there; the data set stays incomplete.
-            DatasetWriteError: the system cannot write.
+        `duration_s`: of the scan as it ran [s]; None keeps the planned one.
+        Raises DatasetMissingError: an image is not there; the data set stays incomplete;
+        DatasetWriteError: the system cannot write.
         """
         missing = self.missing
         if missing:
@@ -173,21 +169,16 @@ class DatasetWriter:
         self._files.close()
 
     def _prepare_folder(self, resume: bool) -> set[str]:
-        """Check that the folder is empty or holds this scan, and remove unfinished files
-        from it.
+        """Check that the folder is empty or holds this scan, and remove unfinished files from
+        it.
 
-        Of an image only the header is read. With a document, `record` takes over its
-        start and correction.
+        Of an image only the header is read. With a document, `record` takes over its start and
+        correction.
 
-        Args:
-            resume: whether the folder may have files.
-
-        Returns:
-            Names of the images that are complete.
-
-        Raises:
-            DatasetExistsError: it has files and the scan is not resumed, or those of
-                another scan.
+        `resume`: whether the folder may have files.
+        Returns names of the images that are complete.
+        Raises DatasetExistsError: it has files and the scan is not resumed, or those of another
+        scan.
         """
         names = self._files.names()
         if names and not resume:

@@ -54,8 +54,7 @@ class UsedBytes:
 
         Folders that have not changed since the last call are not listed again.
 
-        Returns:
-            The sum; 0 if the directory cannot be read.
+        Returns the sum; 0 if the directory cannot be read.
         """
         with suppress(OSError):
             changed_ns = os.stat(self._root.fileno() or self._root.path).st_mtime_ns
@@ -172,13 +171,8 @@ def require_last(folder: Path, what: str, size: int) -> None:
 
     Nothing is checked where free space is unknown.
 
-    Args:
-        folder: on the disk.
-        what: that is to be written, for the message.
-        size: its bytes.
-
-    Raises:
-        DiskFullError: it does not.
+    `folder`: on the disk; `what`: that is to be written, for the message; `size`: its bytes.
+    Raises DiskFullError: it does not.
     """
     free = free_bytes(folder)
     need = size + LAST_BYTES

@@ -92,11 +92,7 @@ class JobFiles:
         return sorted(found, key=lambda job: number_of(job.id))
 
     def put(self, changes: documents.Changes, job: JobMemory) -> None:
-        """Write a job, among other changes.
-
-        Raises:
-            DatasetWriteError: the system refuses.
-        """
+        """Write a job, among other changes. Raises DatasetWriteError: the system refuses."""
         self._records.make()
         changes.put(self._folder, _file(job.id), _text(job))
 
@@ -105,11 +101,8 @@ class JobFiles:
         changes.remove(self._folder, *map(_file, jobs))
 
     def write(self, job: JobMemory) -> None:
-        """Write a job that has changed; the folder is made if it is missing.
-
-        Raises:
-            DatasetWriteError: the system refuses.
-        """
+        """Write a job that has changed; the folder is made if it is missing. Raises
+        DatasetWriteError: the system refuses."""
         self._records.make()
         self._folder.keep(_file(job.id), _text(job))
 

@@ -317,8 +317,7 @@ class Journal:
     def _put(self, record: Record, make: Keep | None = None) -> None:
         """Write a record; blocks.
 
-        Raises:
-            DatasetWriteError, ValueError: it cannot be written.
+        Raises DatasetWriteError, ValueError: it cannot be written.
         """
         text = record.model_dump_json(by_alias=True).encode("utf-8")
         with self._turn:
@@ -369,15 +368,11 @@ def _same(a: Content, b: Content) -> bool:
 
 
 def _within(machine: Machine, positions: dict[str, float]) -> dict[str, float]:
-    """Limit positions to the travel of their motors, as rounding may have brought them
-    out.
+    """Limit positions to the travel of their motors, as rounding may have brought them out.
 
-    Args:
-        machine: whose motors; positions of others are left out.
-        positions: motor -> position [mm, deg].
-
-    Returns:
-        Motor -> position [mm, deg].
+    `machine`: whose motors; positions of others are left out. `positions`: motor -> position
+    [mm, deg].
+    Returns motor -> position [mm, deg].
     """
     axes = machine.axes
     return {

@@ -98,17 +98,11 @@ def remember(
 ) -> Memory:
     """Make the document of the scanner at twin time `now`.
 
-    It has rates, tube, camera, sample and correction, the time of writing, and the
-    arguments.
+    It has rates, tube, camera, sample and correction, the time of writing, and the arguments.
 
-    Args:
-        scanner: as it is.
-        now: twin time [s].
-        record: of the journal, now.
-        made: jobs there ever were.
-        corrections: as `Memory` has them.
-        unfiled: jobs of an earlier server that could not be given files yet.
-        ended: whether the server has ended.
+    `scanner`: as it is; `now`: twin time [s]; `record`: of the journal, now; `made`: jobs there
+    ever were; `corrections`: as `Memory` has them; `unfiled`: jobs of an earlier server that
+    could not be given files yet; `ended`: whether the server has ended.
     """
     scene = save_scene(scanner, now).model_copy(update={"positions": record.positions})
     return Memory(
@@ -127,15 +121,12 @@ def remember(
 def with_scanner_state(
     memory: Memory, scanner: ScannerTwin, corrections: list[str | None] | None = None
 ) -> Memory:
-    """Replace settings, rates, sample and correction of the document by those of
-    `scanner`.
+    """Replace settings, rates, sample and correction of the document by those of `scanner`.
 
     Positions, jobs and E-stop stay.
 
-    Args:
-        memory: the document; not changed.
-        scanner: as it will be.
-        corrections: as `Memory` has them; None leaves them.
+    `memory`: the document; not changed. `scanner`: as it will be. `corrections`: as `Memory` has
+    them; None leaves them.
     """
     scene = save_scene(scanner, 0.0).model_copy(
         update={"positions": memory.scene.positions}
@@ -513,16 +504,14 @@ class StateStore:
         document: Memory | None,
         files: Callable[[documents.Changes], None] | None,
     ) -> None:
-        """Write files, then the document, as changes that the caller confirms or undoes;
-        blocks.
+        """Write files, then the document, as changes that the caller confirms or undoes; blocks.
 
         Args:
             changes: gets all that is written.
             document: of the state; None leaves it.
             files: adds files; None for none.
 
-        Raises:
-            DatasetWriteError: the disk does not take them, or the server is ending.
+        Raises DatasetWriteError: the disk does not take them, or the server is ending.
         """
         with self._file:
             if self._ended:

@@ -52,8 +52,7 @@ def scene_apart(raw: bytes, *, name: str) -> Phantom:
 
 
 def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Phantom:
-    """Read a mesh or scene from bytes in a worker process of its own, with limits;
-    blocks.
+    """Read a mesh or scene from bytes in a worker process of its own, with limits; blocks.
 
     The limits are `TIMEOUT_S` and `MEMORY_BYTES`; the process is ended in any case.
 
@@ -62,11 +61,8 @@ def _apart(read: Callable[..., Phantom], how: dict[str, str], raw: bytes) -> Pha
         how: its keyword arguments; "name" is that of the sample.
         raw: bytes of the file.
 
-    Returns:
-        The phantom.
-
-    Raises:
-        PhantomError: they cannot be read, or take too much time or memory.
+    Returns the phantom.
+    Raises PhantomError: they cannot be read, or take too much time or memory.
     """
     worker = Worker(MEMORY_BYTES)
     try:

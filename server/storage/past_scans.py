@@ -93,9 +93,8 @@ class PastScans:
     """
 
     def __init__(self, root: Path, machine: Machine, profile: Profile) -> None:
-        """Set up the listing of data sets below `root`, with worker processes that start
-        on demand: `MAX_WORKERS`, and one with longer limits for calibration and
-        alignment.
+        """Set up the listing of data sets below `root`, with worker processes that start on
+        demand: `MAX_WORKERS`, and one with longer limits for calibration and alignment.
 
         Args:
             root: the data directory.
@@ -137,8 +136,7 @@ class PastScans:
 
 
 def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[bytes]:
-    """Answer a request in the worker and encode the answer; only files below `root` are
-    read.
+    """Answer a request in the worker and encode the answer; only files below `root` are read.
 
     Args:
         root: data directory.
@@ -146,12 +144,8 @@ def work(root: Path, asked: Params, context: TwinContext, codec: Codec) -> list[
         context: facts about the twin.
         codec: of the answer.
 
-    Returns:
-        The pieces of the encoded answer.
-
-    Raises:
-        DatasetMissingError: a file that cannot be read.
-        TwinError, RpcError: of the method.
+    Returns the pieces of the encoded answer.
+    Raises DatasetMissingError: a file that cannot be read; TwinError, RpcError: of the method.
     """
     try:
         directory = Directory(root)
@@ -255,19 +249,12 @@ class _Scan:
 def _place(root: Directory, name: str) -> tuple[Path, tuple[object, ...]]:
     """Find a data set's folder.
 
-    The key is made of the name, and of inode, time and size of the folder and of its
-    document, if there is one.
+    The key is made of the name, and of inode, time and size of the folder and of its document,
+    if there is one.
 
-    Args:
-        root: data directory.
-        name: of the data set.
-
-    Returns:
-        Its path, and a key that changes with its files and its document.
-
-    Raises:
-        DatasetMissingError: no such data set.
-        DatasetNameError: the name is not a plain one.
+    `root`: data directory; `name`: of the data set.
+    Returns its path, and a key that changes with its files and its document.
+    Raises DatasetMissingError: no such data set; DatasetNameError: the name is not a plain one.
     """
     about = root.stat(plain_name(name, "data set"))
     if about is None or not stat.S_ISDIR(about.st_mode):
@@ -507,18 +494,13 @@ def _folders(root: Directory) -> tuple[list[tuple[float, str]], int]:
 def _row_until(
     until: float, root: Directory, name: str, modified: float
 ) -> tuple[p.DatasetInfo | None, bool]:
-    """Summarise the data set in a folder; one that is not in the cache is read only until
-    a time.
+    """Summarise the data set in a folder; one that is not in the cache is read only until a
+    time.
 
-    Args:
-        until: monotonic time [s].
-        root: data directory.
-        name: of the folder.
-        modified: its time of modification [s].
-
-    Returns:
-        The summary, None for a folder that holds no data set or has gone, and whether it
-        was too late to read it.
+    `until`: monotonic time [s]; `root`: data directory; `name`: of the folder; `modified`: its
+    time of modification [s].
+    Returns the summary, None for a folder that holds no data set or has gone, and whether it was
+    too late to read it.
     """
     try:
         path, key = _place(root, name)
@@ -558,15 +540,11 @@ def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
 def _list_row(path: Path, modified: float) -> p.DatasetInfo | str:
     """Read and summarise a data set; what cannot be read is the problem in the summary.
 
-    Documents above `MAX_LISTED_DOCUMENT_BYTES` are not read. Paths in the problem are
-    relative to the data directory.
+    Documents above `MAX_LISTED_DOCUMENT_BYTES` are not read. Paths in the problem are relative
+    to the data directory.
 
-    Args:
-        path: of its folder.
-        modified: its time of modification [s].
-
-    Returns:
-        The summary; "" for a folder that holds no data set.
+    `path`: of its folder; `modified`: its time of modification [s].
+    Returns the summary; "" for a folder that holds no data set.
     """
     folder = files.list_folder(path)
     if folder.document is None and folder.geometry is None and not folder.projections:

@@ -87,20 +87,14 @@ def correction_of(part: p.CorrectionPart) -> NamedCorrection:
 
 
 def require_fit(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Check that a scene is of this machine, then its positions, settings and correction;
-    the scanner is not changed.
+    """Check that a scene is of this machine, then its positions, settings and correction; the
+    scanner is not changed.
 
     Settings are tried on a new scanner of that machine. Collisions are not looked for.
 
-    Args:
-        scene: document.
-        scanner: that is to have it.
-
-    Raises:
-        RpcError: -32602, another machine's.
-        UnknownNameError, LimitError: an axis, position or setting this scanner does not
-            have.
-        GeometryError: a correction that no scanner can have.
+    `scene`: document; `scanner`: that is to have it.
+    Raises RpcError: -32602, another machine's; UnknownNameError, LimitError: an axis, position
+    or setting this scanner does not have; GeometryError: a correction that no scanner can have.
     """
     if scene.machine != scanner.machine.name:
         raise invalid_params(
@@ -126,14 +120,12 @@ def paces_of(scene: p.Scene, scanner: ScannerTwin) -> dict[str, tuple[float, flo
 
 
 def apply_settings(scene: p.Scene, scanner: ScannerTwin) -> None:
-    """Set rates of the axes, then tube voltage and power, then camera as in the scene;
-    X-rays and motors stay as they are.
+    """Set rates of the axes, then tube voltage and power, then camera as in the scene; X-rays
+    and motors stay as they are.
 
     Settings made before an error stay.
 
-    Raises:
-        LimitError, UnknownNameError: a setting or an axis that this scanner does not
-            have.
+    Raises LimitError, UnknownNameError: a setting or an axis that this scanner does not have.
     """
     for axis, speed in scene.speeds.items():
         scanner.set_axis(axis, speed=speed)

@@ -169,8 +169,7 @@ class SampleStore:
         return _shown(head, revision)
 
     def load(self, name: str, material: str | None = None) -> Phantom:
-        """Return the phantom called `name` from the cache, or parse it and cache it;
-        blocks.
+        """Return the phantom called `name` from the cache, or parse it and cache it; blocks.
 
         Two threads may parse the same one at once; the last result is kept.
 
@@ -178,14 +177,10 @@ class SampleStore:
             name: a shipped phantom's or an upload's.
             material: instead of the one a mesh was uploaded with.
 
-        Returns:
-            The phantom, the same object until another file comes under the name.
-
-        Raises:
-            UnknownNameError: no such sample or material.
-            LimitError: a material for a sample that has its own.
-            PhantomError: an upload that cannot be read any more; if its bytes are damaged
-                it is removed from the list.
+        Returns the phantom, the same object until another file comes under the name.
+        Raises UnknownNameError: no such sample or material; LimitError: a material for a sample
+        that has its own; PhantomError: an upload that cannot be read any more; if its bytes are
+        damaged it is removed from the list.
         """
         key = (name, material)
         with self._lock:
@@ -223,8 +218,7 @@ class SampleStore:
     def receive(
         self, head: UploadHead, start: int, data: bytes, *, observer: bool = False
     ) -> tuple[int, Upload]:
-        """Check an upload's size and name, and write one chunk of it, see
-        `Incoming.receive`.
+        """Check an upload's size and name, and write one chunk of it, see `Incoming.receive`.
 
         A stored name may be replaced even if no further upload is allowed.
 
@@ -234,15 +228,10 @@ class SampleStore:
             data: the chunk.
             observer: whether another client has control.
 
-        Returns:
-            Number of bytes received so far, and the upload that they are of.
-
-        Raises:
-            RpcError: -32008, larger than allowed.
-            LimitError: a gap before this chunk, too many uploads (of observers, too
-                large ones together), a name that is too long, or that of a shipped
-                phantom or the empty stage.
-            DatasetWriteError: the disk does not take it.
+        Returns number of bytes received so far, and the upload that they are of.
+        Raises RpcError: -32008, larger than allowed; LimitError: a gap before this chunk, too
+        many uploads (of observers, too large ones together), a name that is too long, or that of
+        a shipped phantom or the empty stage; DatasetWriteError: the disk does not take it.
         """
         if head.total > self._limit:
             raise too_large("an upload", head.total, self._limit)
@@ -298,15 +287,10 @@ class SampleStore:
 
         It is removed from the uploads under way, so a second call fails.
 
-        Args:
-            complete: the upload, as `receive` told it.
-            material: also parse it of this material, in which it is on the stage; None:
-                not.
-            observer: whether another client has control.
-
-        Raises:
-            PhantomError, UnknownNameError: its content does not hold.
-            LimitError: observers have sent too much meanwhile.
+        `complete`: the upload, as `receive` told it. `material`: also parse it of this material,
+        in which it is on the stage; None: not. `observer`: whether another client has control.
+        Raises PhantomError, UnknownNameError: its content does not hold; LimitError: observers
+        have sent too much meanwhile.
         """
         head, raw = self._incoming.take(complete)
         head = head.model_copy(update={"observer": observer})
@@ -321,11 +305,10 @@ class SampleStore:
     def prepare(self, upload: ReceivedSample) -> None:
         """Write an upload's bytes, before any lock is taken; `store` makes them visible.
 
-        The file is named after its content, and nothing refers to it yet: unless `know`
-        is called, `tidy` deletes it.
+        The file is named after its content, and nothing refers to it yet: unless `know` is
+        called, `tidy` deletes it.
 
-        Raises:
-            DatasetWriteError: the system cannot write.
+        Raises DatasetWriteError: the system cannot write.
         """
         name = upload.head.name
         file = _bytes_file(name, upload.revision)
@@ -425,21 +408,16 @@ class SampleStore:
     def _load(
         self, head: UploadHead | None, name: str, material: str | None
     ) -> tuple[Phantom, str | None]:
-        """Load a phantom from the shipped ones or from an upload's file; nothing is
-        cached here.
+        """Load a phantom from the shipped ones or from an upload's file; nothing is cached here.
 
         Args:
             head: description of the upload; None for a shipped phantom.
             name: of the sample.
             material: of an uploaded mesh; None: that of its description.
 
-        Returns:
-            The phantom, and the revision of an upload, else None.
-
-        Raises:
-            LimitError: a material for a shipped phantom.
-            UnknownNameError: no such sample.
-            PhantomError: an upload that cannot be read.
+        Returns the phantom, and the revision of an upload, else None.
+        Raises LimitError: a material for a shipped phantom; UnknownNameError: no such sample;
+        PhantomError: an upload that cannot be read.
         """
         if head is None:
             if material is not None:
@@ -598,15 +576,14 @@ def _head_of(file: str) -> Callable[[bytes], UploadHead]:
 
 
 def sample_material(head: UploadHead | None, material: str | None) -> str | None:
-    """Choose the material that an uploaded mesh is filled with: the requested one, else
-    that of its description, else `DEFAULT_MATERIAL`.
+    """Choose the material that an uploaded mesh is filled with: the requested one, else that of
+    its description, else `DEFAULT_MATERIAL`.
 
     Args:
         head: description of the upload; None for a shipped phantom.
         material: requested with the sample, if any.
 
-    Returns:
-        Name of the material; None for a sample that is no mesh.
+    Returns name of the material; None for a sample that is no mesh.
     """
     if head is None or head.kind != "mesh":
         return None

@@ -89,8 +89,7 @@ class TwinSession:
         control, and publish the state.
 
         If it was the controller, its way around obstacles ends with the leg under way.
-        Other motion goes on.
-        """
+        Other motion goes on."""
         if self._twin.control.holder == self._client.name:
             self._twin.detours.cancel()  # the controller's way ends with the present leg
         self._twin.hub.drop(self._client.peer)
@@ -98,15 +97,9 @@ class TwinSession:
         self._twin.feed.changed()
 
     def _take_control(self, what: str) -> None:
-        """Take control for the client if nobody holds it, and renew its lease; the state
-        is published only if the controller has changed.
-
-        Args:
-            what: method, for the error.
-
-        Raises:
-            RpcError: -32003, another client is the controller.
-        """
+        """Take control for the client if nobody holds it, and renew its lease; the state is
+        published only if the controller has changed. `what`: method, for the error. Raises
+        RpcError: -32003, another client is the controller."""
         before = self._twin.control.holder
         self._twin.control.require(self._client.name, what)
         if before != self._twin.control.holder:

@@ -109,19 +109,12 @@ class ControlLease:
             self._heard = self._clock()
 
     def require(self, who: str, what: str) -> None:
-        """Check that `who` may move: it has control already, or takes it because it is
-        free.
+        """Check that `who` may move: it has control already, or takes it because it is free.
 
-        Control is free without a holder, or after `idle_s` without a request of the
-        holder. The lease of `who` is renewed.
-
-        Args:
-            who: name of the client's connection.
-            what: method, for the error.
-
-        Raises:
-            RpcError: -32003, another client is the controller.
-        """
+        Control is free without a holder, or after `idle_s` without a request of the holder. The
+        lease of `who` is renewed.
+        `who`: name of the client's connection; `what`: method, for the error.
+        Raises RpcError: -32003, another client is the controller."""
         expired = self._clock() - self._heard > self._idle_s
         if self.holder is None or expired:
             self.holder = who
@@ -134,12 +127,8 @@ class ControlLease:
         return self.holder not in (None, who)
 
     def ensure_allowed(self, who: str, what: str) -> None:
-        """Check after a wait that `who` may still move: no other client has taken
-        control.
-
-        Raises:
-            RpcError: -32003, another client is the controller.
-        """
+        """Check after a wait that `who` may still move: no other client has taken control.
+        Raises RpcError: -32003, another client is the controller."""
         if self.is_observer(who):
             raise self._control_error(what)
 
@@ -750,17 +739,10 @@ class TwinServer:
         correction: NamedCorrection | None,
         upload: ReceivedSample | None = None,
     ) -> Guard | None:
-        """Build, in a thread, the guard that finds contacts with a sample and a
-        correction.
+        """Build, in a thread, the guard that finds contacts with a sample and a correction.
 
-        Args:
-            sample: on the stage.
-            correction: in force; None for none.
-            upload: as for `Stage.pieces`.
-
-        Returns:
-            The guard; None for a machine without components.
-        """
+        `sample`: on the stage. `correction`: in force; None for none. `upload`: as for
+        `Stage.pieces`. Returns the guard; None for a machine without components."""
         parameters = NOMINAL
         if correction is not None:
             parameters = correction.parameters

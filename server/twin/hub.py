@@ -132,13 +132,10 @@ class Hub:
         max_rate_hz: float | None = None,
         view: ImageRequest | None = None,
     ) -> None:
-        """Subscribe `listener` to `topics`, and send it the kept events that it has not
-        had.
+        """Subscribe `listener` to `topics`, and send it the kept events that it has not had.
 
-        Kept events are those of topics with a history, oldest first, at once and without
-        the rate.
-
-        A second call changes rate and view.
+        Kept events are those of topics with a history, oldest first, at once and without the
+        rate. A second call changes rate and view.
 
         Args:
             listener: connection.
@@ -146,9 +143,8 @@ class Hub:
             max_rate_hz: of events in slots; None for no limit.
             view: kind and binning of images.
 
-        Raises:
-            RpcError: -32003, more subscriptions or views than there may be; nothing has
-                changed.
+        Raises RpcError: -32003, more subscriptions or views than there may be; nothing has
+        changed.
         """
         interval = 0.0
         if max_rate_hz is not None:
@@ -203,8 +199,7 @@ class Hub:
         """End subscriptions of `listener` to `topics`; topics that it is not subscribed
         to are ignored.
 
-        Its events that wait for the rate are dropped.
-        """
+        Its events that wait for the rate are dropped."""
         for topic in topics:
             subscription = self._listeners.get(topic, {}).pop(listener, None)
             if subscription is not None and subscription.timer is not None:
@@ -266,18 +261,13 @@ class Hub:
         data: object | Render,
         slot: str | None = "",
     ) -> None:
-        """Send one subscriber of `topic` the present data, out of turn, with the number
-        of the last event.
+        """Send one subscriber of `topic` the present data, out of turn, with the number of the
+        last event.
 
-        Nothing is sent if it is not subscribed. Other subscribers, the history, the
-        numbers and the rate are not touched. Before the first event the number is 0.
-
-        Args:
-            listener: who has just subscribed.
-            topic: of the event.
-            data: as for `publish`.
-            slot: as for `publish`.
-        """
+        Nothing is sent if it is not subscribed. Other subscribers, the history, the numbers and
+        the rate are not touched. Before the first event the number is 0.
+        `listener`: who has just subscribed; `topic`: of the event; `data`: as for `publish`;
+        `slot`: as for `publish`."""
         subscription = self._listeners.get(topic, {}).get(listener)
         if subscription is not None:
             # Not a number of its own: to all other subscribers that would be a gap.

@@ -254,21 +254,17 @@ class LiveView:
     ) -> tuple[Radiograph, ConeVec]:
         """Compute the image of a shot without noise, and the shot's public geometry.
 
-        The image has the scanner's true geometry, and becomes the one that the state's
-        flags judge; not so with `predicted`.
+        The image has the scanner's true geometry, and becomes the one that the state's flags
+        judge; not so with `predicted`.
 
         Args:
             shot: pose, tube and camera.
             predicted: compute the image with the public geometry, and leave the state's
                 flags alone.
 
-        Returns:
-            The radiograph without noise, and one row of cone_vec, nominal plus
-            correction.
-
-        Raises:
-            ProjectorUnavailable: the projector does not answer.
-            GeometryError: a geometry no scanner can have.
+        Returns the radiograph without noise, and one row of cone_vec, nominal plus correction.
+        Raises ProjectorUnavailable: the projector does not answer; GeometryError: a geometry no
+        scanner can have.
         """
         scanner = self.scanner
         poses = scanner.poses_at(dict(shot.positions), shot.camera)

@@ -155,14 +155,8 @@ async def run(options: TwinSettings) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the twin's process until it is stopped.
 
-    It sets the level of the log and the interpreter's switch interval, `SWITCH_S`.
-
-    Args:
-        argv: arguments; None for those of the command line.
-
-    Returns:
-        The exit code.
-    """
+    It sets the level of the log and the interpreter's switch interval, `SWITCH_S`. `argv`:
+    arguments; None for those of the command line. Returns the exit code."""
     options = parse(TwinSettings, argv)
     set_up(level=LEVELS[options.log_level], apart=True)
     sys.setswitchinterval(SWITCH_S)

@@ -44,16 +44,9 @@ class Reader:
         """Decode the message of `raw`, or those of a batch.
 
         An empty batch gives (). The parameters stay pickled.
-
-        Args:
-            raw: bytes of the message.
-            wire: its connection.
-            urgent: whether it may be urgent; then it has a worker that larger messages do
-                not keep.
-
-        Raises:
-            RpcError: -32008, it cannot be read within the limits.
-        """
+        `raw`: bytes of the message. `wire`: its connection. `urgent`: whether it may be urgent;
+        then it has a worker that larger messages do not keep.
+        Raises RpcError: -32008, it cannot be read within the limits."""
         REQUESTER.set(Requester(wire, lambda: False))
         workers = self._urgent if urgent else self._ordinary
         kind, *items = await workers.ask(work, wire.codec, wire.max_batch, raw=(raw,))
@@ -68,8 +61,7 @@ class Reader:
 
 
 def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
-    """Decode a message or a batch and validate the parameters of its calls; runs in the
-    worker.
+    """Decode a message or a batch and validate the parameters of its calls; runs in the worker.
 
     A malformed message raises nothing: its error is pickled.
 
@@ -78,9 +70,8 @@ def work(codec: Codec | None, most: int, raw: bytes) -> list[bytes]:
         most: largest number of items in a batch.
         raw: bytes of the message.
 
-    Returns:
-        b"batch" or b"single", then for each item two entries: the method's name (b"" if
-        unknown or no call), and the pickle of `_pickled_call`.
+    Returns b"batch" or b"single", then for each item two entries: the method's name (b"" if
+    unknown or no call), and the pickle of `_pickled_call`.
     """
     message = Connection(codec, max_batch=most).decode(raw)
     batch = isinstance(message, m.Batch)

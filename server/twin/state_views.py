@@ -48,13 +48,9 @@ def derived(
 ) -> Value | None:
     """Compute a derived part of the state, whatever it meets.
 
-    Args:
-        missing: gets the reason under `name` where it could not be computed.
-        name: of the part.
-        make: computes it.
-
-    Returns:
-        The part; None where it could not be computed.
+    `missing`: gets the reason under `name` where it could not be computed; `name`: of the part;
+    `make`: computes it.
+    Returns the part; None where it could not be computed.
     """
     try:
         return make()
@@ -69,12 +65,8 @@ def derived(
 def geometry_view(readout: Readout | None) -> w.GeometryState:
     """Convert the derived geometry to its wire form.
 
-    Args:
-        readout: None for a pose whose rotation axis or detector is not in front of the
-            source.
-
-    Raises:
-        GeometryError: `readout` is None.
+    `readout`: None for a pose whose rotation axis or detector is not in front of the source.
+    Raises GeometryError: `readout` is None.
     """
     if readout is None:
         raise GeometryError(

@@ -178,13 +178,9 @@ class Substance:
 
     @classmethod
     def of(cls, name: str, formula: str, density_g_cm3: float) -> Substance:
-        """Make a chemical compound from formula and density, e.g. Substance.of("water",
-        "H2O", 1.0).
-
-        Raises:
-            UnknownNameError: an element the table does not have.
-            LimitError: a formula that cannot be read, or an impossible density.
-        """
+        """Make a chemical compound from formula and density, e.g. Substance.of("water", "H2O",
+        1.0). Raises UnknownNameError: an element the table does not have; LimitError: a formula
+        that cannot be read, or an impossible density."""
         return cls(
             name, tuple(mass_fractions(parse_formula(formula)).items()), density_g_cm3
         )
@@ -195,9 +191,8 @@ class Substance:
 
         Spaces around the formula are ignored; the substance's name is the whole text.
 
-        Raises:
-            UnknownNameError: as `of`.
-            LimitError: as `of`, or the density is missing or no number.
+        Raises UnknownNameError: as `of`; LimitError: as `of`, or the density is missing or no
+        number.
         """
         formula, _, density = text.partition("@")
         try:
@@ -276,14 +271,9 @@ def parse_formula(formula: str) -> dict[str, float]:
 def mass_fractions(atoms: Mapping[str, float]) -> dict[str, float]:
     """Compute the mass fractions of a compound's elements from its numbers of atoms.
 
-    Args:
-        atoms: symbol -> number of atoms, above 0.
-
-    Returns:
-        symbol -> fraction, in the same order; they add up to 1.
-
-    Raises:
-        UnknownNameError: the tables lack an element.
+    `atoms`: symbol -> number of atoms, above 0.
+    Returns symbol -> fraction, in the same order; they add up to 1.
+    Raises UnknownNameError: the tables lack an element.
     """
     masses = {
         symbol: n * float(tables().molar_mass[_row(symbol)])

@@ -138,8 +138,7 @@ class BeadModel:
         """Mean place of the beads, (3,) [mm]: the point of a phantom that is as its file says,
         whatever its scale and its shape are.
 
-        No image shows another one, and the origin of a file is where somebody drew it.
-        """
+        No image shows another one, and the origin of a file is where somebody drew it."""
         return np.asarray(self.beads.mean(axis=0))
 
     @property
@@ -247,16 +246,9 @@ def _centre(ball: Solid) -> FloatArray:
 
 
 def spot_radii(model: BeadModel, cone: ConeVec) -> FloatArray:
-    """Compute the radius of each bead's spot (minor semi-axis) to first order: radius
-    times magnification over the column pitch.
-
-    Args:
-        model: k beads.
-        cone: n views.
-
-    Returns:
-        (n, k) [px]; below 0 for a bead behind the source.
-    """
+    """Compute the radius of each bead's spot (minor semi-axis) to first order: radius times
+    magnification over the column pitch. `model`: k beads; `cone`: n views. Returns (n, k) [px];
+    below 0 for a bead behind the source."""
     depth = np.einsum("nkj,nj->nk", model.beads[None] - cone.source[:, None], cone.normal)
     scale = cone.source_detector_distance / np.linalg.norm(cone.u, axis=1)
     return np.asarray(model.bead_radius_mm[None] * scale[:, None] / depth)

@@ -99,17 +99,11 @@ def lag_of(
 def without_lag(frames: Frames, plan: Windows, lag: Lag) -> Float32Array:
     """Remove the lag of the frame before from the windows of every frame.
 
-    The lag in the two frames before is removed first. Pixels for which no frame before
-    has a value stay as they are; at least `LEAST_LIGHT` of the open beam is left.
-
-    Args:
-        frames: of the scan, in the order in which they were taken.
-        plan: windows round the beads of each frame.
-        lag: of the camera.
-
-    Returns:
-        Line integrals (n, k, side, side), nan where a frame has no image.
-    """
+    The lag in the two frames before is removed first. Pixels for which no frame before has a
+    value stay as they are; at least `LEAST_LIGHT` of the open beam is left.
+    `frames`: of the scan, in the order in which they were taken; `plan`: windows round the beads
+    of each frame; `lag`: of the camera.
+    Returns line integrals (n, k, side, side), nan where a frame has no image."""
     light = np.full((*plan.corner.shape[:2], plan.side, plan.side), np.nan)
     for back in (2, 1, 0):
         shown = np.exp(-np.roll(frames.windows(_rolled(plan, -back)), back, axis=0))
@@ -128,17 +122,12 @@ def _rolled(plan: Windows, step: int) -> Windows:
 def _near(
     corner: npt.NDArray[np.int64], plan: Windows, some: slice
 ) -> npt.NDArray[np.bool_]:
-    """Mark pixels of windows within reach of any bead that is predicted in that frame:
-    1.12 times its longer semi-axis and 3 px.
+    """Mark pixels of windows within reach of any bead that is predicted in that frame: 1.12
+    times its longer semi-axis and 3 px.
 
-    Args:
-        corner: (n, k, 2) corners of the windows.
-        plan: gives predictions and the size of windows.
-        some: frames of the plan, n of them.
-
-    Returns:
-        (n, k, side, side) bool.
-    """
+    `corner`: (n, k, 2) corners of the windows; `plan`: gives predictions and the size of
+    windows; `some`: frames of the plan, n of them.
+    Returns (n, k, side, side) bool."""
     reach = (1.12 * plan.radii * plan.stretch[..., 2] + 3.0)[some]
     out = np.zeros((*corner.shape[:2], plan.side, plan.side), dtype=bool)
     for bead in range(reach.shape[1]):

@@ -142,19 +142,15 @@ def _limits(state: Calibration, request: CalibrationRequest) -> dict[str, float]
 
 
 def _stated_arc(state: Calibration) -> float | None:
-    """Return the part of a step that an exposure lasts, if it is equal in all scans.
-
-    Returns:
-        None if the scans differ, or do not state it.
-    """
+    """Return the part of a step that an exposure lasts, if it is equal in all scans. Returns
+    None if the scans differ, or do not state it."""
     arcs = {scan.arc for scan in state.scans}
     return arcs.pop() if len(arcs) == 1 else None
 
 
 def _arc_left(state: Calibration) -> float | None:
     """Return the standard deviation of the squared share of a step that the spots' smear
-    leaves in their positions, the largest of all scans; None where it is not measured.
-    """
+    leaves in their positions, the largest of all scans; None where it is not measured."""
     left = [measured.smear.left for measured in state.measured]
     return max(left) if left and math.isfinite(max(left)) else None
 
@@ -221,8 +217,7 @@ def check_fixed(
 
     def without(name: str) -> FitResult:
         """Fit with one parameter's prior so wide that the images alone determine it,
-        without a bound.
-        """
+        without a bound."""
         alone = replace(asked, priors={**asked.priors, name: ANYWHERE}, bound=math.inf)
         return refit_scans(state, alone, fit)
 
@@ -278,15 +273,10 @@ def _contradicted(
 
     The free fit is judged if it has all of them; else a fit for each, with that one free.
 
-    Args:
-        state: the scans and their measurements.
-        asked: the user's request.
-        fit: its fit.
-        fixed: main parameters that it fixes, edge units; may be empty.
-        free: the fit with more parameters free, and the findings on its residuals.
-
-    Returns:
-        Findings on the residuals and on the first contradiction; None if there is none.
+    `state`: the scans and their measurements. `asked`: the user's request. `fit`: its fit.
+    `fixed`: main parameters that it fixes, edge units; may be empty. `free`: the fit with more
+    parameters free, and the findings on its residuals.
+    Returns findings on the residuals and on the first contradiction; None if there is none.
     """
     trials = [free]
     if not set(fixed) <= set(free[0].values):
@@ -304,16 +294,12 @@ def _contradicted(
 def _with_usual_priors(
     state: Calibration, asked: CalibrationRequest
 ) -> tuple[CalibrationRequest, dict[str, float]]:
-    """Give the parameters stated as exact (prior 0) their usual priors; not those that
-    only choose the object's frame when beads are anywhere.
+    """Give the parameters stated as exact (prior 0) their usual priors; not those that only
+    choose the object's frame when beads are anywhere.
 
-    Args:
-        state: the scans, which may state priors, too.
-        asked: the caller's request.
-
-    Returns:
-        The request with those priors, and the values that were exact, edge units; empty
-        if there are none.
+    `state`: the scans, which may state priors, too; `asked`: the caller's request.
+    Returns the request with those priors, and the values that were exact, edge units; empty if
+    there are none.
     """
     stated = stated_priors(state.scans, asked, state.model)
     defined = OF_FRAME if (asked.bead_tolerance_mm or 0.0) >= ANYWHERE else ()
@@ -330,18 +316,12 @@ def _left_by_priors(
     loose_fit: FitResult,
     explained: Sequence[Finding],
 ) -> list[Finding]:
-    """Return the findings on residuals that remain with wider priors, where priors are
-    off.
+    """Return the findings on residuals that remain with wider priors, where priors are off.
 
-    Args:
-        state: the scans and their measurements.
-        usual: request with its priors.
-        loose_fit: the fit with wider ones.
-        explained: findings with the priors; one on the beads' tolerance stays if that fit
-            frees beads.
-
-    Returns:
-        Findings without "misfit", and without what a wide prior of the distance hides.
+    `state`: the scans and their measurements. `usual`: request with its priors. `loose_fit`: the
+    fit with wider ones. `explained`: findings with the priors; one on the beads' tolerance stays
+    if that fit frees beads.
+    Returns findings without "misfit", and without what a wide prior of the distance hides.
     """
     priors = loosened({**usual.priors, **priors_of(state.scans, usual, state.model)})
     left = explain(state, replace(usual, priors=priors), loose_fit)[1]
@@ -355,14 +335,10 @@ def _left_by_priors(
 def _doubted(
     fit: FitResult, free_fit: FitResult, fixed: Mapping[str, float]
 ) -> FitResult:
-    """Widen the intervals by the change of each value between both fits, where the data
-    doubt fixed parameters by more than `DOUBT_SIGMAS`; else return `fit` as it is.
-
-    Args:
-        fit: with the fixed parameters.
-        free_fit: with more parameters free.
-        fixed: name -> fixed value, edge units.
-    """
+    """Widen the intervals by the change of each value between both fits, where the data doubt
+    fixed parameters by more than `DOUBT_SIGMAS`; else return `fit` as it is. `fit`: with the
+    fixed parameters; `free_fit`: with more parameters free; `fixed`: name -> fixed value, edge
+    units."""
     if max(held_distance(free_fit, fixed).values(), default=0.0) <= DOUBT_SIGMAS:
         return fit
     doubt = {n: free_fit.values.get(n, v) - v for n, v in fit.values.items()}
@@ -370,12 +346,11 @@ def _doubted(
 
 
 def _with_stated_priors(fit: FitResult, stated: FitResult) -> FitResult:
-    """Widen the intervals of a fit to widened priors so that they hold where the stated
-    ones are right, too: another cause may move the images as a scanner elsewhere does.
+    """Widen the intervals of a fit to widened priors so that they hold where the stated ones are
+    right, too: another cause may move the images as a scanner elsewhere does.
 
-    Args:
-        fit: with the widened priors.
-        stated: with the stated ones, of the same parameters; else nothing changes.
+    `fit`: with the widened priors. `stated`: with the stated ones, of the same parameters; else
+    nothing changes.
     """
     if list(fit.values) != list(stated.values):
         return fit

@@ -157,10 +157,8 @@ def _by_exposure(
 def _of_exposure(found: Identification, model: BeadModel, scan: Scan) -> Finding | None:
     """Make the error that shadows are drawn out by an exposure's arc; None if they are not.
 
-    Args:
-        found: an identification that says where the beads are.
-        model: the beads.
-        scan: its images.
+    `found`: an identification that says where the beads are; `model`: the beads; `scan`: its
+    images.
     """
     arc = seen_arc(scan, model, found.parameters)
     if arc is None:

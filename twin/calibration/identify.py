@@ -99,8 +99,7 @@ class Search:
 
     def allows(self, x: FloatArray, start: FloatArray) -> bool:
         """Check whether the six parameters `x` turn the phantom as far from `start`, (6,),
-        as `turn` says.
-        """
+        as `turn` says."""
         return not math.isinf(self.turn) and _turn_between(x, start) <= self.turn
 
 
@@ -451,9 +450,7 @@ def assign(
 def _shared(index: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
     """List the frames in which two beads have the same spot.
 
-    Args:
-        index: (n, k) spot of each bead, -1 without one.
-    """
+    `index`: (n, k) spot of each bead, -1 without one."""
     ordered = np.sort(index, axis=1)
     same = (ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)
     return np.flatnonzero(same.any(axis=1))
@@ -558,21 +555,14 @@ def _followed(
 def _rounds(
     problem: FitProblem, shadows: _Shadows, h: _Hypothesis, gates: Sequence[float]
 ) -> _Hypothesis:
-    """Refine one hypothesis: assign spots to beads and fit in a few steps, with ever
-    smaller gates.
+    """Refine one hypothesis: assign spots to beads and fit in a few steps, with ever smaller
+    gates.
 
-    A hypothesis without a finite loss takes its start from a vote. All rounds have the
-    same loss, capped at 40 px, so that hypotheses can be compared.
-
-    Args:
-        problem: of the fit.
-        shadows: the spots of all frames.
-        h: the hypothesis to refine.
-        gates: largest distances of a spot from its bead, one a round [px].
-
-    Returns:
-        The refined hypothesis; with the parameters of `h` and an infinite loss if it
-        failed.
+    A hypothesis without a finite loss takes its start from a vote. All rounds have the same
+    loss, capped at 40 px, so that hypotheses can be compared.
+    `problem`: of the fit; `shadows`: the spots of all frames; `h`: the hypothesis to refine;
+    `gates`: largest distances of a spot from its bead, one a round [px].
+    Returns the refined hypothesis; with the parameters of `h` and an infinite loss if it failed.
     """
     if math.isfinite(h.loss):
         x = h.x
@@ -626,10 +616,8 @@ def _with_tracks(
 ) -> FitProblem:
     """Return the problem with assigned spots as its measurements, each of unit weight.
 
-    Args:
-        problem: of the fit.
-        shadows: the spots.
-        index: (n, k) spot of each bead; negative: unseen.
+    `problem`: of the fit. `shadows`: the spots. `index`: (n, k) spot of each bead; negative:
+    unseen.
     """
     tracks, _, bias = shadows.picked(index, np.zeros((len(index), 2)))
     whiten = np.broadcast_to([1.0, 0.0, 1.0], (*index.shape, 3)).copy()
@@ -658,13 +646,8 @@ def _finalists(
     hypotheses: Sequence[_Hypothesis], base: FloatArray, how: Search
 ) -> list[_Hypothesis]:
     """Choose the best different hypotheses, `MAX_FINALISTS` of all and as many of those that
-    turn the phantom as is stated.
-
-    Args:
-        hypotheses: best first.
-        base: (6,) start of the search.
-        how: settings.
-    """
+    turn the phantom as is stated. `hypotheses`: best first; `base`: (6,) start of the search;
+    `how`: settings."""
     different = _different(hypotheses)
     stated = [h for h in different[MAX_FINALISTS:] if how.allows(h.x, base)]
     return different[:MAX_FINALISTS] + stated[:MAX_FINALISTS]
@@ -682,17 +665,12 @@ def _finish(
     how: Search,
     wide_px: float = 20.0,
 ) -> _Hypothesis:
-    """Assign and fit on all frames with up to 12 gates: from `wide_px`, halved until 20
-    px, then the search's final one.
+    """Assign and fit on all frames with up to 12 gates: from `wide_px`, halved until 20 px, then
+    the search's final one.
 
     Columns that the hypothesis lacks start at the problem's values.
-
-    Args:
-        problem: of all frames.
-        shadows: their spots.
-        h: the hypothesis.
-        how: settings.
-        wide_px: first gate [px].
+    `problem`: of all frames; `shadows`: their spots; `h`: the hypothesis; `how`: settings;
+    `wide_px`: first gate [px].
     """
     x = np.concatenate([h.x, problem.start[len(h.x) :]])
     gates = [max(wide_px, how.gate_px)]

@@ -169,19 +169,16 @@ def _detected(
 ) -> Calibration:
     """Detect spots in all frames, mark repeated frames, and judge the frames.
 
-    If a finding forbids using them and no settings were given, other spot sizes are
-    looked for, which may add findings.
+    If a finding forbids using them and no settings were given, other spot sizes are looked for,
+    which may add findings.
 
     Args:
         scans: the scans.
         model: the beads.
         detector: settings; None: from beads and geometry.
 
-    Returns:
-        The state with spots and findings.
-
-    Raises:
-        TwinError: scans share images.
+    Returns the state with spots and findings.
+    Raises TwinError: scans share images.
     """
     sought = [detector or detector_for(model, scan.poses) for scan in scans]
     looks = tuple(
@@ -201,19 +198,15 @@ def _detected(
 
 
 def _first_fit(state: Calibration, asked: CalibrationRequest) -> Fitted:
-    """Fit to the detected spots: with all six main parameters free if they are
-    determined, else with the requested ones.
+    """Fit to the detected spots: with all six main parameters free if they are determined, else
+    with the requested ones.
 
     The motion of single frames, if requested, is put into the poses, so that spots are looked
     for where they are. Adds findings on bead sizes if these are known and the fit is not
     singular.
 
-    Args:
-        state: scans with identified spots.
-        asked: the caller's request.
-
-    Returns:
-        State, the request that was fitted, the fit and its number of iterations.
+    `state`: scans with identified spots; `asked`: the caller's request.
+    Returns state, the request that was fitted, the fit and its number of iterations.
     """
     request = with_free(asked, SIX)
     fit = fit_scans(state, request)
@@ -261,16 +254,12 @@ def _second_fit(fitted: Fitted, solids: Scene | None) -> Fitted:
 def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
     """Explain the residuals, check the parameters that were not estimated, and add findings.
 
-    A motion that is requested is put into the poses at the end. Where light is missing, it is
-    a rival of a phantom of another shape.
+    A motion that is requested is put into the poses at the end. Where light is missing, it is a
+    rival of a phantom of another shape.
 
-    Args:
-        fitted: the last fit.
-        asked: the caller's request, whose fixed parameters are checked.
-
-    Returns:
-        The calibration, its fit relative to the caller's start and with the iterations of
-        all fits.
+    `fitted`: the last fit; `asked`: the caller's request, whose fixed parameters are checked.
+    Returns the calibration, its fit relative to the caller's start and with the iterations of
+    all fits.
     """
     state, request, fit = fitted.state, fitted.request, fitted.fit
     if state.motions:
@@ -288,18 +277,10 @@ def _diagnosed(fitted: Fitted, asked: CalibrationRequest) -> Calibration:
 def _judged_places(
     state: Calibration, fit: FitResult, explained: Sequence[Finding]
 ) -> Calibration:
-    """Judge places of spots without a bead, unless another finding than a misfit forbids
-    using the fit.
-
-    Args:
-        state: the calibration.
-        fit: its fit.
-        explained: findings on the residuals; not added.
-
-    Returns:
-        The state with at most one further finding a scan, and without `extra_spots` where a
-        displaced bead explains them.
-    """
+    """Judge places of spots without a bead, unless another finding than a misfit forbids using
+    the fit. `state`: the calibration. `fit`: its fit. `explained`: findings on the residuals;
+    not added. Returns the state with at most one further finding a scan, and without
+    `extra_spots` where a displaced bead explains them."""
     told = Findings(explained)
     if not told.errors.without(CalibrationCode.MISFIT) and not told.of(*OF_MOTION):
         # Of what moves, or turns otherwise than is said, all frames are elsewhere.

@@ -215,6 +215,5 @@ def _log_student(deviation: FloatArray, sigma: FloatArray) -> FloatArray:
 
 def _unexplained(deviation: FloatArray, sigma: FloatArray) -> float:
     """Compute the factor on standard deviations that explains the scatter of most
-    frames, 1 or more.
-    """
+    frames, 1 or more."""
     return max(ROBUST * float(np.median(np.abs(deviation / sigma))), 1.0)

@@ -142,12 +142,10 @@ def strain_prior(model: BeadModel, request: CalibrationRequest) -> Strain:
 
 
 def with_free(request: CalibrationRequest, names: Sequence[str]) -> CalibrationRequest:
-    """Return the request with further free parameters, each once; those that were fixed
-    lose the request's priors.
+    """Return the request with further free parameters, each once; those that were fixed lose the
+    request's priors.
 
-    Args:
-        request: not changed.
-        names: of parameters.
+    `request`: not changed; `names`: of parameters.
     """
     priors = {
         n: w for n, w in request.priors.items() if n in request.free or n not in names

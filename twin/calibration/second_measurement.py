@@ -242,16 +242,11 @@ def _judge_confirmation(state: Calibration) -> list[Finding]:
 
 
 def _moved_px(state: Calibration, fit: FitResult, plans: Sequence[Windows]) -> float:
-    """Compute the largest distance that a fit moved a bead from where its window was
-    planned, over beads with more than half of their spot in view.
+    """Compute the largest distance that a fit moved a bead from where its window was planned,
+    over beads with more than half of their spot in view.
 
-    Args:
-        state: the scans.
-        fit: the new geometry.
-        plans: windows of each scan.
-
-    Returns:
-        [px]; 0 without such beads.
+    `state`: the scans; `fit`: the new geometry; `plans`: windows of each scan.
+    Returns [px]; 0 without such beads.
     """
     worst = 0.0
     for g, (scan, plan) in enumerate(zip(state.scans, plans, strict=True)):

@@ -147,14 +147,11 @@ def triangulate(tracks: FloatArray, cone: ConeVec, shape: tuple[int, int]) -> Fl
 def centred(
     points: FloatArray, poses: Poses, shape: tuple[int, int], start: Offsets
 ) -> Offsets:
-    """Move the axis in `start` (dO_x) to the mean column of the spots: over a full turn
-    they agree. Other offsets stay.
+    """Move the axis in `start` (dO_x) to the mean column of the spots: over a full turn they
+    agree. Other offsets stay.
 
-    Args:
-        points: (n, m, 2) pixels, not finite without a spot; one finite at least.
-        poses: nominal geometry.
-        shape: detector (rows, cols).
-        start: offsets to begin with.
+    `points`: (n, m, 2) pixels, not finite without a spot; one finite at least. `poses`: nominal
+    geometry. `shape`: detector (rows, cols). `start`: offsets to begin with.
     """
     flat = points[np.isfinite(points).all(axis=2)]
     scale = float(np.median(np.linalg.norm(poses.u, axis=1) * poses.sod / poses.sdd))
@@ -169,13 +166,9 @@ def _rays(
 ) -> tuple[FloatArray, FloatArray]:
     """Compute the ray to each spot.
 
-    Args:
-        tracks: (n, k, 2) column and row [px], nan where unseen.
-        cone: geometry of the n frames.
-        shape: detector (rows, cols).
-
-    Returns:
-        Sources (n, 3) [mm] and unit directions (n, k, 3).
+    `tracks`: (n, k, 2) column and row [px], nan where unseen; `cone`: geometry of the n frames;
+    `shape`: detector (rows, cols).
+    Returns sources (n, 3) [mm] and unit directions (n, k, 3).
     """
     off = tracks - (np.array(shape[::-1]) - 1) / 2
     at = (

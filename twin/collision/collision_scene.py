@@ -108,14 +108,10 @@ class CollisionScene:
     """
 
     def separation(self, pair: tuple[int, int]) -> Separate:
-        """Return the function that certifies how far the two bodies of a pair are apart;
-        see `separation_of`.
+        """Return the function that certifies how far the two bodies of a pair are apart; see
+        `separation_of`.
 
-        It is made at the first call for a pair and kept.
-
-        Args:
-            pair: indices of the bodies.
-        """
+        It is made at the first call for a pair and kept. `pair`: indices of the bodies."""
         if pair not in self._separations:
             a, b = (self.bodies[i].solid for i in pair)
             self._separations[pair] = separation_of(a, b)
@@ -143,12 +139,8 @@ class CollisionScene:
         return PairStack.of(len(self.axes), self.bodies, (*self.pairs, *self.distant))
 
     def candidates(self, lower: FloatArray, upper: FloatArray) -> PairStack:
-        """Return the pairs to check while motors stay in [lower, upper]: the near ones,
-        or all if a motor may leave `reach`.
-
-        Args:
-            lower, upper: positions, (axes,) [mm, deg].
-        """
+        """Return the pairs to check while motors stay in [lower, upper]: the near ones, or all
+        if a motor may leave `reach`. `lower` and `upper`: positions, (axes,) [mm, deg]."""
         within = (lower >= self.reach[:, 0]).all() and (upper <= self.reach[:, 1]).all()
         return self.near if within else self.all
 
@@ -236,19 +228,12 @@ class PairStack:
         return np.abs(self.slides)
 
     def clearances(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
-        """Compute lower bounds of the clearances while motors stay within a box of
-        positions.
+        """Compute lower bounds of the clearances while motors stay within a box of positions.
 
-        Motors that carry both bodies of a pair cancel; turning bodies count at every
-        angle. Bodies are bounded by their boxes; where these may overlap the bound is 0.
-
-        Args:
-            lower: (..., axes) least positions [mm, deg].
-            upper: (..., axes) greatest positions.
-
-        Returns:
-            (..., m) [mm], never too large.
-        """
+        Motors that carry both bodies of a pair cancel; turning bodies count at every angle.
+        Bodies are bounded by their boxes; where these may overlap the bound is 0.
+        `lower`: (..., axes) least positions [mm, deg]; `upper`: (..., axes) greatest positions.
+        Returns (..., m) [mm], never too large."""
         shape = (*lower.shape[:-1], len(self.pairs), 3)
         middle = (0.5 * (lower + upper) @ self.slides).reshape(shape) + self.offset
         spread = (0.5 * (upper - lower) @ self._reach).reshape(shape)

@@ -178,29 +178,18 @@ def _clip(triangles: FloatArray, axis: int, at: float, side: float) -> FloatArra
 
 
 def _led_by(triangles: FloatArray, height: FloatArray, sign: float) -> FloatArray:
-    """Rotate the corners of triangles, in their order, so that the one with the largest
-    sign * height comes first.
-
-    Args:
-        triangles: (n, 3, 3) corners.
-        height: of the corners, (n, 3).
-        sign: +1 or -1.
-
-    Returns:
-        (n, 3, 3); the sense of turning stays.
-    """
+    """Rotate the corners of triangles, in their order, so that the one with the largest sign *
+    height comes first. `triangles`: (n, 3, 3) corners; `height`: of the corners, (n, 3); `sign`:
+    +1 or -1. Returns (n, 3, 3); the sense of turning stays."""
     first = np.argmax(sign * height, axis=1)
     order = (first[:, None] + np.arange(3)) % 3
     return np.take_along_axis(triangles, order[:, :, None], axis=1)
 
 
 def _crossing(start: FloatArray, end: FloatArray, axis: int, at: float) -> FloatArray:
-    """Compute where edges `start` to `end` (n, 3) cross the plane of coordinate `axis` at
-    `at` [mm].
-
-    Returns (n, 3); that coordinate is `at` exactly. Edges parallel to the plane are not
-    allowed.
-    """
+    """Compute where edges `start` to `end` (n, 3) cross the plane of coordinate `axis` at `at`
+    [mm]. Returns (n, 3); that coordinate is `at` exactly. Edges parallel to the plane are not
+    allowed."""
     share = (at - start[:, axis]) / (end[:, axis] - start[:, axis])
     points = start + share[:, None] * (end - start)
     points[:, axis] = at

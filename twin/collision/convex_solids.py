@@ -125,12 +125,10 @@ class UprightCylinder(ConvexSolid):
     height: float
 
     def farthest(self, directions: FloatArray) -> FloatArray:
-        """Find the point farthest along each of `directions` (..., 3): (..., 3) [mm], on
-        a rim.
+        """Find the point farthest along each of `directions` (..., 3): (..., 3) [mm], on a rim.
 
-        For a vertical direction it is the middle of the end face; a horizontal one gets a
-        rim by the sign of its zero.
-        """
+        For a vertical direction it is the middle of the end face; a horizontal one gets a rim by
+        the sign of its zero."""
         across = np.hypot(directions[..., 0], directions[..., 1])
         out = directions * (self.radius / np.where(across > 0.0, across, 1.0))[..., None]
         out[..., 2] = np.copysign(0.5 * self.height, directions[..., 2])

@@ -213,13 +213,9 @@ class PathSearch:
 
 
 def clearance(scene: CollisionScene, positions: Mapping[str, float]) -> NearestPair:
-    """Find the nearest pair of a pose among all that must not touch, with 0 for an
-    overlap; (inf, None) without pairs.
-
-    Args:
-        scene: bodies and pairs.
-        positions: motor -> position [mm, deg]; motors left out are at home.
-    """
+    """Find the nearest pair of a pose among all that must not touch, with 0 for an overlap;
+    (inf, None) without pairs. `scene`: bodies and pairs. `positions`: motor -> position [mm,
+    deg]; motors left out are at home."""
     q = scene.vector(positions)
     stack = scene.candidates(q, q)
     return _nearest(scene, q, stack.pairs, stack.clearances(q, q))
@@ -261,16 +257,12 @@ def clearance_trace(
 ) -> tuple[tuple[float, float, tuple[str, str] | None], ...]:
     """Compute the least clearance of the scene at moments of a path.
 
-    inf and None where no pair is near enough to be a candidate
-    (`CollisionScene.candidates`); () without times.
+    inf and None where no pair is near enough to be a candidate (`CollisionScene.candidates`); ()
+    without times.
 
-    Args:
-        scene: bodies and pairs.
-        path: of all motors.
-        times: moments [s]; outside the path its ends count.
-
-    Returns:
-        (time [s], clearance [mm], nearest pair or None) for each moment.
+    `scene`: bodies and pairs. `path`: of all motors. `times`: moments [s]; outside the path its
+    ends count.
+    Returns (time [s], clearance [mm], nearest pair or None) for each moment.
     """
     if len(times) == 0:
         return ()
@@ -287,16 +279,13 @@ def clearance_trace(
 def _nearest(
     scene: CollisionScene, q: FloatArray, pairs: Sequence[Pair], bounds: FloatArray
 ) -> NearestPair:
-    """Find the nearest pair with the motors at `q`; `bounds` are lower bounds of the
-    clearances.
+    """Find the nearest pair with the motors at `q`; `bounds` are lower bounds of the clearances.
 
-    A `NearestPair` of inf and None without pairs; of equal gaps the one with the smaller
-    bound is kept.
+    A `NearestPair` of inf and None without pairs; of equal gaps the one with the smaller bound
+    is kept.
 
-    Args:
-        q: (axes,) positions.
-        pairs: m candidates.
-        bounds: (m,) lower bounds of their clearances [mm].
+    `q`: (axes,) positions; `pairs`: m candidates; `bounds`: (m,) lower bounds of their
+    clearances [mm].
     """
     best = NearestPair(math.inf, None)
     for k in np.argsort(bounds, kind="stable").tolist():
@@ -310,18 +299,13 @@ def _nearest(
 
 
 def separation_at(scene: CollisionScene, pair: Pair, q: FloatArray) -> float:
-    """Compute the certified clearance [mm] of a pair with the motors at `q` (axes,); 0
-    for an overlap.
+    """Compute the certified clearance [mm] of a pair with the motors at `q` (axes,); 0 for an
+    overlap.
 
     It is never more than the true distance.
 
-    Args:
-        scene: the bodies.
-        pair: indices of two.
-        q: (axes,) positions [mm, deg].
-
-    Returns:
-        Clearance, never more than the true distance.
+    `scene`: the bodies; `pair`: indices of two; `q`: (axes,) positions [mm, deg].
+    Returns clearance, never more than the true distance.
     """
     a, b = (scene.bodies[i] for i in pair)
     offset = q @ (a.slides - b.slides) + (a.origin - b.origin)

@@ -62,15 +62,10 @@ class SceneGuard:
         return Contact(pair, now, here, here, now, near[pair], free_before=False)
 
     def standing(self, positions: Mapping[str, float]) -> SceneGuard:
-        """Return a guard with the stages on the turntable fixed where they are.
-
-        Contacts are then those of this pose, and not those of all that such a stage can
-        sweep with its sample. A scene without such stages, or of other bodies, gives this
-        guard itself.
-
-        Args:
-            positions: motor -> position [mm, deg].
-        """
+        """Return a guard with the stages on the turntable fixed where they are. Contacts are
+        then those of this pose, and not those of all that such a stage can sweep with its
+        sample. A scene without such stages, or of other bodies, gives this guard itself.
+        `positions`: motor -> position [mm, deg]."""
         parts = self.scene.parts
         if parts is None or not parts.mounts:
             return self
@@ -83,13 +78,9 @@ class SceneGuard:
 
         Of several bodies of one name the nearest counts; without `deep` an overlap is 0.
 
-        Args:
-            positions: motor -> position; motors left out are at home.
-            deep: measure overlaps, as negative clearances; it takes some milliseconds a
-                pair.
-
-        Returns:
-            Names -> clearance.
+        `positions`: motor -> position; motors left out are at home. `deep`: measure overlaps, as
+        negative clearances; it takes some milliseconds a pair.
+        Returns names -> clearance.
         """
         scene = self.scene
         q = self.scene.vector(positions)

@@ -104,13 +104,10 @@ def _planes(solid: Polytope) -> FloatArray:
 
 
 def _corners(planes: list[FloatArray], inside: FloatArray) -> FloatArray:
-    """Compute the corners (k, 3) of the body that planes (n, 4) bound, each once (to
-    1e-6).
+    """Compute the corners (k, 3) of the body that planes (n, 4) bound, each once (to 1e-6).
 
-    Args:
-        planes: unit normal n and offset d of each, with n . x + d <= 0 inside [mm].
-        inside: (3,) point strictly within.
-    """
+    `planes`: unit normal n and offset d of each, with n . x + d <= 0 inside [mm]. `inside`: (3,)
+    point strictly within."""
     from scipy.spatial import HalfspaceIntersection
 
     corners = HalfspaceIntersection(np.array(planes), inside).intersections

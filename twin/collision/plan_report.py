@@ -117,8 +117,7 @@ def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
     """Make an upright cylinder of a sample's size, centred on the stage's origin; () for
     no body.
 
-    No body without a size or diameter; without a height it is as high as wide.
-    """
+    No body without a size or diameter; without a height it is as high as wide."""
     if size is None or size.diameter_mm <= 0.0:
         return ()
     height = size.height_mm or size.diameter_mm
@@ -210,15 +209,11 @@ def _line(plan: ScanPlan, scene: CollisionScene, contact: Contact) -> int:
 def _trace_times(path: Path, count: int) -> FloatArray:
     """Choose about `count` times for a plot: half evenly by travel, half evenly by time.
 
-    Sorted, without repeats. Only start and end of the path if nothing moves or `count` is
-    below 2.
+    Sorted, without repeats. Only start and end of the path if nothing moves or `count` is below
+    2.
 
-    Args:
-        path: of all motors.
-        count: number of times.
-
-    Returns:
-        (m,) times [s], m at most `count` (or 2).
+    `path`: of all motors; `count`: number of times.
+    Returns (m,) times [s], m at most `count` (or 2).
     """
     travelled = np.abs(np.diff(path.q, axis=0)).sum(axis=1)
     along = np.concatenate([[0.0], np.cumsum(travelled)])

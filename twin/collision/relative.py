@@ -389,18 +389,14 @@ class _Turn:
     def lever(
         self, normal: FloatArray, orientation: FloatArray, allowance: float
     ) -> tuple[float, float]:
-        """Compute a bound of how fast the solid approaches by turning, and within what
-        turn it holds: (mm per rad, rad).
+        """Compute a bound of how fast the solid approaches by turning, and within what turn it
+        holds: (mm per rad, rad).
 
-        The crude bound, the reach across the axis, holds for any turn (inf) and is taken
-        where it is good enough. Else it is a chord, since the nearing along a fixed
-        normal is a convex function of the turn.
-
-        Args:
-            normal: (3,) unit direction from b to a.
-            orientation: of the body, (3, 3).
-            allowance: approach for which the bound is made [mm], > 0.
-        """
+        The crude bound, the reach across the axis, holds for any turn (inf) and is taken where
+        it is good enough. Else it is a chord, since the nearing along a fixed normal is a convex
+        function of the turn.
+        `normal`: (3,) unit direction from b to a; `orientation`: of the body, (3, 3);
+        `allowance`: approach for which the bound is made [mm], > 0."""
         along = float(normal @ self.body.spin_axis)
         crude = self.body.reach * math.sqrt(max(0.0, 1.0 - along * along))
         turn = self.body.turn_until(
@@ -705,9 +701,8 @@ def refine_pair(
         limits: margin, accuracy.
         best: clearance of interest [mm]; greater ones are not refined.
 
-    Returns:
-        A clearance that occurs, not more than `limits.slack` above the least (`best` if
-        nothing is below that), and the number of evaluations.
+    Returns a clearance that occurs, not more than `limits.slack` above the least (`best` if
+    nothing is below that), and the number of evaluations.
     """
     at: Moment | None = START
     looks = 0
@@ -725,11 +720,9 @@ def refine_pair(
 
 
 def _last_free(motion: RelativeMotion, before: Look, wanted: float) -> Moment:
-    """Find the moment after the look `before` until which the gap stays above `wanted`
-    [mm].
+    """Find the moment after the look `before` until which the gap stays above `wanted` [mm].
 
-    The look's own moment if its gap is not above that, or the gap never falls to it.
-    """
+    The look's own moment if its gap is not above that, or the gap never falls to it."""
     if before.gap <= wanted:
         return before.at
     return motion.next_at(before, wanted) or before.at

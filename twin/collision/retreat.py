@@ -55,13 +55,9 @@ def leaving(scene: CollisionScene, path: Path) -> Contact | None:
     """Find the first contact of a motion that begins with bodies overlapping; None for a
     retreat.
 
-    Pairs up to `GRAZING_MM` apart count as overlapping: they stop only what brings them
-    closer, or touches again once they were free (`_pair_contact`). All others keep the
-    margin.
-
-    Args:
-        scene: bodies and pairs that must not touch.
-        path: the motion.
+    Pairs up to `GRAZING_MM` apart count as overlapping: they stop only what brings them closer,
+    or touches again once they were free (`_pair_contact`). All others keep the margin.
+    `scene`: bodies and pairs that must not touch; `path`: the motion.
     """
     stuck = [pair for pair, gap in bodies_touching(scene, path.q[0]) if gap <= GRAZING_MM]
     others = first_contact(_without(scene, stuck), path)
@@ -113,13 +109,9 @@ def _deeper(
 
     The floor follows from the separation at the start and the margin (`safety.floor`).
 
-    Args:
-        motion: of one body relative to the other.
-        overlap: directions across which the bodies are judged.
-        margin: clearance to keep [mm].
-
-    Returns:
-        The moment of the look before, and that of the fall; None for never.
+    `motion`: of one body relative to the other; `overlap`: directions across which the bodies
+    are judged; `margin`: clearance to keep [mm].
+    Returns the moment of the look before, and that of the fall; None for never.
     """
     look = motion.look(START, overlap.separate)
     level = floor(look.gap, margin)
@@ -134,14 +126,12 @@ def _deeper(
 def _free_from(
     motion: RelativeMotion, separate: Separate, limits: Limits, until: float
 ) -> float | None:
-    """Find when the gap of two bodies exceeds margin plus tolerance, before the time
-    `until`.
+    """Find when the gap of two bodies exceeds margin plus tolerance, before the time `until`.
 
-    It is looked at from the start, each time after the travel that could open it to
-    margin plus two tolerances.
+    It is looked at from the start, each time after the travel that could open it to margin plus
+    two tolerances.
 
-    Returns:
-        Time of the first such look [s]; None if there is none.
+    Returns time of the first such look [s]; None if there is none.
     """
     at: Moment | None = START
     while at is not None and motion.time(at) < until:

@@ -153,12 +153,9 @@ def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
     Args:
         solid: in its own frame.
 
-    Returns:
-        The shape, and its own centre in the solid's frame (3,) [mm]; the origin for a
-        polytope.
-
-    Raises:
-        TypeError: neither cylinder nor polytope.
+    Returns the shape, and its own centre in the solid's frame (3,) [mm]; the origin for a
+    polytope.
+    Raises TypeError: neither cylinder nor polytope.
     """
     import fcl
 

@@ -392,18 +392,12 @@ def _panel_turn(profile: Profile, p: Offsets) -> FloatArray:
 def _placed(
     piece: ConvexSolid, place: FloatArray, tau: FloatArray
 ) -> UprightCylinder | Polytope:
-    """Move a sample's piece by p -> place (p - tau); return it as it is if that changes
-    nothing.
+    """Move a sample's piece by p -> place (p - tau); return it as it is if that changes nothing.
 
     A moved cylinder becomes a prism around it.
 
-    Args:
-        piece: cylinder or polytope [mm].
-        place: (3, 3) rotation.
-        tau: (3,) [mm].
-
-    Raises:
-        TypeError: another kind of solid.
+    `piece`: cylinder or polytope [mm]; `place`: (3, 3) rotation; `tau`: (3,) [mm].
+    Raises TypeError: another kind of solid.
     """
     if not isinstance(piece, (UprightCylinder, Polytope)):
         raise TypeError(f"cannot place a {type(piece).__name__}")
@@ -418,8 +412,7 @@ def _group(machine: Machine, part: Component) -> str:
     """Return the name of the first part, from `part` up its parents, that a motor moves;
     "" if none does.
 
-    Parts of one group are fixed to each other.
-    """
+    Parts of one group are fixed to each other."""
     named = {c.name: c for c in machine.components}
     while part.axis is None and part.parent is not None:
         part = named[part.parent]

@@ -33,12 +33,8 @@ def plain_name(name: str, what: str = "file") -> str:
 
     The rules are those of `_reason`.
 
-    Args:
-        name: as it came.
-        what: kind of the named thing, for the message.
-
-    Raises:
-        DatasetNameError: the name is not allowed; the message names the rule.
+    `name`: as it came; `what`: kind of the named thing, for the message.
+    Raises DatasetNameError: the name is not allowed; the message names the rule.
     """
     reason = _reason(name)
     if reason is not None:

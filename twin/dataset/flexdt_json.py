@@ -284,8 +284,7 @@ class ScanRecord(ArrayValue):
 
     def poses_of(self, block: FrameBlock) -> Poses:
         """Compute nominal poses of a block's images, without limits and correction
-        (`motor_poses`).
-        """
+        (`motor_poses`)."""
         return motor_poses(self.machine, self.profile, block.camera, block.positions)
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:
@@ -355,9 +354,8 @@ def _flat_axis(machine: Machine, blocks: Sequence[FrameBlock]) -> str:
         machine: whose turning motors do not count.
         blocks: images with their motor positions.
 
-    Returns:
-        The motor that is farthest from its place then; "" if none is more than 1 mm off,
-        or flats or projections are missing.
+    Returns the motor that is farthest from its place then; "" if none is more than 1 mm off, or
+    flats or projections are missing.
     """
     flats = next((b for b in blocks if b.kind == "flat"), None)
     scans = next((b for b in blocks if b.kind == "projection"), None)
@@ -609,8 +607,7 @@ class DatasetDocument(_Model):
         """Collect the motor positions of the frames of one kind: motor -> (n,) [mm, deg].
 
         The motors are those of the first such frame; {} if there is none. KeyError if a
-        later frame lacks one.
-        """
+        later frame lacks one."""
         chosen = [f.positions for f in self.frames if f.kind == kind]
         return {
             n: np.array([p[n] for p in chosen]) for n in (chosen[0] if chosen else {})
@@ -656,20 +653,14 @@ class DatasetDocument(_Model):
     ) -> Poses:
         """Compute nominal poses of the frames of one kind from their motor positions.
 
-        The camera is each frame's; frames of one mode and region in a row must name the
-        same motors. No correction is applied; limits are not checked.
+        The camera is each frame's; frames of one mode and region in a row must name the same
+        motors. No correction is applied; limits are not checked.
 
-        Args:
-            machine: whose geometry and sensor are used.
-            profile: zero offsets.
-            kind: of the frames.
-
-        Returns:
-            n poses, in the order of the frames; none without such frames.
-
-        Raises:
-            TwinError: `machine` does not have a motor, or a camera mode does not exist.
-            DatasetFormatError: frames name different motors.
+        `machine`: whose geometry and sensor are used; `profile`: zero offsets; `kind`: of the
+        frames.
+        Returns n poses, in the order of the frames; none without such frames.
+        Raises TwinError: `machine` does not have a motor, or a camera mode does not exist;
+        DatasetFormatError: frames name different motors.
         """
         chosen = [f for f in self.frames if f.kind == kind]
         parts = []

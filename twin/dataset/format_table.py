@@ -133,8 +133,7 @@ def refused(
     of: Part = Part.NONE,
 ) -> Field:
     """Make a field whose value makes a scan impossible to read, unless what it states is
-    given in its place.
-    """
+    given in its place."""
     return Field(name, meaning, Role.REFUSED, because, neutral=neutral, of=of)
 
 
@@ -244,13 +243,9 @@ class Ledger:
     ) -> None:
         """Enter a value of the file, in its order; every one is entered once.
 
-        Args:
-            name: of its field, as the table has it.
-            value: as text.
-            place: where it stands in the file, if that is not the field's name.
-            listed: whether it belongs to a member of a list, whose others state other
-                things.
-        """
+        `name`: of its field, as the table has it; `value`: as text; `place`: where it stands in
+        the file, if that is not the field's name; `listed`: whether it belongs to a member of a
+        list, whose others state other things."""
         entry = _Entry(place or name, name, str(value))
         self._entries.append(entry)
         if listed:
@@ -337,12 +332,8 @@ class Ledger:
         return re.split(r"[\s(]", text)[0] not in OFF
 
     def set_aside(self, name: str, consequence: str) -> None:
-        """Say that a value is contradicted by one that was taken; one warning has both.
-
-        Args:
-            name: of its field.
-            consequence: both values, and which was taken.
-        """
+        """Say that a value is contradicted by one that was taken; one warning has both. `name`:
+        of its field; `consequence`: both values, and which was taken."""
         self._mark(name, Use.CONTRADICTED, consequence)
         self.warnings.append(f"{self.file}: {consequence}")
 

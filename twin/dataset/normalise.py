@@ -55,8 +55,7 @@ class LineIntegrals:
 
         Pixels whose flat is not at least `MIN_FLAT` above the dark are dead, NaN too.
 
-        Raises:
-            DatasetFormatError: no pixel of the flat is brighter than the dark image.
+        Raises DatasetFormatError: no pixel of the flat is brighter than the dark image.
         """
         opened = np.asarray(flat, dtype=np.float32) - np.asarray(dark, dtype=np.float32)
         dead = ~(opened >= MIN_FLAT)
@@ -68,30 +67,20 @@ class LineIntegrals:
     def interpolating(self, mask: npt.NDArray[np.bool_]) -> LineIntegrals:
         """Return a conversion that interpolates more pixels.
 
-        Pixels that are dead already stay so. If no pixel would be left, the conversion
-        itself is returned.
-
-        Args:
-            mask: (rows, cols), True for pixels to interpolate.
-        """
+        Pixels that are dead already stay so. If no pixel would be left, the conversion itself is
+        returned. `mask`: (rows, cols), True for pixels to interpolate."""
         dead = self.dead | mask
         if dead.all():
             return self
         return LineIntegrals(self.dark, self.log_open, dead, *_neighbours(dead))
 
     def __call__(self, counts: npt.NDArray[np.generic]) -> Float32Array:
-        """Convert an image of counts to line integrals; dead pixels are interpolated in
-        their row.
+        """Convert an image of counts to line integrals; dead pixels are interpolated in their
+        row.
 
-        Counts less the dark are taken as at least `MIN_COUNTS`; `counts` is not changed.
-        A dead pixel without a live one on both sides gets the nearest live pixel's value.
-
-        Args:
-            counts: (rows, cols).
-
-        Returns:
-            float32 (rows, cols), finite.
-        """
+        Counts less the dark are taken as at least `MIN_COUNTS`; `counts` is not changed. A dead
+        pixel without a live one on both sides gets the nearest live pixel's value. `counts`:
+        (rows, cols). Returns float32 (rows, cols), finite."""
         out: Float32Array = np.subtract(counts, self.dark, dtype=np.float32)
         np.maximum(out, np.float32(MIN_COUNTS), out=out)
         np.log(out, out=out)

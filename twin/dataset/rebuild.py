@@ -49,23 +49,16 @@ class Rebuilt:
 
 
 def angles_deg(settings: ScanSettings, count: int, file: str) -> FloatArray:
-    """Compute stage angles of images 0 to count - 1 by the smooth-scan rule: i * (last -
-    start) / (N - 1).
+    """Compute stage angles of images 0 to count - 1 by the smooth-scan rule: i * (last - start)
+    / (N - 1).
 
     N is `count` where the texts state none; the step is 0 for N up to 1. Images beyond N
     continue the rule.
 
-    Args:
-        settings: gives N ("# projections"), start and last angle; rot_obj there is the
-            run-up position and does not enter.
-        count: number of images wanted.
-        file: for error messages.
-
-    Returns:
-        Angles (count,) [deg].
-
-    Raises:
-        DatasetFormatError: the texts state no angles.
+    `settings`: gives N ("# projections"), start and last angle; rot_obj there is the run-up
+    position and does not enter. `count`: number of images wanted. `file`: for error messages.
+    Returns angles (count,) [deg].
+    Raises DatasetFormatError: the texts state no angles.
     """
     start = settings.start_angle_deg
     last = settings.last_angle_deg
@@ -210,22 +203,16 @@ def _profile(
     positions: Mapping[str, FloatArray],
     printed: Figures | None,
 ) -> tuple[Profile, str] | None:
-    """Choose the only profile given, or the first of this machine that reproduces the
-    printed figures.
+    """Choose the only profile given, or the first of this machine that reproduces the printed
+    figures.
 
-    Compared at the first image's positions (`_figures_agree`). Zero offsets are tried
-    last, only for a machine without a default profile.
+    Compared at the first image's positions (`_figures_agree`). Zero offsets are tried last, only
+    for a machine without a default profile.
 
-    Args:
-        machine: whose profiles count.
-        profiles: candidates of any machine; one alone is taken as it is.
-        camera: of the images.
-        positions: motor -> (n,) positions [mm, deg].
-        printed: figures of the texts; None: the machine's default profile is taken,
-            unchecked.
-
-    Returns:
-        The profile and the reason for the choice; None if no profile fits.
+    `machine`: whose profiles count. `profiles`: candidates of any machine; one alone is taken as
+    it is. `camera`: of the images. `positions`: motor -> (n,) positions [mm, deg]. `printed`:
+    figures of the texts; None: the machine's default profile is taken, unchecked.
+    Returns the profile and the reason for the choice; None if no profile fits.
     """
     if len(profiles) == 1:
         return profiles[0], ": as asked"
@@ -333,11 +320,8 @@ def _camera(
         file: for error messages.
         modes: named modes of the machine: name, binning.
 
-    Returns:
-        The settings; None if the texts lack ROI or mode, or the mode is unknown.
-
-    Raises:
-        DatasetFormatError: ROI and mode give images of another shape.
+    Returns the settings; None if the texts lack ROI or mode, or the mode is unknown.
+    Raises DatasetFormatError: ROI and mode give images of another shape.
     """
     if settings.roi is None or settings.mode is None:
         return None
@@ -360,8 +344,7 @@ def _figures_agree(ours: Figures, printed: Figures) -> bool:
     and 1e-5 mm of pitch.
 
     SOD and SDD are compared in mm, HC, VC and COR in pixels; every figure must differ by
-    less.
-    """
+    less."""
     slack = {"sod_mm": MATCH_MM, "sdd_mm": MATCH_MM, "pixel_mm": 1e-5}
     return all(
         abs(value - getattr(printed, name)) < slack.get(name, MATCH_PX)

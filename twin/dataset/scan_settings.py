@@ -67,11 +67,8 @@ class Entry:
 def _stated(
     kind: Kind, key: str, section: str = "", xre_key: str = "", *, separator: str = " : "
 ) -> Any:
-    """Make a field of `ScanSettings`, None by default, whose metadata has its `Entry` in
-    the two settings texts.
-
-    Without `section` the XRE text has no such entry.
-    """
+    """Make a field of `ScanSettings`, None by default, whose metadata has its `Entry` in the two
+    settings texts. Without `section` the XRE text has no such entry."""
     xre = (section, xre_key) if section else None
     return field(default=None, metadata={"entry": Entry(kind, key, xre, separator)})
 

@@ -69,14 +69,12 @@ def clean(text: str) -> str:
 
 
 def parse_number(text: str) -> float:
-    """Read a finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`,
-    `874.6E-9`.
+    """Read a finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`, `874.6E-9`.
 
-    One comma without a point is the decimal sign; all after a space is dropped. Infinity,
-    NaN and underscores are errors.
+    One comma without a point is the decimal sign; all after a space is dropped. Infinity, NaN
+    and underscores are errors.
 
-    Raises:
-        ValueError: it is not a number.
+    Raises ValueError: it is not a number.
     """
     word = text.strip().rstrip(";").strip().split(" ")[0]
     if word.count(",") == 1 and "." not in word:
@@ -101,9 +99,7 @@ def parse_roi(text: str) -> Roi:
     """Read four whole numbers, left, top, right, bottom, with any separators.
 
     Decimals that are zero are allowed; order and sensor are not checked.
-
-    Raises:
-        ValueError: there are not exactly four.
+    Raises ValueError: there are not exactly four.
     """
     words = re.findall(r"-?\d+(?:\.0*)?", text)
     if len(words) != 4:
@@ -315,13 +311,11 @@ def _split(line: str) -> tuple[str | None, str]:
 
 
 def _read_field(field: str, value: str, values: dict[str, Any]) -> None:
-    """Read a value into `values[field]`, unless it is there; a serial number behind the
-    scanner type goes to `serial`.
+    """Read a value into `values[field]`, unless it is there; a serial number behind the scanner
+    type goes to `serial`.
 
     An empty value is skipped unless the field is a text.
-
-    Raises:
-        ValueError: the value is not of the field's form.
+    Raises ValueError: the value is not of the field's form.
     """
     if field == "scanner_type" and _SERIAL in value:
         value, serial = value.split(_SERIAL, 1)

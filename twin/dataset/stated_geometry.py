@@ -64,15 +64,12 @@ class Figures:
 
 
 def figures_of(pose: Poses, shape: tuple[int, int]) -> Figures:
-    """Compute the figures of one nominal pose: SOD, SDD [mm], HC, VC, COR [px, from the
-    edge] and pixel [mm].
+    """Compute the figures of one nominal pose: SOD, SDD [mm], HC, VC, COR [px, from the edge]
+    and pixel [mm].
 
-    COR is the column of the rotation axis at the source's height; the pixel is the pitch
-    from column to column.
-
-    Args:
-        pose: one (n = 1).
-        shape: image (rows, cols).
+    COR is the column of the rotation axis at the source's height; the pixel is the pitch from
+    column to column.
+    `pose`: one (n = 1); `shape`: image (rows, cols).
     """
     cone = pose.cone_vec()
     hc, vc = (cone.piercing_points(shape)[0] + EDGE).tolist()
@@ -92,21 +89,15 @@ def poses_of(
     source_z: float = 0.0,
     axis_z: float = 0.0,
 ) -> Poses:
-    """Compute poses with these figures and an upright detector; the inverse of
-    `figures_of`.
+    """Compute poses with these figures and an upright detector; the inverse of `figures_of`.
 
-    Pixels are square; the source is at y = 0. The figures do not determine the scanner's
-    origin and the sample's height, so those are arguments.
+    Pixels are square; the source is at y = 0. The figures do not determine the scanner's origin
+    and the sample's height, so those are arguments.
 
-    Args:
-        figures: as printed.
-        shape: image (rows, cols).
-        angles: stage angle of each frame, (n,) [rad].
-        source_x, source_z: focal spot [mm], world.
-        axis_z: height of the sample's reference point [mm], world.
-
-    Returns:
-        n poses.
+    `figures`: as printed; `shape`: image (rows, cols); `angles`: stage angle of each frame, (n,)
+    [rad]; `source_x` and `source_z`: focal spot [mm], world; `axis_z`: height of the sample's
+    reference point [mm], world.
+    Returns n poses.
     """
     f, (rows, cols) = figures, shape
     axis_x = source_x + (f.cor_px - f.hc_px) * f.pixel_mm * f.sod_mm / f.sdd_mm

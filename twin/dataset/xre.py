@@ -121,12 +121,9 @@ def format_settings(settings: ScanSettings) -> str:
 
 
 def format_sections(sections: Sections) -> str:
-    """Format sections as text with CRLF: `[name]`, one line for each entry, and an empty
-    line between sections.
-
-    Texts are quoted, truth values TRUE and FALSE, whole numbers without decimals, others
-    with six.
-    """
+    """Format sections as text with CRLF: `[name]`, one line for each entry, and an empty line
+    between sections. Texts are quoted, truth values TRUE and FALSE, whole numbers without
+    decimals, others with six."""
     blocks = [
         f"[{clean(name)}]{EOL}{_lines(entries)}" for name, entries in sections.items()
     ]
@@ -209,17 +206,11 @@ def _entry(
     track: bool = False,
     safe: bool = True,
 ) -> str:
-    """Format one place with its three axes, a radius and a height, as one text of the XRE
-    file.
+    """Format one place with its three axes, a radius and a height, as one text of the XRE file.
 
     The movable range is always infinite.
-
-    Args:
-        place: (3,) [mm], world frame.
-        x, y, z: axes, (3,) each.
-        radius, height: of the thing there [mm]; -1: no height.
-        track, safe: switches of the entry.
-    """
+    `place`: (3,) [mm], world frame. `x` and `y` and `z`: axes, (3,) each. `radius` and `height`:
+    of the thing there [mm]; -1: no height. `track` and `safe`: switches of the entry."""
     return (
         f"WC{_triple(place)}dirX{_triple(x)}dirY{_triple(y)}dirZ{_triple(z)}radius[{radius:f}]"
         f"height[{height:f}]track[{str(track).upper()}]safe range?[{str(safe).upper()}]"
@@ -234,8 +225,7 @@ def _word(name: str) -> str:
 
 def _triple(vector: Sequence[float] | FloatArray) -> str:
     """Format a vector as "[x;y;z]" with up to four decimals, without trailing zeros and
-    minus zero.
-    """
+    minus zero."""
     texts = [f"{value:.4f}".rstrip("0").rstrip(".") for value in vector]
     return f"[{';'.join('0' if text in ('-0', '') else text for text in texts)}]"
 

@@ -33,13 +33,11 @@ class XreSettings:
         )
 
     def number(self, section: str, key: str) -> float | None:
-        """Return an entry's value as a number (`parse_number`); None if it is absent or
-        empty.
+        """Return an entry's value as a number (`parse_number`); None if it is absent or empty.
 
         Case of section and key does not matter.
 
-        Raises:
-            DatasetFormatError: it is present and not a number.
+        Raises DatasetFormatError: it is present and not a number.
         """
         text = self.text(section, key)
         if text is None:
@@ -105,8 +103,7 @@ class XreSettings:
     @property
     def one_circle(self) -> bool:
         """True if one pose and one angle rule describe the scan, or if that is not
-        stated.
-        """
+        stated."""
         sections = self.number("Acquisition settings", "nr of sections")
         return sections is None or sections <= 1.0
 

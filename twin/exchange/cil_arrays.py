@@ -50,18 +50,14 @@ ORIGINS: Final = {
 def cil_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to CIL's arguments.
 
-    Rows point up, so their direction is -v; num_pixels and pixel_size are (columns,
-    rows).
+    Rows point up, so their direction is -v; num_pixels and pixel_size are (columns, rows).
 
     Args:
         geometry: with the detector's shape.
 
-    Returns:
-        Name (of `POSES` and `PANEL`) -> array: places and unit directions (n, 3) [mm],
-        numbers and sizes of pixels, origin of the panel.
-
-    Raises:
-        ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
+    Returns name (of `POSES` and `PANEL`) -> array: places and unit directions (n, 3) [mm],
+    numbers and sizes of pixels, origin of the panel.
+    Raises ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
     """
     rows, columns = require_shape(geometry, "CIL")
     pitch_u, pitch_v = require_panel(geometry.cone_vec, "CIL")

@@ -118,17 +118,12 @@ def flexdata_text(geometry: ScanGeometry) -> str:
 
 
 def _angles(axes: FloatArray) -> tuple[float, float, float]:
-    """Compute a panel's roll about y, yaw about the turned z and pitch about the turned x
-    [rad], in this order.
+    """Compute a panel's roll about y, yaw about the turned z and pitch about the turned x [rad],
+    in this order.
 
-    Args:
-        axes: (3, 3); columns are the panel's x, y and z.
-
-    Returns:
-        Roll, yaw, pitch.
-
-    Raises:
-        ExchangeError: the rows run along the beam.
+    `axes`: (3, 3); columns are the panel's x, y and z.
+    Returns roll, yaw, pitch.
+    Raises ExchangeError: the rows run along the beam.
     """
     yaw = math.asin(max(-1.0, min(1.0, axes[1, 0])))
     if math.hypot(axes[0, 0], axes[2, 0]) < 1e-9:

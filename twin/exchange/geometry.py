@@ -77,11 +77,7 @@ class ScanGeometry:
 
     def accounted(self, said: Ledger) -> ScanGeometry:
         """Return the geometry with what became of its file's values, and what they told as
-        notes.
-
-        Raises:
-            TwinError: of the ledger: a value that is refused has an effect.
-        """
+        notes. Raises TwinError: of the ledger: a value that is refused has an effect."""
         values = said.finish()
         notes = (*self.notes, *said.warnings)
         return replace(self, notes=notes, provenance=self.provenance.and_also(values))
@@ -101,8 +97,7 @@ class ScanGeometry:
         `real` too.
 
         It belongs to images that are turned upside down. Twice gives the same geometry;
-        files, shape and notes stay.
-        """
+        files, shape and notes stay."""
         down = np.repeat([1.0, -1.0], [9, 3])
         real = None
         if self.real is not None:
@@ -190,15 +185,11 @@ def circle_of(
 def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
     """Return the pixel pitch (u, v) [mm] of a panel with rectangular pixels of one size.
 
-    Orthogonal, and of one length over the views, within `SQUARE_TOLERANCE`; u and v may
-    differ. The pitches are means over the views.
+    Orthogonal, and of one length over the views, within `SQUARE_TOLERANCE`; u and v may differ.
+    The pitches are means over the views.
 
-    Args:
-        cone_vec: n views.
-        format_name: format that needs such a panel, for the message.
-
-    Raises:
-        ExchangeError: u and v are not orthogonal, or their lengths vary; names the view.
+    `cone_vec`: n views; `format_name`: format that needs such a panel, for the message.
+    Raises ExchangeError: u and v are not orthogonal, or their lengths vary; names the view.
     """
     u, v = cone_vec.u, cone_vec.v
     lengths = np.stack([np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)], axis=1)
@@ -215,13 +206,9 @@ def require_panel(cone_vec: ConeVec, format_name: str) -> tuple[float, float]:
 def require_each(what: str, off: FloatArray, most: float) -> None:
     """Check that a figure of every view, (n,), n > 0, is at most `most`.
 
-    Args:
-        what: name of the figure, for the message.
-        off: (n,) the figure.
-        most: greatest value allowed.
-
-    Raises:
-        ExchangeError: one is above; names the view with the largest.
+    `what`: name of the figure, for the message; `off`: (n,) the figure; `most`: greatest value
+    allowed.
+    Raises ExchangeError: one is above; names the view with the largest.
     """
     view = int(np.argmax(off))
     if off[view] > most:

@@ -44,14 +44,10 @@ NAMES: Final = (*COUNTS, *SIZES, SOURCE, DETECTOR, ROWS, COLUMNS)
 def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to LEAP's arguments by name, in double precision.
 
-    Source and panel centre [mm], unit vectors of rows and columns, (n, 3) each; counts
-    and pixel sizes are scalars.
-
-    Args:
-        geometry: with the detector's shape.
-
-    Raises:
-        ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
+    Source and panel centre [mm], unit vectors of rows and columns, (n, 3) each; counts and pixel
+    sizes are scalars.
+    `geometry`: with the detector's shape.
+    Raises ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
     """
     rows, columns = require_shape(geometry, "LEAP")
     pitch_u, pitch_v = require_panel(geometry.cone_vec, "LEAP")

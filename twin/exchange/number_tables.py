@@ -43,11 +43,8 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 def vectors_text(geometry: ScanGeometry) -> str:
-    """Format a geometry as ASTRA's cone_vec text, a line of twelve numbers for each view,
-    in full precision.
-
-    Shape and files are not in it.
-    """
+    """Format a geometry as ASTRA's cone_vec text, a line of twelve numbers for each view, in
+    full precision. Shape and files are not in it."""
     return "".join(
         " ".join(map(repr, row)) + "\n" for row in geometry.cone_vec.rows.tolist()
     )
@@ -97,8 +94,7 @@ def read_vectors_array(
 ) -> ScanGeometry:
     """Read ASTRA's cone_vec from an array (n, 12) of integers or floats.
 
-    Raises:
-        ExchangeError: the shape or type is different.
+    Raises ExchangeError: the shape or type is different.
     """
     if array.ndim != 2 or array.shape[1] != 12 or not _real(array):
         message = f"{file}: an array of {array.dtype}"
@@ -190,14 +186,9 @@ def tomosipo_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]
 
     The names are those of `TOMOSIPO_NAMES`; the shape is (rows, columns).
 
-    Args:
-        geometry: with the detector's shape.
-
-    Returns:
-        Name -> array: shape (2,), and vectors (n, 3) as z, y, x [mm].
-
-    Raises:
-        ExchangeError: the detector's shape is unknown.
+    `geometry`: with the detector's shape.
+    Returns name -> array: shape (2,), and vectors (n, 3) as z, y, x [mm].
+    Raises ExchangeError: the detector's shape is unknown.
     """
     if geometry.shape is None:
         raise ExchangeError(
@@ -285,9 +276,7 @@ def _numbers(words: Sequence[str], file: str, line: int) -> list[float]:
         file: for messages.
         line: number of the line, for messages.
 
-    Raises:
-        ExchangeError: another number of cells, or one that is no number; names file and
-            line.
+    Raises ExchangeError: another number of cells, or one that is no number; names file and line.
     """
     where: dict[str, object] = {"line": line, "path": file}
     try:
@@ -449,8 +438,7 @@ def read_json(text: str, file: str, kind: type[dict[str, Any]] = dict) -> dict[s
         file: for messages.
         kind: dict, or a class of it.
 
-    Raises:
-        ExchangeError: the text is not a JSON object.
+    Raises ExchangeError: the text is not a JSON object.
     """
     try:
         document = parse_json(text, kind, file=file)

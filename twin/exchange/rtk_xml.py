@@ -270,8 +270,7 @@ def _require_distances(stated: list[tuple[float, float]], file: str) -> None:
 
 
 def row_of(values: tuple[float, ...], pitch_mm: tuple[float, float]) -> FloatArray:
-    """Compute a cone_vec row (12,) [mm] from nine numbers; the inverse of
-    `parameters_of`.
+    """Compute a cone_vec row (12,) [mm] from nine numbers; the inverse of `parameters_of`.
 
     u and v are orthogonal, of length `pitch_mm`.
 
@@ -335,12 +334,8 @@ def view_of_matrix(
 def _matrix(text: str | None, where: str) -> FloatArray | None:
     """Return the projection matrix (3, 4) of a view, or None if it has none.
 
-    Args:
-        text: of its element.
-        where: file and view, for messages.
-
-    Raises:
-        ExchangeError: it has not twelve finite numbers.
+    `text`: of its element; `where`: file and view, for messages.
+    Raises ExchangeError: it has not twelve finite numbers.
     """
     if text is None:
         return None

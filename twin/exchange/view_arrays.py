@@ -22,10 +22,7 @@ SPACE: Final = 3
 def stated(table: FormatTable, arrays: Arrays, file: str) -> Ledger:
     """Enter the arrays of a file in a ledger, each as its shape or its value.
 
-    Args:
-        table: of the format.
-        arrays: name -> array.
-        file: for messages.
+    `table`: of the format; `arrays`: name -> array; `file`: for messages.
     """
     said = Ledger(table, file, error=ExchangeError)
     for name, array in arrays.items():
@@ -46,9 +43,7 @@ def _shown(values: npt.NDArray[np.generic]) -> str:
 def require_shape(geometry: ScanGeometry, format_name: str) -> tuple[int, int]:
     """Return the detector's (rows, cols).
 
-    Raises:
-        ExchangeError: they are unknown.
-    """
+    Raises ExchangeError: they are unknown."""
     if geometry.shape is None:
         raise ExchangeError(f"{format_name} needs the detector's shape, which is unknown")
     return geometry.shape
@@ -57,8 +52,7 @@ def require_shape(geometry: ScanGeometry, format_name: str) -> tuple[int, int]:
 def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
     """Check that each of `names` is among the arrays; further ones are allowed.
 
-    Raises:
-        ExchangeError: names those that are missing.
+    Raises ExchangeError: names those that are missing.
     """
     lost = [name for name in names if name not in arrays]
     if lost:
@@ -69,8 +63,7 @@ def require_names(arrays: Arrays, names: Sequence[str], file: str) -> None:
 def views_of(arrays: Arrays, name: str, file: str) -> int:
     """Count the views of the array `name`, (n, ...).
 
-    Raises:
-        ExchangeError: there are none, or it is a scalar.
+    Raises ExchangeError: there are none, or it is a scalar.
     """
     shape = np.shape(arrays[name])
     if not shape or not shape[0]:
@@ -119,8 +112,7 @@ def counts_of(
 
     Floats that are whole are allowed.
 
-    Raises:
-        ExchangeError: it has another shape or other content.
+    Raises ExchangeError: it has another shape or other content.
     """
     counts = numbers_of(arrays, name, file, shape).ravel()
     if (counts < 1).any() or (counts % 1 != 0).any():
@@ -133,8 +125,7 @@ def counts_of(
 def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> FloatArray:
     """Read one array of finite numbers above 0, as float64 of `shape`.
 
-    Raises:
-        ExchangeError: it has another shape or other content.
+    Raises ExchangeError: it has another shape or other content.
     """
     sizes = numbers_of(arrays, name, file, shape)
     if (sizes <= 0.0).any():

@@ -155,22 +155,19 @@ class Follower:
                 assert_never(heard.what)
 
     def tick(self, mirror: Mirror, now: float) -> Mirror:
-        """Update the mirror after time without a message: raise alarms for overdue and
-        silent commands and a late script.
+        """Update the mirror after time without a message: raise alarms for overdue and silent
+        commands and a late script.
 
-        Only commands with a prediction that are not superseded can be overdue or silent.
-        An overdue one (`most_s` and `SLACK_S`) is a warning, after which ends count
-        as not reported, unless one has been heard; a server that does not report ends has
-        its commands ended by prediction instead, and its arrivals judged. Silence of
-        `MAX_SILENCE_S`, before it is overdue, is a warning, after which the server counts as one
-        that does not speak, unless it has; of such a server silence is expected. Commands
-        silent for `FORGOTTEN_AFTER_S` (or `most_s`, if longer) are forgotten. The script
-        is late `SLACK_S` after it was due. An alarm is raised once until its condition
-        ends.
+        Only commands with a prediction that are not superseded can be overdue or silent. An
+        overdue one (`most_s` and `SLACK_S`) is a warning, after which ends count as not
+        reported, unless one has been heard; a server that does not report ends has its commands
+        ended by prediction instead, and its arrivals judged. Silence of `MAX_SILENCE_S`, before
+        it is overdue, is a warning, after which the server counts as one that does not speak,
+        unless it has; of such a server silence is expected. Commands silent for
+        `FORGOTTEN_AFTER_S` (or `most_s`, if longer) are forgotten. The script is late `SLACK_S`
+        after it was due. An alarm is raised once until its condition ends.
 
-        Args:
-            mirror: present state.
-            now: moment [s].
+        `mirror`: present state; `now`: moment [s].
         """
         if mirror.ends is False:
             mirror = self._end_overdue(mirror, "", now)
@@ -232,12 +229,7 @@ class Follower:
         Coming up ends the alarms of the link and forgets nothing. Going down forgets the
         commands under way, takes motors as at rest where they were heard last, drops the
         script's due time, and raises an error alarm with the reason.
-
-        Args:
-            connected: whether the link is up.
-            now: moment [s].
-            why: reason for the loss.
-        """
+        `connected`: whether the link is up; `now`: moment [s]; `why`: reason for the loss."""
         if connected:
             return replace(mirror.cleared("link"), connected=True)
         axes = {n: a.at_rest for n, a in mirror.axes.items()}
@@ -618,13 +610,8 @@ class Follower:
         """Return the mirror, with an error alarm `offset` if a motor is more than
         `TARGET_TOLERANCE` from where its move led.
 
-        Args:
-            mirror: present state.
-            name: of the motor.
-            there: its position [mm, deg].
-            meant: target of the move.
-            now: moment [s].
-        """
+        `mirror`: present state; `name`: of the motor; `there`: its position [mm, deg]; `meant`:
+        target of the move; `now`: moment [s]."""
         if abs(there - meant) <= TARGET_TOLERANCE:
             return mirror
         unit = self.machine.axes[name].unit
@@ -714,8 +701,7 @@ class Follower:
         """Return the motor that a reading of `axis` is of, and that motor's position.
 
         The reading of a virtual axis is converted to the motor that it reads; any other
-        axis is returned as it is.
-        """
+        axis is returned as it is."""
         virtual = self.machine.virtual_axes.get(axis)
         if virtual is None:
             return axis, at
@@ -868,18 +854,14 @@ def _alarm(
     mirror: Mirror, now: float, severity: Severity, kind: str, about: str, message: str
 ) -> Mirror:
     """Add an alarm to a mirror, unless one of this kind and subject is active
-    (`Mirror.alarmed`).
-    """
+    (`Mirror.alarmed`)."""
     return mirror.alarmed(Alarm(now, severity, kind, about, message))
 
 
 def _bounds(step: PlanStep, machine: Machine) -> Range:
-    """Compute bounds of a step's time that a healthy machine exceeds less than once a day
-    [s]: (least, most).
-
-    A measured time has its 90 % range, widened; an assumed one may be anything from
-    nothing to twice itself.
-    """
+    """Compute bounds of a step's time that a healthy machine exceeds less than once a day [s]:
+    (least, most). A measured time has its 90 % range, widened; an assumed one may be anything
+    from nothing to twice itself."""
     measured = step_range(step, machine.timing)
     if measured is None:
         return (step.computed_s, step.holds_s + step.assumed_s)
@@ -950,20 +932,13 @@ def _record_unwaited(mirror: Mirror, now: float) -> Mirror:
 
 
 def _line(waiting: Waiting, wait: str, took: float, reply: str) -> tuple[bytes, ...]:
-    """Format the log line of a command that a script can have; () if it has one already
-    or is no command of the language.
+    """Format the log line of a command that a script can have; () if it has one already or is no
+    command of the language.
 
     A move under another name is written as "move absolute" with its target.
-
-    Args:
-        waiting: record of the command.
-        wait: its wait.
-        took: its own time [s].
-        reply: of the machine.
-
-    Returns:
-        () or the one line.
-    """
+    `waiting`: record of the command; `wait`: its wait; `took`: its own time [s]; `reply`: of the
+    machine.
+    Returns () or the one line."""
     command = waiting.heard.command
     words = waiting.heard.words
     if waiting.written or command is None:

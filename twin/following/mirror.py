@@ -65,11 +65,8 @@ class Heard:
         return self.key != " ".join(self.words[:2])
 
     def may_answer(self, command: Identity) -> bool:
-        """Return whether this message can be a reply to a command: by its key, and
-        without a UUID by its arguments, too.
-
-        Arguments of such a reply must be the command's or empty.
-        """
+        """Return whether this message can be a reply to a command: by its key, and without a
+        UUID by its arguments, too. Arguments of such a reply must be the command's or empty."""
         same = self.words[2:] in (command[2][2:], ("", ""))
         return command[0] == self.key and (self.named or same)
 
@@ -258,19 +255,14 @@ class Mirror:
 
     def with_waiting(self, command: Waiting, **changes: object) -> Mirror:
         """Return the mirror with fields of a command changed; it is added to those that
-        wait if it is not among them.
-        """
+        wait if it is not among them."""
         changed = replace(command, **changes)  # type: ignore[arg-type]
         return replace(self, waiting={**self.waiting, command.heard.identity: changed})
 
     def finished(self, command: Heard, unheard: bool = False) -> Mirror:
-        """Move a command from waiting to ended; only the last `MAX_WAITING` ended ones
-        are kept.
+        """Move a command from waiting to ended; only the last `MAX_WAITING` ended ones are kept.
 
-        Args:
-            command: that has ended.
-            unheard: whether only its end was heard.
-        """
+        `command`: that has ended; `unheard`: whether only its end was heard."""
         left = {i: w for i, w in self.waiting.items() if i != command.identity}
         newest = dict(list(self.ended.items())[1 - MAX_WAITING :])
         return replace(self, waiting=left, ended={**newest, command.identity: unheard})

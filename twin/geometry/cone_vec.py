@@ -283,8 +283,7 @@ class ConeVec:
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=9, shape=(76, 96), pixel=0.15)
             >>> ConeVec.from_astra(scan.to_astra()) == scan
-            True
-        """
+            True"""
         geometry: dict[str, Any] = _formats().to_astra(self)
         return geometry
 
@@ -483,8 +482,7 @@ class ConeVec:
         """Select views by index, slice or array of indices; one index gives a geometry of
         one view.
 
-        The detector's shape is kept.
-        """
+        The detector's shape is kept."""
         return ConeVec(self.rows[index], self.detector_shape)
 
     def __iter__(self) -> Iterator[ConeVec]:
@@ -564,8 +562,7 @@ class ConeVec:
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
             >>> sorted(scan.to_dict()), scan.to_dict()["detector_shape"]
-            (['detector_shape', 'rows'], [76, 96])
-        """
+            (['detector_shape', 'rows'], [76, 96])"""
         if self.detector_shape is not None:
             known = {"detector_shape": list(self.detector_shape)}
         else:
@@ -646,8 +643,7 @@ class ConeVec:
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
             >>> scan.with_shape(None).detector_shape is None
-            True
-        """
+            True"""
         return replace(self, detector_shape=shape)
 
     def show(self) -> Any:
@@ -959,15 +955,9 @@ def _numbers(
 ) -> tuple[float, ...]:
     """Convert one number or several to a tuple of `count` finite numbers.
 
-    Args:
-        name: of the argument, for the message.
-        value: one number or several.
-        count: number of them.
-        unit: for the message.
-        repeated: whether one number is repeated `count` times.
-
-    Raises:
-        GeometryError: another number of them, or one that is not finite.
+    `name`: of the argument, for the message; `value`: one number or several; `count`: number of
+    them; `unit`: for the message; `repeated`: whether one number is repeated `count` times.
+    Raises GeometryError: another number of them, or one that is not finite.
     """
     array = np.asarray(value, dtype=np.float64)
     if array.ndim == 0 and (repeated or count == 1):

@@ -61,8 +61,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
     Example:
         >>> cross(np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])).tolist()
-        [[0.0, 0.0, 1.0]]
-    """
+        [[0.0, 0.0, 1.0]]"""
     first = a.take(NEXT_AXIS, axis=1) * b.take(LAST_AXIS, axis=1)
     return np.asarray(first - a.take(LAST_AXIS, axis=1) * b.take(NEXT_AXIS, axis=1))
 
@@ -106,8 +105,7 @@ def rotation_x(angle: float) -> FloatArray:
 
     Example:
         >>> (rotation_x(np.pi / 2) @ [0, 1, 0]).round(9).tolist()
-        [0.0, 0.0, 1.0]
-    """
+        [0.0, 0.0, 1.0]"""
     c = math.cos(angle)
     s = math.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
@@ -118,8 +116,7 @@ def rotation_y(angle: float) -> FloatArray:
 
     Example:
         >>> (rotation_y(np.pi / 2) @ [0, 0, 1]).round(9).tolist()
-        [1.0, 0.0, 0.0]
-    """
+        [1.0, 0.0, 0.0]"""
     c = math.cos(angle)
     s = math.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
@@ -153,8 +150,7 @@ def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
 
     Example:
         >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))
-        True
-    """
+        True"""
     k = np.asarray(axis, dtype=np.float64)
     k = k / np.linalg.norm(k, axis=-1, keepdims=True)
     cross = np.swapaxes(np.cross(k[..., None, :], np.eye(3)), -1, -2)
@@ -170,8 +166,7 @@ def stage_rotation(angle: float | FloatArray) -> FloatArray:
 
     Example:
         >>> (stage_rotation(np.pi / 2) @ [1, 0, 0]).round(9).tolist()  # clockwise from above
-        [0.0, -1.0, 0.0]
-    """
+        [0.0, -1.0, 0.0]"""
     return rotation_z(-np.asarray(angle, dtype=np.float64))
 
 
@@ -181,8 +176,7 @@ def from_unity(vector: npt.ArrayLike) -> FloatArray:
 
     Example:
         >>> from_unity([1.0, 2.0, 3.0]).tolist()
-        [1.0, 3.0, 2.0]
-    """
+        [1.0, 3.0, 2.0]"""
     swapped: FloatArray = np.asarray(vector, dtype=np.float64)[..., [0, 2, 1]]
     return swapped
 

@@ -143,8 +143,7 @@ def to_internal(name: str, value: float) -> float:
 
     Example:
         >>> round(to_internal("det_roll", 180.0), 6), to_internal("dS_x", 2.0)
-        (3.141593, 2.0)
-    """
+        (3.141593, 2.0)"""
     if UNITS[name] == "deg":
         return math.radians(value)
     return float(value)
@@ -158,8 +157,7 @@ def to_edge(name: str, value: float) -> float:
 
     Example:
         >>> round(to_edge("det_roll", to_internal("det_roll", 0.5)), 9)
-        0.5
-    """
+        0.5"""
     if UNITS[name] == "deg":
         return math.degrees(value)
     return float(value)

@@ -80,8 +80,7 @@ class PanelModel:
         """Standard deviations of the coefficients' priors, (m,) [px], in the order of
         `names`; the priors' means are zero.
 
-        `width_px` for affine and bending terms, `GAP_SIGMA_PX` for gaps between tiles.
-        """
+        `width_px` for affine and bending terms, `GAP_SIGMA_PX` for gaps between tiles."""
         m = len(self.names)
         out = np.full(m, self.width_px)
         out[m - 2 * len(self.borders) :] = GAP_SIGMA_PX
@@ -132,8 +131,7 @@ class Panel:
     @classmethod
     def flat(cls, shape: tuple[int, int]) -> Panel:
         """Make a panel without distortion, lag and tile borders, for images of `shape`
-        (rows, cols).
-        """
+        (rows, cols)."""
         model = PanelModel(0.0, shape)
         return cls(model, (0.0,) * len(model.names))
 
@@ -197,18 +195,14 @@ class Panel:
     def undistorted(self, image: Float32Array) -> Float32Array:
         """Resample an image as a panel without distortion would have taken it.
 
-        By Lanczos interpolation; places beyond the image get the value at its edge. The
-        lag is not removed.
+        By Lanczos interpolation; places beyond the image get the value at its edge. The lag is
+        not removed.
 
         Args:
             image: (rows, cols).
 
-        Returns:
-            float32 (rows, cols); the image itself where there is no distortion.
-
-        Raises:
-            TwinError: an image of another shape than those in which the distortion was
-                found.
+        Returns float32 (rows, cols); the image itself where there is no distortion.
+        Raises TwinError: an image of another shape than those in which the distortion was found.
         """
         if not any(self.coefficients):
             return image

@@ -88,8 +88,7 @@ class Rigid:
 
         Example:
             >>> Rigid.translate(1, 2, 3) @ [0.0, 0.0, 0.0]
-            array([1., 2., 3.])
-        """
+            array([1., 2., 3.])"""
         return cls(np.eye(3), np.array([x, y, z], dtype=np.float64))
 
     @classmethod
@@ -138,12 +137,9 @@ class Rigid:
     def __matmul__(self, other: Any) -> Any:
         """Apply this motion after another one, to a geometry, or to points (..., 3) [mm].
 
-        Returns:
-            A `Rigid` for a `Rigid`, a `ConeVec` for a `ConeVec`, else the points (..., 3)
-            [mm], moved.
-
-        Raises:
-            GeometryError: points whose last dimension is not 3.
+        Returns a `Rigid` for a `Rigid`, a `ConeVec` for a `ConeVec`, else the points (..., 3)
+        [mm], moved.
+        Raises GeometryError: points whose last dimension is not 3.
         """
         if isinstance(other, Rigid):
             return Rigid(self.turn @ other.turn, self.turn @ other.shift + self.shift)
@@ -175,8 +171,7 @@ class Rigid:
 
         Example:
             >>> Rigid.translate(0, 0, 2).to_dict()["shift"]
-            [0.0, 0.0, 2.0]
-        """
+            [0.0, 0.0, 2.0]"""
         return {"turn": self.turn.tolist(), "shift": self.shift.tolist()}
 
     @classmethod
@@ -186,6 +181,5 @@ class Rigid:
         Example:
             >>> move = Rigid.rotate("x", 30)
             >>> Rigid.from_dict(move.to_dict()) == move
-            True
-        """
+            True"""
         return cls(np.asarray(document["turn"]), np.asarray(document["shift"]))

@@ -71,9 +71,7 @@ def offsets_in(row: FloatArray) -> Offsets:
 def ways(poses: Poses) -> tuple[FloatArray, FloatArray]:
     """Compute the ways of axis and panel, from the source, about their means over the frames.
 
-    Returns:
-        (n, 3) each [mm], world frame.
-    """
+    Returns (n, 3) each [mm], world frame."""
     axis = poses.axis - poses.source
     panel = poses.detector - poses.source
     return axis - axis.mean(axis=0), panel - panel.mean(axis=0)

@@ -18,18 +18,13 @@ MOVED_BEHIND: Final = 1.001
 
 
 def stretches(cone_vec: ConeVec, points: FloatArray) -> FloatArray:
-    """Compute the factor on each panel's distance from the source that puts it behind an
-    object, and 1 where it is behind already.
+    """Compute the factor on each panel's distance from the source that puts it behind an object,
+    and 1 where it is behind already.
 
     A moved panel is `MOVED_BEHIND` times as far as the farthest point; without points all
     factors are 1.
-
-    Args:
-        cone_vec: n views.
-        points: (k, 3) whose convex hull holds the object [mm].
-
-    Returns:
-        (n,), each at least 1.
+    `cone_vec`: n views; `points`: (k, 3) whose convex hull holds the object [mm].
+    Returns (n,), each at least 1.
     """
     if not len(points) or not len(cone_vec):
         return np.ones(len(cone_vec))
@@ -62,15 +57,11 @@ def run_through(cone_vec: ConeVec, points: FloatArray) -> ConeVec:
 
 
 def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
-    """Move panels to `times` their distance from the source, with pixels enlarged alike,
-    so that the images stay the same.
+    """Move panels to `times` their distance from the source, with pixels enlarged alike, so that
+    the images stay the same.
 
-    Args:
-        cone_vec: n views.
-        times: (n,), factors; 1 leaves a view as it is.
-
-    Returns:
-        A new geometry; the argument itself if all are 1.
+    `cone_vec`: n views. `times`: (n,), factors; 1 leaves a view as it is.
+    Returns a new geometry; the argument itself if all are 1.
     """
     moved = times != 1.0
     if not moved.any():
@@ -81,14 +72,11 @@ def stretched(cone_vec: ConeVec, times: FloatArray) -> ConeVec:
 
 
 def stretched_steps(rows: FloatArray, times: FloatArray) -> FloatArray:
-    """Stretch rows (n, 12), or changes of such rows, to panels `times` (n,) as far from
-    the source, with pixels enlarged alike.
+    """Stretch rows (n, 12), or changes of such rows, to panels `times` (n,) as far from the
+    source, with pixels enlarged alike.
 
     The source's three numbers stay; the input is not changed.
-
-    Returns:
-        New rows, (n, 12).
-    """
+    Returns new rows, (n, 12)."""
     out = rows.copy()
     many = times[:, None]
     out[:, 3:6] = rows[:, :3] + many * (rows[:, 3:6] - rows[:, :3])

@@ -183,8 +183,7 @@ def no_mode(mode: str, allowed: Sequence[str]) -> LimitError:
     """Make the error for a camera mode that is not among those `allowed`; returned, not
     raised.
 
-    Its data has `asked` and `allowed`.
-    """
+    Its data has `asked` and `allowed`."""
     message = f"camera mode {mode!r} does not exist; allowed: {', '.join(allowed)}"
     return LimitError(message, {"asked": mode, "allowed": list(allowed)})
 

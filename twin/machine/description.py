@@ -281,8 +281,7 @@ class DetectorSpec(_Frozen):
     @property
     def camera(self) -> CameraSettings:
         """Camera settings at start: mode, region and exposure of the file; one exposure an
-        image.
-        """
+        image."""
         modes = tuple(self.modes.items())
         return CameraSettings(self.mode, Roi(*self.roi), self.exposure_ms, modes=modes)
 
@@ -363,12 +362,8 @@ class FilterSpec(_Frozen):
     @field_validator("material")
     @classmethod
     def _known(cls, text: str) -> str:
-        """Check that a material is known; return its text unchanged.
-
-        Raises:
-            UnknownNameError: no material of that name.
-            LimitError: a formula or density that is not possible.
-        """
+        """Check that a material is known; return its text unchanged. Raises UnknownNameError: no
+        material of that name; LimitError: a formula or density that is not possible."""
         from flexdt.twin.attenuation.materials import material
 
         material(text)
@@ -405,14 +400,11 @@ class TubeSpec(_Frozen):
 
     @model_validator(mode="after")
     def _starts_within(self) -> TubeSpec:
-        """Check that the initial kV is within min_kV and max_kV, the initial power at
-        most max_W, and spot_points not 2.
+        """Check that the initial kV is within min_kV and max_kV, the initial power at most
+        max_W, and spot_points not 2.
 
         Returns the tube unchanged.
-
-        Raises:
-            PydanticCustomError: names the first wrong field, its value and the allowed
-                ones.
+        Raises PydanticCustomError: names the first wrong field, its value and the allowed ones.
         """
         allowed = f"from min_kV to max_kV, [{self.min_kV:g}, {self.max_kV:g}]"
         _refuse_if(not self.min_kV <= self.kV <= self.max_kV, "kV", self.kV, allowed)
@@ -424,8 +416,7 @@ class TubeSpec(_Frozen):
 
 def _box_around(points: Iterable[Vector3]) -> tuple[Vector3, Vector3]:
     """Compute size and centre of the upright box around points, at least one: (x, y, z)
-    each [mm].
-    """
+    each [mm]."""
     (x, x_), (y, y_), (z, z_) = ((min(c), max(c)) for c in zip(*points, strict=True))
     return (x_ - x, y_ - y, z_ - z), ((x + x_) / 2, (y + y_) / 2, (z + z_) / 2)
 
@@ -748,16 +739,12 @@ class Machine(_Frozen):
     def _check_chains(self) -> None:
         """Check the kinematic chains of the components.
 
-        A name is used once and is not `SAMPLE`; parents come first; a part's axis is a
-        motor of the machine that drives its anchor and occurs once in its chain; a part
-        carried by a moved one has its anchor; a stage on the turntable (mount_x, mount_y)
-        is carried by all motors of the angle.
+        A name is used once and is not `SAMPLE`; parents come first; a part's axis is a motor of
+        the machine that drives its anchor and occurs once in its chain; a part carried by a
+        moved one has its anchor; a stage on the turntable (mount_x, mount_y) is carried by all
+        motors of the angle. The first violation is raised.
 
-        The first violation is raised.
-
-        Raises:
-            PydanticCustomError: names the component's key, its value and the allowed
-                ones.
+        Raises PydanticCustomError: names the component's key, its value and the allowed ones.
         """
         names = [c.name for c in self.components]
         for component in self.components:
@@ -888,12 +875,9 @@ class Machine(_Frozen):
         return any(motor in self.geometry.get(q, {}) for q in ("mount_x", "mount_y"))
 
     def _motors_of(self, anchor: str) -> list[str]:
-        """List the motors that drive a coordinate of `anchor`, in the order of
-        `QUANTITIES`; those of the object include the motors of angle, mount_x and
-        mount_y.
-
-        A motor that drives two coordinates is listed twice.
-        """
+        """List the motors that drive a coordinate of `anchor`, in the order of `QUANTITIES`;
+        those of the object include the motors of angle, mount_x and mount_y. A motor that drives
+        two coordinates is listed twice."""
         quantities = [q for q in QUANTITIES if q.startswith(f"{anchor}_")]
         quantities += ["angle", "mount_x", "mount_y"] if anchor == "object" else []
         return [motor for q in quantities for motor in self.geometry.get(q, {})]
@@ -937,8 +921,7 @@ class Machine(_Frozen):
         for motors in mm and deg, and for one that moves nothing.
 
         What counts as rounding, in mm or deg, is so many times that of the motor. Of
-        several parts the one that it moves farthest counts.
-        """
+        several parts the one that it moves farthest counts."""
         shares = (abs(of.get(motor, 0.0)) for of in self.geometry.values())
         return 1.0 / (max(shares, default=0.0) or 1.0)
 
@@ -954,11 +937,8 @@ class Machine(_Frozen):
 
 
 def _refused(at: str, value: object, allowed: str) -> PydanticCustomError:
-    """Make the error of a value, reported at `at`, relative to the model's own key;
-    returned, not raised.
-
-    The message is "must be" and `allowed`.
-    """
+    """Make the error of a value, reported at `at`, relative to the model's own key; returned,
+    not raised. The message is "must be" and `allowed`."""
     context = {"at": at, "value": value, "allowed": allowed}
     return PydanticCustomError("refused", "must be {allowed}", context)
 
@@ -1098,8 +1078,7 @@ def builtin_profiles(machine: str | None = None) -> tuple[str, ...]:
     """List the names of the shipped profiles, sorted: those of `machine`, or (None) of
     all machines.
 
-    For a machine the profiles are read; an unknown machine gives ().
-    """
+    For a machine the profiles are read; an unknown machine gives ()."""
     names = _names("profiles")
     return tuple(
         n for n in names if machine is None or builtin_profile(n).machine == machine
@@ -1119,12 +1098,8 @@ def _names(kind: str) -> tuple[str, ...]:
 def _data(kind: str, name: str) -> str:
     """Read the text of a shipped TOML file.
 
-    Args:
-        kind: "machines" or "profiles".
-        name: of the machine or profile.
-
-    Raises:
-        UnknownNameError: there is none; lists the allowed names.
+    `kind`: "machines" or "profiles"; `name`: of the machine or profile.
+    Raises UnknownNameError: there is none; lists the allowed names.
     """
     if name not in _names(kind):
         message = f"no {kind[:-1]} called {name!r} ships with flexdt; there are"
@@ -1289,17 +1264,16 @@ def _without_part(parts: list[Raw], name: object) -> list[Raw]:
 def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
     """Merge a machine's content into that of its base, key by key.
 
-    In `geometry` each quantity is replaced whole, elsewhere a table `moves`; components
-    are merged by name (`_merged_parts`). Merged tables say in `source` which values come
-    from the file (`_credit`).
+    In `geometry` each quantity is replaced whole, elsewhere a table `moves`; components are
+    merged by name (`_merged_parts`). Merged tables say in `source` which values come from the
+    file (`_credit`).
 
     Args:
         base: content of the base; unchanged.
         own: content of the file, whose values go before the base's.
         whole: keys whose tables are replaced; others are merged.
 
-    Returns:
-        A new table; values of both are shared.
+    Returns a new table; values of both are shared.
     """
     out = dict(base)
     for key, value in own.items():
@@ -1319,16 +1293,12 @@ def _merged(base: Raw, own: Raw, whole: tuple[str, ...] = ("timing",)) -> Raw:
 def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
     """Merge components by name: values of the file replace those of the base key by key.
 
-    Of two components of one name in the file the first is merged and the other kept, so
-    that the check of names finds them. Each merged component says in `source` which
-    values come from the file (`_credit`).
+    Of two components of one name in the file the first is merged and the other kept, so that the
+    check of names finds them. Each merged component says in `source` which values come from the
+    file (`_credit`).
 
-    Args:
-        old: of the base machine.
-        own: of the file, which go before those.
-
-    Returns:
-        The base's components in their order, then the file's new ones.
+    `old`: of the base machine; `own`: of the file, which go before those.
+    Returns the base's components in their order, then the file's new ones.
     """
     first = {
         part["name"]: part for part in reversed(own) if isinstance(part.get("name"), str)
@@ -1342,17 +1312,10 @@ def _merged_parts(old: list[Raw], own: list[Raw]) -> list[Raw]:
 
 
 def _credit(merged: Raw, old: Raw, own: Raw) -> None:
-    """Write into `merged["source"]` which keys come from this file, and the base's source
-    for the others.
-
-    Does nothing if this file has no values or a source of its own, or the base has no
-    `source`. An empty source of the base becomes "as the base has it".
-
-    Args:
-        merged: table that is changed in place.
-        old: of the base.
-        own: of the file.
-    """
+    """Write into `merged["source"]` which keys come from this file, and the base's source for
+    the others. Does nothing if this file has no values or a source of its own, or the base has
+    no `source`. An empty source of the base becomes "as the base has it". `merged`: table that
+    is changed in place; `old`: of the base; `own`: of the file."""
     if own and isinstance(old.get("source"), str) and "source" not in own:
         keys = ", ".join(key for key in own if key != "name")
         merged["source"] = (
@@ -1424,14 +1387,12 @@ def _parse(model: type[_M], prepared: Callable[[Raw], Raw], text: str, file: str
 
 
 def _limit(path: str) -> str:
-    """Return the limitation of the twin that a key comes from, as the end of an error
-    message, or "".
+    """Return the limitation of the twin that a key comes from, as the end of an error message,
+    or "".
 
-    The text is of the first of `_KEY_LIMITS` with which the last part of `path`, case
-    ignored, begins, and refers to docs/limits.md.
-
-    Args:
-        path: of the key, parts separated by dots.
+    The text is of the first of `_KEY_LIMITS` with which the last part of `path`, case ignored,
+    begins, and refers to docs/limits.md.
+    `path`: of the key, parts separated by dots.
     """
     last = path.rpartition(".")[2].lower()
     limit = next(
@@ -1448,14 +1409,8 @@ def _require(
     """Raise the error of `_refused` for the first of `names` that is not in `allowed`.
 
     The message lists the allowed ones, or that there is none.
-
-    Args:
-        names: to check.
-        allowed: names.
-        where: key path of the error.
-        what: noun of the message, such as "axis".
-        more: end of the message.
-    """
+    `names`: to check; `allowed`: names; `where`: key path of the error; `what`: noun of the
+    message, such as "axis"; `more`: end of the message."""
     valid = list(allowed)
     for name in names:
         if name not in valid:

@@ -104,8 +104,7 @@ def motor_poses(
         """Sum up a quantity over its motors and its fixed part, (n,) [mm, deg]; zero
         offsets are not in it.
 
-        A quantity that no motor moves is its fixed part, or zero.
-        """
+        A quantity that no motor moves is its fixed part, or zero."""
         out = np.full_like(columns[0], machine.fixed.get(quantity, 0.0))
         for motor, factor in machine.geometry.get(quantity, {}).items():
             out = out + factor * values[motor]
@@ -113,8 +112,7 @@ def motor_poses(
 
     def place(anchor: str, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> FloatArray:
         """Compute a place in the world from the motors of `anchor` and `x`, `y`, `z`
-        added to it, (n, 3) [mm].
-        """
+        added to it, (n, 3) [mm]."""
         added = zip(COORDINATES, (x, y, z), strict=True)
         return np.stack([total(f"{anchor}_{c}") + more for c, more in added], axis=1)
 
@@ -293,8 +291,7 @@ def places(machine: Machine) -> list[Place]:
     Example:
         >>> from flexdt.twin.machine.description import builtin_machine
         >>> places(builtin_machine("xyzr_cabinet"))[0]
-        Place(name='SOD', total='Z', least=20.0, most=850.0, home=400.0)
-    """
+        Place(name='SOD', total='Z', least=20.0, most=850.0, home=400.0)"""
     return [
         place(machine, quantity)
         for quantity in _QUANTITY_NAMES

@@ -55,20 +55,16 @@ class Arrival:
 
 
 def arrival(machine: Machine, axis: str, targets: Mapping[str, float]) -> Arrival:
-    """Apply the rule for targets beyond a limit to a move of `axis`: move targets into
-    the travel and say which lay beyond; raises nothing.
+    """Apply the rule for targets beyond a limit to a move of `axis`: move targets into the
+    travel and say which lay beyond; raises nothing.
 
-    Beyond is by more than `POSITION_ROUNDING`; motors of a virtual axis are shortened
-    together (`clamp`).
+    Beyond is by more than `POSITION_ROUNDING`; motors of a virtual axis are shortened together
+    (`clamp`).
 
-    Args:
-        machine: whose motors these are.
-        axis: motor or virtual axis that is moved.
-        targets: motor -> requested target [mm, deg].
-
-    Returns:
-        Targets within the travel, a message for each that lies beyond, and the error of
-        the first that lies beyond by more than its axis's `arrival_tolerance`, or None.
+    `machine`: whose motors these are; `axis`: motor or virtual axis that is moved; `targets`:
+    motor -> requested target [mm, deg].
+    Returns targets within the travel, a message for each that lies beyond, and the error of the
+    first that lies beyond by more than its axis's `arrival_tolerance`, or None.
     """
     messages = []
     beyond = None
@@ -153,12 +149,11 @@ def check_target(machine: Machine, axis: str, value: float) -> float:
 def clamp(machine: Machine, targets: Mapping[str, float], axis: str) -> dict[str, float]:
     """Return the targets of an axis's motors, moved into their travel.
 
-    If a motor of a virtual axis is cut short, all its motors give up the same
-    displacement of the axis, the largest that one needs, and are then limited once more.
+    If a motor of a virtual axis is cut short, all its motors give up the same displacement of
+    the axis, the largest that one needs, and are then limited once more.
 
-    Args:
-        targets: motor -> target [mm, deg]; for a virtual axis those of all its motors.
-        axis: motor or virtual axis that is moved.
+    `targets`: motor -> target [mm, deg]; for a virtual axis those of all its motors. `axis`:
+    motor or virtual axis that is moved.
     """
     bounded = _bounded(machine, targets)
     if axis in machine.axes or bounded == targets:
@@ -178,8 +173,7 @@ def _bounded(machine: Machine, targets: Mapping[str, float]) -> dict[str, float]
 
 def distance_beyond(machine: Machine, motor: str, target: float) -> float:
     """Compute how far beyond the travel a target brings the motor's part [mm, deg];
-    negative within it.
-    """
+    negative within it."""
     a = machine.axes[motor]
     return max(a.lower - target, target - a.upper) / machine.counts(motor)
 

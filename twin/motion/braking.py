@@ -176,17 +176,11 @@ def coasting(
 
 
 def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
-    """Compute the programme time [s] to which a stop along the path, begun at `at`,
-    advances.
+    """Compute the programme time [s] to which a stop along the path, begun at `at`, advances.
 
-    It is not after the end of the programme that is left. Returns `at` if nothing moves
-    then.
-
-    Args:
-        drives: every motor with all that it is to follow.
-        at: start of braking [s].
-        most: as for `braked_along`.
-    """
+    It is not after the end of the programme that is left. Returns `at` if nothing moves then.
+    `drives`: every motor with all that it is to follow; `at`: start of braking [s]; `most`: as
+    for `braked_along`."""
     due = {name: drive for name, drive in drives.items() if drive.end > at}
     cells = _cells(due, at, most)
     if cells:
@@ -197,20 +191,13 @@ def programme_time_at_rest(drives: Drives, at: float, most: Most) -> float:
 def braked_at(
     drives: Drives, at: float, trajectories: Mapping[str, Trajectory], most: Most
 ) -> dict[str, Drive]:
-    """Return `drives` that follow `trajectories` up to `at` and brake along their common
-    path from then on.
+    """Return `drives` that follow `trajectories` up to `at` and brake along their common path
+    from then on.
 
     Drives that have nothing left to do at `at` are not braked.
-
-    Args:
-        drives: motors; not changed.
-        at: start of braking [s].
-        trajectories: motor -> trajectory, which replaces all that this motor was to
-            follow.
-        most: as for `braked_along`.
-
-    Returns:
-        Motor -> drive, of all motors.
+    `drives`: motors; not changed. `at`: start of braking [s]. `trajectories`: motor ->
+    trajectory, which replaces all that this motor was to follow. `most`: as for `braked_along`.
+    Returns motor -> drive, of all motors.
     """
     following = {**drives, **{n: drives[n].following(t) for n, t in trajectories.items()}}
     braked = braked_along(following, at, most)
@@ -223,16 +210,11 @@ def braked_at(
 
 
 def _coupled(machine: Machine, velocity: Mapping[str, float]) -> Iterable[list[str]]:
-    """Yield, for each virtual axis whose motors move in step now, the names of its
-    motors.
+    """Yield, for each virtual axis whose motors move in step now, the names of its motors.
 
     In step: their velocities divided by their shares agree within `STEP_TOLERANCE` of the
-    fastest, and are not all 0.
-
-    Args:
-        machine: with the virtual axes.
-        velocity: motor -> velocity [mm/s, deg/s]; 0 for those left out.
-    """
+    fastest, and are not all 0. `machine`: with the virtual axes. `velocity`: motor -> velocity
+    [mm/s, deg/s]; 0 for those left out."""
     for virtual in machine.virtual_axes.values():
         rates = [velocity.get(name, 0.0) / share for name, share in virtual.moves.items()]
         fastest = max(map(abs, rates))
@@ -244,8 +226,7 @@ def greatest(name: str, leg: Trajectory, time: float, most: Most) -> float:
     """Return the acceleration that a motor may brake with at `time` while it follows
     `leg` [mm/s2, deg/s2].
 
-    It is the largest that `leg` has from then on, or that of `most` if greater.
-    """
+    It is the largest that `leg` has from then on, or that of `most` if greater."""
     planned = leg.acceleration(time)
     if most is None:
         return planned
@@ -334,8 +315,8 @@ class _State:
         return abs(self.velocity) / self.counts
 
     def slowing(self, rate: float, ahead: float) -> float:
-        """Compute by how much programme time may slow, at a constant rate, without
-        exceeding the acceleration that the motor may use.
+        """Compute by how much programme time may slow, at a constant rate, without exceeding the
+        acceleration that the motor may use.
 
         The acceleration that the motor has by itself counts: braking leaves less for the
         slowing, speeding up more; 0 if braking leaves nothing.
@@ -344,8 +325,7 @@ class _State:
             rate: of programme time at the start, programme seconds a second.
             ahead: programme seconds over which the slowing is constant.
 
-        Returns:
-            The greatest slowing [1/s]; inf for a motor without velocity now and `ahead`.
+        Returns the greatest slowing [1/s]; inf for a motor without velocity now and `ahead`.
         """
         speed = abs(self.velocity)
         a = abs(self.acceleration)

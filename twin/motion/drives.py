@@ -126,16 +126,12 @@ def clock_left(now: float) -> float:
 
 
 def require_time(what: str, end: float, now: float) -> None:
-    """Check that a motion ends before the clock does: its steps would be too coarse for
-    what was swept.
+    """Check that a motion ends before the clock does: its steps would be too coarse for what was
+    swept.
 
-    Args:
-        what: the command, for the message.
-        end: of the motion [s]; one without an end passes, as a jog that is renewed.
-        now: time of the command [s].
-
-    Raises:
-        LimitError: it ends more than `LATEST_MOTION_S` after `LATE_S` and now.
+    `what`: the command, for the message. `end`: of the motion [s]; one without an end passes, as
+    a jog that is renewed. `now`: time of the command [s].
+    Raises LimitError: it ends more than `LATEST_MOTION_S` after `LATE_S` and now.
     """
     last = now + clock_left(now)
     if last < end < math.inf:
@@ -169,29 +165,20 @@ def plan_move(
     relative: bool = False,
     shortest: bool = False,
 ) -> dict[str, Trajectory]:
-    """Plan the motions to `targets` of the motors that these move; all begin now, from
-    the present motion.
+    """Plan the motions to `targets` of the motors that these move; all begin now, from the
+    present motion.
 
     Motors of a virtual axis get paces in proportion, so that from rest they keep in step;
-    acceleration is at least that of the motion in force. `shortest` is ignored for
-    relative targets.
+    acceleration is at least that of the motion in force. `shortest` is ignored for relative
+    targets.
 
-    Args:
-        machine: whose motors these are.
-        drives: every motor.
-        targets: axis (motor or virtual) -> position, or displacement [mm, deg].
-        now: time of the command [s].
-        relative: targets are displacements from where the motors are bound for.
-        shortest: rotations go the shorter way round to an equivalent angle (thesis
-            4.5.2).
-
-    Returns:
-        Motor -> trajectory, of those that `targets` moves.
-
-    Raises:
-        UnknownNameError: no such axis.
-        LimitError: a target outside its travel by more than the tolerance, or two targets
-            of one motor.
+    `machine`: whose motors these are; `drives`: every motor; `targets`: axis (motor or virtual)
+    -> position, or displacement [mm, deg]; `now`: time of the command [s]; `relative`: targets
+    are displacements from where the motors are bound for; `shortest`: rotations go the shorter
+    way round to an equivalent angle (thesis 4.5.2).
+    Returns motor -> trajectory, of those that `targets` moves.
+    Raises UnknownNameError: no such axis; LimitError: a target outside its travel by more than
+    the tolerance, or two targets of one motor.
     """
     bound = {name: d.at(now).target for name, d in drives.items()}
     _refuse_double(machine, targets)
@@ -285,10 +272,8 @@ def plan_jog(
 
 
 def least_rate(machine: Machine, axis: str) -> float:
-    """Return the least speed, and acceleration, that an axis may be set to [per s, per s2].
-
-    It is that of its motor that would be the slowest; see `MIN_RATE`.
-    """
+    """Return the least speed, and acceleration, that an axis may be set to [per s, per s2]. It
+    is that of its motor that would be the slowest; see `MIN_RATE`."""
     shares = machine.moves(axis).items()
     return max(MIN_RATE * machine.counts(name) / abs(share) for name, share in shares)
 

@@ -268,11 +268,8 @@ class AxisPath(ArrayValue):
         return cls(zero, np.array([position]), zero, zero)
 
     def _at(self, times: npt.ArrayLike) -> tuple[npt.NDArray[np.intp], FloatArray]:
-        """Find for each of `times` the index of the piece in force, and the time since
-        its start [s], of the same shape.
-
-        Before the path: 0 and 0.
-        """
+        """Find for each of `times` the index of the piece in force, and the time since its start
+        [s], of the same shape. Before the path: 0 and 0."""
         t = np.asarray(times, dtype=np.float64)
         index = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, None)
         return index, np.maximum(t - self.times[index], 0.0)
@@ -284,8 +281,7 @@ class AxisPath(ArrayValue):
 
     def velocities(self, times: npt.ArrayLike) -> FloatArray:
         """Compute velocities at `times` [s], of the same shape; before the path that of
-        its first piece.
-        """
+        its first piece."""
         i, dt = self._at(times)
         return np.asarray(self.v[i] + self.a[i] * dt)
 
@@ -296,8 +292,7 @@ def at_rest(position: float, time: float = 0.0) -> Trajectory:
 
     Example:
         >>> at_rest(5.0).position(100.0)
-        5.0
-    """
+        5.0"""
     return Trajectory((Piece(time, position, 0.0, 0.0),), time, position)
 
 
@@ -438,8 +433,7 @@ def rejoined(before: Trajectory, at: float, after: Trajectory) -> Trajectory:
         >>> m = move(0.0, 0.0, target=10.0, speed=2.0, acceleration=4.0, time=0.0)
         >>> halt = stop(m.position(3.0), m.velocity(3.0), acceleration=4.0, time=3.0)
         >>> rejoined(m, 3.0, halt).target
-        6.0
-    """
+        6.0"""
     pieces = tuple(p for p in before.pieces if p.start < at)
     return Trajectory((*pieces, *after.pieces), after.end, after.target)
 
@@ -545,8 +539,7 @@ class _Builder:
         """Return the trajectory of the pieces, at rest at `target` from the present time
         on; without pieces rest since the beginning.
 
-        Whether the pieces end at `target` is not checked.
-        """
+        Whether the pieces end at `target` is not checked."""
         pieces = self.pieces or [Piece(self.begin[0], target, 0.0, 0.0)]
         return Trajectory(tuple(pieces), self.time, target)
 

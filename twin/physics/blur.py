@@ -90,11 +90,8 @@ def blurred(
         across_px: across them [pixels]; None: the same.
         weights: makes the kernel of a standard deviation; default: a Gaussian.
 
-    Returns:
-        float32 (rows, cols).
-
-    Raises:
-        LimitError: a blur wider than `MAX_SIGMA_PX`.
+    Returns float32 (rows, cols).
+    Raises LimitError: a blur wider than `MAX_SIGMA_PX`.
     """
     if across_px is None:
         across = sigma_px
@@ -115,11 +112,10 @@ def blurred(
 
 
 def spot_blur_px(view: FloatArray, spot_mm: float, towards_mm: float = 0.0) -> float:
-    """Compute the standard deviation of the focal spot's image for a point at the
-    rotation axis, or `towards_mm` nearer to the source [pixels along u].
+    """Compute the standard deviation of the focal spot's image for a point at the rotation axis,
+    or `towards_mm` nearer to the source [pixels along u].
 
-    Not negative; points at the source or behind it count as at 1e-3 of the axis's
-    distance.
+    Not negative; points at the source or behind it count as at 1e-3 of the axis's distance.
 
     Args:
         view: cone_vec row (12,) [mm].

@@ -58,8 +58,7 @@ def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
 
     Weights are electrons and their variance per cm2 of pixel and mAs at 1 m. With
     `mono_keV` the weights are those of the full spectrum, and all attenuation is that of
-    this one energy.
-    """
+    this one energy."""
     signal, noise = weights_of(chain, kV)
     beam = effective_beam(signal, noise, chain.substances, chain.thickest_mm)
     if chain.mono_keV is None:
@@ -69,20 +68,12 @@ def beam_of(chain: Chain, kV: float) -> EffectiveBeam:
 
 
 def weights_of(chain: Chain, kV: float) -> tuple[FloatArray, FloatArray]:
-    """Compute the contribution of each energy to an open pixel's electrons and their
-    variance.
+    """Compute the contribution of each energy to an open pixel's electrons and their variance.
 
-    The variance is that of a compound Poisson process: photons are counted, each gives a
-    spread amount of charge. With `mono_keV` all photons have this energy, as many as give
-    the full spectrum's signal.
-
-    Args:
-        chain: tube and panel.
-        kV: tube voltage [kV].
-
-    Returns:
-        (e,) both, per cm2 of pixel and mAs, 1 m from the source.
-    """
+    The variance is that of a compound Poisson process: photons are counted, each gives a spread
+    amount of charge. With `mono_keV` all photons have this energy, as many as give the full
+    spectrum's signal. `chain`: tube and panel; `kV`: tube voltage [kV]. Returns (e,) both, per
+    cm2 of pixel and mAs, 1 m from the source."""
     charge, variance = chain.panel.charge_of_photons()
     fluence = tube_spectrum(kV, chain.tube).fluence
     if chain.mono_keV is not None:
@@ -170,10 +161,8 @@ def open_noise(chain: Chain, view: npt.ArrayLike, exposure: ExposureSettings) ->
     """Compute the noise of a pixel of the open beam at the panel's centre, relative to its
     signal (standard deviation); infinite without a signal.
 
-    Args:
-        chain: tube and panel; its materials are not used.
-        view: cone_vec row (12,) [mm].
-        exposure: tube, time and averages; taken as if X-rays were on.
+    `chain`: tube and panel; its materials are not used. `view`: cone_vec row (12,) [mm].
+    `exposure`: tube, time and averages; taken as if X-rays were on.
     """
     signal, variance = weights_of(chain, exposure.kV)
     charge = float(flux_of(view, (1, 1))[0, 0]) * mAs(replace(exposure, xrays_on=True))
@@ -185,8 +174,7 @@ def open_noise(chain: Chain, view: npt.ArrayLike, exposure: ExposureSettings) ->
 
 def mean_attenuation(chain: Chain, kV: float) -> FloatArray:
     """Compute the attenuation of each substance, weighted by the open beam's signal [1/mm]:
-    behind a thickness it is less.
-    """
+    behind a thickness it is less."""
     beam = beam_of(chain, kV)
     return np.asarray(beam.mu @ beam.signal / beam.signal.sum())
 
@@ -250,18 +238,13 @@ def flux_map(
     pixel_v: float,
     shape: tuple[int, int],
 ) -> Float32Array:
-    """Compute pixel area [cm2] times inverse square of the distance relative to 1 m,
-    times the obliquity.
+    """Compute pixel area [cm2] times inverse square of the distance relative to 1 m, times the
+    obliquity.
 
-    Args:
-        distance: from the source to the panel's plane [mm].
-        foot_u, foot_v: foot point of the source, from the panel's centre along u and v
-            [mm].
-        pixel_u, pixel_v: pitch [mm].
-        shape: (rows, cols).
-
-    Returns:
-        Float32 (rows, cols), read-only; the last 16 are kept.
+    `distance`: from the source to the panel's plane [mm]; `foot_u` and `foot_v`: foot point of
+    the source, from the panel's centre along u and v [mm]; `pixel_u` and `pixel_v`: pitch [mm];
+    `shape`: (rows, cols).
+    Returns float32 (rows, cols), read-only; the last 16 are kept.
     """
     rows, cols = shape
     y = (np.arange(rows) - (rows - 1) / 2) * pixel_v - foot_v
@@ -293,15 +276,11 @@ class Scattered:
         view: FloatArray,
         exposure: ExposureSettings,
     ) -> Expected:
-        """Add the scatter to the expected electrons of primary radiation; `expected` is
-        not changed.
+        """Add the scatter to the expected electrons of primary radiation; `expected` is not
+        changed.
 
-        Args:
-            expected: electrons without scatter.
-            chain: tube and panel.
-            view: cone_vec row (12,) [mm].
-            exposure: tube and time.
-        """
+        `expected`: electrons without scatter; `chain`: tube and panel; `view`: cone_vec row
+        (12,) [mm]; `exposure`: tube and time."""
         signal, noise = weights_of(chain, exposure.kV)
         flux = flux_of(view, self.signal.shape) * np.float32(mAs(exposure))
         mean = expected.mean_e + self.signal * flux * np.float32(signal.sum())
@@ -374,18 +353,11 @@ def radiographs(
 def _as_line_integrals(
     chain: Chain, expected: Expected, view: FloatArray, exposure: ExposureSettings
 ) -> Float32Array:
-    """Compute -log of the expected signal over the open beam's, both taken as at least
-    1e-6 electrons.
+    """Compute -log of the expected signal over the open beam's, both taken as at least 1e-6
+    electrons.
 
-    Args:
-        chain: tube and detector.
-        expected: the image.
-        view: cone_vec row (12,).
-        exposure: tube and time.
-
-    Returns:
-        (rows, cols).
-    """
+    `chain`: tube and detector; `expected`: the image; `view`: cone_vec row (12,); `exposure`:
+    tube and time. Returns (rows, cols)."""
     area = np.float32(weights_of(chain, exposure.kV)[0].sum() * mAs(exposure))
     least = np.float32(1e-6)
     lines = np.log(np.maximum(area * flux_of(view, expected.mean_e.shape), least))

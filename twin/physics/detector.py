@@ -253,8 +253,7 @@ class Detector:
 
         Example:
             >>> Detector(exposure_ms=50).camera((100, 200)).roi
-            Roi(left=0, top=0, right=199, bottom=99)
-        """
+            Roi(left=0, top=0, right=199, bottom=99)"""
         roi = Roi(0, 0, shape[1] - 1, shape[0] - 1)
         if self.exposure_ms is None:
             time = USUAL_MS
@@ -274,8 +273,7 @@ class Detector:
         Example:
             >>> panel = Detector(blur_mm=0.3, pixels=PixelGrid(4, 4, 0.1))
             >>> [round(sigma, 6) for sigma in panel.blur_px(panel.camera((4, 4)))]
-            [3.0, 3.0]
-        """
+            [3.0, 3.0]"""
         across, up = self.pixels.edges_mm
         sigma = self.blur_mm / camera.binning
         return sigma / across, sigma / up
@@ -290,8 +288,7 @@ class Detector:
         Example:
             >>> panel = Detector(electrons_per_count=20)
             >>> panel.gain(panel.camera((4, 4)))
-            20
-        """
+            20"""
         if self.electrons_per_count is not None:
             return self.electrons_per_count
         across, up = self.pixels.edges_mm
@@ -306,8 +303,7 @@ class Detector:
         Example:
             >>> panel = Detector(read_noise_e=200.0)
             >>> panel.read_noise(panel.camera((4, 4)))
-            200.0
-        """
+            200.0"""
         return self.read_noise_e * (LOW_READ_NOISE if _is_low(camera) else 1.0)
 
     def dark_charge(self, camera: CameraSettings) -> float:
@@ -317,8 +313,7 @@ class Detector:
         Example:
             >>> panel = Detector(dark_e_per_s=100.0)
             >>> panel.dark_charge(panel.camera((4, 4)))
-            100.0
-        """
+            100.0"""
         if self.dark_e_per_s is None:
             each = DARK_E_PER_S
         else:

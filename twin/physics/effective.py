@@ -249,15 +249,11 @@ def _pursue(
 
 
 def _non_negative(columns: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Solve a least squares problem with weights that are not negative; by a slower
-    method (BVLS) where NNLS does not converge.
+    """Solve a least squares problem with weights that are not negative; by a slower method
+    (BVLS) where NNLS does not converge.
 
-    Args:
-        columns: (m, p) what each weight adds.
-        wanted: (m,).
-
-    Returns:
-        (p,) weights.
+    `columns`: (m, p) what each weight adds; `wanted`: (m,).
+    Returns (p,) weights.
     """
     from scipy.optimize import lsq_linear, nnls
 

@@ -97,8 +97,7 @@ def open_beam(model: IdealResponse, settings: ExposureSettings) -> float:
         model: signal at its reference settings.
         settings: voltage [kV], power [W], exposure [ms].
 
-    Returns:
-        Counts; 0 with X-rays off.
+    Returns counts; 0 with X-rays off.
     """
     if not settings.xrays_on:
         return 0.0
@@ -168,14 +167,11 @@ def _noisy(
 ) -> Float32Array:
     """Add the noise of a saved image to `signal` in place, and return it.
 
-    Photons are drawn from Poisson's distribution where fewer than `MIN_GAUSSIAN_PHOTONS`
-    are expected, else from a normal one. Read noise is normal; averaging reduces both.
+    Photons are drawn from Poisson's distribution where fewer than `MIN_GAUSSIAN_PHOTONS` are
+    expected, else from a normal one. Read noise is normal; averaging reduces both.
 
-    Args:
-        model: photons in a count, and read noise.
-        settings: number of read-outs that are averaged.
-        rng: source of random numbers.
-        signal: expected counts above dark, (n,).
+    `model`: photons in a count, and read noise; `settings`: number of read-outs that are
+    averaged; `rng`: source of random numbers; `signal`: expected counts above dark, (n,).
     """
     photons = np.float32(model.photons_per_count * settings.averages)
     variance = signal / photons

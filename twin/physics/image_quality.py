@@ -140,8 +140,7 @@ def mass_energy_transfer(substance: Substance) -> FloatArray:
 
     Photoelectric absorption in full, and the electron's mean share of incoherent
     scattering. Without fluorescence that escapes, so for light elements only. Kept for
-    each substance.
-    """
+    each substance."""
     parts = cross_sections((substance,))
     scattered = parts.coherent[0] + parts.incoherent[0]
     per_mm = np.maximum(parts.total[0] - scattered, 0.0)

@@ -120,16 +120,12 @@ that spread first."""
 def drawn(
     exposed: Exposed, rng: np.random.Generator, *, spreads: bool
 ) -> Iterator[Float32Array]:
-    """Draw the noise of each term of `NOISE` that spreads with light, blurred by the
-    panel, or of each that does not.
+    """Draw the noise of each term of `NOISE` that spreads with light, blurred by the panel, or
+    of each that does not.
 
-    Args:
-        exposed: electrons, panel and camera.
-        rng: source of random numbers.
-        spreads: True: the terms that spread; False: the others.
-
-    Yields:
-        Electrons of a saved image, float32 (rows, cols), one array a term.
+    `exposed`: electrons, panel and camera. `rng`: source of random numbers. `spreads`: True: the
+    terms that spread; False: the others.
+    Yields electrons of a saved image, float32 (rows, cols), one array a term.
     """
     for term in NOISE:
         if term.spreads != spreads:
@@ -147,13 +143,9 @@ def pixel_variance(
     """Add up the variance of a pixel of a saved image in surroundings that are like it
     [counts^2], the rounding to whole counts included.
 
-    Args:
-        panel: the detector.
-        camera: its mode determines how pixels are binned and read.
-        averages: read-outs that are averaged into the image.
-        xrays_e2: variance that X-rays have in one read-out before light spreads
-            [electrons^2].
-    """
+    `panel`: the detector; `camera`: its mode determines how pixels are binned and read;
+    `averages`: read-outs that are averaged into the image; `xrays_e2`: variance that X-rays have
+    in one read-out before light spreads [electrons^2]."""
     kept_share = _kept_by_blur(panel.blur_px(camera))
     electrons = 0.0
     for term in NOISE:
@@ -166,10 +158,8 @@ def _kept_by_blur(sigmas_px: tuple[float, float]) -> float:
     """Compute the part of a flat image's white noise that remains in a pixel where light
     spreads, 0 to 1.
 
-    Args:
-        sigmas_px: standard deviations of the light's spread along rows and across; if
-            both are below `MIN_SIGMA_PX` the part is 1.
-    """
+    `sigmas_px`: standard deviations of the light's spread along rows and across; if both are
+    below `MIN_SIGMA_PX` the part is 1."""
     if max(sigmas_px) < MIN_SIGMA_PX:
         return 1.0
     return math.prod(

@@ -84,12 +84,8 @@ class CountShares:
 
     @classmethod
     def of(cls, counts: npt.NDArray[np.floating], full_counts: float) -> CountShares:
-        """Count the pixels of images.
-
-        Args:
-            counts: expected above dark, not clipped, of any shape.
-            full_counts: counts above dark from which a pixel is saturated.
-        """
+        """Count the pixels of images. `counts`: expected above dark, not clipped, of any shape;
+        `full_counts`: counts above dark from which a pixel is saturated."""
         starved = counts < ideal.FEW_COUNTS
         return cls(float((counts >= full_counts).mean()), float(starved.mean()))
 
@@ -149,18 +145,13 @@ def open_beam_of(
     view: npt.ArrayLike,
     physics: Physics = "poly",
 ) -> OpenBeam | None:
-    """Predict the open beam of one image: the counts of its brightest pixel above dark,
-    and those at which it saturates.
+    """Predict the open beam of one image: the counts of its brightest pixel above dark, and
+    those at which it saturates.
 
-    Args:
-        machine: its tube and detector.
-        camera: mode and region of interest.
-        exposure: tube and time; taken as if X-rays were on.
-        view: cone_vec row (12,): distances and pixel size.
-        physics: how the counts are made; mono has the counts of poly.
-
-    Returns:
-        The open beam; None where mono or poly have no spectrum for the voltage.
+    `machine`: its tube and detector. `camera`: mode and region of interest. `exposure`: tube and
+    time; taken as if X-rays were on. `view`: cone_vec row (12,): distances and pixel size.
+    `physics`: how the counts are made; mono has the counts of poly.
+    Returns the open beam; None where mono or poly have no spectrum for the voltage.
     """
     match physics:
         case "ideal":

@@ -158,15 +158,12 @@ class ScatterImage:
 
 
 def spread_out(values: FloatArray, shape: tuple[int, int]) -> Float32Array:
-    """Interpolate values at nodes at every pixel, by cubic splines (of lower order for
-    fewer than 4 nodes).
+    """Interpolate values at nodes at every pixel, by cubic splines (of lower order for fewer
+    than 4 nodes).
 
-    Args:
-        values: (v, u) at nodes that reach from the first to the last pixel, evenly.
-        shape: the panel's (rows, cols).
-
-    Returns:
-        float32 (rows, cols).
+    `values`: (v, u) at nodes that reach from the first to the last pixel, evenly; `shape`: the
+    panel's (rows, cols).
+    Returns float32 (rows, cols).
     """
     from scipy.interpolate import RectBivariateSpline
 
@@ -333,15 +330,8 @@ def _energy_chances(
     """Compute the chances to draw each energy: half as in the open beam, half as behind the
     thickest part, where hard photons make most of the signal.
 
-    Args:
-        thing: the object.
-        row: cone_vec row (12,).
-        mu: (materials, s) attenuations.
-        share: (s,) of each energy in the open beam.
-
-    Returns:
-        (s,), adding up to 1.
-    """
+    `thing`: the object; `row`: cone_vec row (12,); `mu`: (materials, s) attenuations; `share`:
+    (s,) of each energy in the open beam. Returns (s,), adding up to 1."""
     axis = int(np.argmax(np.abs(np.cross(row[6:9], row[9:12]))))
     columns = thing.amounts.sum(axis=2 - axis, dtype=np.float64) * thing.voxel_mm[axis]
     thickest = columns.reshape(-1, len(mu))[np.argmax(columns.sum(axis=-1))]
@@ -445,8 +435,7 @@ class ScanScatter:
         """Compute the standard error of a view's scatter, float32 (rows, cols), of the
         open beam's signal.
 
-        That of the Monte Carlo alone: interpolation between nodes and views comes on top.
-        """
+        That of the Monte Carlo alone: interpolation between nodes and views comes on top."""
         squares = self._at(index, self._stack["error"] ** 2, 2)
         return spread_out(np.sqrt(squares), self.images[0].shape)
 
@@ -507,16 +496,10 @@ def view_scatter(
 ) -> Scattered:
     """Simulate the scatter of one view at every pixel, independent of other views.
 
-    Args:
-        thing: the object's voxels, in the frame of `view`.
-        view: the cone_vec row (12,) [mm]; other views draw other photons, the same the
-            same.
-        shape: the panel's (rows, cols).
-        beam: spectrum and panel.
-        settings: how; `step_deg` does not count.
-
-    Raises:
-        GeometryError: the source is beside or inside the object's box.
+    `thing`: the object's voxels, in the frame of `view`. `view`: the cone_vec row (12,) [mm];
+    other views draw other photons, the same the same. `shape`: the panel's (rows, cols). `beam`:
+    spectrum and panel. `settings`: how; `step_deg` does not count.
+    Raises GeometryError: the source is beside or inside the object's box.
     """
     row = np.ascontiguousarray(view, dtype=np.float64)
     stream = int.from_bytes(blake2b(row.tobytes(), digest_size=8).digest(), "little")

@@ -179,21 +179,15 @@ def depth_of(paths: Any, mu: Any) -> float:
 
 @kernel
 def depth_drawn(number, depth):
-    """Draw the optical depth of a forced interaction on a path of optical depth `depth`,
-    and its weight.
+    """Draw the optical depth of a forced interaction on a path of optical depth `depth`, and its
+    weight.
 
-    Args:
-        number: random, in [0, 1).
-        depth: above 0.
-
-    Returns:
-        The depth, 0 to `depth`, and the weight.
-
-    Half of the chance is the exponential's, cut off at the far side; half is even, since
-    a photon that goes on to the panel is weakened as much wherever on the way it
-    interacts. Without it thick objects would be sampled at their entrance alone. Newton's
-    steps from 0 invert the running chance, which is concave, from below.
-    """
+    `number`: random, in [0, 1); `depth`: above 0.
+    Returns the depth, 0 to `depth`, and the weight. Half of the chance is the exponential's, cut
+    off at the far side; half is even, since a photon that goes on to the panel is weakened as
+    much wherever on the way it interacts. Without it thick objects would be sampled at their
+    entrance alone. Newton's steps from 0 invert the running chance, which is concave, from
+    below."""
     hit = -math.expm1(-depth)
     t = 0.0
     for _ in range(12):
@@ -277,9 +271,9 @@ def coherent_cosine(state, energy, cumulated, root_step):
 
 @kernel
 def incoherent_cosine(state, energy, shell, root_step):
-    """Draw the angle of an incoherent interaction, by rejection from the even
-    distribution: Klein-Nishina, at most 1 here, and S over its greatest value. Half of
-    the trials or more succeed below 250 keV.
+    """Draw the angle of an incoherent interaction, by rejection from the even distribution:
+    Klein-Nishina, at most 1 here, and S over its greatest value. Half of the trials or more
+    succeed below 250 keV.
 
     Args:
         state: of the random stream.
@@ -287,8 +281,7 @@ def incoherent_cosine(state, energy, shell, root_step):
         shell: (e,) S, the incoherent scattering function.
         root_step: step of its table, in the root of x.
 
-    Returns:
-        The stream's new state, and the cosine.
+    Returns the stream's new state, and the cosine.
     """
     most = shell[len(shell) - 1]
     while True:

@@ -88,8 +88,7 @@ def deposited(screen: Filter) -> Deposited:
 
     def escaping(mu: FloatArray) -> FloatArray:
         """Compute the part of isotropically emitted photons that escapes through both
-        faces, (e, slice).
-        """
+        faces, (e, slice)."""
         back = through(mu[..., None] * depth)
         return np.asarray((back + through(mu[..., None] * (thick - depth))) / 2.0)
 

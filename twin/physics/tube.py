@@ -284,8 +284,7 @@ class Tube:
         Example:
             >>> lit = Tube(kV=60, power_W=30).exposure(100.0, averages=4)
             >>> lit.kV, lit.power_W, lit.exposure_ms, lit.averages, lit.xrays_on
-            (60.0, 30.0, 100.0, 4, True)
-        """
+            (60.0, 30.0, 100.0, 4, True)"""
         return ExposureSettings(
             float(self.kV), float(self.power_W), float(exposure_ms), int(averages)
         )
@@ -294,9 +293,7 @@ class Tube:
 def _filter(layer: tuple[str, float] | Filter) -> Filter:
     """Convert (material, thickness [mm]) to a filter; a filter itself is only checked.
 
-    Raises:
-        LimitError: the thickness is not 0 to 1000 mm.
-        UnknownNameError: an unknown material.
+    Raises LimitError: the thickness is not 0 to 1000 mm; UnknownNameError: an unknown material.
     """
     if not isinstance(layer, Filter):
         layer = Filter(material(layer[0]).substance, float(layer[1]))

@@ -80,16 +80,13 @@ def ordered(names: Sequence[str]) -> Ordered:
 
 
 def _numbered(names: list[str]) -> Ordered | None:
-    """Sort names quickly if they differ only by a whole number of fixed width whose steps
-    are even.
+    """Sort names quickly if they differ only by a whole number of fixed width whose steps are
+    even.
 
-    Args:
-        names: sorted, without repetition.
-
-    Returns:
-        The names in that order, without findings. None for fewer than two names, names of
-        unequal length, several differing parts, uneven steps, or a number next to a sign,
-        decimal point or another number.
+    `names`: sorted, without repetition.
+    Returns the names in that order, without findings. None for fewer than two names, names of
+    unequal length, several differing parts, uneven steps, or a number next to a sign, decimal
+    point or another number.
     """
     split = _split(names, DECIMAL)
     if split is None:
@@ -103,15 +100,13 @@ def _numbered(names: list[str]) -> Ordered | None:
 
 
 def _hexadecimal(names: list[str]) -> Ordered | None:
-    """Sort names that differ only by a hexadecimal number of fixed width whose steps are
-    even.
+    """Sort names that differ only by a hexadecimal number of fixed width whose steps are even.
 
     Args:
         names: sorted, without repetition.
 
-    Returns:
-        The names in that order, without findings. None for other names, and where no
-        number or every number has a letter.
+    Returns the names in that order, without findings. None for other names, and where no number
+    or every number has a letter.
     """
     split = _split(names, HEXADECIMAL)
     if split is None:
@@ -130,9 +125,8 @@ def _split(names: list[str], digits: str) -> tuple[str, list[str], str] | None:
         names: sorted, without repetition.
         digits: of which the number is, after its first decimal ones.
 
-    Returns:
-        The text before it, the numbers, and the text after it. None for fewer than two
-        names, unequal lengths, or several differing parts.
+    Returns the text before it, the numbers, and the text after it. None for fewer than two
+    names, unequal lengths, or several differing parts.
     """
     if len(names) < 2 or len({*map(len, names)}) != 1:
         return None
@@ -156,14 +150,11 @@ def _even(names: list[str], numbers: list[int]) -> Ordered | None:
 
 
 def other_name(others: Sequence[str], names: Sequence[str]) -> Finding:
-    """Make the warning on names that are written otherwise than those of the other
-    images; its figure is their number.
+    """Make the warning on names that are written otherwise than those of the other images; its
+    figure is their number.
 
-    Args:
-        others: the names in question; the first `MAX_NAMES_SHOWN` are named.
-        names: all names, at least one of them not in `others`; the first such is the
-            example.
-    """
+    `others`: the names in question; the first `MAX_NAMES_SHOWN` are named. `names`: all names,
+    at least one of them not in `others`; the first such is the example."""
     like = next(name for name in names if name not in others)
     listed = ", ".join(others[:MAX_NAMES_SHOWN])
     cause = f"{listed} {_is(others)} named otherwise than the rest, such as {like}"
@@ -273,14 +264,12 @@ def _decimal(
 ) -> bool:
     """Decide whether points in names are decimal points and not separators of numbers.
 
-    If decimal points make more names equal (1.1 and 1.10), they are only believed when
-    they make more texts equal. Otherwise True if all fractions have one width or none of
-    several digits ends in 0; False for names without points.
+    If decimal points make more names equal (1.1 and 1.10), they are only believed when they make
+    more texts equal. Otherwise True if all fractions have one width or none of several digits
+    ends in 0; False for names without points.
 
-    Args:
-        decimal: keys with decimal points, by name.
-        whole: keys without.
-        stems: names without their endings, by name.
+    `decimal`: keys with decimal points, by name; `whole`: keys without; `stems`: names without
+    their endings, by name.
     """
     if len(set(decimal.values())) < len(set(whole.values())):
         return len(_texts(decimal)) < len(_texts(whole))
@@ -294,16 +283,11 @@ def _decimal(
 
 
 def _written_otherwise(names: Sequence[str], keys: dict[str, Key]) -> tuple[str, ...]:
-    """Return the few names whose text (without numbers) differs from that which most
-    share.
+    """Return the few names whose text (without numbers) differs from that which most share.
 
-    Args:
-        names: in order.
-        keys: their sort keys.
-
-    Returns:
-        The names, in order; empty unless at least four share one text and the others are
-        at most two or `MAX_OTHERS_SHARE` of all.
+    `names`: in order; `keys`: their sort keys.
+    Returns the names, in order; empty unless at least four share one text and the others are at
+    most two or `MAX_OTHERS_SHARE` of all.
     """
     texts = Counter(_text(keys[name]) for name in names)
     usual, most = texts.most_common(1)[0] if texts else ("", 0)

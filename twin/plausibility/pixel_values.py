@@ -140,9 +140,8 @@ _FROM_COUNTS: Final = (
 
 
 def _beam(images: npt.NDArray[Any]) -> float | None:
-    """Return the mean of the median values at the images' left and right edges
-    (`EDGE_PART` of the columns each) if both differ by at most 10 %, else None, also for
-    NaN.
+    """Return the mean of the median values at the images' left and right edges (`EDGE_PART` of
+    the columns each) if both differ by at most 10 %, else None, also for NaN.
 
     Args:
         images: (k, rows, cols).

@@ -153,12 +153,10 @@ def beam_findings(levels_seen: Sequence[float | None]) -> Iterator[Finding]:
 
 
 def _drifts(levels: FloatArray) -> bool:
-    """Return whether levels rise or fall steadily: none is off the fitted straight line
-    by 30 % of their range or more.
+    """Return whether levels rise or fall steadily: none is off the fitted straight line by 30 %
+    of their range or more.
 
-    Args:
-        levels: (k,) in the order of the views.
-    """
+    `levels`: (k,) in the order of the views."""
     line = np.polyval(
         np.polyfit(np.arange(len(levels)), levels, 1), np.arange(len(levels))
     )
@@ -215,7 +213,6 @@ def open_beam(
 
 def _blocks(strip: npt.NDArray[Any]) -> FloatArray:
     """Average `STRIP_BLOCKS` parts of a strip, from top to bottom, over finite pixels;
-    NaN for a part without any.
-    """
+    NaN for a part without any."""
     parts = [part[np.isfinite(part)] for part in np.array_split(strip, STRIP_BLOCKS)]
     return np.array([float(part.mean()) if part.size else np.nan for part in parts])

@@ -217,8 +217,7 @@ def _round_degrees(span: float, step: float) -> bool:
 
 def arc_deg(cone_vec: ConeVec) -> float:
     """Compute the arc that the views of a circular scan cover [deg]: the full turn
-    without its widest gap between neighbouring directions of beams (0 for one view).
-    """
+    without its widest gap between neighbouring directions of beams (0 for one view)."""
     return _arc_of(azimuths(cone_vec))
 
 

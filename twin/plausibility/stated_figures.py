@@ -110,16 +110,12 @@ def _wrapped(angle: FloatArray) -> FloatArray:
 
 
 def _worst(own: FloatArray, stated: FloatArray) -> float:
-    """Compute the largest difference of angles modulo a turn, for the better sense of
-    rotation and the mean difference as zero.
+    """Compute the largest difference of angles modulo a turn, for the better sense of rotation
+    and the mean difference as zero.
 
-    Args:
-        own: (n,) angles of the geometry [rad].
-        stated: (n,) stated angles [rad], in the same order.
-
-    Returns:
-        Difference [rad], at most pi.
-    """
+    `own`: (n,) angles of the geometry [rad]; `stated`: (n,) stated angles [rad], in the same
+    order.
+    Returns difference [rad], at most pi."""
     found = []
     for sense in (1.0, -1.0):
         off = own - sense * stated

@@ -105,14 +105,10 @@ def grid_findings(
 
 
 def _crossed(at: FloatArray, ahead: FloatArray, shape: tuple[int, int]) -> bool:
-    """Return whether the bounding box of the images of the grid's points meets the panel
-    in some view, so that a grid coarser than the panel counts as seen.
-
-    Args:
-        at: images of the points, (n, k, 2) [px].
-        ahead: whether each point is between source and panel, (n, k); others are ignored.
-        shape: detector (rows, cols).
-    """
+    """Return whether the bounding box of the images of the grid's points meets the panel in some
+    view, so that a grid coarser than the panel counts as seen. `at`: images of the points, (n,
+    k, 2) [px]. `ahead`: whether each point is between source and panel, (n, k); others are
+    ignored. `shape`: detector (rows, cols)."""
     far = np.array(shape[::-1]) - 0.5
     low = np.where(ahead[..., None], at, np.inf).min(axis=1)
     high = np.where(ahead[..., None], at, -np.inf).max(axis=1)
@@ -123,11 +119,7 @@ def voxel_findings(voxel_mm: float, view_mm: float) -> Iterator[Finding]:
     """Find voxels so large that fewer than `FEWEST_VOXELS` fit into a field of view.
 
     Yields (does not raise) at most one refusal, its figure the voxel size.
-
-    Args:
-        voxel_mm: edge of a voxel [mm].
-        view_mm: width of the field of view [mm].
-    """
+    `voxel_mm`: edge of a voxel [mm]; `view_mm`: width of the field of view [mm]."""
     if voxel_mm * FEWEST_VOXELS > view_mm:
         cause = f"voxels of {voxel_mm:g} mm in a field of view of {view_mm:.4g} mm across"
         remedy = f"allowed: below {view_mm / FEWEST_VOXELS:.3g} mm; is the voxel in mm?"

@@ -214,17 +214,12 @@ def shadows(
 ) -> IntArray:
     """Find the pixels that each solid can darken.
 
-    The box around a solid's shadow, cut to the panel. A solid that is not wholly before
-    the source can darken all pixels.
+    The box around a solid's shadow, cut to the panel. A solid that is not wholly before the
+    source can darken all pixels.
 
-    Args:
-        shapes: the k solids.
-        rays: (n, 12) as of `ConeVec.rays`.
-        shape: detector (rows, cols).
-
-    Returns:
-        int64 (n, k, 4) first row, last row + 1, first column, last column + 1; without a
-        pixel the first is not below the last.
+    `shapes`: the k solids; `rays`: (n, 12) as of `ConeVec.rays`; `shape`: detector (rows, cols).
+    Returns int64 (n, k, 4) first row, last row + 1, first column, last column + 1; without a
+    pixel the first is not below the last.
     """
     result = np.empty((len(rays), len(shapes), 4), np.int64)
     inverse = _inverses(rays)
@@ -315,14 +310,8 @@ def _ellipsoid_ranges(
 
 
 def _inverses(rays: FloatArray) -> FloatArray:
-    """Compute matrices that map points seen from the source to (column, row, 1) times
-    depth.
-
-    Depth is in distances of the panel.
-
-    Returns:
-        (n, 3, 3).
-    """
+    """Compute matrices that map points seen from the source to (column, row, 1) times depth.
+    Depth is in distances of the panel. Returns (n, 3, 3)."""
     basis = np.stack([rays[:, 6:9], rays[:, 9:12], rays[:, 3:6]], axis=2)
     return np.asarray(np.linalg.inv(basis))
 
@@ -335,14 +324,9 @@ def _pixels(
 ) -> IntArray:
     """Convert ranges of columns and rows to whole pixels.
 
-    Args:
-        low: (..., 2) least column and row.
-        high: (..., 2) largest.
-        ahead: (...) the range is known; otherwise all pixels are taken.
-        shape: (rows, cols).
-
-    Returns:
-        (..., 4) first row, row after the last, first column, column after the last.
+    `low`: (..., 2) least column and row. `high`: (..., 2) largest. `ahead`: (...) the range is
+    known; otherwise all pixels are taken. `shape`: (rows, cols).
+    Returns (..., 4) first row, row after the last, first column, column after the last.
     """
     known = ahead[..., None]
     size = np.array(shape[::-1], dtype=np.float64)
@@ -400,8 +384,7 @@ def _positive(shape: Shape, *sizes: float) -> None:
 def _unit(shape: Shape, direction: Vector) -> FloatArray:
     """Check that a direction of a shape is a unit vector, and return it normalised, (3,).
 
-    Raises:
-        GeometryError: its length differs from 1 by more than `UNIT_TOLERANCE`.
+    Raises GeometryError: its length differs from 1 by more than `UNIT_TOLERANCE`.
     """
     k = np.array(direction, dtype=np.float64)
     if k.shape != (3,) or abs(np.linalg.norm(k) - 1) > UNIT_TOLERANCE:
@@ -410,11 +393,9 @@ def _unit(shape: Shape, direction: Vector) -> FloatArray:
 
 
 def _orthonormal(shape: Shape, axes: Matrix) -> FloatArray:
-    """Check that the axes of a shape are orthonormal rows, and return them as an array
-    (3, 3).
+    """Check that the axes of a shape are orthonormal rows, and return them as an array (3, 3).
 
-    Raises:
-        GeometryError: a dot product differs by more than `UNIT_TOLERANCE`.
+    Raises GeometryError: a dot product differs by more than `UNIT_TOLERANCE`.
     """
     a = np.array(axes, dtype=np.float64)
     if a.shape != (3, 3) or np.abs(a @ a.T - np.eye(3)).max() > UNIT_TOLERANCE:

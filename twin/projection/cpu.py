@@ -140,15 +140,9 @@ def _project_averaged(
 def _project_alone(
     box: Box, views: FloatArray, chosen: IntArray, out: Float32Array
 ) -> None:
-    """Fill the chosen views of `out` with line integrals of rays that are walked one by
-    one, on all threads.
-
-    Args:
-        box: the volume.
-        views: (n, 12) rays in voxel units.
-        chosen: indices of views.
-        out: (n, rows, cols), changed.
-    """
+    """Fill the chosen views of `out` with line integrals of rays that are walked one by one, on
+    all threads. `box`: the volume; `views`: (n, 12) rays in voxel units; `chosen`: indices of
+    views; `out`: (n, rows, cols), changed."""
     from flexdt.twin.projection.kernels import siddon_kernels
 
     jobs = len(chosen) * -(-out.shape[2] // TILE_COLUMNS)
@@ -171,13 +165,9 @@ def spread(
 ) -> None:
     """Apply the transpose of `project`: add values (n, rows, cols) to box.flat.
 
-    Args:
-        box: the volume; its spans are not used.
-        views: as in `project`.
-        values: C-ordered float32.
-        clean: True if box.flat holds zeros; otherwise its content is overwritten (if
-            there is a view).
-        fans: False to walk every ray on its own.
+    `box`: the volume; its spans are not used. `views`: as in `project`. `values`: C-ordered
+    float32. `clean`: True if box.flat holds zeros; otherwise its content is overwritten (if
+    there is a view). `fans`: False to walk every ray on its own.
     """
     shape = (values.shape[1], values.shape[2])
     for some, turned in runs(views, shape) if fans else [(slice(None), False)]:
@@ -253,8 +243,7 @@ def z_slices(nz: int, count: int) -> IntArray:
     """Cut nz levels into at most `count` ranges (s, 2) of about equal height.
 
     Cuts are at multiples of `LANE_FLOATS` voxels; fewer ranges where there are fewer of
-    these.
-    """
+    these."""
     lines = -(-nz // LANE_FLOATS)
     edges = np.unique(np.arange(count + 1) * lines // count) * LANE_FLOATS
     edges[-1] = nz
@@ -264,11 +253,8 @@ def z_slices(nz: int, count: int) -> IntArray:
 def box_shadows(
     box: Box, views: FloatArray, levels: tuple[int, int], shape: tuple[int, int]
 ) -> IntArray:
-    """Find the pixels that levels [low, high) of a box can reach.
-
-    Returns:
-        (n, 4) first row, last row + 1, first column, last column + 1.
-    """
+    """Find the pixels that levels [low, high) of a box can reach. Returns (n, 4) first row, last
+    row + 1, first column, last column + 1."""
     ends = [[x, y, z] for x in (0, box.nx) for y in (0, box.ny) for z in levels]
     return corner_shadows(np.array(ends, dtype=np.float64), views, shape)
 

@@ -47,11 +47,10 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_images(cls, images: Any) -> DeviceArray:
-        """Make an array of images (n, rows, cols): a copy of those on the host, or the
-        shared memory of those on the device.
+        """Make an array of images (n, rows, cols): a copy of those on the host, or the shared
+        memory of those on the device.
 
-        Raises:
-            DeviceError: the device failed.
+        Raises DeviceError: the device failed.
         """
         if gpu.is_there(images):
             there = images

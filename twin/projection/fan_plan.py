@@ -53,15 +53,11 @@ voxel columns beyond its own lines, and so does its second neighbour."""
 
 
 def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Find views in which images of vertical planes follow the rows more than the
-    columns.
+    """Find views in which images of vertical planes follow the rows more than the columns.
 
-    Args:
-        views: (n, 12) source, first pixel minus source, u, v in voxel units.
-        shape: detector (rows, cols).
-
-    Returns:
-        (n,) bool.
+    `views`: (n, 12) source, first pixel minus source, u, v in voxel units; `shape`: detector
+    (rows, cols).
+    Returns (n,) bool.
     """
     rows, cols = shape
     first, u, v = (views[:, i : i + 3] for i in (3, 6, 9))
@@ -97,9 +93,7 @@ class FanPlan:
     alone: IntArray
 
     def fans(self, views: FloatArray, some: slice = slice(None)) -> Fans:
-        """Return the plan of `views` (n, 12), or `some` of its jobs, as the kernels'
-        `Fans`.
-        """
+        """Return the plan of `views` (n, 12), or `some` of its jobs, as the kernels' `Fans`."""
         return Fans(views, self.lines, self.jobs[some], self.room, self.widest)
 
 
@@ -256,8 +250,7 @@ def _expand_counts(counts: IntArray) -> tuple[IntArray, IntArray]:
 def _fan_columns(
     source: FloatArray, u: FloatArray, rays: FloatArray, counts: tuple[int, int, int]
 ) -> FloatArray:
-    """Compute the columns a fan may span so that its rays stay within
-    `MAX_SPREAD_VOXELS`.
+    """Compute the columns a fan may span so that its rays stay within `MAX_SPREAD_VOXELS`.
 
     Args:
         source: (n, 3) [voxels].
@@ -265,8 +258,7 @@ def _fan_columns(
         rays: (n, k, 3) directions of k rays of each view.
         counts: the box's voxels along x, y and z.
 
-    Returns:
-        (n,) columns, at most `MAX_FAN_COLUMNS`.
+    Returns (n,) columns, at most `MAX_FAN_COLUMNS`.
     """
     ends = np.array(
         [[x, y] for x in (0, counts[0]) for y in (0, counts[1])], dtype=np.float64

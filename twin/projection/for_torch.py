@@ -55,20 +55,16 @@ class TorchOperator:
         """Project voxels, or spread projections if this is the adjoint.
 
         Args:
-            values: (nz, ny, nx) [1/mm] or projections (n, rows, cols), with any number of batch
-                dimensions before them.
+            values: (nz, ny, nx) [1/mm] or projections (n, rows, cols), with any number of
+                batch dimensions before them.
             rows: the geometry as a tensor (n, 12) [mm], for all of the batch; with
                 `requires_grad` it gets the derivative. Take float64: single precision rounds
                 distances of a metre to 0.06 um, which is felt in sums over many pixels.
 
-        Returns:
-            float32 tensor, batch dimensions as given.
-
-        Raises:
-            GeometryError: a shape does not fit.
-            NotBuiltError: a tensor is on a device other than CUDA's, or a second
-                derivative with respect to the geometry is requested.
-            DeviceError: the device failed; the log has the reason.
+        Returns float32 tensor, batch dimensions as given.
+        Raises GeometryError: a shape does not fit; NotBuiltError: a tensor is on a device other
+        than CUDA's, or a second derivative with respect to the geometry is requested;
+        DeviceError: the device failed; the log has the reason.
         """
         values = _tensor(values)
         rows = _tensor(self.geometry.rows if rows is None else rows)
@@ -95,14 +91,9 @@ class _Project(torch.autograd.Function):
     def forward(ctx: Any, x: Any, rows: Any, a: TorchOperator) -> Any:
         """Project a batch of volumes, on their device, and store them for `backward`.
 
-        Args:
-            ctx: of torch.
-            x: volumes (..., nz, ny, nx).
-            rows: cone_vec (n, 12).
-            a: the operator, for grid and detector.
-
-        Returns:
-            float32 (..., n, rows, cols).
+        `ctx`: of torch; `x`: volumes (..., nz, ny, nx); `rows`: cone_vec (n, 12); `a`: the
+        operator, for grid and detector.
+        Returns float32 (..., n, rows, cols).
         """
         ctx.save_for_backward(x, rows)
         ctx.a = a
@@ -134,18 +125,12 @@ class _Spread(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, y: Any, rows: Any, a: TorchOperator) -> Any:
-        """Apply the transpose of the projection to a batch of images, on their device,
-        and store them for `backward`.
+        """Apply the transpose of the projection to a batch of images, on their device, and store
+        them for `backward`.
 
-        Args:
-            ctx: of torch.
-            y: images (..., n, rows, cols).
-            rows: cone_vec (n, 12).
-            a: the operator, for grid and detector.
-
-        Returns:
-            float32 (..., nz, ny, nx).
-        """
+        `ctx`: of torch; `y`: images (..., n, rows, cols); `rows`: cone_vec (n, 12); `a`: the
+        operator, for grid and detector.
+        Returns float32 (..., nz, ny, nx)."""
         ctx.save_for_backward(y, rows)
         ctx.a = a
         cone_vec = _cone_vec(rows)
@@ -195,8 +180,7 @@ class _ByRows(torch.autograd.Function):
     def backward(ctx: Any, g: Any) -> Any:
         """Refuse second derivatives with respect to the geometry.
 
-        Raises:
-            NotBuiltError: always.
+        Raises NotBuiltError: always.
         """
         raise NotBuiltError(
             "second derivatives with respect to the geometry are not built; allowed: the first",

@@ -75,8 +75,7 @@ _failed: list[Availability] = []
 def availability() -> Availability:
     """Return whether projections can run on a CUDA device; probed once, never raises.
 
-    With NUMBA_DISABLE_CUDA=1 in the environment no device is available.
-    """
+    With NUMBA_DISABLE_CUDA=1 in the environment no device is available."""
     return _failed[0] if _failed else _probe()
 
 
@@ -130,8 +129,7 @@ def _project_one_ray() -> None:
 
     It uses one kernel, because each takes seconds to compile.
 
-    Raises:
-        Exception: any error of numba or the driver, or a wrong result.
+    Raises Exception: any error of numba or the driver, or a wrong result.
     """
     box = Box(np.array([1, 3], np.float32), None, 0, 1, 2, 2, 1, 1, 0.5, 0.5, 0.5)
     views = np.array([[-1.0, 0.5, 0.5, 4.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0]])
@@ -238,8 +236,7 @@ def on(device: int) -> Any:
 
 def current_device() -> int:
     """Return the number of the current device, whose context this thread has from now on;
-    0 in the simulator.
-    """
+    0 in the simulator."""
     from numba import cuda
 
     return int(getattr(cuda.current_context().device, "id", 0))
@@ -313,18 +310,10 @@ def demand(work: Callable[[], Any]) -> Any:
 def project_there(
     box: Box, voxels: Any, views: FloatArray, shape: tuple[int, ...]
 ) -> Any:
-    """Project a volume on the device to images that stay there; does not wait for the
-    kernels.
+    """Project a volume on the device to images that stay there; does not wait for the kernels.
 
-    Args:
-        box: the layout's voxels.
-        voxels: of the layout, on the device.
-        views: (n, 12) rays in voxels.
-        shape: (rows, cols).
-
-    Returns:
-        (n, rows, cols) on the device.
-    """
+    `box`: the layout's voxels; `voxels`: of the layout, on the device; `views`: (n, 12) rays in
+    voxels; `shape`: (rows, cols). Returns (n, rows, cols) on the device."""
     from numba import cuda
 
     images = cuda.device_array(len(views) * shape[0] * shape[1], np.float32)
@@ -391,16 +380,12 @@ def spread(
     clean: bool = False,
     deterministic: bool = False,
 ) -> None:
-    """Apply `spread_there` to box.flat on the host: the voxels are moved to the device
-    and the sums back.
+    """Apply `spread_there` to box.flat on the host: the voxels are moved to the device and the
+    sums back.
 
-    Args:
-        box: the volume.
-        views: as in `project`.
-        values: (n, rows, cols) on the host.
-        clean: True if box.flat holds zeros, which are not transferred.
-        deterministic: add integers; see `spread_there`.
-    """
+    `box`: the volume. `views`: as in `project`. `values`: (n, rows, cols) on the host. `clean`:
+    True if box.flat holds zeros, which are not transferred. `deterministic`: add integers; see
+    `spread_there`."""
     if clean:
         voxels = zeros(box.flat.size)
     else:
@@ -412,12 +397,10 @@ def spread(
 def whole_factor(box: Box, values: Any) -> float:
     """Compute the power of 2 that scales values for a sum of 64-bit integers.
 
-    A ray adds at most its value times a voxel's diagonal; the sum of all rays stays below
-    2^62. 1 for values that are all zero or not finite.
+    A ray adds at most its value times a voxel's diagonal; the sum of all rays stays below 2^62.
+    1 for values that are all zero or not finite.
 
-    Args:
-        box: sizes of the voxels.
-        values: images, on the host or the device (copied to the host).
+    `box`: sizes of the voxels; `values`: images, on the host or the device (copied to the host).
     """
     diagonal = math.hypot(box.size_x, box.size_y, box.size_z)
     if is_there(values):
@@ -436,8 +419,7 @@ def by_slabs(
     All rays of such a view cross the box from side to side between source and pixel, and
     rise at most one voxel for each that they pass along the faster one of x and y. These
     are convex conditions: if the detector's corners meet them, all pixels do. A view that
-    fails may still have only such rays.
-    """
+    fails may still have only such rays."""
     return clear_of(box, views, shape) & (rises(views, shape) <= 1.0)
 
 
@@ -584,8 +566,7 @@ def launcher(
 
 def forward_kernels() -> tuple[Any, Any, Any]:
     """Return the forward kernels by the walk's number: single rays, slabs, upright
-    columns.
-    """
+    columns."""
     from flexdt.twin.projection.kernels import gpu_kernels as kernels
 
     return kernels.project_rays, kernels.project_slabs, kernels.project_columns
@@ -596,14 +577,10 @@ def launch_sizes(
 ) -> tuple[int, tuple[int, int], tuple[int, int, int, int]]:
     """Find what a kernel is launched with for views of one kind.
 
-    Args:
-        kind: WALK_KINDS for a panel on its side, plus the walk's number.
-        count: views.
-        shape: the detector's (rows, cols).
-
-    Returns:
-        The walk's number, the grid of blocks, and lanes, columns and their steps in the
-        image.
+    `kind`: WALK_KINDS for a panel on its side, plus the walk's number; `count`: views; `shape`:
+    the detector's (rows, cols).
+    Returns the walk's number, the grid of blocks, and lanes, columns and their steps in the
+    image.
     """
     from flexdt.twin.projection.kernels import gpu_kernels as kernels
 

@@ -26,9 +26,7 @@ EXCHANGED: Final = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
 def check_model(model: object) -> None:
     """Check the name of a model.
 
-    Raises:
-        LimitError: unknown; lists the allowed ones.
-    """
+    Raises LimitError: unknown; lists the allowed ones."""
     if model not in MODELS:
         allowed = ", ".join(repr(name) for name in MODELS)
         raise LimitError.instead(f"model is {model!r}", repr(model), allowed)

@@ -61,12 +61,10 @@ def on_host(function: Callable[[npt.NDArray[Any]], Float32Array]) -> Callable[[A
     """
 
     def wrapped(x: Any) -> Any:
-        """Call the function with a NumPy array of `x`, and return its result in the library
-        that `x` is from.
+        """Call the function with a NumPy array of `x`, and return its result in the library that
+        `x` is from.
 
-        Raises:
-            NotBuiltError: `x` is on a device.
-        """
+        Raises NotBuiltError: `x` is on a device."""
         if isinstance(x, np.ndarray) or not hasattr(x, "__dlpack__"):
             return function(np.asarray(x))
         gpu.check_host(x.__dlpack_device__()[0] == HOST, type(x).__name__)
@@ -207,8 +205,7 @@ class Operator:
     def _back(self, y: npt.NDArray[Any]) -> Float32Array:
         """Apply the transpose to images of `image_shape`; returns voxels (nz, ny, nx).
 
-        Raises:
-            GeometryError: another shape.
+        Raises GeometryError: another shape.
         """
         _check(y.shape, self.image_shape, "projections")
         room = room_like(self.like)
@@ -218,8 +215,7 @@ class Operator:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns of the matrix, as `scipy.sparse.linalg.aslinearoperator` needs
-        them.
-        """
+        them."""
         return math.prod(self.image_shape), math.prod(self.voxel_shape)
 
     def matvec(self, x: npt.NDArray[Any]) -> Float32Array:
@@ -228,8 +224,7 @@ class Operator:
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
             >>> Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1)).matvec(np.ones(36))
-            array([2.], dtype=float32)
-        """
+            array([2.], dtype=float32)"""
         return self._forward(x.reshape(self.voxel_shape)).ravel()
 
     def rmatvec(self, y: npt.NDArray[Any]) -> Float32Array:
@@ -238,8 +233,7 @@ class Operator:
         Example:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
             >>> Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1)).rmatvec(np.ones(1)).shape
-            (36,)
-        """
+            (36,)"""
         return self._back(y.reshape(self.image_shape)).ravel()
 
     def norm(self, tolerance: float = 1e-3) -> float:
@@ -279,8 +273,7 @@ class Operator:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
             >>> A = Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1))
             >>> A.gradient(np.ones((3, 4, 3)), np.ones((1, 1, 1))).shape
-            (1, 12)
-        """
+            (1, 12)"""
         return geometry_gradient(self._volume(x), self.geometry, weights)
 
     def change(self, x: Volume | npt.ArrayLike, change: npt.ArrayLike) -> Float32Array:
@@ -293,8 +286,7 @@ class Operator:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
             >>> A = Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1))
             >>> A.change(np.ones((3, 4, 3)), np.ones((1, 12))).shape
-            (1, 1, 1)
-        """
+            (1, 1, 1)"""
         return geometry_change(
             self._volume(x), self.geometry, change, self.detector_shape
         )
@@ -312,8 +304,7 @@ class Operator:
             >>> view = ConeVec.from_vectors((0, -500, 0), (0, 500, 0), (1, 0, 0), (0, 0, -1))
             >>> A = Operator(view, like=Grid((3, 4, 3), 0.5), shape=(1, 1))
             >>> A.linear_operator().shape
-            (1, 36)
-        """
+            (1, 36)"""
         from scipy.sparse.linalg import aslinearoperator
 
         return aslinearoperator(self)
@@ -342,31 +333,20 @@ class Operator:
         return TorchOperator(self.geometry, self.like, self.detector_shape)
 
     def odl(self) -> Any:
-        """Return the map as an `odl.Operator`, from a discretised function space in mm
-        (z, y, x).
-
-        Needs the extra `odl`. Both spaces have the weight 1, so that ODL's adjoint is the
-        transpose.
-
-        Raises:
-            TwinError: ODL is not installed.
-        """
+        """Return the map as an `odl.Operator`, from a discretised function space in mm (z, y,
+        x). Needs the extra `odl`. Both spaces have the weight 1, so that ODL's adjoint is the
+        transpose. Raises TwinError: ODL is not installed."""
         _require("odl", "pip install 'flexdt[odl]'")
         from flexdt.twin.projection.for_odl_and_cil import odl_operator
 
         return odl_operator(self._forward, self._back, self.like, self.image_shape)
 
     def cil(self) -> Any:
-        """Return the map as a `LinearOperator` of CIL, with CIL geometries of voxels and
-        panel.
+        """Return the map as a `LinearOperator` of CIL, with CIL geometries of voxels and panel.
 
-        CIL's algorithms, its power method and its dot test were run on it with CIL 26.0.
-        CIL's geometry has the distances and sizes for CIL's displays; the rays are this
-        operator's.
-
-        Raises:
-            TwinError: CIL is not installed.
-        """
+        CIL's algorithms, its power method and its dot test were run on it with CIL 26.0. CIL's
+        geometry has the distances and sizes for CIL's displays; the rays are this operator's.
+        Raises TwinError: CIL is not installed."""
         _require("cil", "conda install -c ccpi cil")
         from flexdt.twin.projection.for_odl_and_cil import cil_operator
 
@@ -402,14 +382,11 @@ class Adjoint:
         return f"{self.T!r}.T"
 
     def __matmul__(self, y: Any) -> Any:
-        """Apply the transpose to projections (n, rows, cols); returns voxels (nz, ny,
-        nx).
+        """Apply the transpose to projections (n, rows, cols); returns voxels (nz, ny, nx).
 
-        An array on a CUDA device (but no tensor) gives a `DeviceVolume`; a tensor a
-        tensor, with gradients; any other array one of its own library.
-
-        Raises:
-            GeometryError: another shape than the operator's images.
+        An array on a CUDA device (but no tensor) gives a `DeviceVolume`; a tensor a tensor, with
+        gradients; any other array one of its own library.
+        Raises GeometryError: another shape than the operator's images.
         """
         if not _is_tensor(y) and gpu.is_there(y):
             _check(tuple(y.shape), self.T.image_shape, "projections")
@@ -428,8 +405,7 @@ def _is_tensor(x: object) -> bool:
 def _check(got: tuple[int, ...], wanted: tuple[int, int, int], what: str) -> None:
     """Check a shape of `what`, as the message calls it.
 
-    Raises:
-        GeometryError: `got` is not `wanted`.
+    Raises GeometryError: `got` is not `wanted`.
     """
     if got != wanted:
         raise GeometryError.of_shape(

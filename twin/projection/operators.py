@@ -95,13 +95,10 @@ Shape2 = tuple[int, int]
 
 
 def in_order(geometry: ConeVec, order: Order) -> ConeVec:
-    """Return the geometry with its axes permuted as `Volume.in_order` does; the images
-    are the same. (x, y, z) gives the geometry itself.
+    """Return the geometry with its axes permuted as `Volume.in_order` does; the images are the
+    same. (x, y, z) gives the geometry itself.
 
-    Args:
-        geometry: n views.
-        order: the old axis in the place of x, y and z.
-    """
+    `geometry`: n views; `order`: the old axis in the place of x, y and z."""
     if order == ORDERS[0]:
         return geometry
     rows = geometry.rows.reshape(-1, 4, 3)[:, :, list(order)].reshape(-1, 12)
@@ -632,15 +629,13 @@ def layout_data(layout: Layout) -> Float32Array:
 
 
 def check_projections(projections: npt.ArrayLike, n: int) -> Any:
-    """Convert projections to C-ordered float32 (n, rows, cols); those on a device stay
-    there.
+    """Convert projections to C-ordered float32 (n, rows, cols); those on a device stay there.
 
     Args:
         projections: an array of any library.
         n: number of views.
 
-    Raises:
-        GeometryError: they are not `n` images, or on a device not float32 in C order.
+    Raises GeometryError: they are not `n` images, or on a device not float32 in C order.
     """
     if gpu.is_there(projections):
         values = gpu.taken(projections)
@@ -674,11 +669,8 @@ def require_finite(values: Any) -> None:
 
 
 def voxel_rays(cone_vec: ConeVec, layout: Layout, shape: Shape2) -> FloatArray:
-    """Convert `ConeVec.rays` to voxel units.
-
-    The unit is the voxel's edge along each axis, the origin the low corner of the
-    occupied box.
-    """
+    """Convert `ConeVec.rays` to voxel units. The unit is the voxel's edge along each axis, the
+    origin the low corner of the occupied box."""
     rays = cone_vec.rays(shape)
     rays[:, 0:3] -= np.array(layout.low_mm)
     return np.ascontiguousarray(rays / np.tile(np.array(layout.voxel_mm), 4))
@@ -700,11 +692,10 @@ def _are_finite(values: npt.NDArray[Any]) -> bool:
 
 
 def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
-    """Check that each pixel of cone_vec, a ConeVec or (n, 12) [mm], has its own ray, and
-    return a ConeVec.
+    """Check that each pixel of cone_vec, a ConeVec or (n, 12) [mm], has its own ray, and return
+    a ConeVec.
 
-    Raises:
-        GeometryError: a row does not; it is named.
+    Raises GeometryError: a row does not; it is named.
     """
     if isinstance(cone_vec, ConeVec):
         given = cone_vec

@@ -180,16 +180,10 @@ def rays_needed(
 ) -> Marks:
     """Find the rays that every pixel needs.
 
-    Args:
-        body: solids, a mesh or voxels.
-        cone_vec: ConeVec or (n, 12) [mm], in the body's frame.
-        shape: detector (rows, cols).
-        need: permitted error.
-        weight: attenuation of a unit of the body's projection: 1 for solids and voxels,
-            1/mm for a mesh.
-
-    Returns:
-        Marks, uint8 (n, rows, cols), see `rays_of`; 1 where one ray has the mean.
+    `body`: solids, a mesh or voxels; `cone_vec`: ConeVec or (n, 12) [mm], in the body's frame;
+    `shape`: detector (rows, cols); `need`: permitted error; `weight`: attenuation of a unit of
+    the body's projection: 1 for solids and voxels, 1/mm for a mesh.
+    Returns marks, uint8 (n, rows, cols), see `rays_of`; 1 where one ray has the mean.
     """
     geometry = as_cone_vec(cone_vec)
     marks = np.ones((len(geometry), *shape), np.uint8)
@@ -223,9 +217,8 @@ def paths_within(
         shape: detector (rows, cols).
         within: the pixels of (n, rows, cols).
 
-    Returns:
-        float32, the line integral (of a mesh the path length [mm]) of each ray, those of a
-        pixel in a row.
+    Returns float32, the line integral (of a mesh the path length [mm]) of each ray, those of a
+    pixel in a row.
     """
     geometry = as_cone_vec(cone_vec)
     out = np.zeros(int(within.starts[-1]), np.float32)

@@ -92,12 +92,9 @@ class SingleViews:
             row: (12,) source, detector's centre, u and v [mm].
             image: (rows, cols) filled.
 
-        Returns:
-            Whether it is filled; False where `gpu` has to project the view. Without the
-            driver's package or a part of it, `usable` becomes False.
-
-        Raises:
-            RuntimeError: the driver failed.
+        Returns whether it is filled; False where `gpu` has to project the view. Without the
+        driver's package or a part of it, `usable` becomes False.
+        Raises RuntimeError: the driver failed.
         """
         try:
             memory = self._memory((image.shape[0], image.shape[1]))
@@ -329,16 +326,10 @@ def project(volume: Volume, box: Box, row: FloatArray, image: Float32Array) -> b
     """Fill an image with line integrals of a volume that is on the device.
 
     What is prepared for single views is kept with the volume's copy.
-
-    Args:
-        volume: whose layout has a copy on the device.
-        box: of its layout.
-        row: (12,) source, detector's centre, u and v [mm].
-        image: (rows, cols) filled.
-
-    Returns:
-        Whether it is filled; False where `gpu` has to project the view, or the device
-        failed.
+    `volume`: whose layout has a copy on the device; `box`: of its layout; `row`: (12,) source,
+    detector's centre, u and v [mm]; `image`: (rows, cols) filled.
+    Returns whether it is filled; False where `gpu` has to project the view, or the device
+    failed.
     """
     copy = volume.layout.device_copy
     if copy.single_views is None:

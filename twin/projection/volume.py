@@ -348,8 +348,7 @@ def room_like(volume: Volume) -> Float32Array:
 
     Example:
         >>> room_like(Volume(np.zeros((6, 4, 4)), 0.5)).strides[0]  # bytes: z is contiguous
-        4
-    """
+        4"""
     nz, ny, nx = volume.shape
     stride = math.ceil(nz / LANE_FLOATS) * LANE_FLOATS
     flat = aligned_zeros(ny * nx * stride)
@@ -457,8 +456,7 @@ class Volume:
 
     def __dlpack__(self, **options: Any) -> Any:
         """Export the values to another library, such as `torch.from_dlpack(volume)`,
-        read-only.
-        """
+        read-only."""
         return self.data.__dlpack__(**options)
 
     def __dlpack_device__(self) -> Any:
@@ -680,8 +678,7 @@ class Volume:
         Example:
             >>> volume = fx.reconstruct("my-scans/lego")  # doctest: +SKIP
             >>> volume.accuracy  # doctest: +SKIP
-            Accuracy(half=0.006, most=0.021, cause='cone', cut_off=False)
-        """
+            Accuracy(half=0.006, most=0.021, cause='cone', cut_off=False)"""
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         summary: Accuracy | None
         if bias is None:
@@ -698,8 +695,7 @@ class Volume:
 
         Example:
             >>> print(Volume(np.zeros((6, 4, 4)), voxel_mm=0.5).sharpness)
-            sharpness: not known, no edges
-        """
+            sharpness: not known, no edges"""
         found: Sharpness = backend("sharpness").sharpness_of(self)
         return found
 
@@ -707,8 +703,7 @@ class Volume:
     def residuals(self) -> Residuals | None:
         """What the volume, projected again, leaves of the images (`reconstruct`): by
         view, by pixel, and the worst views; at most 180 views, of pixels binned to at most
-        80 a side. None if no copy of the images was made. Computed at the first access.
-        """
+        80 a side. None if no copy of the images was made. Computed at the first access."""
         bias: Any = getattr(self, "_bias", None)  # of `volume_errors.with_errors`
         found: Residuals | None = None if bias is None else bias.residuals(self)
         return found
@@ -977,8 +972,7 @@ class Grid:
 
         Example:
             >>> Grid((100, 200, 200), 0.1).slab(0, 20)
-            Grid(shape=(20, 200, 200), voxel_mm=0.1, center_mm=(0.0, 0.0, -4.0))
-        """
+            Grid(shape=(20, 200, 200), voxel_mm=0.1, center_mm=(0.0, 0.0, -4.0))"""
         x, y, z = self.center_mm
         middle = z + ((first + last) / 2 - self.shape[0] / 2) * self.voxel_mm
         return Grid((last - first, *self.shape[1:]), self.voxel_mm, (x, y, middle))
@@ -989,8 +983,7 @@ class Grid:
 
         Example:
             >>> Grid((100, 200, 200), 0.1).slabs(8_000_000)
-            [(0, 50), (50, 100)]
-        """
+            [(0, 50), (50, 100)]"""
         layers = max(1, most_bytes * self.shape[0] // self.bytes)
         return cut(self.shape[0], math.ceil(self.shape[0] / layers))
 
@@ -999,8 +992,7 @@ class Grid:
 
         Example:
             >>> Grid((6, 4, 4), 0.5).blank()
-            <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
-        """
+            <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>"""
         zeros = np.broadcast_to(np.zeros((), np.float32), self.shape)
         return Volume(zeros, self.voxel_mm, self.center_mm)
 
@@ -1015,8 +1007,7 @@ def as_volume(volume: Volume | Grid) -> Volume:
 
     Example:
         >>> as_volume(Grid((6, 4, 4), 0.5))
-        <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>
-    """
+        <Volume: 6 x 4 x 4 voxels (z, y, x) of 0.5 mm about (0, 0, 0) mm>"""
     if isinstance(volume, Grid):
         return volume.blank()
     return volume
@@ -1081,8 +1072,7 @@ def _flat_alias(data: Float32Array, count: int) -> Float32Array:
     """Return `count` floats from the first voxel on, without the read-only mark.
 
     A kernel that can also write is compiled for plain arrays only. Projection never
-    writes into a volume.
-    """
+    writes into a volume."""
     return np.asarray(_Memory(data, count))
 
 

@@ -83,21 +83,13 @@ def hardening(
     panel: Detector | None = None,
     tube: TubeModel | None = None,
 ) -> Hardening:
-    """Compute the correction for an object of one material, by the models of tube and
-    detector.
+    """Compute the correction for an object of one material, by the models of tube and detector.
 
-    Args:
-        material: of the object.
-        kV: of the scan.
-        energy_keV: the volume shall hold the attenuation at this energy; the nearest in
-            the tables is taken.
-        panel, tube: of the scan; default the default ones.
-
-    Returns:
-        Table up to where a 1e-5th of the signal gets through, 1e5 mm at most.
-
-    Raises:
-        LimitError: there is no spectrum for `kV`.
+    `material`: of the object. `kV`: of the scan. `energy_keV`: the volume shall hold the
+    attenuation at this energy; the nearest in the tables is taken. `panel` and `tube`: of the
+    scan; default the default ones.
+    Returns table up to where a 1e-5th of the signal gets through, 1e5 mm at most.
+    Raises LimitError: there is no spectrum for `kV`.
     """
     signal, _ = _weights(kV, panel, tube)
     mu = material.attenuation()
@@ -153,16 +145,11 @@ class Polychromatic:
     ) -> Polychromatic:
         """Compute the model of a beam from tube and detector.
 
-        Args:
-            materials: of the object, in any order.
-            kV: tube voltage.
-            energy_keV: at which the volume's attenuations hold.
-            panel: detector; the default one without.
-            tube: the default one without.
-
-        Raises:
-            LimitError: no material, two that attenuate alike (`require_apart`), no
-                spectrum for `kV`, or an energy that the tables do not have.
+        `materials`: of the object, in any order. `kV`: tube voltage. `energy_keV`: at which the
+        volume's attenuations hold. `panel`: detector; the default one without. `tube`: the
+        default one without.
+        Raises LimitError: no material, two that attenuate alike (`require_apart`), no spectrum
+        for `kV`, or an energy that the tables do not have.
         """
         ends = tables().energy_keV[[0, -1]]
         require_within("energy_keV", energy_keV, float(ends[0]), float(ends[1]), "keV")
@@ -175,18 +162,12 @@ class Polychromatic:
         return cls(mu, beam, energy_keV)
 
     def amounts(self, values: Float32Array) -> Iterator[Float32Array]:
-        """Yield each material's density in voxels, relative to the named material's, in
-        the order of `mu`.
+        """Yield each material's density in voxels, relative to the named material's, in the
+        order of `mu`.
 
-        A voxel is of the one material whose attenuation is nearest by ratio; negative
-        values are of the one that attenuates least.
-
-        Args:
-            values: (...) [1/mm].
-
-        Yields:
-            (...), 0 in voxels of other materials.
-        """
+        A voxel is of the one material whose attenuation is nearest by ratio; negative values are
+        of the one that attenuates least. `values`: (...) [1/mm]. Yields (...), 0 in voxels of
+        other materials."""
         order = np.argsort(self.mu)
         of = order[
             np.searchsorted(np.sqrt(self.mu[order][1:] * self.mu[order][:-1]), values)
@@ -224,15 +205,14 @@ class Polychromatic:
 
 
 def require_apart(materials: Sequence[Substance], mu: FloatArray) -> None:
-    """Check that there are materials, and that a volume separates them: attenuations
-    differ by the share `APART` of the larger.
+    """Check that there are materials, and that a volume separates them: attenuations differ by
+    the share `APART` of the larger.
 
     Args:
         materials: m of them.
         mu: (m,) their attenuations.
 
-    Raises:
-        LimitError: none, or two that attenuate alike, which it names.
+    Raises LimitError: none, or two that attenuate alike, which it names.
     """
     if not len(materials):
         raise LimitError(

@@ -143,12 +143,10 @@ class Bias:
         return np.asarray(self.shift + SIGMAS * self.spread, np.float32)
 
     def bound(self, grid: Volume) -> Float32Array | None:
-        """Compute the bound of the error at each voxel of a grid, interpolated from the
-        nodes.
+        """Compute the bound of the error at each voxel of a grid, interpolated from the nodes.
 
-        Returns:
-            (nz, ny, nx) [1/mm], NaN where the grid has no value; None if images and
-            geometry contradict each other.
+        Returns (nz, ny, nx) [1/mm], NaN where the grid has no value; None if images and geometry
+        contradict each other.
         """
         if self.contradiction is not None:
             return None
@@ -296,9 +294,8 @@ class BiasOnDemand:
         """Look at copies of a scan; None where a coarse copy cannot be reconstructed (any
         GeometryError), as of a steep helix or of neither a circle nor a helix.
 
-        Args:
-            copied: that have taken all images they want; None where they cannot be made.
-            sides_known, known: see the class.
+        `copied`: that have taken all images they want; None where they cannot be made.
+        `sides_known` and `known`: see the class.
         """
         if copied is None:
             return None
@@ -343,9 +340,7 @@ class BiasOnDemand:
         return self.bias.bound(grid)
 
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
-        """Compute the relative accuracy of uniform regions in a grid; see
-        `Bias.accuracy`.
-        """
+        """Compute the relative accuracy of uniform regions in a grid; see `Bias.accuracy`."""
         return self.bias.accuracy(grid)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
@@ -605,15 +600,10 @@ def bias_of(
 ) -> Bias | None:
     """Find the possible errors of FDK's volume of a scan at once.
 
-    Args:
-        image: gives the line integrals of a view, (rows, cols), by its number; read once.
-        cone_vec: of all views.
-        shape: (rows, cols).
-        truncation: of `truncation_of`.
-        sides_known: beads have told the direction of rotation and mirrored images.
-
-    Returns:
-        None where a coarse scan cannot be reconstructed; see `BiasOnDemand.of`.
+    `image`: gives the line integrals of a view, (rows, cols), by its number; read once.
+    `cone_vec`: of all views. `shape`: (rows, cols). `truncation`: of `truncation_of`.
+    `sides_known`: beads have told the direction of rotation and mirrored images.
+    Returns None where a coarse scan cannot be reconstructed; see `BiasOnDemand.of`.
     """
     copies = copies_of(cone_vec, shape, truncation)
     if copies is None:
@@ -632,10 +622,7 @@ def copies_of(
 ) -> ScanCopies | None:
     """Make copies of a scan, which take its images; None where it cannot be copied.
 
-    Args:
-        cone_vec: of all views.
-        shape: (rows, cols).
-        truncation: of `truncation_of`.
+    `cone_vec`: of all views; `shape`: (rows, cols); `truncation`: of `truncation_of`.
     """
     try:
         copies = ScanCopies(cone_vec, shape)
@@ -648,9 +635,7 @@ def copies_of(
 def _bounded(scan: CoarseScan, *, angles_alone: bool = False) -> Bias:
     """Bound the errors of a coarse volume, by cause (`BiasOnDemand.bias`).
 
-    Args:
-        scan: the coarse copy.
-        angles_alone: look for what few views do, and nothing else.
+    `scan`: the coarse copy; `angles_alone`: look for what few views do, and nothing else.
     """
     nodes = UniformNodes.of(scan.volume, scan.rim)
     causes = _extrapolated(scan, nodes, _angles if angles_alone else _flaws)
@@ -781,15 +766,9 @@ def _beside(scan: CoarseScan, nodes: UniformNodes) -> dict[str, FloatArray]:
 
 
 def _drift(images: Float32Array) -> Float32Array:
-    """Make images of each view's level beside the object: the smaller value, by size, of
-    its rows' two ends, in every pixel.
-
-    Args:
-        images: (n, rows, cols); each view's ends are averaged over rows.
-
-    Returns:
-        New images of that shape.
-    """
+    """Make images of each view's level beside the object: the smaller value, by size, of its
+    rows' two ends, in every pixel. `images`: (n, rows, cols); each view's ends are averaged over
+    rows. Returns new images of that shape."""
     ends = images[:, :, [0, -1]].mean(axis=1)
     beside = np.take_along_axis(ends, np.abs(ends).argmin(axis=1)[:, None], axis=1)
     return np.ascontiguousarray(np.broadcast_to(beside[:, :, None], images.shape))

@@ -217,8 +217,7 @@ class CoarseScan:
     def complete(self) -> Truncation | None:
         """The truncation of an object that the panel sees completely; not None where rays
         that a shifted panel's near edge hides (`Truncation.beyond`) are weighed as in the
-        scan.
-        """
+        scan."""
         if self.truncation is None or not self.truncation.beyond:
             return None
         return self.truncation.nothing
@@ -397,21 +396,15 @@ class CoarseScan:
         cone_vec: ConeVec,
         truncation: Truncation | None = None,
     ) -> Float32Array:
-        """Reconstruct the grid by FDK on the processor; voxels that only continued rows
-        show are kept.
+        """Reconstruct the grid by FDK on the processor; voxels that only continued rows show are
+        kept.
 
         The images are not changed.
 
-        Args:
-            images: (n, rows, cols) line integrals.
-            cone_vec: n views.
-            truncation: continues the images beyond the panel.
-
-        Returns:
-            (nz, ny, nx) [1/mm], NaN where no data cover it.
-
-        Raises:
-            GeometryError: FDK cannot use the views.
+        `images`: (n, rows, cols) line integrals; `cone_vec`: n views; `truncation`: continues
+        the images beyond the panel.
+        Returns (nz, ny, nx) [1/mm], NaN where no data cover it.
+        Raises GeometryError: FDK cannot use the views.
         """
         shape = (images.shape[1], images.shape[2])
         volume = fdk_parts(
@@ -450,18 +443,12 @@ class CoarseScan:
         *,
         fine: bool = True,
     ) -> Float32Array:
-        """Project values on the grid as some views see them; the outermost layers are
-        repeated above and below (`more`).
+        """Project values on the grid as some views see them; the outermost layers are repeated
+        above and below (`more`).
 
-        Args:
-            thing: the values, (nz, ny, nx).
-            views: n of them.
-            shape: (rows, cols).
-            fine: average two rays a column: the steps of voxels would show as a flaw of
-                their own.
-
-        Returns:
-            (n, rows, cols) line integrals.
+        `thing`: the values, (nz, ny, nx); `views`: n of them; `shape`: (rows, cols); `fine`:
+        average two rays a column: the steps of voxels would show as a flaw of their own.
+        Returns (n, rows, cols) line integrals.
         """
         if self.more:
             thing = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
@@ -594,8 +581,7 @@ class CoarseCopy:
         return bool(self._slots[number] >= 0 and not self._taken[number])
 
     def take(self, number: int, image: npt.NDArray[np.generic]) -> None:
-        """Add a view's image, averaged over pixels, unless it is not wanted or has been
-        taken.
+        """Add a view's image, averaged over pixels, unless it is not wanted or has been taken.
 
         Args:
             number: of the view among all.

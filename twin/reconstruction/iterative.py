@@ -375,19 +375,17 @@ def _em(
     watch: Watch | None,
     advance: Advance,
 ) -> Volume:
-    """Multiply by the back-projected ratios of measured and projected line integrals
-    (MLEM), for all iterations.
+    """Multiply by the back-projected ratios of measured and projected line integrals (MLEM), for
+    all iterations.
 
     Args:
         problem: images, geometry and grid; negative line integrals count as 0.
         iterations: how many.
         start: first volume; without, one value in all voxels that a ray meets.
-        watch: called before each step with its residual, to the images as they were
-            given.
+        watch: called before each step with its residual, to the images as they were given.
         advance: called with the share that is done.
 
-    Returns:
-        The volume; 0 in voxels that no ray meets.
+    Returns the volume; 0 in voxels that no ray meets.
     """
     measured = np.maximum(problem.measured, np.float32(0))
     whole = problem.spread(ones(measured)).copy(order="K")

@@ -208,10 +208,8 @@ class LinearSystem:
             x: voxels (nz, ny, nx).
             views: which ones.
 
-        Returns:
-            The differences (n, rows, cols), and the factor by which a step must be
-            scaled: line integrals at one energy over expected ones, of that shape; 1
-            without `hardening`.
+        Returns the differences (n, rows, cols), and the factor by which a step must be scaled:
+        line integrals at one energy over expected ones, of that shape; 1 without `hardening`.
         """
         measured = self.measured[views]
         if self.hardening is None:
@@ -252,8 +250,7 @@ class LinearSystem:
 
     def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
         """Report iteration i (from 0) of `of` to `watch`, with the root mean square of
-        `rest`; does nothing without `watch`.
-        """
+        `rest`; does nothing without `watch`."""
         if watch is not None:
             watch(Step(i + 1, of, float(np.sqrt(dot(rest, rest) / rest.size))))
 
@@ -388,12 +385,10 @@ class RegionSystem(LinearSystem):
         )
 
     def first(self, start: Volume | None) -> Float32Array:
-        """Return start values of region and surroundings as one flat vector: `start` or
-        zeros in the region, zeros around it.
+        """Return start values of region and surroundings as one flat vector: `start` or zeros in
+        the region, zeros around it.
 
-        Raises:
-            GeometryError: `start` is on another grid than the region's.
-        """
+        Raises GeometryError: `start` is on another grid than the region's."""
         x = np.zeros(math.prod(self.like.shape) + self.outside.size, np.float32)
         if start is not None:
             self.grids(x)[0][...] = super().first(start)
@@ -435,19 +430,15 @@ class RegionSystem(LinearSystem):
 
 
 def solved(problem: LinearSystem, method: Callable[[LinearSystem], Found]) -> Found:
-    """Run a method on the device, if images are there or it has room, else on the
-    processor.
+    """Run a method on the device, if images are there or it has room, else on the processor.
 
-    If the device fails with images of the host, the method is run again on the processor.
-    With hardening, surroundings or another model the method always runs on the processor, and only
+    If the device fails with images of the host, the method is run again on the processor. With
+    hardening, surroundings or another model the method always runs on the processor, and only
     projections are made on a device.
 
-    Args:
-        problem: of the host, but its images may be on a device.
-        method: called with `problem` or its copy on the device.
-
-    Returns:
-        The method's result.
+    `problem`: of the host, but its images may be on a device; `method`: called with `problem` or
+    its copy on the device.
+    Returns the method's result.
     """
     here = problem.hardening is not None or problem.model != "exact"
     if here or isinstance(problem, RegionSystem):

@@ -212,13 +212,10 @@ def scatterer_of(
 
 def volume_of(stack: Float32Array, cone_vec: ConeVec, grid: Grid) -> Volume:
     """Reconstruct straightened line integrals by FDK with a Hann window, for the scatter
-    estimate; truncated rows are continued, and voxels without a view are 0, as they
-    scatter nothing.
+    estimate; truncated rows are continued, and voxels without a view are 0, as they scatter
+    nothing.
 
-    Args:
-        stack: (n, rows, cols).
-        cone_vec: n views.
-        grid: of the volume.
+    `stack`: (n, rows, cols); `cone_vec`: n views; `grid`: of the volume.
     """
     shape = shape_of(stack)
     truncation = truncation_of(stack.__getitem__, cone_vec, shape)
@@ -238,15 +235,12 @@ def shape_of(stack: Float32Array) -> tuple[int, int]:
 def attenuations(
     chain: Chain, kV: float
 ) -> tuple[FloatArray, Callable[[Float32Array], Float32Array]]:
-    """Compute the materials' attenuation at the mean energy of the signal, and a function
-    that straightens line integrals.
+    """Compute the materials' attenuation at the mean energy of the signal, and a function that
+    straightens line integrals.
 
-    Returns:
-        (m,) [1/mm], and a function that converts line integrals to those of the first
-        material at that energy; of a monochromatic beam it returns them unchanged.
-
-    Raises:
-        LimitError: no material, two that attenuate alike, or no spectrum for `kV`.
+    Returns (m,) [1/mm], and a function that converts line integrals to those of the first
+    material at that energy; of a monochromatic beam it returns them unchanged.
+    Raises LimitError: no material, two that attenuate alike, or no spectrum for `kV`.
     """
     signal = weights_of(chain, kV)[0]
     energies = np.arange(len(signal))

@@ -343,16 +343,12 @@ class _Objective:
         return self.regular.proximal(z, step * self.strength)
 
     def subset_pass(self, x: Float32Array, step: float, count: int) -> Any:
-        """Take a step for each subset of views, far apart in turn, and one proximal map
-        at the end.
+        """Take a step for each subset of views, far apart in turn, and one proximal map at the
+        end.
 
-        Args:
-            x: volume, not changed.
-            step: length of a step over all views.
-            count: number of subsets; each takes every `count`-th view.
-
-        Returns:
-            A new volume.
+        `x`: volume, not changed. `step`: length of a step over all views. `count`: number of
+        subsets; each takes every `count`-th view.
+        Returns a new volume.
         """
         n = len(self.problem.geometry)
         x = x.copy()
@@ -446,14 +442,10 @@ class Regular:
         return x
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
-        """Fill x from the dual variables, by portions of layers; see
-        `tv_kernels.primal_step`.
+        """Fill x from the dual variables, by portions of layers; see `tv_kernels.primal_step`.
 
-        Args:
-            z: voxels (nz, ny, nx).
-            dual: (3, nz, ny, nx).
-            theta: weight of total variation.
-            x: (nz, ny, nx), changed in place.
+        `z`: voxels (nz, ny, nx); `dual`: (3, nz, ny, nx); `theta`: weight of total variation;
+        `x`: (nz, ny, nx), changed in place.
         """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
@@ -468,12 +460,8 @@ class Regular:
         """Update `self.dual` and `ahead` in place, by portions of layers; see
         `tv_kernels.dual_step`.
 
-        Args:
-            x: voxels (nz, ny, nx).
-            ahead: (3, nz, ny, nx), extrapolated dual variables.
-            rate: length of the step.
-            further: momentum of the extrapolation.
-        """
+        `x`: voxels (nz, ny, nx); `ahead`: (3, nz, ny, nx), extrapolated dual variables; `rate`:
+        length of the step; `further`: momentum of the extrapolation."""
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
@@ -490,13 +478,8 @@ class DeviceRegular(Regular):
     def of_host(cls, regular: Regular, like: Volume) -> DeviceRegular:
         """Create the same regulariser on the device, with all dual variables zero.
 
-        Args:
-            regular: of the host.
-            like: grid of the volume.
-
-        Raises:
-            gpu.DeviceError: the device fails.
-        """
+        `regular`: of the host; `like`: grid of the volume.
+        Raises gpu.DeviceError: the device fails."""
         allowed = DeviceArray.of_voxels(like.like(regular.allowed.astype(np.float32)))
         dual = gpu.demand(lambda: gpu.zeros(3 * allowed.flat.size))
         flat = DeviceArray.of_images(dual.reshape(1, 1, dual.size))

@@ -47,14 +47,12 @@ class UniformNodes:
     def of(cls, values: Float32Array, rim: npt.NDArray[np.bool_]) -> UniformNodes:
         """Find the uniform nodes of a volume.
 
-        Edges are changes of `EDGE_CHANGE_SHARE` of the body's attenuation (`_typical`).
-        Nodes of the object are seen by all views and have at least
-        `MIN_NEIGHBOURHOOD_SHARE` of the smooth value and `MIN_BODY_SHARE` of the body's.
-        Nodes that some view does not see have hardly any weight (1e-3).
-
-        Args:
-            values: (nz, ny, nx) [1/mm], NaN where no data cover a node.
-            rim: voxel columns outside some views, (ny, nx); they count as 0.
+        Edges are changes of `EDGE_CHANGE_SHARE` of the body's attenuation (`_typical`). Nodes of
+        the object are seen by all views and have at least `MIN_NEIGHBOURHOOD_SHARE` of the
+        smooth value and `MIN_BODY_SHARE` of the body's. Nodes that some view does not see have
+        hardly any weight (1e-3).
+        `values`: (nz, ny, nx) [1/mm], NaN where no data cover a node. `rim`: voxel columns
+        outside some views, (ny, nx); they count as 0.
         """
         unseen = np.isnan(values) | rim
         sharp = np.where(rim, np.float32(0.0), np.nan_to_num(values))
@@ -73,12 +71,10 @@ class UniformNodes:
         return away if away.any() else self.inside
 
     def change(self, other: Float32Array) -> float:
-        """Compute the largest relative change of nine of ten uniform nodes; 0 without
-        such nodes.
+        """Compute the largest relative change of nine of ten uniform nodes; 0 without such
+        nodes.
 
-        Args:
-            other: smooth values of another volume, (nz, ny, nx) [1/mm].
-        """
+        `other`: smooth values of another volume, (nz, ny, nx) [1/mm]."""
         if not self.uniform.any():
             return 0.0
         ratios = other[self.uniform] / self.found[self.uniform]
@@ -98,15 +94,11 @@ def smoothed(values: Float32Array) -> Float32Array:
 
 
 def _typical(values: Float32Array) -> float:
-    """Compute the attenuation below which half of the summed attenuation is: of a body,
-    not of a pin in it.
+    """Compute the attenuation below which half of the summed attenuation is: of a body, not of a
+    pin in it.
 
-    Args:
-        values: of any shape; only those above 0 count.
-
-    Returns:
-        [1/mm]; 0 without any.
-    """
+    `values`: of any shape; only those above 0 count.
+    Returns [1/mm]; 0 without any."""
     ordered = np.sort(values[values > 0.0], axis=None)
     if not ordered.size:
         return 0.0
@@ -115,16 +107,10 @@ def _typical(values: Float32Array) -> float:
 
 
 def _evenness(values: Float32Array, most: float) -> FloatArray:
-    """Compute weights of nodes, exp(-(gradient / `most`)^2): 1 where values are uniform,
-    near 0 where they change by more than `most` a node.
+    """Compute weights of nodes, exp(-(gradient / `most`)^2): 1 where values are uniform, near 0
+    where they change by more than `most` a node.
 
-    Args:
-        values: (nz, ny, nx).
-        most: change between nodes [1/mm].
-
-    Returns:
-        (nz, ny, nx).
-    """
+    `values`: (nz, ny, nx); `most`: change between nodes [1/mm]. Returns (nz, ny, nx)."""
     from scipy.ndimage import gaussian_gradient_magnitude
 
     steep = gaussian_gradient_magnitude(values.astype(np.float64), 0.5, mode="nearest")

@@ -47,16 +47,10 @@ class BoundOf(Protocol):
 def with_errors(
     volume: Volume, noise: SigmaOf | None = None, bias: BoundOf | None = None
 ) -> Volume:
-    """Return a copy of a volume with sources of its `sigma` and `bias_bound`; None leaves
-    that of the volume.
-
-    The data are shared. Volumes derived from it have none: they are no fields.
-
-    Args:
-        volume: not changed.
-        noise: source of `sigma`.
-        bias: source of `bias_bound` and `accuracy`.
-    """
+    """Return a copy of a volume with sources of its `sigma` and `bias_bound`; None leaves that
+    of the volume. The data are shared. Volumes derived from it have none: they are no fields.
+    `volume`: not changed; `noise`: source of `sigma`; `bias`: source of `bias_bound` and
+    `accuracy`."""
     found = replace(volume)
     object.__setattr__(found, "_noise", noise or getattr(volume, "_noise", None))
     object.__setattr__(found, "_bias", bias or getattr(volume, "_bias", None))
@@ -94,16 +88,9 @@ def interpolated(nodes: Volume, grid: Volume) -> Float32Array:
 
 
 def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
-    """Find the known places next to others, for linear interpolation; places outside
-    count as the outermost.
-
-    Args:
-        places: (n,).
-        known: (m,) increasing, one at least.
-
-    Returns:
-        Lower and upper index, and the share of the upper one, (n,) each.
-    """
+    """Find the known places next to others, for linear interpolation; places outside count as
+    the outermost. `places`: (n,); `known`: (m,) increasing, one at least. Returns lower and
+    upper index, and the share of the upper one, (n,) each."""
     at = np.interp(places, known, np.arange(len(known)))
     lower = np.minimum(at.astype(np.int64), max(len(known) - 2, 0))
     upper = np.minimum(lower + 1, len(known) - 1)
@@ -113,13 +100,8 @@ def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
 def _between(values: Float32Array, along: Neighbours) -> Float32Array:
     """Interpolate linearly along the first of two axes.
 
-    Args:
-        values: (m, k).
-        along: neighbours of n places, from `_neighbours`.
-
-    Returns:
-        (n, k).
-    """
+    `values`: (m, k); `along`: neighbours of n places, from `_neighbours`.
+    Returns (n, k)."""
     lower, upper, weight = along
     found: Float32Array = values[lower] * (1.0 - weight)[:, None]
     found += values[upper] * weight[:, None]

@@ -168,14 +168,12 @@ class Lookahead:
     def contact(
         self, trajectories: Trajectories, since: float | None = None
     ) -> Contact | None:
-        """Find the first contact if some motors follow `trajectories`, the
-        others their programme.
+        """Find the first contact if some motors follow `trajectories`, the others their
+        programme.
 
         None also without a guard.
-
-        Args:
-            trajectories: motor -> trajectory.
-            since: everything before is known to be free [s]; now if None.
+        `trajectories`: motor -> trajectory. `since`: everything before is known to be free [s];
+        now if None.
         """
         if self.guard is None:
             return None
@@ -196,8 +194,7 @@ class Lookahead:
             deep: measure overlaps.
             standing: of parts at their present places, as `Guard.standing` has them.
 
-        Returns:
-            Pair -> clearance [mm]; empty without a guard.
+        Returns pair -> clearance [mm]; empty without a guard.
         """
         here = {
             name: d.at(self.now).position(self.now) for name, d in self.drives.items()
@@ -216,25 +213,19 @@ class Lookahead:
     def joined(self, new: Trajectories) -> Joined:
         """Find the first certified programme for a requested motion; nothing moves yet.
 
-        A request without contact is taken as it is. Else it is the first of these that is
-        free and either takes some motor `MIN_STEP` farther or halts one that is under
-        way:
-
-        1. No other motor is under way: a single new motor goes to its last free position,
-        and otherwise the new motors halt along their path before the contact.
-        2. Others are under way: the new motors halt before the contact, the others carry
-        on.
-        3. Others and at least one of the new motors are under way: all halt along the new
-        path.
-
-        None of them is tried where the last free moment is not after now.
+        A request without contact is taken as it is. Else it is the first of these that is free
+        and either takes some motor `MIN_STEP` farther or halts one that is under way: 1. No
+        other motor is under way: a single new motor goes to its last free position, and
+        otherwise the new motors halt along their path before the contact. 2. Others are under
+        way: the new motors halt before the contact, the others carry on. 3. Others and at least
+        one of the new motors are under way: all halt along the new path. None of them is tried
+        where the last free moment is not after now.
 
         Args:
             new: motor -> requested trajectory.
 
-        Returns:
-            Trajectories of the programme, empty if there is none, and the contact of the
-            request, or None.
+        Returns trajectories of the programme, empty if there is none, and the contact of the
+        request, or None.
         """
         contact = self.contact(new)
         if contact is None:
@@ -265,18 +256,16 @@ class Lookahead:
     def _halt_alone(
         self, new: Trajectories, contact: Contact
     ) -> dict[str, Trajectory] | None:
-        """Shorten the motion of a single motor to its last free position before the
-        contact.
+        """Shorten the motion of a single motor to its last free position before the contact.
 
-        It goes there with the planned top speed and acceleration (at least
-        `profiles.MIN_RATE`); the shorter motion is swept.
+        It goes there with the planned top speed and acceleration (at least `profiles.MIN_RATE`);
+        the shorter motion is swept.
 
         Args:
             new: motor -> requested trajectory.
             contact: ahead on it.
 
-        Returns:
-            Motor -> trajectory; None for several motors, or if the sweep finds a contact.
+        Returns motor -> trajectory; None for several motors, or if the sweep finds a contact.
         """
         if len(new) != 1:
             return None
@@ -296,18 +285,14 @@ class Lookahead:
     def _halt_along(
         self, new: Trajectories, contact: Contact
     ) -> dict[str, Trajectory] | None:
-        """Slow `new` along its path as late as possible before the contact; the path is
-        free up to there, so nothing is swept.
+        """Slow `new` along its path as late as possible before the contact; the path is free up
+        to there, so nothing is swept.
 
-        Braking is with the hardest accelerations allowed. The moment is found by
-        `HALVINGS` bisection steps.
+        Braking is with the hardest accelerations allowed. The moment is found by `HALVINGS`
+        bisection steps.
 
-        Args:
-            new: motor -> requested trajectory.
-            contact: ahead on it.
-
-        Returns:
-            Motor -> trajectory that rests by the last free moment; None if none does.
+        `new`: motor -> requested trajectory; `contact`: ahead on it.
+        Returns motor -> trajectory that rests by the last free moment; None if none does.
         """
         moving = {name: self.drives[name].following(t) for name, t in new.items()}
 
@@ -325,8 +310,8 @@ class Lookahead:
     def _new_halt_swept(
         self, new: Trajectories, contact: Contact
     ) -> dict[str, Trajectory] | None:
-        """Slow `new` by itself as late as possible while the others carry on; each trial
-        is swept.
+        """Slow `new` by itself as late as possible while the others carry on; each trial is
+        swept.
 
         At most `SWEPT_HALVINGS` trials follow the first moment that holds.
 
@@ -334,8 +319,7 @@ class Lookahead:
             new: motor -> requested trajectory.
             contact: ahead on it.
 
-        Returns:
-            Motor -> trajectory that is free; None if none is found.
+        Returns motor -> trajectory that is free; None if none is found.
         """
 
         new_drives = {name: self.drives[name] for name in new}
@@ -393,17 +377,13 @@ class Lookahead:
     # -----------------------------------------------------------------------------------
 
     def stopped(self, most: Most = None) -> StopMotion:
-        """Compute how everything stops: along the path, or quicker where a sweep shows
-        that free.
+        """Compute how everything stops: along the path, or quicker where a sweep shows that
+        free.
 
         An error of the sweep gives the stop along the path. Nothing moves yet.
 
-        Args:
-            most: motor -> greatest acceleration; None: those that the motion was planned
-                with.
-
-        Returns:
-            The stop, its path "apart" where it is the quicker one, else "along".
+        `most`: motor -> greatest acceleration; None: those that the motion was planned with.
+        Returns the stop, its path "apart" where it is the quicker one, else "along".
         """
         along = braked_along(self.drives, self.now, most)
         try:
@@ -476,17 +456,11 @@ class Lookahead:
         return sum(len(d.trajectories) for d in self.drives.values() if d.end > self.now)
 
     def halted_at_once(self, contact: Contact) -> Trajectories | None:
-        """Slow what is under way along its path from now on, with the hardest
-        accelerations.
+        """Slow what is under way along its path from now on, with the hardest accelerations.
 
         Nothing is swept: the path is free up to the contact.
-
-        Args:
-            contact: ahead on it.
-
-        Returns:
-            Motor -> trajectory; None if it rests later than the contact's last free
-            moment.
+        `contact`: ahead on it.
+        Returns motor -> trajectory; None if it rests later than the contact's last free moment.
         """
         if (
             programme_time_at_rest(self.drives, self.now, self.hardest)
@@ -496,20 +470,16 @@ class Lookahead:
         return braked_along(self.drives, self.now, self.hardest)
 
     def halted(self, under_way: Trajectories, contact: Contact) -> Trajectories | None:
-        """Find a halt of what is under way before a contact that a new stage has put
-        ahead of it.
+        """Find a halt of what is under way before a contact that a new stage has put ahead of
+        it.
 
-        The first of these that is free: a single motor goes to its last free position;
-        all brake as late as possible along the path, which is free up to the contact; all
-        brake at once along the path; each motor brakes at once by itself. The last two
-        brake as hard as the machine can, are swept, and must rest within travel.
+        The first of these that is free: a single motor goes to its last free position; all brake
+        as late as possible along the path, which is free up to the contact; all brake at once
+        along the path; each motor brakes at once by itself. The last two brake as hard as the
+        machine can, are swept, and must rest within travel.
 
-        Args:
-            under_way: motor -> present trajectory.
-            contact: ahead on them.
-
-        Returns:
-            Motor -> trajectory; None if no halt is free.
+        `under_way`: motor -> present trajectory; `contact`: ahead on them.
+        Returns motor -> trajectory; None if no halt is free.
         """
         halted = self._halt_alone(under_way, contact) or self._halt_along(
             under_way, contact
@@ -529,12 +499,8 @@ class Lookahead:
     def _within_travel(self, trajectories: Trajectories) -> bool:
         """Return whether all motors rest within their travel, to `POSITION_ROUNDING`.
 
-        A motor that stops in step with a weaker one goes farther than its own programme
-        did.
-
-        Args:
-            trajectories: motor -> trajectory; only its target is checked.
-        """
+        A motor that stops in step with a weaker one goes farther than its own programme did.
+        `trajectories`: motor -> trajectory; only its target is checked."""
         return all(
             distance_beyond(self.machine, name, t.target) <= POSITION_ROUNDING
             for name, t in trajectories.items()
@@ -639,26 +605,17 @@ class StageChange:
         return replace(self, found=self.verdict())
 
     def renewed(self, before: StageChange) -> Joined:
-        """Judge the change at the takeover, reusing the verdict found `before` where
-        possible.
+        """Judge the change at the takeover, reusing the verdict found `before` where possible.
 
-        1. Stage, stops and programmes are the same, nothing is to be moved, and the
-        motion was free: it still is.
-        2. At most `MAX_SWEPT_LEGS` trajectories are under way: the change is judged anew.
-        3. A longer programme is the same as before and must halt: it halts at once, if it
-        rests before the contact that was found.
-
-        Args:
-            before: the same change, as it was prepared and swept.
-
-        Returns:
-            The halting motion and its contact; no trajectories and None where motion
-            carries on.
-
-        Raises:
-            CollisionError: as `verdict`.
-            SafetyError: none of the three applies (a long programme has begun or gone on
-                meanwhile); nothing changes.
+        1. Stage, stops and programmes are the same, nothing is to be moved, and the motion was
+        free: it still is. 2. At most `MAX_SWEPT_LEGS` trajectories are under way: the change is
+        judged anew. 3. A longer programme is the same as before and must halt: it halts at once,
+        if it rests before the contact that was found.
+        `before`: the same change, as it was prepared and swept.
+        Returns the halting motion and its contact; no trajectories and None where motion carries
+        on.
+        Raises CollisionError: as `verdict`; SafetyError: none of the three applies (a long
+        programme has begun or gone on meanwhile); nothing changes.
         """
         still = before.version == self.version and not self.moves
         found = before.found
@@ -710,19 +667,16 @@ class StageChange:
         return Joined(halted, contact)
 
     def _require_no_nearer(self, changed: Lookahead) -> None:
-        """Check that the new stage brings no pair within the safety margin that was not,
-        and no near pair below its floor.
+        """Check that the new stage brings no pair within the safety margin that was not, and no
+        near pair below its floor.
 
-        A sample on a stage of the turntable is as large as the region that the stage can
-        bring it to. Pairs that are near already are therefore measured at their present
-        positions as well: else that region would excuse a sample that really overlaps.
-        Without a pair within the margin that second measurement is left out.
+        A sample on a stage of the turntable is as large as the region that the stage can bring
+        it to. Pairs that are near already are therefore measured at their present positions as
+        well: else that region would excuse a sample that really overlaps. Without a pair within
+        the margin that second measurement is left out.
 
-        Args:
-            changed: all motors now, with the guard of the new stage.
-
-        Raises:
-            CollisionError: names the first such pair.
+        `changed`: all motors now, with the guard of the new stage.
+        Raises CollisionError: names the first such pair.
         """
         margin = self.ahead.machine.safety_margin_mm
         for standing in (False, True):

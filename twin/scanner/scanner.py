@@ -241,9 +241,8 @@ class ScannerTwin:
         Args:
             now: twin time [s].
 
-        Returns:
-            Distances, magnification, voxel and field; None where SOD or SDD is not
-            positive, or no geometry can be computed.
+        Returns distances, magnification, voxel and field; None where SOD or SDD is not positive,
+        or no geometry can be computed.
         """
         positions = self.positions(now)
         made_of = (tuple(positions.values()), self.camera, self.parameters)
@@ -869,8 +868,7 @@ class ScannerTwin:
         """Return the safety state, with contact judged by where the parts are.
 
         Where that cannot be judged it is the contact known before; no motion begins then
-        (`_require_ready`).
-        """
+        (`_require_ready`)."""
         try:
             return with_contact(self.safety, self._touching(now))
         except Exception:  # whatever the guard meets, the safety state is told
@@ -886,17 +884,13 @@ class ScannerTwin:
     ) -> CollisionError:
         """Count a blocked attempt, and let the motors follow the motion that is left.
 
-        If that was the attempt too many (the state is blocked, and not by a contact that
-        lasts), all motors stop instead.
+        If that was the attempt too many (the state is blocked, and not by a contact that lasts),
+        all motors stop instead.
 
-        Args:
-            joined: the motion that is left, and the contact that cut it short.
-            now: time of the command [s].
-            what: the command, for people.
-            zero: time at which the clock of the contact shows 0 [s].
-
-        Returns:
-            The error to raise, with where the motors come to rest.
+        `joined`: the motion that is left, and the contact that cut it short; `now`: time of the
+        command [s]; `what`: the command, for people; `zero`: time at which the clock of the
+        contact shows 0 [s].
+        Returns the error to raise, with where the motors come to rest.
         """
         contact = joined.contact
         assert contact is not None

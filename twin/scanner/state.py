@@ -122,12 +122,9 @@ class StagePlacement:
         return turned
 
     def to_sample(self, cone_vec: ConeVec) -> ConeVec:
-        """Transform a geometry of the object's frame to the sample's own frame
-        (for the projector).
-
-        The placement's turn and shift [mm] are undone; without a placement the geometry
-        itself.
-        """
+        """Transform a geometry of the object's frame to the sample's own frame (for the
+        projector). The placement's turn and shift [mm] are undone; without a placement the
+        geometry itself."""
         if self == StagePlacement():
             return cone_vec
         back = self.rotation.T
@@ -179,11 +176,8 @@ class NamedCorrection:
         *,
         sides_known: bool = False,
     ) -> NamedCorrection:
-        """Make the correction with these values [mm, deg], without a panel's distortion.
-
-        Raises:
-            UnknownNameError: a name that is not a parameter.
-        """
+        """Make the correction with these values [mm, deg], without a panel's distortion. Raises
+        UnknownNameError: a name that is not a parameter."""
         parameters = Offsets.from_edge(values)
         return cls(name, date, parameters, note, sides_known=sides_known)
 
@@ -334,19 +328,14 @@ def switched(
 ) -> TubeSettings:
     """Switch the tube on or off.
 
-    X-rays are ready after the times of switching on and of stabilising, and after the
-    warm-up too if the tube rested longer than the machine's `cold_after_s`.
+    X-rays are ready after the times of switching on and of stabilising, and after the warm-up
+    too if the tube rested longer than the machine's `cold_after_s`.
 
-    Args:
-        machine: has these times.
-        tube: before; its present state again changes nothing, unless `now` is None.
-        on: on or off.
-        now: time of the command [s]; None: the X-rays are ready already, and the time of
-            the last switch stays.
-        warm: no warm-up, however long the rest was.
-
-    Returns:
-        The tube after it.
+    `machine`: has these times. `tube`: before; its present state again changes nothing, unless
+    `now` is None. `on`: on or off. `now`: time of the command [s]; None: the X-rays are ready
+    already, and the time of the last switch stays. `warm`: no warm-up, however long the rest
+    was.
+    Returns the tube after it.
     """
     if now is None:
         return replace(tube, on=on, ready_at=-math.inf)
@@ -388,18 +377,12 @@ def changed_camera(
 ) -> CameraSettings:
     """Change settings of a camera; those left out stay.
 
-    Args:
-        spec: the detector, with its modes, pixels and range of exposures [ms].
-        camera: settings before.
-        change: the new values; None and what is left out stay. Averages are 1 to 10 000,
-            frames 1 to 1 000 000.
-
-    Returns:
-        The new settings.
-
-    Raises:
-        LimitError: an unknown mode, a region outside the panel, or a number outside its
-            range; the message names the setting.
+    `spec`: the detector, with its modes, pixels and range of exposures [ms]. `camera`: settings
+    before. `change`: the new values; None and what is left out stay. Averages are 1 to 10 000,
+    frames 1 to 1 000 000.
+    Returns the new settings.
+    Raises LimitError: an unknown mode, a region outside the panel, or a number outside its
+    range; the message names the setting.
     """
     stated: dict[str, Any] = {name: x for name, x in change.items() if x is not None}
     new = replace(camera, **stated)
@@ -435,16 +418,12 @@ def require_applicable(
     camera: CameraSettings,
     correction: NamedCorrection | None,
 ) -> None:
-    """Check that a correction leaves a geometry that a scanner can have, anywhere in the
-    travel; see `require_before_source`.
+    """Check that a correction leaves a geometry that a scanner can have, anywhere in the travel;
+    see `require_before_source`.
 
-    Args:
-        machine, profile, camera: as there.
-        correction: None checks the nominal geometry.
-
-    Raises:
-        GeometryError: as there.
-    """
+    `machine` and `profile` and `camera`: as there; `correction`: None checks the nominal
+    geometry.
+    Raises GeometryError: as there."""
     if correction is None:
         what = "the machine file's travel"
         require_before_source(machine, profile, camera, NOMINAL, what)
@@ -460,12 +439,11 @@ def require_before_source(
     offsets: Offsets,
     cause: str,
 ) -> None:
-    """Check that offsets leave a geometry that a scanner can have, anywhere in the
-    travel.
+    """Check that offsets leave a geometry that a scanner can have, anywhere in the travel.
 
-    Each offset is plausible beside the machine's longest linear travel; rotation axis and
-    panel are before the source at every pose of the travel, whatever the region of
-    interest; and the rows are of the camera's pixels.
+    Each offset is plausible beside the machine's longest linear travel; rotation axis and panel
+    are before the source at every pose of the travel, whatever the region of interest; and the
+    rows are of the camera's pixels.
 
     Args:
         machine: with the travel of its motors.
@@ -474,9 +452,8 @@ def require_before_source(
         offsets: correction, or true misalignment.
         cause: of the geometry, for the message.
 
-    Raises:
-        GeometryError: it does not; the message names the offset, or the positions of the
-            motors at the worst pose.
+    Raises GeometryError: it does not; the message names the offset, or the positions of the
+    motors at the worst pose.
     """
     travels = (a.upper - a.lower for a in machine.axes.values() if a.unit == "mm")
     require_plausible(offsets, max(travels, default=math.inf))

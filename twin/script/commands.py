@@ -222,8 +222,7 @@ def _all_commands(cls: type[Command] = Command) -> dict[str, type[Command]]:
 
 def _to_json(command: Command) -> dict[str, Any]:
     """Serialise a command to a dict of its fields in JSON types, and `command`, the name
-    of its type.
-    """
+    of its type."""
     fields = adapter_of(type(command)).dump_python(command, mode="json")
     return {"command": type(command).__name__, **fields}
 
@@ -270,7 +269,6 @@ class Script:
     @classmethod
     def of(cls, commands: Iterable[Command]) -> Script:
         """Make a script from commands in memory, without warnings; `lines` is the
-        greatest line of a command, 0 without any.
-        """
+        greatest line of a command, 0 without any."""
         made = tuple(commands)
         return cls(made, Findings(), max((c.line for c in made), default=0))

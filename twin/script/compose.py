@@ -218,8 +218,7 @@ class _Writer(MotorTargets):
 
     def fly(self) -> Iterator[str]:
         """Yield the sample's move back into the beam, then one smooth turn of 360 degrees
-        with its run-up.
-        """
+        with its run-up."""
         yield from self.go(*self.aside)
         yield from self.turn(360.0, self.request.frames, 0)
 
@@ -350,17 +349,10 @@ class _Writer(MotorTargets):
         yield from self.drive(name, rotation.speed, rotation.acceleration)
 
     def turn(self, total: float, frames: int, first: int) -> Iterator[str]:
-        """Yield a smooth scan of `frames` images over `total` degrees from angle 0, and
-        its run-up.
-
-        Run-up before and after. Afterwards speed and acceleration are the axis's own
-        again; images are numbered from `first`.
-
-        Args:
-            total: angle from first to last image [deg].
-            frames: number of images.
-            first: number in the first image's file name.
-        """
+        """Yield a smooth scan of `frames` images over `total` degrees from angle 0, and its
+        run-up. Run-up before and after. Afterwards speed and acceleration are the axis's own
+        again; images are numbered from `first`. `total`: angle from first to last image [deg];
+        `frames`: number of images; `first`: number in the first image's file name."""
         name, rotation = self.rotation
         yield from self.run_up(total, frames)
         yield from self.sweep(total, frames, first)
@@ -409,11 +401,8 @@ class _Writer(MotorTargets):
             angle: target of the rotation [deg].
             total: angle from first to last image [deg].
 
-        Returns:
-            The target, within the travel.
-
-        Raises:
-            LimitError: beyond the travel; the message names what makes the motion shorter.
+        Returns the target, within the travel.
+        Raises LimitError: beyond the travel; the message names what makes the motion shorter.
         """
         try:
             return check_target(self.machine, self.rotation[0], angle)
@@ -448,8 +437,7 @@ class _Writer(MotorTargets):
 
     def run_up_deg(self, total: float, frames: int) -> float:
         """Compute the length of the run-up [deg] for `frames` images over `total`
-        degrees: acceleration and `MARGIN_IMAGES` images.
-        """
+        degrees: acceleration and `MARGIN_IMAGES` images."""
         speed = self.turn_speed(total, frames)
         return run_up(speed, self.rotation[1].acceleration, self.image_s)
 
@@ -460,11 +448,8 @@ class _Writer(MotorTargets):
 
         Other motors are not moved.
 
-        Args:
-            *quantities: such as object_y; each has a motor of its own (`driver`), else
-                LimitError.
-            place: of the sample; None: the request's SOD.
-            shift: of the detector sideways [mm].
+        `*quantities`: such as object_y; each has a motor of its own (`driver`), else LimitError.
+        `place`: of the sample; None: the request's SOD. `shift`: of the detector sideways [mm].
         """
         if place is None:
             at = ScanPosition(self.request.sod_mm)
@@ -550,8 +535,7 @@ class _Writer(MotorTargets):
 
     def out_of_beam(self) -> dict[str, float]:
         """Compute the target of the stage that takes the sample beside the beam, to the
-        freer side, for the flat image: motor -> [mm].
-        """
+        freer side, for the flat image: motor -> [mm]."""
         station = self.station(self.request.sod_mm)
         return beside_beam(self.machine, self.profile, self.camera, station)[0]
 
@@ -564,12 +548,9 @@ class _Writer(MotorTargets):
     def moves(self, targets: dict[str, float]) -> Iterator[str]:
         """Yield the rows that move motors to targets and wait for all of them.
 
-        Several are first started together without waiting, then each move is repeated to
-        wait for it.
-
-        Args:
-            targets: motor -> target [mm, deg].
-        """
+        Several are first started together without waiting, then each move is repeated to wait
+        for it.
+        `targets`: motor -> target [mm, deg]."""
         if len(targets) > 1:
             for name, value in targets.items():
                 yield _row(name, "move absolute", _decimal(value), wait="no wait")

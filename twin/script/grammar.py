@@ -120,13 +120,8 @@ def number(text: str, what: str, index: int = 0) -> float:
 def positive(text: str, what: str) -> float:
     """Read a number above zero; the least one that may be set is the machine's.
 
-    Args:
-        text: of the argument.
-        what: name of the argument, for the message.
-
-    Raises:
-        ArgumentError: another number, or none.
-    """
+    `text`: of the argument; `what`: name of the argument, for the message.
+    Raises ArgumentError: another number, or none."""
     value = number(text, what)
     if value <= 0.0:
         raise ArgumentError(f"{what} is {shorten(text)}; it must be above 0")
@@ -136,13 +131,8 @@ def positive(text: str, what: str) -> float:
 def not_negative(text: str, what: str) -> float:
     """Read a number from zero up.
 
-    Args:
-        text: of the argument.
-        what: name of the argument, for the message.
-
-    Raises:
-        ArgumentError: a negative number, or none.
-    """
+    `text`: of the argument; `what`: name of the argument, for the message.
+    Raises ArgumentError: a negative number, or none."""
     value = number(text, what)
     if value < 0:
         raise ArgumentError(f"{what} is {shorten(text)}; it must not be negative")
@@ -152,14 +142,9 @@ def not_negative(text: str, what: str) -> float:
 def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
     """Read a whole number from `low` to `high`; `1440.000000` is one too.
 
-    Args:
-        text: of the argument.
-        what: name of the argument, for the message.
-        low, high: least and greatest value allowed.
-        index: place of the argument, 0 or 1.
-
-    Raises:
-        ArgumentError: another number, or none.
+    `text`: of the argument; `what`: name of the argument, for the message; `low` and `high`:
+    least and greatest value allowed; `index`: place of the argument, 0 or 1.
+    Raises ArgumentError: another number, or none.
     """
     value = number(text, what, index)
     if not value.is_integer() or not low <= value <= high:
@@ -225,9 +210,7 @@ def _text(field: str, what: str) -> Read:
 def _keep(a: str, _b: str) -> dict[str, object]:
     """Read TRUE or FALSE, in any case, as the keyword argument `keep`.
 
-    Raises:
-        ArgumentError: any other word.
-    """
+    Raises ArgumentError: any other word."""
     if a.upper() not in ("TRUE", "FALSE"):
         raise ArgumentError(f"keep xrayon is {shorten(a)!r}; allowed: TRUE, FALSE")
     return {"keep": a.upper() == "TRUE"}
@@ -343,17 +326,11 @@ def vocabulary(component: str) -> tuple[str, ...]:
 
 
 def find(component: str, command: str) -> Spec | None:
-    """Look up the command of `component`, case and blanks aside; motors share one
-    vocabulary.
+    """Look up the command of `component`, case and blanks aside; motors share one vocabulary.
 
-    Args:
-        component: first column of a row; an unknown name is taken for a motor.
-        command: its name, as in the second column.
-
-    Returns:
-        Type, reader and number of arguments of the command; None if there is no such
-        command.
-    """
+    `component`: first column of a row; an unknown name is taken for a motor. `command`: its
+    name, as in the second column. Returns type, reader and number of arguments of the command;
+    None if there is no such command."""
     table = _BY_KEY.get(component.lower()) or _BY_KEY[""]
     spec = table.get(command.lower())
     if spec is not None:
@@ -362,11 +339,9 @@ def find(component: str, command: str) -> Spec | None:
 
 
 def match(component: str, words: list[str]) -> tuple[Spec, int] | None:
-    """Find the longest command of `component`, of at most five words, that `words` begin
-    with.
+    """Find the longest command of `component`, of at most five words, that `words` begin with.
 
-    Returns:
-        The command and its number of words, or None.
+    Returns the command and its number of words, or None.
     """
     for count in range(min(len(words), 5), 0, -1):
         spec = find(component, " ".join(words[:count]))
@@ -380,8 +355,7 @@ def bare_name(path: str) -> str:
 
     Characters that some file system does not allow become `_`, blanks and dots at its
     ends are dropped, it is cut to `MAX_NAME_CHARS`, and a device's name (con, nul, com1
-    ...) gets a `_` before it.
-    """
+    ...) gets a `_` before it."""
     name = re.split(r"[\\/]", path)[-1]
     name = _UNSAFE.sub("_", name).strip(" .")[:MAX_NAME_CHARS]
     if _DEVICE.fullmatch(name):
@@ -405,12 +379,10 @@ def image_name(path: str) -> str | None:
 
 
 def sequence_names(prefix: str, first: int, count: int) -> tuple[str, ...]:
-    """List `count` file names from number `first`: prefix without folder, six digits,
-    `.tif`.
+    """List `count` file names from number `first`: prefix without folder, six digits, `.tif`.
 
-    A prefix that ends with a slash is only a folder: the names are numbers. Unsafe
-    characters are replaced as by `bare_name`.
-    """
+    A prefix that ends with a slash is only a folder: the names are numbers. Unsafe characters
+    are replaced as by `bare_name`."""
     name = ""
     if not prefix.endswith(("\\", "/")):
         name = bare_name(prefix)
@@ -422,8 +394,7 @@ def kind_of(name: str) -> ImageKind:
     digits flat, anything else a projection.
 
     Case does not matter; one `_` or `-` before the digits and an ending .tif or .tiff are
-    allowed, digits may be missing.
-    """
+    allowed, digits may be missing."""
     if _DARK.fullmatch(name):
         return "dark"
     if _FLAT.fullmatch(name):

@@ -184,8 +184,7 @@ class LogComparison:
     @classmethod
     def of(cls, log: Log, machine: Machine) -> LogComparison:
         """Predict each line of `log` on `machine`, and warn of axes that are not the
-        machine's (`unlike`).
-        """
+        machine's (`unlike`)."""
         return cls(machine, tuple(against_log(log, machine)), unlike(log, machine))
 
     @property
@@ -563,8 +562,7 @@ def _later(times: Times) -> list[float]:
     """Return the logarithms of the later half's times over the earlier half's median,
     divided by sqrt(1 + 1/h) of h earlier times.
 
-    The later half is empty for a single time.
-    """
+    The later half is empty for a single time."""
     half = (len(times) + 1) // 2
     middle = _log(median(times[:half]))
     scale = math.sqrt(1.0 + 1.0 / half)

@@ -95,19 +95,13 @@ class MotorTargets:
         return out
 
     def solved(self, wanted: Mapping[str, float]) -> dict[str, float]:
-        """Solve for the motors' positions that bring quantities to the `wanted` values
-        [mm].
+        """Solve for the motors' positions that bring quantities to the `wanted` values [mm].
 
-        One after the other in the order of `wanted`, each by its driver, with all other
-        motors at home. A quantity without a driver is not brought anywhere. Limits are
-        not checked.
-
-        Args:
-            wanted: quantity -> value [mm].
-
-        Returns:
-            Motor -> position to six decimals, of all motors that move these quantities;
-            those that set none are at home.
+        One after the other in the order of `wanted`, each by its driver, with all other motors
+        at home. A quantity without a driver is not brought anywhere. Limits are not checked.
+        `wanted`: quantity -> value [mm].
+        Returns motor -> position to six decimals, of all motors that move these quantities;
+        those that set none are at home.
         """
         geometry = self.machine.geometry
         moved = (motor for quantity in wanted for motor in geometry.get(quantity, {}))
@@ -121,8 +115,7 @@ class MotorTargets:
     def driver(self, quantity: str) -> str:
         """Return the motor that sets a quantity.
 
-        Raises:
-            LimitError: no motor is left for it.
+        Raises LimitError: no motor is left for it.
         """
         if quantity not in self.drivers:
             message = f"has no motor of its own for {QUANTITIES[quantity]}"
@@ -130,15 +123,9 @@ class MotorTargets:
         return self.drivers[quantity]
 
     def need(self, what: str, quantity: str) -> None:
-        """Check that motors move a quantity.
-
-        Args:
-            what: purpose, for the message.
-            quantity: one of `QUANTITIES`.
-
-        Raises:
-            LimitError: names the quantity that no motor moves, and the purpose.
-        """
+        """Check that motors move a quantity. `what`: purpose, for the message; `quantity`: one
+        of `QUANTITIES`. Raises LimitError: names the quantity that no motor moves, and the
+        purpose."""
         if not self.has(quantity):
             none = f"has no motor for {QUANTITIES[quantity]}, which {what} needs"
             raise self.lacking(none, asked=what, missing=quantity)

@@ -148,8 +148,7 @@ def is_log(text: str | bytes) -> bool:
         >>> is_log("tube\txrayoff\t\t\tACK")
         False
         >>> is_log("tube\txrayoff\t\t\tACK\t\t\t501\t\t09:36:31.952")
-        True
-    """
+        True"""
     return (
         LOG_STAMP.search(grammar.encode(text) if isinstance(text, str) else text)
         is not None
@@ -161,8 +160,7 @@ def rows(data: str | bytes) -> Iterator[CodeLine]:
     comment.
 
     A row without tabs has no columns (None); one with the binary argument of `set sample
-    info` is divided in its own way (`_blob_columns`).
-    """
+    info` is divided in its own way (`_blob_columns`)."""
     for number, text in _lines(decode(data)):
         if _BLOB.match(text) and "\t" in text:
             yield CodeLine(number, text, _blob_columns(text))
@@ -197,19 +195,14 @@ def _lines(text: str) -> Iterator[tuple[int, str]]:
 def _blob_end(parts: list[str], ends: list[str], first: int, crlf: bool) -> int:
     """Find the part that ends the binary argument begun in part `first`.
 
-    It ends where a line ends with a wait column. In a file with CRLF the search stops at
-    the first CRLF, since an end of line within the data is a lone CR or LF there; it
-    never goes beyond `_MAX_BLOB_LINES` parts.
-
-    Args:
-        parts: pieces of the text between line ends.
-        ends: the line end behind each piece.
-        first: index of the piece in which the argument begins.
-        crlf: whether the file has CRLF line ends.
-
-    Returns:
-        Index of the part, in a file with CRLF that of the first CRLF if no wait is found;
-        else `first`.
+    It ends where a line ends with a wait column. In a file with CRLF the search stops at the
+    first CRLF, since an end of line within the data is a lone CR or LF there; it never goes
+    beyond `_MAX_BLOB_LINES` parts.
+    `parts`: pieces of the text between line ends; `ends`: the line end behind each piece;
+    `first`: index of the piece in which the argument begins; `crlf`: whether the file has CRLF
+    line ends.
+    Returns index of the part, in a file with CRLF that of the first CRLF if no wait is found;
+    else `first`.
     """
     joined = ""
     for i in range(first, min(first + _MAX_BLOB_LINES, len(parts))):
@@ -281,13 +274,9 @@ def _blob_columns(text: str) -> tuple[Field, ...]:
 def _field(piece: str, start: int, *, keep: bool = False) -> Field:
     """Make a field with blanks stripped, unless `keep`.
 
-    Args:
-        piece: its text.
-        start: index of the first character in the line.
-        keep: whether blanks stay.
-
-    Returns:
-        The field; its column, from 1, is that of the first character left.
+    `piece`: its text; `start`: index of the first character in the line; `keep`: whether blanks
+    stay.
+    Returns the field; its column, from 1, is that of the first character left.
     """
     if keep or not piece:
         return Field(piece, start + 1)
@@ -302,8 +291,7 @@ def is_light(script: bytes) -> bool:
     """Return whether a script is planned so fast that any thread may do it.
 
     It has at most `LIGHT_BYTES` and no number of five digits or more, or with an
-    exponent, which may mean many images.
-    """
+    exponent, which may mean many images."""
     return len(script) <= LIGHT_BYTES and _MANY_IMAGES.search(script) is None
 
 

@@ -243,11 +243,10 @@ def _load_inputs(
     geometries: list[Path],
     known: Given,
 ) -> list[DataSet]:
-    """Load the data sets, any scanner's frames, or the geometry of markers without
-    images.
+    """Load the data sets, any scanner's frames, or the geometry of markers without images.
 
-    Frames come before markers if both are given. Markers alone give one data set without
-    images, named by their file.
+    Frames come before markers if both are given. Markers alone give one data set without images,
+    named by their file.
 
     Args:
         folders: data sets; none needs `frames` or `markers`.
@@ -256,11 +255,8 @@ def _load_inputs(
         geometries: files, one for each data set; exactly one without data sets.
         known: detector shape and pitch that the files lack.
 
-    Returns:
-        The data sets.
-
-    Raises:
-        typer.BadParameter: options that do not go together.
+    Returns the data sets.
+    Raises typer.BadParameter: options that do not go together.
     """
     if folders:
         if frames is not None:
@@ -287,16 +283,12 @@ def _load_data_sets(
 ) -> list[DataSet]:
     """Load the data sets, each with its own geometry or the one of a file.
 
-    Without geometries each data set keeps its own; with them folders of anybody's TIFFs
-    are data sets, too. Order is that of the folders.
+    Without geometries each data set keeps its own; with them folders of anybody's TIFFs are data
+    sets, too. Order is that of the folders.
 
-    Args:
-        folders: of the data sets.
-        geometries: one file for each, or none.
-        known: detector shape and pitch that the files lack.
-
-    Raises:
-        typer.BadParameter: another number of geometries.
+    `folders`: of the data sets; `geometries`: one file for each, or none; `known`: detector
+    shape and pitch that the files lack.
+    Raises typer.BadParameter: another number of geometries.
     """
     from flexdt.library.reading.folders import load_dataset
 
@@ -429,13 +421,8 @@ def _push(
     """Put a correction in force on the twin, with a note on standard error.
 
     A motion is not put in force, and warned of.
-
-    Args:
-        twin: connects to it.
-        correction: name and offsets.
-        source: name of the data set.
-        document: of the result, which may contain a motion; a twin's correction cannot.
-    """
+    `twin`: connects to it. `correction`: name and offsets. `source`: name of the data set.
+    `document`: of the result, which may contain a motion; a twin's correction cannot."""
     with twin() as client:
         push_correction(client, correction, source)
     note(f"in force on the twin: {correction.name}")

@@ -275,11 +275,9 @@ def _correction(named: str | None, twin: Twin) -> tuple[Offsets | None, Report |
 
 
 def _require_of_geometry(correction: str, report: Report | None) -> None:
-    """Check that a correction comes from a report of a scan whose geometry came from a
-    file.
+    """Check that a correction comes from a report of a scan whose geometry came from a file.
 
-    Raises:
-        typer.BadParameter: there is no report, or its geometry is the scanner's own.
+    Raises typer.BadParameter: there is no report, or its geometry is the scanner's own.
     """
     if report is None or not report.of_geometry:
         raise typer.BadParameter(
@@ -334,8 +332,7 @@ def _workers(
 
     `scheduler` is an address, `slurm` a file; with both the scheduler counts.
 
-    Raises:
-        TwinError: flexdt-extensions is not installed.
+    Raises TwinError: flexdt-extensions is not installed.
     """
     from flexdt.library.optional.extras import extension
 

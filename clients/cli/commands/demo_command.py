@@ -173,8 +173,7 @@ def _drawn_truth() -> Iterator[Path]:
     """Write a random hidden misalignment to a temporary file outside the folder of the
     results; deleted at the end.
 
-    Yields the path of the TOML file.
-    """
+    Yields the path of the TOML file."""
     with tempfile.TemporaryDirectory(prefix="flexdt-truth-") as secret:
         path = Path(secret) / "truth.toml"
         hidden.write(hidden.draw(), path)

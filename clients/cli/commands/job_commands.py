@@ -204,12 +204,8 @@ def _on_job(does: str, method: str, steers: str | None = None) -> Callable[..., 
 def _require_current(client: TwinClient, verb: str) -> None:
     """Check that there is a current job, for a command that names none.
 
-    Args:
-        client: connected to the twin.
-        verb: of the command, for the error.
-
-    Raises:
-        CommandError: no job is queued, running or paused; its exit code is REFUSED.
+    `client`: connected to the twin; `verb`: of the command, for the error.
+    Raises CommandError: no job is queued, running or paused; its exit code is REFUSED.
     """
     from flexdt.clients.client.twin_methods import FINAL_STATES
 

@@ -71,11 +71,8 @@ def _declared(settings: type[Settings]) -> list[inspect.Parameter]:
 
 
 def _public() -> list[inspect.Parameter]:
-    """List the options that `up` shows; one left out is None, so that the settings
-    file can set it.
-
-    Switches keep False.
-    """
+    """List the options that `up` shows; one left out is None, so that the settings file can set
+    it. Switches keep False."""
     public = {f.name for f in fields(UpSettings) if f.metadata["public"]}
     own = [p for p in _declared(UpSettings) if p.name in public]
     return [p if p.default is False else p.replace(default=None) for p in own]
@@ -125,8 +122,7 @@ def start(name: str, more: Sequence[str]) -> None:
 
     It ends by typer.Exit; if `more` requests the help, that is shown and nothing runs.
     Raises typer.BadParameter and TwinError for options that do not hold, before the
-    process begins.
-    """
+    process begins."""
     settings = settings_of(TABLES[name], more)
     if settings is not None:
         given = {f.name: getattr(settings, f.name) for f in fields(settings)}

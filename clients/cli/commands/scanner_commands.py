@@ -351,8 +351,7 @@ def _outwait(client: TwinClient, axis: str, duration_s: float) -> State:
     The last lease runs out by itself, to the moment. At the fastest clock every lease
     does: a renewal could come before or after its end, and the time of motion would be
     unknown. `duration_s` counts on the twin's clock; the state is requested every
-    `JOG_POLL_S` seconds.
-    """
+    `JOG_POLL_S` seconds."""
     now = client.state()
     end = now.time + duration_s  # counted from after its start, not from before
     while now.time < end and now.axes[axis].moving:
@@ -616,8 +615,7 @@ def warn_of_exposure(flags: ImageFlags) -> None:
     """Warn on standard error of the share [%] of saturated and of starved pixels, each
     from `WARNING_SHARE` on.
 
-    Nothing is written below that share.
-    """
+    Nothing is written below that share."""
     from flexdt.twin.physics.exposure import WARNING_SHARE
 
     for name, share in (("saturated", flags.saturated), ("starved", flags.starved)):

@@ -49,12 +49,11 @@ class BeamPlane:
 def fans(
     world: World, lines: npt.NDArray[np.generic], radius_mm: float
 ) -> list[BeamPlane]:
-    """Compute four planes of the beam: through the image's middle column and middle row,
-    each one before the sample, with all light, and one behind it, with the light that
-    passes.
+    """Compute four planes of the beam: through the image's middle column and middle row, each
+    one before the sample, with all light, and one behind it, with the light that passes.
 
-    The transmission is exp(-line integral). The order is column before, column behind,
-    row before, row behind.
+    The transmission is exp(-line integral). The order is column before, column behind, row
+    before, row behind.
 
     Args:
         world: of the image's moment.

@@ -55,8 +55,7 @@ class Gizmos:
         targets when one is dragged.
 
         The targets are of motors [mm, deg], with viser's client id. Handles are at the
-        origin until the first `update`.
-        """
+        origin until the first `update`."""
         self._machine = machine
         self._drag = drag
         self._positions: dict[str, float] = {}
@@ -169,14 +168,10 @@ class Gizmos:
     ) -> None:
         """Set the target of the motor that changes a quantity, within its limits.
 
-        Nothing is set if the quantity depends on none or several motors, or if the change
-        is below 0.001.
-
-        Args:
-            targets: motor -> target, added to.
-            handle: that is dragged.
-            quantity: of the machine's geometry.
-            change: of it since the drag began [mm, deg].
+        Nothing is set if the quantity depends on none or several motors, or if the change is
+        below 0.001.
+        `targets`: motor -> target, added to; `handle`: that is dragged; `quantity`: of the
+        machine's geometry; `change`: of it since the drag began [mm, deg].
         """
         factors = self._machine.geometry.get(quantity, {})
         if len(factors) != 1 or abs(change) < 1e-3:

@@ -408,17 +408,14 @@ class LabScene:
         self._image.position = tuple(at)
 
     def shapes(self, world: World, shown: Shown, near: bool = False) -> list[Shape]:
-        """Collect the drawn shapes for a picture that needs no browser; any thread may
-        call.
+        """Collect the drawn shapes for a picture that needs no browser; any thread may call.
 
-        An opaque sample is drawn where it is near and has no dense part. "near" also
-        leaves out panel and beam. The order is parts, sample, panel, beam; the cone is
-        drawn only while X-rays are on. Shapes are in the world's frame [m].
+        An opaque sample is drawn where it is near and has no dense part. "near" also leaves out
+        panel and beam. The order is parts, sample, panel, beam; the cone is drawn only while
+        X-rays are on. Shapes are in the world's frame [m].
 
-        Args:
-            world: of the state that was drawn last.
-            shown: by the page.
-            near: leave out shapes that do not turn with the sample.
+        `world`: of the state that was drawn last; `shown`: by the page; `near`: leave out shapes
+        that do not turn with the sample.
         """
         poses = dict(self._sent)
         out = self._drawn_parts(poses, shown, near)
@@ -464,8 +461,7 @@ class LabScene:
         shaded beam.
 
         The ball around the sample is left out of the beam; `rgb` is uint8, `lines` (rows,
-        cols).
-        """
+        cols)."""
         self._image.image = rgb
         with self._server.atomic():
             self._shade.show(
@@ -610,8 +606,7 @@ def motor_of(machine: Machine, part: Component | None) -> str | None:
     >>> flexray = builtin_machine("flexray")
     >>> parts = {part.name: part for part in flexray.components}
     >>> [motor_of(flexray, parts[n]) for n in ("xray_source", "sample_mount", "main_platform")]
-    ['ver_tube', 'rot_obj', None]
-    """
+    ['ver_tube', 'rot_obj', None]"""
     parts = {each.name: each for each in machine.components}
     while part is not None:
         if part.axis is not None:
@@ -627,12 +622,9 @@ def sample_motor(machine: Machine) -> str | None:
 
 
 def _clear(opacity: float, dense: bool) -> dict[str, Any]:
-    """Choose opacity and sides of a skin: dense ones stay opaque, others show their
-    rear, too.
-
-    None as opacity is opaque; an opaque skin shows its front only, a dense one of a
-    translucent sample both sides.
-    """
+    """Choose opacity and sides of a skin: dense ones stay opaque, others show their rear, too.
+    None as opacity is opaque; an opaque skin shows its front only, a dense one of a translucent
+    sample both sides."""
     opaque = opacity >= 1.0
     side = "front" if opaque else "double"
     return {"opacity": None if dense or opaque else opacity, "side": side}

@@ -36,11 +36,9 @@ class Layer:
     def nodes_of(self, parts: Collection[str]) -> Iterator[tuple[str, str | None]]:
         """Name its nodes, each with its component or None.
 
-        Nodes keep the layer's order; `{part}` gives one node a part.
-
-        >>> list(Layer("margin", "safety margin", False, ("/{part}/margin",)).nodes_of(["tube"]))
-        [('/tube/margin', 'tube')]
-        """
+        Nodes keep the layer's order; `{part}` gives one node a part. >>> list(Layer("margin",
+        "safety margin", False, ("/{part}/margin",)).nodes_of(["tube"])) [('/tube/margin',
+        'tube')]"""
         for node in self.nodes:
             if "{part}" in node:
                 yield from ((node.format(part=part), part) for part in parts)
@@ -93,8 +91,7 @@ class Shown:
         as they are.
 
         >>> sorted(Shown(frozenset(["beam", "axis"])).changed(axis=False, names=True).layers)
-        ['beam', 'names']
-        """
+        ['beam', 'names']"""
         on = {name for name, wanted in layers.items() if wanted}
         off = {name for name, wanted in layers.items() if wanted is False}
         if opacity is None:
@@ -118,13 +115,9 @@ class Shown:
     ) -> dict[str, bool]:
         """Determine whether each node of all layers is visible.
 
-        A part's node is also visible if the part is in `near` and the layer has `near`.
-        Returns node -> bool.
-
-        Args:
-            parts: names of the machine's components.
-            near: those near a contact.
-        """
+        A part's node is also visible if the part is in `near` and the layer has `near`. Returns
+        node -> bool.
+        `parts`: names of the machine's components; `near`: those near a contact."""
         return {
             node: layer.name in self or (layer.near and part in near)
             for layer in LAYERS

@@ -45,8 +45,7 @@ def covered_by_page(area: tuple[float, float]) -> FloatArray:
     As style.css places them (.view .tag, button, .inset).
 
     >>> covered_by_page((600.0, 400.0))[2].tolist()
-    [458.0, 258.0, 590.0, 390.0]
-    """
+    [458.0, 258.0, 590.0, 390.0]"""
     width, height = area
     side = max(84.0, min(0.33 * height, 0.46 * width))
     return np.array([

@@ -94,10 +94,7 @@ class PlanDrawing:
         """Show some clients the focal spot's path as the sample sees it; None: no longer.
 
         A former path is replaced; fewer than two points show none.
-
-        Args:
-            clients: that see it.
-            points: (n, 3) [mm], object frame.
+        `clients`: that see it; `points`: (n, 3) [mm], object frame.
         """
         if points is None:
             steps = None

@@ -93,8 +93,7 @@ class SampleLook:
         """Compute the greatest distance of the skins from the origin along the first
         `axes` axes [mm]; None without skins.
 
-        With 3 axes it is the distance from the origin, with 2 that from the z axis.
-        """
+        With 3 axes it is the distance from the origin, with 2 that from the z axis."""
         far = [
             np.linalg.norm(skin.vertices[:, :axes], axis=1).max() for skin in self.skins
         ]
@@ -134,14 +133,9 @@ class MeshCache:
         return sample.revision is not None and _key(sample) not in self._made
 
     def add(self, sample: SampleState, stl: bytes) -> None:
-        """Store the look of an upload from its STL (bytes, mm), kept at its own place.
-
-        Without a material it is `DEFAULT_MATERIAL`. At most `MAX_LOOKS` looks are kept,
-        the oldest goes first.
-
-        Raises:
-            TwinError: it is no mesh.
-        """
+        """Store the look of an upload from its STL (bytes, mm), kept at its own place. Without a
+        material it is `DEFAULT_MATERIAL`. At most `MAX_LOOKS` looks are kept, the oldest goes
+        first. Raises TwinError: it is no mesh."""
         material = sample.material or DEFAULT_MATERIAL
         made = mesh_phantom(stl, material=material, file_type="stl", place="keep")
         self._keep(sample, made)
@@ -213,14 +207,11 @@ def _box(sample: SampleState) -> SampleLook:
 
 
 async def fetch(ask: Ask, sample: SampleState) -> bytes | None:
-    """Get the STL of the sample on the stage; None if the sample has changed or is too
-    large.
+    """Get the STL of the sample on the stage; None if the sample has changed or is too large.
 
-    `ask` sends a request to the twin. None too if there is no mesh, and for every error
-    of the twin.
-
-    Raises:
-        ConnectionLost: the twin has gone.
+    `ask` sends a request to the twin. None too if there is no mesh, and for every error of the
+    twin.
+    Raises ConnectionLost: the twin has gone.
     """
     try:
         told = await adrive(sample_shape(), lambda asked: ask(asked.method, asked.params))

@@ -118,8 +118,7 @@ def cone(world: World, color: tuple[int, int, int], opacity: float) -> Shape:
     """Make the translucent shape of the beam's sides, from the focal spot to the image's
     corners [m], not lit.
 
-    Four triangles; `color` is (r, g, b) from 0 to 255, `opacity` from 0 to 1.
-    """
+    Four triangles; `color` is (r, g, b) from 0 to 255, `opacity` from 0 to 1."""
     corners = world.corners * MM
     spot = np.broadcast_to(world.source * MM, corners.shape)
     sides = np.stack([spot, np.roll(corners, -1, axis=0), corners], axis=1)
@@ -219,14 +218,9 @@ def _projected(
     Rows grow downwards. Too near is less than `NEAR_M` ahead; the opening is the camera's
     vertical one.
 
-    Args:
-        corners: (n, 3, 3) [m].
-        camera: where it is and looks.
-        width: of the picture [px].
-        height: of the picture [px].
-
-    Returns:
-        (n, 3, 3) column, row [px] and inverse depth [1/m]; NaN too near the eye.
+    `corners`: (n, 3, 3) [m]; `camera`: where it is and looks; `width`: of the picture [px];
+    `height`: of the picture [px].
+    Returns (n, 3, 3) column, row [px] and inverse depth [1/m]; NaN too near the eye.
     """
     eye = np.asarray(camera.position)
     up = np.asarray(camera.up)

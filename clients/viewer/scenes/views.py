@@ -52,13 +52,8 @@ FOV_RAD: Final = {
 
 def _way(yaw_deg: float, pitch_deg: float) -> Vector:
     """Compute the unit direction (x, y, z) of a look along the beam, turned to the side
-    (positive: from the right) and down.
-
-    >>> _way(0.0, 0.0)
-    (-0.0, 1.0, -0.0)
-
-    The direction (x, y, z) is of length 1; angles in degrees.
-    """
+    (positive: from the right) and down. >>> _way(0.0, 0.0) (-0.0, 1.0, -0.0) The direction (x,
+    y, z) is of length 1; angles in degrees."""
     yaw = math.radians(yaw_deg)
     pitch = math.radians(pitch_deg)
     level = math.cos(pitch)
@@ -107,13 +102,11 @@ class Fitted:
     around: FloatArray
 
     def at(self, aspect: float) -> Standpoint:
-        """Choose the camera for a pane: of those that hold all points, the one nearest to
-        the middle.
+        """Choose the camera for a pane: of those that hold all points, the one nearest to the
+        middle.
 
         The aspect is limited to `MIN_ASPECT` to `MAX_ASPECT`.
-
-        Args:
-            aspect: the pane's width over its height.
+        `aspect`: the pane's width over its height.
         """
         cameras = [
             fitted(self.points, way, self.fov, self.around, aspect) for way in self.ways
@@ -188,16 +181,15 @@ def presets(
 
 
 def rim(world: World, vertices_m: Sequence[npt.NDArray[np.float32]]) -> FloatArray | None:
-    """Compute points (n, 3) [mm] around the cylinder in which the sample turns; None
-    without a sample.
+    """Compute points (n, 3) [mm] around the cylinder in which the sample turns; None without a
+    sample.
 
-    At its lower and upper end, a polygon outside the circle. The cylinder is upright
-    through the rotation axis, from the lowest to the highest vertex; None for meshes
-    without vertices, too. The lower end's points come first.
+    At its lower and upper end, a polygon outside the circle. The cylinder is upright through the
+    rotation axis, from the lowest to the highest vertex; None for meshes without vertices, too.
+    The lower end's points come first.
 
-    Args:
-        world: pose of the sample.
-        vertices_m: of its meshes, or of their convex hulls, in its own frame.
+    `world`: pose of the sample; `vertices_m`: of its meshes, or of their convex hulls, in its
+    own frame.
     """
     if not any(len(some) for some in vertices_m):
         return None

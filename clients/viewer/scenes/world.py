@@ -94,8 +94,7 @@ class World:
         """Compute the centre of a pixel (column, row), in the world's frame, (3,) [mm].
 
         The first pixel is (0, 0), at the top left; parts of pixels and places outside the
-        image are allowed.
-        """
+        image are allowed."""
         rows, cols = self.shape
         across = column - (cols - 1) / 2
         down = row - (rows - 1) / 2
@@ -139,13 +138,8 @@ def motors(machine: Machine, state: State) -> dict[str, float]:
 def world_of(machine: Machine, profile: Profile, state: State) -> World:
     """Compute the geometry of a state.
 
-    With the correction in force, the motors' positions and the sample's offset on the
-    stage.
-
-    Args:
-        machine, profile: the twin's.
-        state: as the twin sends it.
-    """
+    With the correction in force, the motors' positions and the sample's offset on the stage.
+    `machine` and `profile`: the twin's; `state`: as the twin sends it."""
     camera = camera_of(machine, state.camera)
     positions = motors(machine, state)
     offset = StagePlacement(**state.sample.offset.model_dump())
@@ -203,18 +197,10 @@ def beads_on(
 ) -> list[list[float]]:
     """Project bead centres into an image of geometry `cone_vec` (object's frame).
 
-    Bead order is kept; beads outside the image, by more than half a pixel, are left out.
-    Pixel centres are whole numbers.
-
-    Args:
-        cone_vec: twelve numbers, with the correction in force.
-        beads: (k, 3) [mm], the sample's own frame.
-        world: pose of the sample on the stage.
-        shape: (rows, cols) of the image.
-
-    Returns:
-        Those within the image, (column, row) in pixels.
-    """
+    Bead order is kept; beads outside the image, by more than half a pixel, are left out. Pixel
+    centres are whole numbers. `cone_vec`: twelve numbers, with the correction in force; `beads`:
+    (k, 3) [mm], the sample's own frame; `world`: pose of the sample on the stage; `shape`:
+    (rows, cols) of the image. Returns those within the image, (column, row) in pixels."""
     points = world.stage.inverse @ world.sample @ beads
     rows = shape[0]
     cols = shape[1]

@@ -39,16 +39,14 @@ _EDGES: Final = tuple(
 def otsu(values: npt.NDArray[np.generic]) -> float:
     """Find the threshold that parts values into two classes with the least variance in each.
 
-    It is an edge of one of OTSU_BINS equal bins. Among equally good thresholds the middle
-    one is taken. Fails on an empty array.
+    It is an edge of one of OTSU_BINS equal bins. Among equally good thresholds the middle one is
+    taken. Fails on an empty array.
 
     Args:
         values: of any shape, finite.
 
-    Returns:
-        The threshold, in the values' unit.
-
-    Source: N. Otsu, A threshold selection method from gray-level histograms, 1979.
+    Returns the threshold, in the values' unit. Source: N. Otsu, A threshold selection method
+    from gray-level histograms, 1979.
     """
     counts, edges = np.histogram(values, OTSU_BINS)
     middles = 0.5 * (edges[:-1] + edges[1:])
@@ -136,19 +134,16 @@ def surface(
 ) -> dict[str, Any]:
     """Find the surface of the dense parts, for the scenes.
 
-    The volume is averaged over cubes so that its longest side has at most `cells`, NaN
-    counting as 0; Otsu's threshold of that gives the level. The cubes grow twofold until
-    there are at most `MAX_FACES` faces. Voxels beyond whole cubes are left out; the
-    border is padded with the least value, so the mesh is closed.
+    The volume is averaged over cubes so that its longest side has at most `cells`, NaN counting
+    as 0; Otsu's threshold of that gives the level. The cubes grow twofold until there are at
+    most `MAX_FACES` faces. Voxels beyond whole cubes are left out; the border is padded with the
+    least value, so the mesh is closed.
 
-    Args:
-        grown: (y, x, z) [1/mm]; not a number where no data cover.
-        voxel_mm, center_mm: of the volume (x, y, z), as `Volume` has them.
-        cells: along the longest side of the search grid.
-
-    Returns:
-        `vertices` (v, 3) float32 [mm, object frame] and `faces` (f, 3) int32, both
-        base64; empty where nothing is dense.
+    `grown`: (y, x, z) [1/mm]; not a number where no data cover. `voxel_mm` and `center_mm`: of
+    the volume (x, y, z), as `Volume` has them. `cells`: along the longest side of the search
+    grid.
+    Returns `vertices` (v, 3) float32 [mm, object frame] and `faces` (f, 3) int32, both base64;
+    empty where nothing is dense.
     """
     factor = max(1, -(-max(grown.shape) // cells))
     while True:
@@ -166,11 +161,9 @@ def surface(
 
 
 def _means(grown: Float32Array, shape: list[int], factor: int) -> Float32Array:
-    """Compute means over cubes of voxels.
-
-    A cube has `factor` voxels a side; `shape` is the number of cubes along each axis. NaN
-    in a cube gives NaN; voxels beyond the cubes are left out.
-    """
+    """Compute means over cubes of voxels. A cube has `factor` voxels a side; `shape` is the
+    number of cubes along each axis. NaN in a cube gives NaN; voxels beyond the cubes are left
+    out."""
     cut = grown[tuple(slice(n * factor) for n in shape)]
     blocks = [part for n in shape for part in (n, factor)]
     return np.asarray(cut.reshape(blocks).mean(axis=(1, 3, 5)), dtype=np.float32)

@@ -156,9 +156,7 @@ class Held:
     request: VolumeRequest | None = None
 
     def say(self, **more: Any) -> None:
-        """Print a line (`tell`) with the facts known so far and `more`; `more` is not
-        stored.
-        """
+        """Print a line (`tell`) with the facts known so far and `more`; `more` is not stored."""
         self.tell({"type": "volume", **self.about, **more})
 
     def keep(self, **more: Any) -> None:
@@ -358,11 +356,10 @@ def made_of(data: DataSet) -> dict[str, Any]:
 def _facts(data: DataSet) -> dict[str, Any]:
     """Collect a data set's facts for people; unknown ones are empty.
 
-    `sample` and `started` are "" without the scan's document, `kV` is None without
-    settings. Times are formatted YYYY-MM-DD HH:MM; kV is the tube's voltage.
+    `sample` and `started` are "" without the scan's document, `kV` is None without settings.
+    Times are formatted YYYY-MM-DD HH:MM; kV is the tube's voltage.
 
-    Returns:
-        `sample`, `started` and `kV`.
+    Returns `sample`, `started` and `kV`.
     """
     settings = data.settings
     document = data.document
@@ -449,8 +446,7 @@ class Served:
 
         Codes are limited to `MAX_VOXELS` of a past scan, `MAX_GROWING_VOXELS` of a
         growing one. Voxel values are None where not covered. A comparison blocks until it
-        ends; its error becomes `not_compared`.
-        """
+        ends; its error becomes `not_compared`."""
         self._write("answer", str(len(content)), json.dumps(told), content=content)
 
     def _write(self, *words: str, content: bytes = b"") -> None:
@@ -537,8 +533,7 @@ def main() -> None:
         thread, until the parent process ends.
 
         Only a growing one uses one thread and ends with the parent; a past one uses all
-        threads.
-        """
+        threads."""
         if past:
             reconstruct(held, Path(folder), int(side))
             return

@@ -55,8 +55,7 @@ class LiveReconstruction:
 
     def warm(self) -> None:
         """Start a spare process that loads its libraries ahead of the first request; do
-        nothing if one is spare or running.
-        """
+        nothing if one is spare or running."""
         if self._spare is None and self._task is None:
             self._spare = asyncio.create_task(_started())
 
@@ -116,16 +115,11 @@ class LiveReconstruction:
     async def ask(self, asked: Wish, *words: str) -> Answer | None:
         """Send a request to the process and wait for its answer.
 
-        None also if another volume is requested before the answer. Answers come in the
-        order of the requests; the words are joined by tabs.
+        None also if another volume is requested before the answer. Answers come in the order of
+        the requests; the words are joined by tabs.
 
-        Args:
-            asked: the volume that it must have.
-            words: of the request.
-
-        Returns:
-            The answer, and its bytes; None without a process, or if it has another
-            volume.
+        `asked`: the volume that it must have; `words`: of the request.
+        Returns the answer, and its bytes; None without a process, or if it has another volume.
         """
         if self._writer is None or asked != self._asked:
             return None

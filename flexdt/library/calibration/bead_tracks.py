@@ -101,9 +101,7 @@ def tracks_document(outcome: Outcome[ImageSet]) -> dict[str, object]:
 
 
 def write_tracks(outcome: Outcome[ImageSet], path: Path) -> None:
-    """Write `tracks_document` as JSON; the file appears under its name only when
-    complete.
-    """
+    """Write `tracks_document` as JSON; the file appears under its name only when complete."""
     write_whole(path, json.dumps(tracks_document(outcome)) + "\n")
 
 

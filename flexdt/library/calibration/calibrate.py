@@ -124,10 +124,8 @@ class Outcome(Generic[Images_co]):
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, object]]:
-        """Name -> {value, sigma, low, high, unit, images, priors, prior, asked} [mm,
-        deg], as `Estimate` describes them; parameters with a prior that were not
-        requested come last.
-        """
+        """Name -> {value, sigma, low, high, unit, images, priors, prior, asked} [mm, deg], as
+        `Estimate` describes them; parameters with a prior that were not requested come last."""
         estimates: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return estimates
 
@@ -443,8 +441,7 @@ def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
 
 def explained_by(saturated: Sequence[Finding], findings: Findings) -> Findings:
     """List findings on saturated images first, and leave out those that saturation
-    falsifies (`explains` of its code); unchanged if none is saturated.
-    """
+    falsifies (`explains` of its code); unchanged if none is saturated."""
     return Findings(saturated).and_also(findings.unexplained_by(saturated))
 
 

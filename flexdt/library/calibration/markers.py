@@ -149,13 +149,9 @@ class Scale:
 def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Markers:
     """Read the markers of a CSV or NumPy file, or collect given marks.
 
-    Args:
-        source: the file's path (.npy is a NumPy file, anything else a CSV file), or the
-            marks.
-        views: how many frames there are.
-
-    Raises:
-        TwinError: the file cannot be read or is invalid; names the line.
+    `source`: the file's path (.npy is a NumPy file, anything else a CSV file), or the marks;
+    `views`: how many frames there are.
+    Raises TwinError: the file cannot be read or is invalid; names the line.
     """
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)
@@ -356,12 +352,8 @@ def spots_of(markers: Markers, shape: tuple[int, int]) -> tuple[list[FrameSpots]
 
     Radii are NaN.
 
-    Args:
-        markers: k markers in n frames.
-        shape: (rows, cols).
-
-    Returns:
-        The frames' spots, and (n, k) the number of each marker's spot, -1 where unseen.
+    `markers`: k markers in n frames; `shape`: (rows, cols).
+    Returns the frames' spots, and (n, k) the number of each marker's spot, -1 where unseen.
     """
     seen = markers.seen
     looks = []
@@ -435,12 +427,11 @@ def calibrate_unknown(
 ) -> tuple[Calibration, dict[str, object]]:
     """Calibrate from three or more markers of unknown positions.
 
-    The markers define the object's frame: its height, turn and place on the axis (dO_y,
-    alpha, tau_x, tau_z) are those of the request's start. Images determine only the ratio
-    of their scale and the distance of the axis; one of these states it: `scale`, a prior
-    on dO_z, or a free dO_z. Without any, dO_z has a wide prior, of
-    `FREE_SCALE` times the SOD. With `scale` markers and axis are scaled and fitted up to
-    four times.
+    The markers define the object's frame: its height, turn and place on the axis (dO_y, alpha,
+    tau_x, tau_z) are those of the request's start. Images determine only the ratio of their
+    scale and the distance of the axis; one of these states it: `scale`, a prior on dO_z, or a
+    free dO_z. Without any, dO_z has a wide prior, of `FREE_SCALE` times the SOD. With `scale`
+    markers and axis are scaled and fitted up to four times.
 
     Args:
         data: geometry, and names.
@@ -450,14 +441,10 @@ def calibrate_unknown(
         scale: a known distance of two of them.
         detector: finds spots in the images.
 
-    Returns:
-        The calibration, and the document: markers (of `_described`) and scale, a text:
-        the stated one, "estimated", "free" or "from the prior on dO_z".
-
-    Raises:
-        TwinError: fewer than three markers, one that is seen from too few directions,
-            neither images nor markers, or a scale with dO_z free, with one marker or with
-            one that is not there.
+    Returns the calibration, and the document: markers (of `_described`) and scale, a text: the
+    stated one, "estimated", "free" or "from the prior on dO_z".
+    Raises TwinError: fewer than three markers, one that is seen from too few directions, neither
+    images nor markers, or a scale with dO_z free, with one marker or with one that is not there.
     """
     sod = float(np.median(data.poses.sod))
     if markers is not None:
@@ -486,18 +473,12 @@ def calibrate_unknown(
 def _locate_detected(
     data: ImageSet, images: Frames, detector: SpotFinder, start: Offsets
 ) -> _Located:
-    """Detect markers in the images, and link their spots by the geometry; they are named
-    0, 1, ...
+    """Detect markers in the images, and link their spots by the geometry; they are named 0, 1,
+    ...
 
-    Args:
-        data: geometry.
-        images: its frames.
-        detector: finds spots.
-        start: offsets to begin with.
-
-    Raises:
-        TwinError: as `link`.
-    """
+    `data`: geometry; `images`: its frames; `detector`: finds spots; `start`: offsets to begin
+    with.
+    Raises TwinError: as `link`."""
     looks = images.look(detector)
     spots = [look.detections for look in looks]
     index, places, at = link(spots, data.poses, start)
@@ -509,13 +490,8 @@ def _locate_detected(
 def _locate_marked(data: ImageSet, markers: Markers, start: Offsets) -> _Located:
     """Triangulate markers from their pixels; their radii, which nobody states, are 1 um.
 
-    Args:
-        data: geometry.
-        markers: their pixels.
-        start: offsets to begin with.
-
-    Raises:
-        TwinError: fewer than three markers, or as `triangulate`.
+    `data`: geometry; `markers`: their pixels; `start`: offsets to begin with.
+    Raises TwinError: fewer than three markers, or as `triangulate`.
     """
     looks, index = spots_of(markers, data.shape)
     names = markers.names

@@ -196,11 +196,9 @@ def import_geometry(
 
 
 def _with_doubts(geometry: ScanGeometry, path: Path) -> ScanGeometry:
-    """Return the geometry with the doubts about it added to its notes; itself without
-    doubts.
+    """Return the geometry with the doubts about it added to its notes; itself without doubts.
 
-    Raises:
-        ExchangeError: no scanner has such a geometry.
+    Raises ExchangeError: no scanner has such a geometry.
     """
     findings = examine(Operation.OPEN, geometry.cone_vec, geometry.shape)
     doubts = settled(findings, ExchangeError, str(path))
@@ -227,13 +225,8 @@ def _known(format: str, allowed: Iterable[str]) -> Format:
 def _to_write(out: Path, format: str, allowed: Iterable[str]) -> Format:
     """Return the format of a name, for a file with this ending (in either case).
 
-    Args:
-        out: file to write.
-        format: name.
-        allowed: names of formats.
-
-    Raises:
-        ExchangeError: another name, or the file's ending is not the format's.
+    `out`: file to write; `format`: name; `allowed`: names of formats.
+    Raises ExchangeError: another name, or the file's ending is not the format's.
     """
     form = _known(format, allowed)
     if out.suffix.lower() not in form.endings:
@@ -343,16 +336,11 @@ def stated_in(path: Path) -> ScanGeometry:
 def _json(path: Path, given: Given) -> ScanGeometry:
     """Read our own document, or a CTSimU scenario, by its content.
 
-    A document with a "file" section is a scenario. Notes that our own document keeps are
-    left out: they were told when it was written.
+    A document with a "file" section is a scenario. Notes that our own document keeps are left
+    out: they were told when it was written.
 
-    Args:
-        path: file.
-        given: shape and pitch, which must agree with the file's or complete it.
-
-    Raises:
-        ExchangeError: the file is neither.
-        GeometryError: it contradicts `given`.
+    `path`: file; `given`: shape and pitch, which must agree with the file's or complete it.
+    Raises ExchangeError: the file is neither; GeometryError: it contradicts `given`.
     """
     document = read_json(text_of(path), str(path))
     if "file" in document:

@@ -69,9 +69,7 @@ def _export_ctsimu(
     """Write a data set's geometry as a CTSimU scenario; `real` adds the deviations from the
     known one.
 
-    Raises:
-        TwinError: flexdt-extensions is not installed.
-    """
+    Raises TwinError: flexdt-extensions is not installed."""
     from flexdt.library.optional.extras import extension
     from flexdt.runtime.files.whole_files import write_whole
 
@@ -82,9 +80,7 @@ def _export_ctsimu(
 def _read_ctsimu(path: Path, given: Given) -> ScanGeometry:
     """Read the geometry of a CTSimU scenario, with the files that it names.
 
-    Raises:
-        TwinError: flexdt-extensions is not installed.
-        ExchangeError: the file is no scenario.
+    Raises TwinError: flexdt-extensions is not installed; ExchangeError: the file is no scenario.
     """
     from flexdt.library.datasets.geometry_content import text_of
     from flexdt.library.optional.extras import extension
@@ -251,12 +247,8 @@ def _read_csv(path: Path, given: Given) -> ScanGeometry:
 def _export_nxtomo(
     dataset: ImageSet, out: Path, parameters: Offsets | None, real: Offsets | None
 ) -> None:
-    """Write a complete data set as NXtomo, with other offsets if `parameters` are given;
-    `real` is ignored.
-
-    Raises:
-        DatasetMissingError: the data set is incomplete.
-    """
+    """Write a complete data set as NXtomo, with other offsets if `parameters` are given; `real`
+    is ignored. Raises DatasetMissingError: the data set is incomplete."""
     from flexdt.library.datasets.nxtomo_writing import save_nxtomo
 
     whole = dataset.require_complete()

@@ -37,9 +37,7 @@ DARK: Final = (
 def saturated_part(what: str, share: float) -> str:
     """Make the sentence on the saturated part of some images, with its remedy.
 
-    Args:
-        what: which images.
-        share: of their pixels, 0 to 1.
+    `what`: which images; `share`: of their pixels, 0 to 1.
     """
     return (
         f"{100.0 * share:.3g} % of the pixels of the {what} {SATURATED}: "
@@ -50,15 +48,11 @@ def saturated_part(what: str, share: float) -> str:
 def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
     """Check images for saturation before anything is computed from them.
 
-    Args:
-        paths: one image of each kind, which the sentence names. An unreadable image is
-            skipped; reading it later is an error.
-        full_scale: largest count of the panel; None where it is not known: nothing is
-            checked.
-
-    Returns:
-        One sentence, of the first kind of which at least `WARNING_SHARE` of the pixels is
-        saturated; else [].
+    `paths`: one image of each kind, which the sentence names. An unreadable image is skipped;
+    reading it later is an error. `full_scale`: largest count of the panel; None where it is not
+    known: nothing is checked.
+    Returns one sentence, of the first kind of which at least `WARNING_SHARE` of the pixels is
+    saturated; else [].
     """
     for kind, path in paths.items():
         if full_scale is None:

@@ -399,12 +399,9 @@ class ImageSet:
 
     @cached_property
     def poses(self) -> Poses:
-        """Nominal poses of `frames`; where motors are not known, those that `cone_vec`
-        implies.
+        """Nominal poses of `frames`; where motors are not known, those that `cone_vec` implies.
 
-        Raises:
-            GeometryError: a panel on its side, so that the stage's angle is unknown.
-        """
+        Raises GeometryError: a panel on its side, so that the stage's angle is unknown."""
         if self.nominal is None:
             return Poses.from_cone_vec(self.cone_vec)
         return self.nominal
@@ -458,8 +455,7 @@ class ImageSet:
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
             >>> data.with_correction(Offsets(det_roll=0.01)).correction.name
-            'given'
-        """
+            'given'"""
         if isinstance(correction, Offsets):
             correction = NamedCorrection("given", "", correction, panel=self.panel)
         return replace(self, correction=correction)
@@ -614,8 +610,7 @@ class ImageSet:
         """Return line integrals of one projection as they were recorded or given, (rows,
         cols).
 
-        Given integrals are copied; otherwise the counts are normalised.
-        """
+        Given integrals are copied; otherwise the counts are normalised."""
         arrays = self.arrays
         if arrays is None or arrays.integrals is None:
             return self.normalisation(self.counts(index))
@@ -631,8 +626,7 @@ class ImageSet:
             >>> counts, flat = np.full((3, 4, 5), 500), np.full((4, 5), 1000)
             >>> data = DataSet.from_arrays(counts, scan, flat=flat)
             >>> data.stack([0, 2]).shape
-            (2, 4, 5)
-        """
+            (2, 4, 5)"""
         if indices is None:
             chosen = self.present
         else:
@@ -679,10 +673,8 @@ def _normalise(
 
     Several dark or flat images are averaged.
 
-    Args:
-        values: (n, rows, cols) intensities.
-        dark: (rows, cols) or (k, rows, cols); 0 without.
-        flat: (rows, cols) or (k, rows, cols).
+    `values`: (n, rows, cols) intensities. `dark`: (rows, cols) or (k, rows, cols); 0 without.
+    `flat`: (rows, cols) or (k, rows, cols).
     """
     shape = values.shape[1], values.shape[2]
     darks = _image_stack("dark", dark, shape)
@@ -695,12 +687,10 @@ def _normalise(
 
 
 def _blank(counts: Counts) -> npt.NDArray[np.bool_]:
-    """Mark images (n, rows, cols) that are zero everywhere; pixels of one row decide for
-    most.
+    """Mark images (n, rows, cols) that are zero everywhere; pixels of one row decide for most.
 
     The pixels are every 41st of the middle row; only if all are zero the whole image is
-    searched.
-    """
+    searched."""
     blank: npt.NDArray[np.bool_] = counts[:, counts.shape[1] // 2, ::41].max(axis=1) == 0
     for i in np.flatnonzero(blank):
         blank[i] = not counts[i].any()

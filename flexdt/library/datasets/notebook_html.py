@@ -20,8 +20,7 @@ def facts_table(caption: str, facts: Mapping[str, object]) -> str:
 
     Example:
         >>> facts_table("scan", {"frames": 3})
-        '<table><caption>scan</caption><tr><th>frames</th><td>3</td></tr></table>'
-    """
+        '<table><caption>scan</caption><tr><th>frames</th><td>3</td></tr></table>'"""
     rows = "".join(
         f"<tr><th>{escape(str(name))}</th><td>{escape(str(value))}</td></tr>"
         for name, value in facts.items()

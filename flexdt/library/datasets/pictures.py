@@ -41,8 +41,7 @@ def round_length(most: float) -> float:
 
     Example:
         >>> round_length(37.0), round_length(0.7)
-        (20.0, 0.5)
-    """
+        (20.0, 0.5)"""
     power = 10.0 ** math.floor(math.log10(most))
     return next(step * power for step in (5.0, 2.0, 1.0) if step * power <= most)
 
@@ -50,15 +49,13 @@ def round_length(most: float) -> float:
 def windowed(
     image: npt.NDArray[Any], like: npt.NDArray[Any] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """Convert an image to 8 bits, with the `PERCENTILES` of its finite values black and
-    white.
+    """Convert an image to 8 bits, with the `PERCENTILES` of its finite values black and white.
 
     Args:
         image: any shape; NaN becomes black.
         like: image whose percentiles are taken instead.
 
-    Returns:
-        uint8; all 0 where the percentiles are equal or no value is finite.
+    Returns uint8; all 0 where the percentiles are equal or no value is finite.
     """
     seen = image if like is None else like
     seen = seen[np.isfinite(seen)]
@@ -132,14 +129,10 @@ def png(
 ) -> bytes:
     """Encode an image as PNG, with percentiles as black and white.
 
-    Args:
-        image: (rows, cols).
-        dark_is_dense: encode the negative.
-        marks: (rows, cols), see `MARKS`; unless all are zero the picture is in colour.
-        like: image whose percentiles are taken; `image` itself without.
-
-    Raises:
-        ValueError: it has no pixels, or is no image.
+    `image`: (rows, cols). `dark_is_dense`: encode the negative. `marks`: (rows, cols), see
+    `MARKS`; unless all are zero the picture is in colour. `like`: image whose percentiles are
+    taken; `image` itself without.
+    Raises ValueError: it has no pixels, or is no image.
     """
     if image.ndim != 2 or image.size == 0:
         raise ValueError(f"an image has rows and columns, got shape {image.shape}")

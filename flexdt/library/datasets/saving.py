@@ -132,9 +132,7 @@ def unfinished(path: Path) -> str:
     """Describe a folder in which saving was interrupted.
 
     Numbers that are missing in its note are "?".
-
-    Args:
-        path: of a folder with the file `UNFINISHED`.
+    `path`: of a folder with the file `UNFINISHED`.
     """
     noted = _read_note(path)
     tiffs = [entry for entry in path.iterdir() if entry.suffix.lower().startswith(".tif")]
@@ -203,8 +201,7 @@ def stated_settings(data: ImageSet) -> ScanSettings | None:
 
 def stated_voltage(data: ImageSet) -> float | None:
     """Return the tube's voltage [kV], of the simulated exposure or of the files; None where
-    it is unknown.
-    """
+    it is unknown."""
     beam = getattr(data.truth, "exposure", None) or data.settings
     return None if beam is None or not beam.kV else float(beam.kV)
 

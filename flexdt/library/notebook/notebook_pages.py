@@ -72,11 +72,8 @@ class NotebookPage:
         return f"<NotebookPage of {self.title}: {len(self.html) >> 10} kB of HTML>"
 
     def save(self, file: Any) -> None:
-        """Write it as an HTML file that needs nothing else.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write it as an HTML file that needs nothing else. Raises OSError: it cannot be
+        written."""
         head = f'<!doctype html><meta charset="utf-8"><title>{escape(self.title)}</title>'
         write_whole(Path(file), f"{head}\n{self.html}\n")
 
@@ -317,8 +314,7 @@ def _slider_indices(count: int) -> list[int]:
     """Choose at most `MAX_PICTURES` indices below `count`, evenly spread, of which a
     slider shows one.
 
-    They ascend from 0 to count - 1; all if there are no more; [] for 0.
-    """
+    They ascend from 0 to count - 1; all if there are no more; [] for 0."""
     if not count:
         return []
     spread = np.linspace(0, count - 1, min(count, MAX_PICTURES))
@@ -339,11 +335,8 @@ def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.ui
 def _slider(count: int, what: str, handler: str, start: int) -> str:
     """Write a slider with the values 0 to count - 1 as HTML; hidden for a single picture.
 
-    Args:
-        count: positions.
-        what: its label.
-        handler: JavaScript to run when it moves.
-        start: first position.
+    `count`: positions; `what`: its label; `handler`: JavaScript to run when it moves; `start`:
+    first position.
     """
     hidden = " hidden" if count < 2 else ""
     return (

@@ -44,16 +44,10 @@ def window_of(
     At most about MAX_VALUES values are looked at, in even steps along each axis. Equal
     percentiles give white = black + 1.
 
-    Args:
-        values: whose percentiles are taken where no window is given; NaN and infinite
-            ones are left out.
-        window: (black, white), or None for the PERCENTILES.
-
-    Returns:
-        (black, white), black the smaller one; (0, 1) if no value is finite.
-
-    Raises:
-        TwinError: not two numbers, the first the smaller one.
+    `values`: whose percentiles are taken where no window is given; NaN and infinite ones are
+    left out. `window`: (black, white), or None for the PERCENTILES.
+    Returns (black, white), black the smaller one; (0, 1) if no value is finite.
+    Raises TwinError: not two numbers, the first the smaller one.
     """
     if window is None:
         step = max(1, round((values.size / MAX_VALUES) ** (1.0 / values.ndim)))

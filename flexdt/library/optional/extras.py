@@ -32,14 +32,9 @@ def package(
 
 
 def lacking(module: str, name: str, extra: str) -> str | None:
-    """Return the install hint for a missing module; None where it is installed. Imports
-    nothing.
-
-    Args:
-        module: as it is imported.
-        name: of its distribution.
-        extra: of flexdt that brings it.
-    """
+    """Return the install hint for a missing module; None where it is installed. Imports nothing.
+    `module`: as it is imported; `name`: of its distribution; `extra`: of flexdt that brings
+    it."""
     if find_spec(module):
         return None
     return f"{name} is missing: pip install 'flexdt[{extra}]'"
@@ -55,17 +50,10 @@ def offered(name: str, group: str) -> Any:
 def extension(name: str, what: str, group: str = "flexdt.extensions") -> Any:
     """Load the object of an entry point of `flexdt-extensions`.
 
-    Args:
-        name: of the entry point.
-        what: needs it, for the message.
-        group: of entry points.
-
-    Returns:
-        The object, e.g. a function.
-
-    Raises:
-        TwinError: no such entry point, as where the distribution is not installed; names
-            the command that installs it.
+    `name`: of the entry point; `what`: needs it, for the message; `group`: of entry points.
+    Returns the object, e.g. a function.
+    Raises TwinError: no such entry point, as where the distribution is not installed; names the
+    command that installs it.
     """
     loaded = offered(name, group)
     if loaded is None:

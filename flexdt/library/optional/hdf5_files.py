@@ -36,17 +36,10 @@ _lock: Final = threading.Lock()
 
 @contextmanager
 def hdf5_file(path: Path, what: str) -> Iterator[Any]:
-    """Open an HDF5 file for reading that can be walked through without harm.
-
-    Args:
-        path: of the file.
-        what: that needs h5py, for the message.
-
-    Raises:
-        TwinError: the package h5py is not installed.
-        DatasetFormatError: its damage ends, or stops, the process that reads it.
-        OSError: it is no HDF5 file, or missing.
-    """
+    """Open an HDF5 file for reading that can be walked through without harm. `path`: of the
+    file; `what`: that needs h5py, for the message. Raises TwinError: the package h5py is not
+    installed; DatasetFormatError: its damage ends, or stops, the process that reads it; OSError:
+    it is no HDF5 file, or missing."""
     h5py = package("h5py", what)
     _require_sound(path, h5py)
     with h5py.File(path) as file:
@@ -116,14 +109,8 @@ def _survived_program(path: Path, h5py: Any) -> bool:
 
 def walk(path: Path | str, h5py: Any) -> None:
     """Read the structure of a file, its attributes, small data sets, and members of others.
-
-    Args:
-        path: of the file.
-        h5py: the package.
-
-    Raises:
-        Exception: any that the library has for a damaged file.
-    """
+    `path`: of the file; `h5py`: the package. Raises Exception: any that the library has for a
+    damaged file."""
     with h5py.File(path) as file:
         _attributes(file)
         file.visititems(lambda _, item: _visit(item))

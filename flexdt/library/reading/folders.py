@@ -481,13 +481,9 @@ def _finite_images(
 ) -> npt.NDArray[Any]:
     """Read images of a folder that are no counts, (n, rows, cols).
 
-    Args:
-        folder: of the images.
-        names: of the files, in order.
-        shape: that each must have (rows, cols).
-
-    Raises:
-        DatasetFormatError: a pixel is not finite, or an image has another shape.
+    `folder`: of the images; `names`: of the files, in order; `shape`: that each must have (rows,
+    cols).
+    Raises DatasetFormatError: a pixel is not finite, or an image has another shape.
     """
     images = np.stack([read_values(folder / n, shape) for n in names])
     bad = np.flatnonzero(~np.isfinite(images).all(axis=(1, 2)))
@@ -855,11 +851,8 @@ def _accounted(
 
 
 def _require_one_each(content: Folder) -> None:
-    """Check that no two images have one number.
-
-    Raises:
-        DatasetFormatError: names two that have.
-    """
+    """Check that no two images have one number. Raises DatasetFormatError: names two that
+    have."""
     if content.duplicate is not None:
         settled([duplicate(*content.duplicate)], DatasetFormatError, str(content.path))
 

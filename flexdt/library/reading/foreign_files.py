@@ -129,12 +129,9 @@ def open_file(
 def format_of(path: Path) -> ScanFormat | None:
     """Find the format of a file by its ending, whatever its case, and its content.
 
-    Of the formats with its ending the first whose content it has counts; a file with none
-    of them is that of the first without such a check.
-
-    Returns:
-        The format; None for an ending that no format has, or another content.
-    """
+    Of the formats with its ending the first whose content it has counts; a file with none of
+    them is that of the first without such a check.
+    Returns the format; None for an ending that no format has, or another content."""
     forms = [form for form in SCAN_FORMATS if path.suffix.lower() in form.endings]
     for form in forms:
         if form.holds is not None and path.is_file() and form.holds(path):
@@ -143,16 +140,9 @@ def format_of(path: Path) -> ScanFormat | None:
 
 
 def refuse_distances(path: Path, name: str, distances: tuple[float, float]) -> NoReturn:
-    """Refuse distances with a scan that states its own.
-
-    Args:
-        path: of the scan.
-        name: of its format.
-        distances: source to axis and to panel [mm].
-
-    Raises:
-        DatasetFormatError: names the formats that are allowed.
-    """
+    """Refuse distances with a scan that states its own. `path`: of the scan; `name`: of its
+    format; `distances`: source to axis and to panel [mm]. Raises DatasetFormatError: names the
+    formats that are allowed."""
     named = ", ".join(one.name for one in SCAN_FORMATS if one.distant)
     said = f"{path}: distances with a scan of {name}"
     raise DatasetFormatError.instead(said, list(distances), f"with {named}")

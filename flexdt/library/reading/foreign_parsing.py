@@ -54,12 +54,8 @@ def head_text(path: Path) -> str:
     """Read a text that describes a scan, as UTF-8 with or without a byte order mark, or as
     UTF-16 with one.
 
-    Bytes that have no character become replacement characters.
-
-    Raises:
-        DatasetFormatError: it is larger than the settings of a scan may be.
-        OSError: it cannot be read.
-    """
+    Bytes that have no character become replacement characters. Raises DatasetFormatError: it is
+    larger than the settings of a scan may be; OSError: it cannot be read."""
     try:
         raw = limited_bytes(path, "settings")
     except InputLimitError as error:

@@ -34,8 +34,7 @@ FLAT_NAME: Final = re.compile(r"flat|white|bright|open|blank|gain|^io", re.IGNOR
 
 
 def without_flat(name: str, names: Sequence[str]) -> str:
-    """Write the warning that a scan lacks flat images, with the first file that looks like
-    one.
+    """Write the warning that a scan lacks flat images, with the first file that looks like one.
 
     Args:
         name: of the scan.
@@ -83,12 +82,10 @@ def in_order(
 
 
 def doubts_of(content: Folder, geometry: ConeVec, shape: tuple[int, int]) -> list[str]:
-    """List doubts about a geometry for images of a shape (rows, cols), as sentences that
-    name the folder; [] without doubts.
+    """List doubts about a geometry for images of a shape (rows, cols), as sentences that name
+    the folder; [] without doubts.
 
-    Raises:
-        DatasetFormatError: no scanner has such a geometry.
-    """
+    Raises DatasetFormatError: no scanner has such a geometry."""
     found = examine(Operation.OPEN, geometry, shape)
     if found:
         return settled(found, DatasetFormatError, str(content.path))

@@ -140,13 +140,8 @@ class _Streams:
     ) -> npt.NDArray[Any]:
         """Read images (k, rows, cols) from streams, one each.
 
-        Args:
-            names: of the streams.
-            code: of the type, DataType.
-            shape: (rows, cols).
-
-        Raises:
-            DatasetFormatError: an unknown type, or a stream of another length.
+        `names`: of the streams; `code`: of the type, DataType; `shape`: (rows, cols).
+        Raises DatasetFormatError: an unknown type, or a stream of another length.
         """
         if code not in KINDS:
             raise DatasetFormatError(
@@ -268,19 +263,13 @@ def _reference(
 ) -> npt.NDArray[Any] | None:
     """Read the images of the open beam.
 
-    The first folder of REFERENCES that has images counts; they are `Image` and `Image1`
-    to `Image999`.
+    The first folder of REFERENCES that has images counts; they are `Image` and `Image1` to
+    `Image999`.
 
-    Args:
-        file: its streams.
-        code: type of the pixels where the file does not state it for these.
-        shape: (rows, cols).
-
-    Returns:
-        (k, rows, cols); None without any.
-
-    Raises:
-        DatasetFormatError: pixels that are not finite, an unknown type, or another size.
+    `file`: its streams; `code`: type of the pixels where the file does not state it for these;
+    `shape`: (rows, cols).
+    Returns (k, rows, cols); None without any.
+    Raises DatasetFormatError: pixels that are not finite, an unknown type, or another size.
     """
     for folder in REFERENCES:
         names = [

@@ -32,18 +32,10 @@ MIN_TURN_SHARE: Final = 0.2
 def without_bad_pixels(
     dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
 ) -> tuple[ImageSet, list[str]]:
-    """Find the pixels of a data set that do not respond as their neighbours do, and mark
-    them to be interpolated.
-
-    Args:
-        dataset: the scan.
-        cone_vec: of all its frames.
-        counts: gives those of a frame by its index.
-
-    Returns:
-        The data set, and one warning that describes the pixels; without any, the data set
-        itself and [].
-    """
+    """Find the pixels of a data set that do not respond as their neighbours do, and mark them to
+    be interpolated. `dataset`: the scan; `cone_vec`: of all its frames; `counts`: gives those of
+    a frame by its index. Returns the data set, and one warning that describes the pixels;
+    without any, the data set itself and []."""
     pixels = _bad_pixels(dataset, cone_vec, counts)
     if pixels is None:
         return dataset, []
@@ -106,11 +98,7 @@ def _bad_pixels(
 
 
 def _some(present: npt.NDArray[np.intp], many: int) -> npt.NDArray[np.intp]:
-    """Choose so many of the present frames, or all if there are fewer, spread evenly.
-
-    Args:
-        present: indices of frames.
-        many: at least 1.
-    """
+    """Choose so many of the present frames, or all if there are fewer, spread evenly. `present`:
+    indices of frames; `many`: at least 1."""
     chosen = np.unique(np.linspace(0, len(present) - 1, many).astype(np.intp))
     return np.asarray(present[chosen])

@@ -58,9 +58,7 @@ class Convention:
     def geometry(self) -> ConeVec:
         """The geometry that fits.
 
-        Raises:
-            TwinError: the images do not decide.
-        """
+        Raises TwinError: the images do not decide."""
         if not self.decided:
             raise TwinError(str(self))
         return self.geometries[0]

@@ -106,8 +106,7 @@ class ImagesOnDisk:
     def _read_into(self, buffer: memoryview) -> int:
         """Read bytes into a buffer, at least one, up to its size; returns how many.
 
-        Raises:
-            OSError: the file ends too early.
+        Raises OSError: the file ends too early.
         """
         count: int = self._file.readinto(buffer)  # type: ignore[attr-defined]
         if not count:
@@ -221,10 +220,8 @@ class KeptImages:
     ) -> Float32Array:
         """Return rows of a prepared image, preparing and keeping it the first time.
 
-        Args:
-            number: of the image.
-            prepare: gives the prepared image by its number, the first time.
-            rows: of it.
+        `number`: of the image; `prepare`: gives the prepared image by its number, the first
+        time; `rows`: of it.
         """
         if number in self._prepared:
             return self._store.get(number, rows)

@@ -52,24 +52,17 @@ def plan_memory(
     *,
     least: bool = False,
 ) -> MemoryPlan:
-    """Divide a volume into as few slabs as fit into the memory, and decide whether images
-    are kept in memory or on disk.
+    """Divide a volume into as few slabs as fit into the memory, and decide whether images are
+    kept in memory or on disk.
 
-    With several slabs all images are kept, as prepared; with one, those that are needed
-    again.
+    With several slabs all images are kept, as prepared; with one, those that are needed again.
 
-    Args:
-        grid: of the volume, (z, y, x) voxels.
-        images: of the scan.
-        again: images that are needed more than once even of a single slab.
-        most_pixels: of an image that is kept.
-        memory: to use [bytes].
-        least: take no more slabs than layers where there is too little memory, instead of
-            an error.
-
-    Raises:
-        LimitError: a layer, and the images that are worked on (at most `WORKING_IMAGES`),
-            need more memory; not with `least`.
+    `grid`: of the volume, (z, y, x) voxels; `images`: of the scan; `again`: images that are
+    needed more than once even of a single slab; `most_pixels`: of an image that is kept;
+    `memory`: to use [bytes]; `least`: take no more slabs than layers where there is too little
+    memory, instead of an error.
+    Raises LimitError: a layer, and the images that are worked on (at most `WORKING_IMAGES`),
+    need more memory; not with `least`.
     """
     work = 4 * most_pixels * min(WORKING_IMAGES, 12 * images)
     layer = grid.bytes // grid.shape[0]
@@ -94,18 +87,10 @@ def plan_whole(grid: Grid, again: int, most_pixels: int, memory: int) -> MemoryP
 
 
 def _plan(grid: Grid, kept: int, most_pixels: int, memory: int) -> MemoryPlan:
-    """Plan slabs, and whether kept images are on disk.
-
-    They are on disk if they need more than KEPT_SHARE of the memory, or if the volume
-    fits whole only without them. `prepared` (kept for several passes) is set for more
-    than one slab.
-
-    Args:
-        grid: of the volume.
-        kept: number of kept images.
-        most_pixels: of one image.
-        memory: free bytes.
-    """
+    """Plan slabs, and whether kept images are on disk. They are on disk if they need more than
+    KEPT_SHARE of the memory, or if the volume fits whole only without them. `prepared` (kept for
+    several passes) is set for more than one slab. `grid`: of the volume; `kept`: number of kept
+    images; `most_pixels`: of one image; `memory`: free bytes."""
     need = 4 * kept * most_pixels
     # Fewer slabs are better than images in memory: the file's parts are cached until
     # another program needs the memory.

@@ -558,8 +558,7 @@ def _copied(views: ScanFrames) -> ScanFrames:
 
 def _bias(views: ScanFrames) -> BiasOnDemand | None:
     """Find what the copies of all views tell of FDK's errors; None where the scan cannot
-    be copied.
-    """
+    be copied."""
     return BiasOnDemand.of(views.copies, sides_known=views.sides_known, known=views.known)
 
 
@@ -672,14 +671,11 @@ def _reading_once(
 ) -> Iterator[tuple[KeptImages, Work]]:
     """Read each image once from here on, and report the work done.
 
-    Yields the kept images, on disk or in memory as planned, and the progress; the images
-    are deleted at the end. Iterative methods report no progress here.
+    Yields the kept images, on disk or in memory as planned, and the progress; the images are
+    deleted at the end. Iterative methods report no progress here.
 
-    Args:
-        task: the reconstruction.
-        plan: the split between memory and a file.
-        folder: of that file.
-        tell: called with the work done and the total, in images; by FDK only.
+    `task`: the reconstruction. `plan`: the split between memory and a file. `folder`: of that
+    file. `tell`: called with the work done and the total, in images; by FDK only.
     """
     views = task.views
     fdk = task.direct
@@ -1065,9 +1061,7 @@ def _known_beam(dataset: ImageSet, request: VolumeRequest) -> KnownBeam:
 def _require_room(out: Path, grid: Grid) -> None:
     """Check, before any work, that the volume fits the disk and a layer of it the memory.
 
-    Raises:
-        LimitError: names the needed and the free space.
-    """
+    Raises LimitError: names the needed and the free space."""
     folder = out.absolute().parent
     _require(f"free in {folder}", grid.bytes, free_bytes(folder), grid)
     _require_layer(grid)
@@ -1107,14 +1101,9 @@ def _require_room_for_images(folder: Path, plan: MemoryPlan, volume_bytes: int) 
 def _require(where: str, need: int, free: int, grid: Grid) -> None:
     """Check that a volume fits the memory or the disk.
 
-    Args:
-        where: words for the message.
-        need: bytes.
-        free: bytes.
-        grid: of the volume, for the message.
-
-    Raises:
-        LimitError: it does not.
+    `where`: words for the message; `need`: bytes; `free`: bytes; `grid`: of the volume, for the
+    message.
+    Raises LimitError: it does not.
     """
     if need > free:
         nz, ny, nx = grid.shape

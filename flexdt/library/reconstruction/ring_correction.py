@@ -28,14 +28,9 @@ def scan_rings(
 ) -> Float32Array:
     """Estimate the offset that each pixel of a scan adds to all views, to be subtracted.
 
-    Args:
-        view: gives the line integrals of a view, (rows, cols), by its number.
-        cone_vec: of all views.
-        shape: (rows, cols).
-
-    Returns:
-        (rows, cols); 0 where no offset exceeds object and noise.
-    """
+    `view`: gives the line integrals of a view, (rows, cols), by its number; `cone_vec`: of all
+    views; `shape`: (rows, cols).
+    Returns (rows, cols); 0 where no offset exceeds object and noise."""
     lies = on_its_side(cone_vec)
     numbers = range(len(cone_vec))
     views: Iterator[Float32Array] = (view(k).T if lies else view(k) for k in numbers)

@@ -119,13 +119,10 @@ class StandingImages:
         return stood
 
     def rows(self, like: Volume) -> slice:
-        """Return the rows with a slab's shadow in some view, with a margin of
-        `MARGIN_ROWS` on either side; all rows if the scan rises or the panel is not
-        upright.
+        """Return the rows with a slab's shadow in some view, with a margin of `MARGIN_ROWS` on
+        either side; all rows if the scan rises or the panel is not upright.
 
-        Args:
-            like: grid of the slab; its values are not used.
-        """
+        `like`: grid of the slab; its values are not used."""
         if self.rises or not is_upright(self.cone_vec):
             return slice(0, self.shape[0])
         first, last = rows_needed(self.cone_vec, self.shape, like)
@@ -222,11 +219,8 @@ class Work:
     ) -> None:
         """Count the work of reading images and of adding slabs.
 
-        Args:
-            images: number of images.
-            reading: work of reading all of them.
-            slabs: work of each slab.
-            tell: called with the share done in images, and all images.
+        `images`: number of images; `reading`: work of reading all of them; `slabs`: work of each
+        slab; `tell`: called with the share done in images, and all images.
         """
         self._images = images
         self._reading = reading

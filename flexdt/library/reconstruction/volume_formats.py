@@ -168,13 +168,9 @@ class VolumeFormat:
 def _write_and_rename(
     write: Callable[[Path, VoxelPlaces], Iterator[Sink]],
 ) -> Callable[..., Iterator[Sink]]:
-    """Wrap the writer of one file: it writes to a temporary path, which gets the final
-    name at the end; after an error it does not.
-
-    Returns:
-        A generator function of (temporary path, final path, places), which yields the
-        function that takes the slabs.
-    """
+    """Wrap the writer of one file: it writes to a temporary path, which gets the final name at
+    the end; after an error it does not. Returns a generator function of (temporary path, final
+    path, places), which yields the function that takes the slabs."""
 
     def write_whole_file(part: Path, path: Path, places: VoxelPlaces) -> Iterator[Sink]:
         yield from write(part, places)
@@ -378,17 +374,12 @@ def _write_hdf5(part: Path, places: VoxelPlaces) -> Iterator[Sink]:
 
 
 def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
-    """Read the fields of an ASCII header, name and value stripped, and the offset of the
-    values [bytes].
+    """Read the fields of an ASCII header, name and value stripped, and the offset of the values
+    [bytes].
 
-    Args:
-        path: of the file.
-        between: separates name and value in a line.
-        end: ends the header, within the first `HEADER_BYTES`.
-
-    Raises:
-        ValueError: no such end, or a header that is not ASCII.
-    """
+    `path`: of the file; `between`: separates name and value in a line; `end`: ends the header,
+    within the first `HEADER_BYTES`.
+    Raises ValueError: no such end, or a header that is not ASCII."""
     with path.open("rb") as file:
         head, mark, _ = file.read(HEADER_BYTES).partition(end)
     if not mark:
@@ -398,15 +389,11 @@ def _header(path: Path, between: str, end: bytes) -> tuple[dict[str, str], int]:
 
 
 def _require_own(fields: Mapping[str, str], own: Mapping[str, str]) -> None:
-    """Check that a header contradicts nothing that each file of flexdt states: a form of
-    values that is read as it is. Fields that are missing pass.
+    """Check that a header contradicts nothing that each file of flexdt states: a form of values
+    that is read as it is. Fields that are missing pass.
 
-    Args:
-        fields: of the file.
-        own: `NRRD_FIELDS` or `MHA_FIELDS`.
-
-    Raises:
-        ValueError: names the first field that does.
+    `fields`: of the file; `own`: `NRRD_FIELDS` or `MHA_FIELDS`.
+    Raises ValueError: names the first field that does.
     """
     for key, value in own.items():
         if value and fields.get(key, value) not in (value, OLDER_FIELDS.get(key)):

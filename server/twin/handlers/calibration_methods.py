@@ -94,19 +94,14 @@ async def list_all(
 
 @h.answers(p.CALIBRATION_REVERT)
 async def revert(twin: TwinServer, client: h.Client, params: Empty) -> p.CorrectionResult:
-    """Put the correction in force again that was before the last one in the history, save
-    that, and log it.
+    """Put the correction in force again that was before the last one in the history, save that,
+    and log it.
 
     Where none was before, none is in force afterwards; an empty history is no error.
-
-    Returns:
-        The correction (or None), and a warning of motion that was halted because it would
-        collide now.
-
-    Raises:
-        RpcError: -32003, the client has lost control.
-        CollisionError: bodies would be too close; nothing changes.
-    """
+    Returns the correction (or None), and a warning of motion that was halted because it would
+    collide now.
+    Raises RpcError: -32003, the client has lost control; CollisionError: bodies would be too
+    close; nothing changes."""
     async with twin.stage_turn:
         history = twin.corrections.history[:-1]
         before = twin.corrections.last(history)
@@ -146,8 +141,7 @@ async def delete(
 
         def files(changes: Changes) -> None:
             """Add the new history and the removal of the correction's file to the set of
-            changes on the disk.
-            """
+            changes on the disk."""
             twin.corrections.store_history(changes, history)
             twin.corrections.remove(changes, params.name)
 
@@ -180,8 +174,7 @@ async def from_data_sets(twin: TwinServer, client: h.Client, params: Params) -> 
     encoded result.
 
     The worker gets the folder name of the current job's data set ("" without a job),
-    which is still being written.
-    """
+    which is still being written."""
     job = twin.jobs.current
     running = ""
     if job is not None:

@@ -97,22 +97,16 @@ def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], 
 def ensure_idle(
     twin: TwinServer, client: Client, method: str, what: str
 ) -> Callable[[], None]:
-    """Return a check, to be called later, that raises if another client has control or a
-    job would be disturbed.
+    """Return a check, to be called later, that raises if another client has control or a job
+    would be disturbed.
 
-    Args:
-        twin, client: whose control and jobs.
-        method: named in the error of control.
-        what: named in the error of the job.
-
-    Returns:
-        The check; it raises RpcError -32003.
-    """
+    `twin` and `client`: whose control and jobs; `method`: named in the error of control; `what`:
+    named in the error of the job.
+    Returns the check; it raises RpcError -32003."""
 
     def check() -> None:
         """Raise RpcError -32003 if another client has control, or else if a job would be
-        disturbed.
-        """
+        disturbed."""
         twin.control.ensure_allowed(client.name, method)
         twin.jobs.require_idle(what)
 

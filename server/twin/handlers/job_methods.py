@@ -42,15 +42,11 @@ async def check(twin: TwinServer, client: h.Client, params: ScanInput) -> Encode
 
 @h.answers(*SUBMIT)
 async def submit(twin: TwinServer, client: h.Client, params: ScanInput) -> p.SubmitResult:
-    """Check a script or poses, and put the scan into the queue; the client's control is
-    checked again when it is queued.
+    """Check a script or poses, and put the scan into the queue; the client's control is checked
+    again when it is queued.
 
-    Returns:
-        The job's id, its data set's folder, and warnings.
-
-    Raises:
-        RpcError, TwinError: as `Submissions.submit`.
-    """
+    Returns the job's id, its data set's folder, and warnings.
+    Raises RpcError, TwinError: as `Submissions.submit`."""
     ready = h.ensure_allowed(twin, client, "a scan")
     job = await twin.submissions.submit(
         _source(params), params.name, params.speed_up, client.program, ready
@@ -74,18 +70,15 @@ async def pause(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSt
 
 @h.answers(p.JOB_RESUME)
 async def resume(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobStatus:
-    """Continue a paused job after its return to its pose; queue a job that ended early,
-    aborted or failed, once more.
+    """Continue a paused job after its return to its pose; queue a job that ended early, aborted
+    or failed, once more.
 
-    For a paused job the answer waits until it runs or is refused, at most `PATIENCE_S`. A
-    done job raises as `Jobs.resume`.
+    For a paused job the answer waits until it runs or is refused, at most `PATIENCE_S`. A done
+    job raises as `Jobs.resume`.
 
-    Returns:
-        The job's status.
-
-    Raises:
-        RpcError: -32003, the client may not move.
-        CollisionError: a contact is ahead; the job stays paused.
+    Returns the job's status.
+    Raises RpcError: -32003, the client may not move; CollisionError: a contact is ahead; the job
+    stays paused.
     """
     job = twin.jobs.get(params.job)
     if job.phase in ENDED_PHASES and job.phase != "done":

@@ -152,8 +152,7 @@ def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
 
     A way around obstacles is cancelled.
 
-    Returns:
-        The duration [s], a warning if the jog is cut short, and `moves` None.
+    Returns the duration [s], a warning if the jog is cut short, and `moves` None.
     """
     with _cancelling_detour(twin):
         jogged = twin.scanner.jog(
@@ -192,13 +191,10 @@ async def set_axis(
 
 @answers(p.AXES_STOP)
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Bring the motors to rest; a running scan pauses, and a way around obstacles is
-    cancelled.
+    """Bring the motors to rest; a running scan pauses, and a way around obstacles is cancelled.
 
     It counts as a stop even if nothing moves. X-rays stay as they are.
-
-    Returns:
-        The state with the stopping motion.
+    Returns the state with the stopping motion.
     """
     twin.detours.cancel()
     twin.interrupt("stop")
@@ -209,16 +205,13 @@ def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
 
 @answers(p.SAFETY_ESTOP)
 async def estop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Stop as the machine's E-stop does with X-rays off, log it, and save that it is in
-    force.
+    """Stop as the machine's E-stop does with X-rays off, log it, and save that it is in force.
 
     It acts at once; the answer waits for the disk for at most `DURABLE_S`. A running scan
-    pauses, and a way around obstacles ends. While it is in force already it stops again,
-    but nothing is written.
-
-    Returns:
-        The state with the stopping motion, at its beginning; `unsaved` says so if the
-        disk does not have the E-stop yet.
+    pauses, and a way around obstacles ends. While it is in force already it stops again, but
+    nothing is written.
+    Returns the state with the stopping motion, at its beginning; `unsaved` says so if the disk
+    does not have the E-stop yet.
     """
     twin.detours.cancel()
     twin.interrupt("E-stop")

@@ -115,14 +115,9 @@ def levelled(
 ) -> Float32Array:
     """Subtract the slope of the background from some windows.
 
-    Args:
-        flat: (m, side, side) line integrals.
-        slope: of `Background`, (m, 2).
-        which: (m,) windows to level.
-
-    Returns:
-        New windows (m, side, side), unchanged in their middles.
-    """
+    `flat`: (m, side, side) line integrals; `slope`: of `Background`, (m, 2); `which`: (m,)
+    windows to level.
+    Returns new windows (m, side, side), unchanged in their middles."""
     at = (np.arange(flat.shape[1]) - (flat.shape[1] - 1) / 2).astype(np.float32)
     right, down = slope[which].astype(np.float32).T[:, :, None, None]
     out = flat.copy()
@@ -155,14 +150,8 @@ def _bends(
 def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
     """Compute means of blocks of BLOCK_PX x BLOCK_PX pixels, row by row.
 
-    Args:
-        windows: (m, side, side).
-        edge: first used row and column.
-        count: blocks along a side.
-
-    Returns:
-        (m, count^2); nan for blocks with nan.
-    """
+    `windows`: (m, side, side); `edge`: first used row and column; `count`: blocks along a side.
+    Returns (m, count^2); nan for blocks with nan."""
     inner = windows[:, edge : edge + count * BLOCK_PX, edge : edge + count * BLOCK_PX]
     part = inner.reshape(len(windows), count, BLOCK_PX, count * BLOCK_PX).sum(axis=2)
     summed = part.reshape(len(windows), count, count, BLOCK_PX).sum(axis=3)
@@ -170,18 +159,12 @@ def _blocks(windows: Float32Array, edge: int, count: int) -> FloatArray:
 
 
 def _shapes(places: FloatArray, side: int) -> FloatArray:
-    """Evaluate the ten polynomials up to third degree (1, x, y, x x, x y, y y, ...) on a
-    square grid, planes first.
+    """Evaluate the ten polynomials up to third degree (1, x, y, x x, x y, y y, ...) on a square
+    grid, planes first.
 
     Coordinates are -1 to 1 over a window, from its middle.
-
-    Args:
-        places: (p,) places along a side [px].
-        side: of the window [px].
-
-    Returns:
-        (p^2, 10), row by row.
-    """
+    `places`: (p,) places along a side [px]; `side`: of the window [px].
+    Returns (p^2, 10), row by row."""
     t = (places - (side - 1) / 2) / (side / 2)
     y, x = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))
     one = np.ones_like(x)

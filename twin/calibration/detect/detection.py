@@ -182,8 +182,7 @@ def detect_beads(
 
 def of_intensity(image: Float32Array) -> Float32Array:
     """Convert an image of intensities to line integrals, relative to the percentile
-    `BRIGHT_PERCENT` of its pixels; intensities count as `LEAST_LIGHT` of that at least.
-    """
+    `BRIGHT_PERCENT` of its pixels; intensities count as `LEAST_LIGHT` of that at least."""
     bright = max(float(np.percentile(image, BRIGHT_PERCENT)), 1e-12)
     return np.asarray(-np.log(np.maximum(image / bright, LEAST_LIGHT)), dtype=np.float32)
 
@@ -283,14 +282,9 @@ def _middle(values: Float32Array) -> float:
 def _distinct(found: Sequence[_Found], by: int, reach: float) -> list[_Found]:
     """Keep one of several at a place: the one with the largest value.
 
-    Args:
-        found: sequences that begin with column, row and radius [px].
-        by: place of the value that decides.
-        reach: distance within which two are at one place, in radii of the kept one.
-
-    Returns:
-        The kept ones, by falling value.
-    """
+    `found`: sequences that begin with column, row and radius [px]; `by`: place of the value that
+    decides; `reach`: distance within which two are at one place, in radii of the kept one.
+    Returns the kept ones, by falling value."""
     out: list[_Found] = []
     for one in sorted(found, key=lambda r: -r[by]):
         if all(math.hypot(one[0] - o[0], one[1] - o[1]) > reach * o[2] for o in out):
@@ -303,8 +297,7 @@ def _window(
 ) -> tuple[Float32Array, float, float]:
     """Cut out the pixels within `reach` of a place, limited to the image.
 
-    Returns:
-        A contiguous window, perhaps empty, and the column and row of its first pixel.
+    Returns a contiguous window, perhaps empty, and the column and row of its first pixel.
     """
     left = max(int(x - reach), 0)
     top = max(int(y - reach), 0)
@@ -394,17 +387,12 @@ def _kinds(found: list[FloatArray]) -> list[tuple[float, float]]:
 def _cut_beads(
     image: Float32Array, spots: list[_Candidate], found: list[FloatArray]
 ) -> list[FloatArray]:
-    """Fit balls to spots at the edge, with radius and contrast of the kind that fits
-    best.
+    """Fit balls to spots at the edge, with radius and contrast of the kind that fits best.
 
-    Args:
-        image: (rows, cols) line integrals.
-        spots: rough places and radii [px]; only the places are used.
-        found: results of the complete spots, whose kinds are tried; without any, no spot
-            is fitted.
-
-    Returns:
-        Results of the good fits, one for each place.
+    `image`: (rows, cols) line integrals. `spots`: rough places and radii [px]; only the places
+    are used. `found`: results of the complete spots, whose kinds are tried; without any, no spot
+    is fitted.
+    Returns results of the good fits, one for each place.
     """
     kinds = _kinds(found) if spots else []
     out: list[FloatArray] = []

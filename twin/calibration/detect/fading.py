@@ -93,20 +93,14 @@ def fading(
 def _shrunk(slope: float, variance: float, free: int, contrast: float) -> Fading:
     """Combine an estimated slope with its prior, whose width is unknown.
 
-    The prior is normal about 0. Its width is of unknown order (log-uniform), from
-    `LEAST_WIDTH` to tanh(C / 4) / C: evenly scattered light changes a contrast C by no more,
-    however much of it there is. Each width counts by its evidence, a t distribution because
-    the variance is estimated, too. A slope that is told clearly is hardly changed, also
-    beyond these widths; one that is not becomes small, and sigma states what stays open.
-
-    Args:
-        slope: by least squares.
-        variance: of it, estimated; inf: nothing is known.
-        free: degrees of freedom of the variance.
-        contrast: the usual line integral through a bead.
-
-    Returns:
-        Mean and standard deviation of the slope.
+    The prior is normal about 0. Its width is of unknown order (log-uniform), from `LEAST_WIDTH`
+    to tanh(C / 4) / C: evenly scattered light changes a contrast C by no more, however much of
+    it there is. Each width counts by its evidence, a t distribution because the variance is
+    estimated, too. A slope that is told clearly is hardly changed, also beyond these widths; one
+    that is not becomes small, and sigma states what stays open.
+    `slope`: by least squares. `variance`: of it, estimated; inf: nothing is known. `free`:
+    degrees of freedom of the variance. `contrast`: the usual line integral through a bead.
+    Returns mean and standard deviation of the slope.
     """
     most = math.tanh(contrast / 4.0) / contrast
     prior = np.geomspace(LEAST_WIDTH, max(most, LEAST_WIDTH), WIDTHS) ** 2
@@ -160,13 +154,9 @@ def evened(
 def more_behind(plane: FloatArray, body: Float32Array | None, side: int) -> Float32Array:
     """Compute how much more is behind each pixel than behind the middle of its window.
 
-    Args:
-        plane: of `Background`, (m, 3).
-        body: line integrals of the body (m, side, side), or None.
-        side: of the windows.
-
-    Returns:
-        Line integrals (m, side, side).
+    `plane`: of `Background`, (m, 3); `body`: line integrals of the body (m, side, side), or
+    None; `side`: of the windows.
+    Returns line integrals (m, side, side).
     """
     at = _from_middle(side)
     _, right, down = plane.astype(np.float32).T[:, :, None, None]

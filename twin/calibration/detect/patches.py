@@ -43,16 +43,12 @@ class Patches:
 def centroids(
     patches: Patches, index: npt.NDArray[np.intp], least: FloatArray | None = None
 ) -> FloatArray:
-    """Measure centroids in some windows by the kernel `measure`, from the expected places
-    and radii.
+    """Measure centroids in some windows by the kernel `measure`, from the expected places and
+    radii.
 
-    Args:
-        patches: m windows.
-        index: of those to measure.
-        least: (m,) least noise, by which pixels are weighted; None: 0.
-
-    Returns:
-        (m, RESULTS); zeros in other windows and where the measurement fails.
+    `patches`: m windows. `index`: of those to measure. `least`: (m,) least noise, by which
+    pixels are weighted; None: 0.
+    Returns (m, RESULTS); zeros in other windows and where the measurement fails.
     """
     results = np.zeros((len(patches.flat), kernels.RESULTS))
     if least is None:
@@ -181,15 +177,11 @@ def contrasts(results: FloatArray, patches: Patches) -> FloatArray:
 
 
 def usable(patches: Patches, index: npt.NDArray[np.intp]) -> npt.NDArray[np.uint8]:
-    """Mark usable pixels of some windows: finite ones, and in crowded windows those free
-    of other beads' spots.
+    """Mark usable pixels of some windows: finite ones, and in crowded windows those free of
+    other beads' spots.
 
-    Args:
-        patches: the windows.
-        index: (j,) of those to mark.
-
-    Returns:
-        (j, side, side) uint8, 1 where usable.
+    `patches`: the windows; `index`: (j,) of those to mark.
+    Returns (j, side, side) uint8, 1 where usable.
     """
     masks = np.isfinite(patches.flat[index]).astype(np.uint8)
     windows = patches.windows

@@ -434,13 +434,9 @@ def _body(
 ) -> tuple[SeenBody, Float32Array | None]:
     """Estimate the phantom's body in the images, and render it.
 
-    Args:
-        images: (n, k, side, side) line integrals.
-        described: the body's solids.
-        cone, model, windows: as of `measure_beads`.
-
-    Returns:
-        The body, and its line integrals; None where none is described or seen.
+    `images`: (n, k, side, side) line integrals; `described`: the body's solids; `cone` and
+    `model` and `windows`: as of `measure_beads`.
+    Returns the body, and its line integrals; None where none is described or seen.
     """
     if not described.solids:
         return NO_BODY, None
@@ -690,16 +686,14 @@ def _evened(
 
 
 def _discount(results: FloatArray, behind: Background, expected: FloatArray) -> None:
-    """Multiply the variance of spots with a foreign background by its misfit, and drop
-    those above `MAX_MISFIT`, unless these are more than `MAX_LOST_SHARE`.
+    """Multiply the variance of spots with a foreign background by its misfit, and drop those
+    above `MAX_MISFIT`, unless these are more than `MAX_LOST_SHARE`.
 
     Spots `NEAR_PX` or more from their expected place are not judged: their own rim looks
     foreign.
 
-    Args:
-        results: (m, RESULTS), changed in place.
-        behind: backgrounds.
-        expected: (m, 2) places in the windows.
+    `results`: (m, RESULTS), changed in place; `behind`: backgrounds; `expected`: (m, 2) places
+    in the windows.
     """
     there = results[:, kernels.OK] > 0
     off = results[:, [kernels.X, kernels.Y]] - expected

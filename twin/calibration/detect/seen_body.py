@@ -271,15 +271,8 @@ def _shift_of_beads(
 ) -> FloatArray:
     """Compute how the spot of a bead moves with the bead, by a difference of 1 mm.
 
-    Args:
-        cone: m views.
-        model: the beads.
-        beads: (m,) number of the bead in each view.
-        shape: (rows, cols).
-
-    Returns:
-        (m, 2, 3) pixels (column, row) for a millimetre along x, y and z.
-    """
+    `cone`: m views; `model`: the beads; `beads`: (m,) number of the bead in each view; `shape`:
+    (rows, cols). Returns (m, 2, 3) pixels (column, row) for a millimetre along x, y and z."""
     one = np.arange(len(beads))
     there = cone.project_points(model.beads, shape)[one, beads]
     moved = [cone.project_points(model.beads + e, shape)[one, beads] for e in np.eye(3)]
@@ -287,12 +280,8 @@ def _shift_of_beads(
 
 
 def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
-    """Mark pixels around the beads that no bead touches: between 1.15 radii and 2 px, and
-    1.6 radii and 4 px, of the one bead a window.
-
-    Returns:
-        (m, side, side) bool.
-    """
+    """Mark pixels around the beads that no bead touches: between 1.15 radii and 2 px, and 1.6
+    radii and 4 px, of the one bead a window. Returns (m, side, side) bool."""
     d2 = distances2(windows.corner, windows.side, windows.predicted)[:, 0]
     radii = windows.radii[:, 0, None, None]
     return np.asarray((d2 > (1.15 * radii + 2.0) ** 2) & (d2 < (1.6 * radii + 4.0) ** 2))
@@ -301,12 +290,8 @@ def _rings(windows: Windows) -> npt.NDArray[np.bool_]:
 def _levelled(values: npt.NDArray[Any], ring: npt.NDArray[np.bool_]) -> FloatArray:
     """Subtract from the values in each ring their mean.
 
-    Args:
-        values: (m, side, side).
-        ring: (m, side, side).
-
-    Returns:
-        (m, side * side); 0 outside the ring.
+    `values`: (m, side, side); `ring`: (m, side, side).
+    Returns (m, side * side); 0 outside the ring.
     """
     inside = np.where(ring, values, 0.0).astype(np.float64)
     mean = inside.sum(axis=(1, 2)) / np.maximum(ring.sum(axis=(1, 2)), 1)

@@ -127,14 +127,8 @@ def rest_of_blur(blur: float, fine: int) -> float:
 def fine_rays(windows: Windows, rays: int, least: int) -> int:
     """Return the rays along a pixel's side with which a bead's radius has a number of rays.
 
-    Args:
-        windows: of the beads.
-        rays: along the radius of the typical bead.
-        least: fewest along a pixel's side.
-
-    Returns:
-        The number; `EXPOSED_FINE` where frames are exposed over moments.
-    """
+    `windows`: of the beads; `rays`: along the radius of the typical bead; `least`: fewest along
+    a pixel's side. Returns the number; `EXPOSED_FINE` where frames are exposed over moments."""
     if windows.moments:
         return EXPOSED_FINE
     fine = math.ceil(rays / float(np.median(windows.radii)))
@@ -436,20 +430,13 @@ def rendering_error(
 
     The images have no part in it, so a fault of the scan does not enlarge it.
 
-    Args:
-        true: estimate for the images.
-        balls: the beads.
-        patches: windows of the images.
-        sample: indices of the windows to compare.
-        cone: geometry of the frames.
-        alone: all windows rendered with `fine` rays and blurred, (n, k, side, side).
-        fine: rays along a pixel's side.
-        noise: of the images' line integrals, by which pixels are weighted: more noise, more
-            weight of the rims.
-
-    Returns:
-        rms error of a coordinate [px], by `LATTICE_ORDER`; 0 if no spot can be measured in
-        both.
+    `true`: estimate for the images; `balls`: the beads; `patches`: windows of the images;
+    `sample`: indices of the windows to compare; `cone`: geometry of the frames; `alone`: all
+    windows rendered with `fine` rays and blurred, (n, k, side, side); `fine`: rays along a
+    pixel's side; `noise`: of the images' line integrals, by which pixels are weighted: more
+    noise, more weight of the rims.
+    Returns rms error of a coordinate [px], by `LATTICE_ORDER`; 0 if no spot can be measured in
+    both.
     """
     frames, beads = np.divmod(sample, patches.windows.corner.shape[1])
     few = patches.windows.pick(frames, beads)
@@ -519,8 +506,7 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
 
     def near(last: _Tried) -> FloatArray:
         """Return the trial blurs next to the one that leaves least in `last`, and it: two
-        or three of `BLURS`.
-        """
+        or three of `BLURS`."""
         i = int(np.searchsorted(blurs, last[0][int(last[1].argmin())]))
         return blurs[max(i - 1, 0) : i + 2]
 
@@ -546,13 +532,9 @@ def _lowest(tried: FloatArray, misfit: FloatArray) -> float:
     """Find the minimum of a misfit: a hyperbola about the right place, so its square is a
     parabola.
 
-    Args:
-        tried: (n,) increasing trial values.
-        misfit: (n,) their misfits; inf where not tried.
-
-    Returns:
-        The minimum between the trials next to the best one; the best trial itself at an
-        end, next to one that was not tried, or if the parabola opens downwards.
+    `tried`: (n,) increasing trial values. `misfit`: (n,) their misfits; inf where not tried.
+    Returns the minimum between the trials next to the best one; the best trial itself at an end,
+    next to one that was not tried, or if the parabola opens downwards.
     """
     i = int(np.argmin(misfit))
     near = slice(i - 1, i + 2)

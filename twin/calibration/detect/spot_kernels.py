@@ -398,23 +398,15 @@ def measure(image, x0, y0, radius0, cap, least, result):  # type: ignore[no-unty
 
 @linked
 def _variance(image, x, y, reach, limit, noise, power, plane, cx, cy, mass, result):  # type: ignore[no-untyped-def]
-    """Write the covariance of a capped centroid: photon noise of a logarithm grows as
-    exp(L / 2).
+    """Write the covariance of a capped centroid: photon noise of a logarithm grows as exp(L /
+    2).
 
-    Pixels at or above the limit add nothing; variances get `FLOOR_PX` squared in
-    addition.
+    Pixels at or above the limit add nothing; variances get `FLOOR_PX` squared in addition.
 
-    Args:
-        image: (rows, cols) line integrals.
-        x, y: centroid [px].
-        reach: radius of the used pixels [px].
-        limit: line integral at which values are cut.
-        noise: of the background.
-        power: of the weight.
-        plane: background about (cx, cy).
-        cx, cy: its origin [px].
-        mass: sum of the weights.
-        result: VAR_X, COV_XY and VAR_Y are written [px^2].
+    `image`: (rows, cols) line integrals; `x` and `y`: centroid [px]; `reach`: radius of the used
+    pixels [px]; `limit`: line integral at which values are cut; `noise`: of the background;
+    `power`: of the weight; `plane`: background about (cx, cy); `cx` and `cy`: its origin [px];
+    `mass`: sum of the weights; `result`: VAR_X, COV_XY and VAR_Y are written [px^2].
     """
     vx, vxy, vy = 0.0, 0.0, 0.0
     for i in range(math.ceil(y - reach), math.floor(y + reach) + 1):

@@ -188,8 +188,7 @@ def _semi_axes(model: BeadModel, cone: ConeVec) -> tuple[FloatArray, FloatArray]
 
 def _disc_share(t: FloatArray) -> FloatArray:
     """Compute the share of a unit disc on the near side of a line at signed distance `t`
-    from its centre: 0 for -1 and less, 1 for 1 and more.
-    """
+    from its centre: 0 for -1 and less, 1 for 1 and more."""
     s = np.clip(t, -1.0, 1.0)
     return np.asarray(0.5 + (s * np.sqrt(1.0 - s * s) + np.arcsin(s)) / math.pi)
 

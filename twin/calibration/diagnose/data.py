@@ -298,10 +298,7 @@ def _why_wrong(
 def _extra(found: Identification, counts: npt.NDArray[np.intp]) -> bool:
     """Check whether more than 0.6 of the frames with nearly all beads have further spots.
 
-    Args:
-        found: the assignment.
-        counts: (n,) all spots of each frame.
-    """
+    `found`: the assignment; `counts`: (n,) all spots of each frame."""
     seen = (found.index >= 0).sum(axis=1)
     good = seen >= 0.7 * max(float(np.median(seen)), 1.0)
     return bool(np.mean(counts[good] > seen[good]) > 0.6)
@@ -354,8 +351,7 @@ def _missing(found: Identification) -> list[int]:
 def _leaves_less(some: Identification, every: Identification) -> bool:
     """Check whether an assignment to some beads leaves fewer spots and beads without each
     other, and the others closer, than one to every bead: so it is without a bead that is
-    elsewhere and has now and then a stray spot at its stated place.
-    """
+    elsewhere and has now and then a stray spot at its stated place."""
     without = [2.0 - found.explained - found.found for found in (some, every)]
     return without[0] < without[1] and some.rms_px < every.rms_px
 
@@ -738,9 +734,8 @@ def _factor_of(turned: FloatArray, stated: FloatArray) -> float | None:
     """Find the factor on stated angles with which frames turn as they show; None if the angles
     follow none to `ONE_FRAME_TURN`.
 
-    Args:
-        turned: what single frames show, up to whole turns [rad].
-        stated: of the same frames [rad].
+    `turned`: what single frames show, up to whole turns [rad]; `stated`: of the same frames
+    [rad].
     """
     best: tuple[float, float | None] = (ONE_FRAME_TURN, None)
     for factor in np.geomspace(TURN_FACTORS[0], TURN_FACTORS[-1], 400).tolist():

@@ -189,14 +189,11 @@ def judge_exact(
 def _unchecked(
     after: Mapping[str, Estimate], growth: Iterable[str], exact: Mapping[str, float]
 ) -> dict[str, None]:
-    """List the values stated as exact that sigmas depend on, or whose usual priors the
-    images hardly narrow.
+    """List the values stated as exact that sigmas depend on, or whose usual priors the images
+    hardly narrow.
 
-    Args:
-        after: estimates with the usual priors.
-        growth: parameters whose sigmas grow.
-        exact: parameter -> value, edge units.
-    """
+    `after`: estimates with the usual priors; `growth`: parameters whose sigmas grow; `exact`:
+    parameter -> value, edge units."""
     own = {n: after[n].prior or math.inf for n in exact if n in after}
     causes = dict.fromkeys(c for n in growth for c in after[n].priors if c in exact)
     return causes | dict.fromkeys(

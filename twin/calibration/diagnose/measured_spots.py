@@ -41,17 +41,15 @@ MAX_BODY_MM = 0.3
 def judge_first_sizes(
     state: Calibration, request: CalibrationRequest, fit: FitResult
 ) -> list[Finding]:
-    """Judge the sizes of spots in the first measurement against those predicted by the
-    fit.
+    """Judge the sizes of spots in the first measurement against those predicted by the fit.
 
     Args:
         state: scans, identified, with their spots.
-        request: whether a second measurement follows; then a deviation of `BLURRED_FIRST`
-            is allowed now, as blur makes spots wider, else `OTHER_BEADS`.
+        request: whether a second measurement follows; then a deviation of `BLURRED_FIRST` is
+            allowed now, as blur makes spots wider, else `OTHER_BEADS`.
         fit: gives the geometry of each scan.
 
-    Returns:
-        At most one finding for each scan; empty if all fit.
+    Returns at most one finding for each scan; empty if all fit.
     """
     out = []
     if request.second_look:
@@ -73,8 +71,7 @@ def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
         state: scans, spots, identifications and the second measurements.
         fit: of the geometry, which predicts the spots' radii.
 
-    Returns:
-        Findings on sizes that do not fit, at most one a scan; empty if all fit.
+    Returns findings on sizes that do not fit, at most one a scan; empty if all fit.
     """
     out = []
     for g, scan in enumerate(state.scans):
@@ -119,19 +116,17 @@ def judge_first_size(
 
 
 def judge_size(measured: Refined, radius_px: float) -> Finding | None:
-    """Judge the spots' size against the one of the phantom's beads at the fitted
-    geometry.
+    """Judge the spots' size against the one of the phantom's beads at the fitted geometry.
 
-    A phantom of another scale at another distance gives the same bead positions; only the
-    beads' own size reveals it.
+    A phantom of another scale at another distance gives the same bead positions; only the beads'
+    own size reveals it.
 
     Args:
         measured: size (nan if unknown) and blur.
         radius_px: expected radius of the spots.
 
-    Returns:
-        Beyond `MAX_SIZE_ERROR` a warning if blur may explain it, else an error; None if
-        the size fits or is unknown.
+    Returns beyond `MAX_SIZE_ERROR` a warning if blur may explain it, else an error; None if the
+    size fits or is unknown.
     """
     off = abs(measured.size - 1.0)
     blur = measured.blur_px / radius_px
@@ -250,12 +245,8 @@ def judge_smear(smear: Smear, step_rad: float) -> Finding | None:
     """Make the warning that the object turns during an exposure, with the arc [deg] and its
     share of a step.
 
-    Args:
-        smear: of the spots of a scan.
-        step_rad: of the stage, from frame to frame.
-
-    Returns:
-        None if the smear does not show it beyond doubt.
+    `smear`: of the spots of a scan; `step_rad`: of the stage, from frame to frame.
+    Returns None if the smear does not show it beyond doubt.
     """
     if not smear.named:
         return None
@@ -268,10 +259,8 @@ def judge_smear(smear: Smear, step_rad: float) -> Finding | None:
 def exposure_arc(arc_deg: float, share: float, done: str) -> Finding:
     """Make the warning that the object turns during an exposure.
 
-    Args:
-        arc_deg: that it turns [deg].
-        share: of a step.
-        done: how the calibration took it into account.
+    `arc_deg`: that it turns [deg]; `share`: of a step; `done`: how the calibration took it into
+    account.
     """
     return warning(
         CalibrationCode.EXPOSURE_ARC,
@@ -284,11 +273,8 @@ def exposure_arc(arc_deg: float, share: float, done: str) -> Finding:
 def shadows_drawn_out(name: str, share: float, step_rad: float, found: float) -> Finding:
     """Make the error that exposures draw shadows out so much that beads are not recognised.
 
-    Args:
-        name: of the scan.
-        share: of a step that an exposure lasts.
-        step_rad: of the stage, from frame to frame.
-        found: share of the beads in view with a round shadow.
+    `name`: of the scan; `share`: of a step that an exposure lasts; `step_rad`: of the stage,
+    from frame to frame; `found`: share of the beads in view with a round shadow.
     """
     return error(
         CalibrationCode.EXPOSURE_ARC,

@@ -339,15 +339,13 @@ class Certificate:
     @property
     def determined(self) -> bool:
         """Whether the data determine every requested parameter, if their errors are white;
-        `identifiable` counts what their residuals show, too.
-        """
+        `identifiable` counts what their residuals show, too."""
         return self.spectrum.full
 
     @property
     def beyond(self) -> tuple[Direction, ...]:
         """Requested parameters that white noise would determine, but that the residuals
-        show to be known worse than the bound: they drift by more, for example.
-        """
+        show to be known worse than the bound: they drift by more, for example."""
         own = {n: s for n, s in self.own.items() if self.estimates[n].asked}
         return beyond_bound(own, self.spectrum.bound) if self.determined else ()
 
@@ -368,8 +366,7 @@ class Certificate:
     @property
     def identifiable(self) -> bool:
         """Whether the data determine every requested parameter within the bound, with what
-        their residuals show.
-        """
+        their residuals show."""
         return self.determined and not self.beyond
 
     @property
@@ -471,8 +468,7 @@ class Certificate:
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
         """Check whether values are in the joint 95 % region of their columns; arguments as
-        `mahalanobis2`.
-        """
+        `mahalanobis2`."""
         return self.level(truth) <= 0.95
 
     def _places(self, truth: Mapping[str, float]) -> tuple[list[int], FloatArray]:
@@ -680,20 +676,15 @@ def spread_of_residuals(
     """Compute the standard deviation of the whitened residuals at `x`, and its degrees of
     freedom.
 
-    A column costs the part of a degree of freedom that the images, not its prior,
-    determine (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a full one.
-    Where priors are moved by more than that to fit the images, their shifts count as
-    residuals. A spread that the problem expects counts as `SPREAD_FREEDOM` residuals.
+    A column costs the part of a degree of freedom that the images, not its prior, determine
+    (MacKay, Neural Computation 4 (1992) 415): a wide prior costs a full one. Where priors are
+    moved by more than that to fit the images, their shifts count as residuals. A spread that the
+    problem expects counts as `SPREAD_FREEDOM` residuals.
 
-    Args:
-        problem: the data.
-        x: column values, internal units.
-        use: (n, k) positions that counted.
-        prior_noise: spread of the whitened residuals with which the priors were weighed.
-
-    Returns:
-        The standard deviation and the degrees of freedom; (nan, 0) for `LEAST_FREEDOM` or
-        fewer.
+    `problem`: the data; `x`: column values, internal units; `use`: (n, k) positions that
+    counted; `prior_noise`: spread of the whitened residuals with which the priors were weighed.
+    Returns the standard deviation and the degrees of freedom; (nan, 0) for `LEAST_FREEDOM` or
+    fewer.
     """
     _, _, norms, _, normal, _ = problem.evaluate(x, use, 1)
     weight = problem.prior_weight(prior_noise)
@@ -734,16 +725,12 @@ def _determined(told: FloatArray, weight: FloatArray) -> float:
 
 
 def _shares(names: Sequence[str], pull: FloatArray, sigma: float) -> dict[str, float]:
-    """Compute the part of a sigma from each prior; those of one source (`SOURCES`)
-    together, as the root of their squares.
+    """Compute the part of a sigma from each prior; those of one source (`SOURCES`) together, as
+    the root of their squares.
 
-    Args:
-        names: of the priors.
-        pull: (p,) effect of each on the parameter.
-        sigma: of the parameter.
-
-    Returns:
-        Source -> part, largest first, without those below a tenth of the sigma.
+    `names`: of the priors; `pull`: (p,) effect of each on the parameter; `sigma`: of the
+    parameter.
+    Returns source -> part, largest first, without those below a tenth of the sigma.
     """
     square: dict[str, float] = {}
     for name, value in zip(names, pull.tolist(), strict=True):
@@ -792,15 +779,10 @@ def _sampling_vectors(problem: FitProblem, predicted: FloatArray) -> FloatArray:
     """Compute whitened unit errors that follow a bead's place in the pixel grid.
 
     An error e(x) with the pixel's period, a sin(2 pi x + theta) with theta unknown, has the
-    covariance a^2 cos 2 pi (x - x'): two vectors, cosine and sine, for each bead and
-    coordinate.
+    covariance a^2 cos 2 pi (x - x'): two vectors, cosine and sine, for each bead and coordinate.
 
-    Args:
-        problem: n frames and k beads.
-        predicted: (n, k, 2) places [px].
-
-    Returns:
-        (2 n k, 4 k).
+    `problem`: n frames and k beads; `predicted`: (n, k, 2) places [px].
+    Returns (2 n k, 4 k).
     """
     n, k = problem.seen.shape
     # Beads that stay in one place of the grid keep the same error, those that wander have all

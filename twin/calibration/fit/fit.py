@@ -199,17 +199,11 @@ def solve(
 
 
 def _spread(norms: FloatArray, columns: int, floor: float) -> float:
-    """Compute the robust standard deviation of whitened residuals, larger for few degrees
-    of freedom: a fit absorbs part of the noise, and a median of few is unreliable.
+    """Compute the robust standard deviation of whitened residuals, larger for few degrees of
+    freedom: a fit absorbs part of the noise, and a median of few is unreliable.
 
-    Args:
-        norms: (m,) lengths of 2-vectors.
-        columns: number of fitted columns.
-        floor: least result.
-
-    Returns:
-        inf without degrees of freedom.
-    """
+    `norms`: (m,) lengths of 2-vectors; `columns`: number of fitted columns; `floor`: least
+    result. Returns inf without degrees of freedom."""
     dof = 2 * len(norms) - columns
     if dof <= 0:
         return math.inf
@@ -258,12 +252,10 @@ def _levenberg(
     huber = math.inf
 
     def at(x: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        """Evaluate cost, norms of the residuals, and Hessian and gradient with the priors
-        in them.
+        """Evaluate cost, norms of the residuals, and Hessian and gradient with the priors in
+        them.
 
-        Returns:
-            The cost is inf if a bead is at or behind the source.
-        """
+        Returns the cost is inf if a bead is at or behind the source."""
         cost, _, norms, _, hess, grad = p.evaluate(x, use, 1, huber)
         off = x - p.prior_mean
         hess.flat[:: len(x) + 1] += weight
@@ -334,14 +326,10 @@ def _levenberg(
 def _step(hess: FloatArray, grad: FloatArray, damping: float) -> FloatArray | None:
     """Solve the column-scaled, damped normal equations.
 
-    Args:
-        hess: (c, c), not changed.
-        grad: (c,).
-        damping: added to the scaled diagonal, which is 1.
-
-    Returns:
-        The step (c,) down the gradient; None where the equations are not positive
-        definite, or only by rounding (`LEAST_PIVOT`).
+    `hess`: (c, c), not changed; `grad`: (c,); `damping`: added to the scaled diagonal, which is
+    1.
+    Returns the step (c,) down the gradient; None where the equations are not positive definite,
+    or only by rounding (`LEAST_PIVOT`).
     """
     diagonal = np.diag(hess)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
@@ -430,8 +418,7 @@ class FitResult:
     @property
     def determined(self) -> bool:
         """Every free parameter is determined, if nothing but white noise is in the data:
-        the other steps of a calibration can go on from the fit.
-        """
+        the other steps of a calibration can go on from the fit."""
         return self.certificate.determined
 
     @property
@@ -636,14 +623,11 @@ def require_identifiable(result: FitResult) -> FitResult:
 
 
 def with_start(result: FitResult, start: Offsets, iterations: int) -> FitResult:
-    """Return the result of a chain of fits, counted from the start of the first;
-    estimates stay.
+    """Return the result of a chain of fits, counted from the start of the first; estimates stay.
 
-    Args:
-        result: the last fit of the chain.
-        start: offsets of all groups at which the first fit started; the start cost is
-            computed there, for the positions used in the end.
-        iterations: of all fits together.
+    `result`: the last fit of the chain. `start`: offsets of all groups at which the first fit
+    started; the start cost is computed there, for the positions used in the end. `iterations`:
+    of all fits together.
     """
     problem = result.problem
     base = np.array(
@@ -685,18 +669,17 @@ def _followed(
 def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float]:
     """Solve a problem, and weight its priors by the spread of the residuals.
 
-    Few positions (up to `FEW_VALUES` coordinates a column) may be explained in two ways:
-    by priors that hold and noise, or by priors that are off and hardly any noise. Then
-    smaller spreads (`QUIET_SHARES`) are tried, too, and one is taken if it is more likely
-    by `QUIET_LOG_ODDS`.
+    Few positions (up to `FEW_VALUES` coordinates a column) may be explained in two ways: by
+    priors that hold and noise, or by priors that are off and hardly any noise. Then smaller
+    spreads (`QUIET_SHARES`) are tried, too, and one is taken if it is more likely by
+    `QUIET_LOG_ODDS`.
 
     Args:
         problem: data, columns and priors.
         solver: settings; the default is robust.
 
-    Returns:
-        The solution, and the spread of the whitened residuals by which its priors were
-        weighted.
+    Returns the solution, and the spread of the whitened residuals by which its priors were
+    weighted.
     """
     found = _weighted(problem, solver, problem.start, 1.0)
     weighed = bool(np.isfinite(problem.prior_sigma).any())
@@ -717,19 +700,14 @@ def _solved(problem: FitProblem, solver: Solver | None) -> tuple[Solution, float
 def _weighted(
     problem: FitProblem, solver: Solver | None, x: FloatArray, noise: float
 ) -> tuple[Solution, float]:
-    """Solve a problem from a spread of the residuals on, until that spread repeats itself
-    within 1 %, four times at most; once without priors.
+    """Solve a problem from a spread of the residuals on, until that spread repeats itself within
+    1 %, four times at most; once without priors.
 
-    Args:
-        problem: the data and columns.
-        solver: settings.
-        x: start of the columns.
-        noise: start of the spread of the whitened residuals.
-
-    Returns:
-        The last solution, and the spread by which its priors were weighted; after four
-        rounds that have not settled, the one that this solution gave. `LEAST_NOISE` at
-        least if it is estimated.
+    `problem`: the data and columns; `solver`: settings; `x`: start of the columns; `noise`:
+    start of the spread of the whitened residuals.
+    Returns the last solution, and the spread by which its priors were weighted; after four
+    rounds that have not settled, the one that this solution gave. `LEAST_NOISE` at least if it
+    is estimated.
     """
     for _ in range(4):
         solution = solve(problem, solver, x=x, prior_noise=noise)
@@ -814,17 +792,12 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
 def image_slopes(
     problem: FitProblem, x: FloatArray, group: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute the quantities of IN_IMAGES, and their derivatives by the parameters, by
-    central differences of `SLOPE_STEP`.
+    """Compute the quantities of IN_IMAGES, and their derivatives by the parameters, by central
+    differences of `SLOPE_STEP`.
 
-    Args:
-        problem: the data.
-        x: column values, internal units.
-        group: of frames.
-
-    Returns:
-        Values (3,) in the group's first frame, and derivatives (3, p) by the columns that
-        are parameters, edge units.
+    `problem`: the data; `x`: column values, internal units; `group`: of frames.
+    Returns values (3,) in the group's first frame, and derivatives (3, p) by the columns that
+    are parameters, edge units.
     """
     names = problem.layout.names[: problem.layout.parameter_count]
     slopes = []

@@ -128,16 +128,10 @@ def forecast(
 def _ranges(names: Iterable[str], sigmas: FloatArray) -> dict[str, tuple[float, float]]:
     """Find between which values the sigma of one more scan lies in `MOST` of all cases.
 
-    Of m scans and one more, each place in their order is as likely as any other, whatever
-    the sigmas' distribution. What is nearly certain lies there more often, for `FIRST_ORDER`.
-
-    Args:
-        names: of the q quantities.
-        sigmas: (m, q) of m scans.
-
-    Returns:
-        Name -> least and largest.
-    """
+    Of m scans and one more, each place in their order is as likely as any other, whatever the
+    sigmas' distribution. What is nearly certain lies there more often, for `FIRST_ORDER`.
+    `names`: of the q quantities; `sigmas`: (m, q) of m scans.
+    Returns name -> least and largest."""
     ordered = np.sort(sigmas, axis=0)
     cut = round((1.0 - MOST) / 2.0 * (len(sigmas) + 1))
     low = ordered[cut - 1] / (1.0 + FIRST_ORDER)
@@ -151,14 +145,9 @@ def visible_beads(
 ) -> npt.NDArray[np.bool_]:
     """Mark beads whose spots are entirely on the detector.
 
-    Args:
-        model: the beads.
-        poses: n frames.
-        shape: (n, 2) detector (rows, cols) of each frame.
-        at: geometry offsets.
-
-    Returns:
-        (n, k) bool; False too for beads behind the source.
+    `model`: the beads; `poses`: n frames; `shape`: (n, 2) detector (rows, cols) of each frame;
+    `at`: geometry offsets.
+    Returns (n, k) bool; False too for beads behind the source.
     """
     cone = poses.cone_vec(at)
     pixels = cone.project_points(model.beads, (1, 1))

@@ -182,8 +182,7 @@ def known_scale(
 
 def gives_room(name: str, width: float) -> bool:
     """Check whether a prior gives a told length more room than is assumed: it says that this
-    one may be off.
-    """
+    one may be off."""
     usual = STRAIN if name == PHANTOM else ASSUMED.get(name, math.inf)
     return name in TOLD and width > MORE_ROOM * usual
 

@@ -488,8 +488,7 @@ class FitProblem:
     def shift_terms(self) -> FloatArray:
         """(n, k, 2, m) shifts of the positions by a coefficient of 1 of the exposure's
         arc and of each power of the rows' turn, if there are any, and each of the panel's
-        terms [px].
-        """
+        terms [px]."""
         if self.turning is None:
             return self.panel_terms
         return np.concatenate([self.turning, self.panel_terms], axis=-1)
@@ -505,8 +504,7 @@ class FitProblem:
 
     def parameters(self, x: FloatArray) -> tuple[Offsets, ...]:
         """Return the geometry of each group for column values `x`, in the reading of
-        corrections.
-        """
+        corrections."""
         params, _ = self.spread(x)
         return tuple(to_printed_reading(offsets_in(row), self.reading) for row in params)
 
@@ -550,8 +548,7 @@ class FitProblem:
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
     ) -> FloatArray:
         """Compute whitened rows d(column, row)/dx, (2 n k, columns); rows of unused
-        positions are 0.
-        """
+        positions are 0."""
         return self._evaluate(x, self.seen if use is None else use, 2)[2]
 
     def _evaluate(
@@ -559,13 +556,8 @@ class FitProblem:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Evaluate the problem at `x`; see `evaluate`, also for the arguments.
 
-        Returns:
-            Predictions from the detector's centre, norms of the whitened residuals, and
-            the Jacobian.
-
-        Raises:
-            TwinError: a bead is at or behind the source.
-        """
+        Returns predictions from the detector's centre, norms of the whitened residuals, and the
+        Jacobian. Raises TwinError: a bead is at or behind the source."""
         cost, predicted, norms, jac, _, _ = self.evaluate(x, use, want)
         if not np.isfinite(cost):
             raise TwinError("a bead lies at or behind the source in this geometry")
@@ -629,8 +621,7 @@ class FitProblem:
         """Compute the weight of each column's prior against whitened residuals of that
         spread; 0 without one.
 
-        Priors are absolute, and the residuals only known up to their spread s: s^2 / sigma^2.
-        """
+        Priors are absolute, and the residuals only known up to their spread s: s^2 / sigma^2."""
         return np.asarray((noise / self.prior_sigma) ** 2)
 
     def with_paths_at(self, x: FloatArray) -> FitProblem:
@@ -675,8 +666,7 @@ def _bases(
 ) -> FloatArray:
     """Return the start of each group, (groups, 28), internal units, in a reading.
 
-    Raises:
-        TwinError: several starts, but not one a group.
+    Raises TwinError: several starts, but not one a group.
     """
     starts = [start] * groups if isinstance(start, Offsets) else list(start)
     if len(starts) != groups:
@@ -687,8 +677,7 @@ def _bases(
 def _common_shifts(common: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Return shifts that all frames have in common, (n, k, 2, c).
 
-    Raises:
-        TwinError: they are not of the tracks' shape.
+    Raises TwinError: they are not of the tracks' shape.
     """
     shared = np.asarray(common, dtype=np.float64)
     if shared.shape[:-1] != shape:
@@ -1025,8 +1014,7 @@ def whitening(
 
 def values_in(p: Offsets) -> FloatArray:
     """List values in the order of PARAMETERS, internal units: those of `p`, and told lengths
-    that are right.
-    """
+    that are right."""
     return np.array([getattr(p, name) for name in NAMES] + [0.0] * len(TOLD))
 
 

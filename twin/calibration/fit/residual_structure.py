@@ -17,8 +17,7 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Compute a.T @ b of two tall matrices, (m, i) and (m, j), in one thread.
 
     These products are too small for BLAS threads, which cost more than the work and spin where
-    the cores are busy.
-    """
+    the cores are busy."""
     return np.asarray(np.einsum("mi,mj->ij", a, b))
 
 
@@ -49,12 +48,10 @@ class Residuals:
 
 
 def larger(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Compute the smallest covariance of a's shape that is at least as wide as both in
-    every direction.
+    """Compute the smallest covariance of a's shape that is at least as wide as both in every
+    direction.
 
-    Args:
-        a: (p, p), positive diagonal.
-        b: (p, p).
+    `a`: (p, p), positive diagonal; `b`: (p, p).
     """
     # Of exact positions `a` is the priors' alone and of lower rank.
     low = np.linalg.cholesky(a + 1e-12 * np.diag(np.diag(a)))

@@ -99,10 +99,8 @@ class Likeness:
     ) -> bool:
         """Check whether the balls differ from others by a turn of the stage alone.
 
-        Args:
-            other: how the same beads are like the others.
-            within_mm: shift that is none [mm].
-            rise_mm: of the stage as it turns, a radian [mm].
+        `other`: how the same beads are like the others; `within_mm`: shift that is none [mm];
+        `rise_mm`: of the stage as it turns, a radian [mm].
         """
         turn = self.rotation @ other.rotation.T
         upright = float(turn[2, 2]) > math.cos(math.radians(0.5))

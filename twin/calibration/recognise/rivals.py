@@ -63,12 +63,10 @@ def judge_rivals(found: Identification, name: str, model_name: str) -> Finding |
 
 
 def asked_of(state: Calibration, request: CalibrationRequest) -> CalibrationRequest:
-    """Return the request without the start angle where the phantom looks alike at all of
-    them: any value of it does.
+    """Return the request without the start angle where the phantom looks alike at all of them:
+    any value of it does.
 
-    Args:
-        state: with the identifications.
-        request: of the calibration.
+    `state`: with the identifications; `request`: of the calibration.
     """
     if not any(found.free_turn for found in state.identifications):
         return request

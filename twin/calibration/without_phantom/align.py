@@ -180,16 +180,10 @@ def _motion(
 ) -> Motion:
     """Find the shifts of single frames as a motion of the sample.
 
-    Args:
-        planes: pairs of the turn's frames.
-        turn: its frames.
-        corrected: offsets that are known by then.
-        random: for the image of noise.
-
-    Raises:
-        NotIdentifiableError: frames are repeated, too many, or the images do not
-            determine shifts.
-    """
+    `planes`: pairs of the turn's frames; `turn`: its frames; `corrected`: offsets that are known
+    by then; `random`: for the image of noise.
+    Raises NotIdentifiableError: frames are repeated, too many, or the images do not determine
+    shifts."""
     if turn.repeated:
         raise NotIdentifiableError(
             f"frames {list(turn.repeated)} repeat the one before: from there on "

@@ -72,8 +72,7 @@ class CircularScan:
 
     def offsets(self, values: FloatArray) -> Offsets:
         """Put parameters, the first ones of `FREE`, into a copy of the offsets in force;
-        missing ones stay.
-        """
+        missing ones stay."""
         return replace(self.base, **dict(zip(FREE, values.tolist(), strict=False)))
 
     def view(self, values: FloatArray) -> FloatArray:
@@ -106,15 +105,11 @@ class CircularScan:
         return float(shown.project_points(level, self.shape)[0, 0, 1])
 
     def slopes(self, values: FloatArray, scales: FloatArray) -> FloatArray:
-        """Compute the change of the axis' column with each parameter, by central
-        differences of a tenth of a step to each side.
+        """Compute the change of the axis' column with each parameter, by central differences of
+        a tenth of a step to each side.
 
-        Args:
-            values: (k,) parameters.
-            scales: (k,) their steps.
-
-        Returns:
-            (k,) [px per unit of the parameter].
+        `values`: (k,) parameters; `scales`: (k,) their steps.
+        Returns (k,) [px per unit of the parameter].
         """
         steps = np.diag(0.1 * scales)
         return np.array(

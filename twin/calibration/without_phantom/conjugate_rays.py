@@ -179,11 +179,10 @@ class Profile:
         return max(found, key=lambda one: abs(one.width) / one.least)
 
     def at(self, radius: float) -> Step:
-        """Estimate the step at the radius next to one beside the axis; its sigma and
-        least are inf unless the innermost bin is inside it.
+        """Estimate the step at the radius next to one beside the axis; its sigma and least are
+        inf unless the innermost bin is inside it.
 
-        Args:
-            radius: distance from the axis [px].
+        `radius`: distance from the axis [px].
         """
         place = self._place(radius, self.certain)
         step = self.beside_axis(radius)
@@ -229,14 +228,11 @@ class Profile:
         return np.asarray(self.basis[:, 0, 2] < MOST_MOVED)
 
     def _fit(self, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fit shift, yaw and step of each radius by weighted least squares, the yaw with
-        a prior of `YAW_PX`.
+        """Fit shift, yaw and step of each radius by weighted least squares, the yaw with a prior
+        of `YAW_PX`.
 
-        Args:
-            sigma: (m,) of the bins [px]; inf for one that does not count.
-
-        Returns:
-            Values (r, 3), their covariances (r, 3, 3), and residuals in sigmas, (r, m).
+        `sigma`: (m,) of the bins [px]; inf for one that does not count.
+        Returns values (r, 3), their covariances (r, 3, 3), and residuals in sigmas, (r, m).
         """
         scaled = self.basis / sigma[:, None]
         aim = self.shift / sigma
@@ -296,17 +292,11 @@ class Profile:
 
 
 def _spread(widths: FloatArray, rest: FloatArray, usable: npt.NDArray[np.bool_]) -> float:
-    """Compute the standard deviation of widths over radii, weighted by how well they
-    explain shifts: exp of half the chi square lost to the best.
+    """Compute the standard deviation of widths over radii, weighted by how well they explain
+    shifts: exp of half the chi square lost to the best.
 
-    Args:
-        widths: of steps at the radii, (r,) [px].
-        rest: residuals of each in sigmas, (r, m).
-        usable: whether a radius counts, (r,); one at least.
-
-    Returns:
-        [px].
-    """
+    `widths`: of steps at the radii, (r,) [px]. `rest`: residuals of each in sigmas, (r, m).
+    `usable`: whether a radius counts, (r,); one at least. Returns [px]."""
     chi_square = np.square(rest).sum(axis=1)
     less = np.minimum(chi_square[usable].min() - chi_square, 0.0)
     likely = usable * np.exp(less / 2.0)
@@ -321,19 +311,12 @@ def _basis(
     at: FloatArray,
     soft: float,
 ) -> FloatArray:
-    """Compute the shares of a common shift, a yaw (`YAW_PX` at the outermost column,
-    growing as the square) and of steps at radii in each bin, as weighted means of its
-    columns.
+    """Compute the shares of a common shift, a yaw (`YAW_PX` at the outermost column, growing as
+    the square) and of steps at radii in each bin, as weighted means of its columns.
 
-    Args:
-        radius: of columns from the axis, (k,) [px].
-        weight: their information, (k,).
-        place: their bins, (k,).
-        at: the radii (r,) [px].
-        soft: sigma of the smoothing [px].
-
-    Returns:
-        (r, m, 3).
+    `radius`: of columns from the axis, (k,) [px]; `weight`: their information, (k,); `place`:
+    their bins, (k,); `at`: the radii (r,) [px]; `soft`: sigma of the smoothing [px].
+    Returns (r, m, 3).
     """
     one_of = (place == np.arange(place.max() + 1)[:, None]) * weight
     one_of /= one_of.sum(axis=1, keepdims=True)
@@ -418,16 +401,13 @@ class ConjugateRays:
         return float(self.rows.mean())
 
     def column(self, values: FloatArray) -> tuple[FloatArray, float]:
-        """Move the first of the parameters of the plane until both ends of rays agree, in
-        up to `ROUNDS` steps; from a coarser smoothing (`COARSE`) where the fine one shows
-        no agreement.
+        """Move the first of the parameters of the plane until both ends of rays agree, in up to
+        `ROUNDS` steps; from a coarser smoothing (`COARSE`) where the fine one shows no
+        agreement.
 
-        Args:
-            values: parameters in the order of `circular_scan.FREE`, (k,); not changed.
-
-        Returns:
-            The parameters, and the standard deviation of the column by sectors [px]; inf
-            if too little turns (`MIN_CORRELATION`), with the parameters of the last step.
+        `values`: parameters in the order of `circular_scan.FREE`, (k,); not changed.
+        Returns the parameters, and the standard deviation of the column by sectors [px]; inf if
+        too little turns (`MIN_CORRELATION`), with the parameters of the last step.
         """
         fine, sigma = self._agreement(values)
         if math.isfinite(sigma):
@@ -568,16 +548,11 @@ class ConjugateRays:
         )
 
     def _read(self, group: int, view: FloatArray, columns: FloatArray) -> FloatArray:
-        """Interpolate one group of rows between views (cyclic) and columns by cubic
-        splines.
+        """Interpolate one group of rows between views (cyclic) and columns by cubic splines.
 
-        Args:
-            group: number of the group.
-            view: (n, k) view numbers, also between two and beyond a turn.
-            columns: (k,) or (n, k) columns of the panel [px]; those off it take its edge.
-
-        Returns:
-            (n, k) line integrals.
+        `group`: number of the group. `view`: (n, k) view numbers, also between two and beyond a
+        turn. `columns`: (k,) or (n, k) columns of the panel [px]; those off it take its edge.
+        Returns (n, k) line integrals.
         """
         at = np.stack(
             [view % self.views + EDGE_VIEWS, np.broadcast_to(columns, view.shape)]
@@ -590,17 +565,13 @@ class ConjugateRays:
 
 
 def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:
-    """Compute a ratio of sums, and its sigma from leaving out each term (jackknife), 1e-6
-    at least.
+    """Compute a ratio of sums, and its sigma from leaving out each term (jackknife), 1e-6 at
+    least.
 
-    Args:
-        moved: (n,) terms of the numerator, by sector or row.
-        told: (n,) terms of the denominator.
-
-    Returns:
-        Ratio and sigma; 0 and inf where the denominator, or it without one term, is not
-        positive.
-    """
+    `moved`: (n,) terms of the numerator, by sector or row; `told`: (n,) terms of the
+    denominator.
+    Returns ratio and sigma; 0 and inf where the denominator, or it without one term, is not
+    positive."""
     count = len(told)
     rest = told.sum() - told
     if not (told.sum() > 0.0 and rest.min() > 0.0):

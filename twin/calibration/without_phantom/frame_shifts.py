@@ -184,12 +184,8 @@ class _System:
         """Solve by weighted least squares for the frames' shifts that would leave such
         differences.
 
-        Args:
-            rest: (q, k).
-
-        Returns:
-            (n, 2) right and down [px].
-        """
+        `rest`: (q, k).
+        Returns (n, 2) right and down [px]."""
         right = np.zeros(len(self.normal))
         np.add.at(
             right, self.places, np.einsum("qak,qk,q->qa", self.slopes, rest, self.weight)

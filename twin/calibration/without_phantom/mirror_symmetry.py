@@ -66,16 +66,11 @@ class Symmetry:
 
 
 def mirror_map(view: FloatArray) -> FloatArray:
-    """Compute the homography that takes a pixel to its mirror image in the plane through
-    source and axis.
+    """Compute the homography that takes a pixel to its mirror image in the plane through source
+    and axis.
 
-    Args:
-        view: source, panel centre, u, v in a frame with the axis along z through its
-            origin, (12,).
-
-    Returns:
-        (3, 3), of (column, row, 1) from the panel's centre.
-    """
+    `view`: source, panel centre, u, v in a frame with the axis along z through its origin,
+    (12,). Returns (3, 3), of (column, row, 1) from the panel's centre."""
     source, detector, u, v = view.reshape(4, 3)
     rays = np.column_stack([u, v, detector - source])
     normal = np.array([source[1], -source[0], 0.0]) / math.hypot(source[0], source[1])
@@ -164,24 +159,16 @@ def find_symmetry(
     border: int | None = None,
     held_px: float | None = None,
 ) -> Symmetry:
-    """Estimate the plane of symmetry from coarse to fine smoothings (LEVELS), each from
-    the last one's values; without a border the search ends at the first that does not
-    converge.
+    """Estimate the plane of symmetry from coarse to fine smoothings (LEVELS), each from the last
+    one's values; without a border the search ends at the first that does not converge.
 
-    Args:
-        turn: the frames' mean.
-        view: parameters to a view.
-        start: of the parameters, (k,).
-        scales: change of each parameter that moves the image's ends by about a pixel,
-            (k,).
-        priors: sigma of each parameter about its start, inf for none, (k,).
-        border: first column beyond a gap between two tiles, whose width is the last
-            parameter [px].
-        held_px: that width, where it is no parameter [px].
-
-    Returns:
-        The estimate of the level that determines the first two parameters best among the
-        converged ones; the coarsest, not converged, if none did.
+    `turn`: the frames' mean; `view`: parameters to a view; `start`: of the parameters, (k,);
+    `scales`: change of each parameter that moves the image's ends by about a pixel, (k,);
+    `priors`: sigma of each parameter about its start, inf for none, (k,); `border`: first column
+    beyond a gap between two tiles, whose width is the last parameter [px]; `held_px`: that
+    width, where it is no parameter [px].
+    Returns the estimate of the level that determines the first two parameters best among the
+    converged ones; the coarsest, not converged, if none did.
     """
     found = []
     values = start
@@ -402,8 +389,7 @@ class _MirrorPairs:
 
     def _polynomials(self, at: FloatArray) -> FloatArray:
         """Evaluate errors of a flat field up to third degree that are odd about some
-        column, (k, 4).
-        """
+        column, (k, 4)."""
         x, y = (a / n - 0.5 for a, n in zip(at, self.level.shape[::-1], strict=True))
         return np.column_stack([x, x * y, x**3, x * y * y])
 
@@ -448,13 +434,10 @@ class _MirrorPairs:
         return rest, max(float(np.average(white, weights=self.w)), 1e-30)
 
     def _copies_power(self) -> float:
-        """Compute the weighted mean square by which mirrored pairs of the scan's own
-        copies differ: of every second frame less those between, and of frames that are
-        missing or repeated (`Turn.doubts`).
-
-        They have the asymmetry of too few views, of noise and of flicker, and none of
-        a mean that is not symmetric.
-        """
+        """Compute the weighted mean square by which mirrored pairs of the scan's own copies
+        differ: of every second frame less those between, and of frames that are missing or
+        repeated (`Turn.doubts`). They have the asymmetry of too few views, of noise and of
+        flicker, and none of a mean that is not symmetric."""
         total = 0.0
         for copy in range(1, len(self.own)):
             squares = np.square(self._rest(copy))
@@ -546,16 +529,9 @@ class _MirrorPairs:
 
 
 def sharpness(mean: FloatArray) -> float:
-    """Measure how sharp edges along the rows are, times the root of their share in the
-    changes from row to row.
-
-    Args:
-        mean: line integrals, (rows, cols).
-
-    Returns:
-        1 for pixels that are points, 0.4 for square ones without blur, 0 without edges
-        above the noise.
-    """
+    """Measure how sharp edges along the rows are, times the root of their share in the changes
+    from row to row. `mean`: line integrals, (rows, cols). Returns 1 for pixels that are points,
+    0.4 for square ones without blur, 0 without edges above the noise."""
     noise = np.full(mean.shape, np.median(_noise(mean)) / MEDIAN_OF_CHI_SQUARE)
     edges, left = _edges(mean, noise)
     change = np.square(gaussian_filter(np.diff(mean, axis=0, append=mean[-1:]), NEAR_PX))
@@ -564,8 +540,7 @@ def sharpness(mean: FloatArray) -> float:
 
 def _noise(mean: FloatArray) -> FloatArray:
     """Compute squares of second differences along rows, whose mean is the noise's
-    variance: photons, flat field and rings, little of the object.
-    """
+    variance: photons, flat field and rings, little of the object."""
     change = np.diff(np.pad(mean, ((0, 0), (1, 1)), mode="reflect"), 2, axis=1)
     return np.asarray(np.square(change) / 6)
 
@@ -576,8 +551,7 @@ def _steps(mean: FloatArray, noise: FloatArray) -> FloatArray:
     Pixels that are points know an edge between two of them to half a row; blur and a
     pixel's size spread it over several. An edge without blur has all frequencies alike,
     so their attenuation at half the sampling's, relative to a quarter, gives the
-    attenuation at the sampling's own.
-    """
+    attenuation at the sampling's own."""
     edges, left = _edges(mean, noise)
     return np.asarray(edges * left**2 / math.sqrt(6.0))
 
@@ -589,9 +563,8 @@ def _edges(mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, float]:
         mean: (rows, cols) mean image.
         noise: its variance, (rows, cols); edges below `MIN_EDGE_SIGMAS` count as 0.
 
-    Returns:
-        Edges (rows, cols), and the strength at half the sampling's frequency over that at
-        a quarter, at most 1; 0 without edges.
+    Returns edges (rows, cols), and the strength at half the sampling's frequency over that at a
+    quarter, at most 1; 0 without edges.
     """
     change = np.diff(mean, axis=0, append=mean[-1:])
 

@@ -146,16 +146,12 @@ class OppositeRays:
         return tried[best], ratio
 
     def find(self, values: FloatArray) -> Symmetry:
-        """Estimate the parameters from coarse to fine images, each from the last
-        converged values.
+        """Estimate the parameters from coarse to fine images, each from the last converged
+        values.
 
-        Args:
-            values: (k,) to start from.
-
-        Returns:
-            The level with the least sigma of the first parameter among those that
-            converged; the first, not converged, if none did.
-        """
+        `values`: (k,) to start from.
+        Returns the level with the least sigma of the first parameter among those that converged;
+        the first, not converged, if none did."""
         found = []
         for part in LEVELS:
             found.append(_Level(self, max(self.shape[1] / part, 1.0)).solve(values))
@@ -204,16 +200,11 @@ class _Level:
         self.images, self.alone = (self._soft(i) for i in (rays.frames, rays.noise))
 
     def _soft(self, images: Float32Array) -> FloatArray:
-        """Compute spline coefficients of all images, smoothed by the level's sigma along
-        rows and columns, stacked below each other with `EDGE_ROWS` mirrored rows on
-        either side.
+        """Compute spline coefficients of all images, smoothed by the level's sigma along rows
+        and columns, stacked below each other with `EDGE_ROWS` mirrored rows on either side.
 
-        Args:
-            images: (n, rows, cols).
-
-        Returns:
-            (n (rows + 2 EDGE_ROWS), cols) float32.
-        """
+        `images`: (n, rows, cols).
+        Returns (n (rows + 2 EDGE_ROWS), cols) float32."""
         soft = gaussian_filter(images, (0, self.sigma, self.sigma))
         for axis in (1, 2):
             soft = spline_filter1d(soft, axis=axis, output=np.float32)
@@ -223,16 +214,12 @@ class _Level:
     def read(
         self, image: FloatArray, places: FloatArray, pairs: npt.NDArray[np.intp]
     ) -> FloatArray:
-        """Read the values of both views of pairs by cubic splines; rows off the band take
-        its edge.
+        """Read the values of both views of pairs by cubic splines; rows off the band take its
+        edge.
 
-        Args:
-            image: spline coefficients of all views, one above the other.
-            places: (side, column and row, q) [px of the panel].
-            pairs: (q, 2) numbers of the views.
-
-        Returns:
-            (2, q, lifts) line integrals, `lifts` rows higher or lower.
+        `image`: spline coefficients of all views, one above the other; `places`: (side, column
+        and row, q) [px of the panel]; `pairs`: (q, 2) numbers of the views.
+        Returns (2, q, lifts) line integrals, `lifts` rows higher or lower.
         """
         rows = self.rays.frames.shape[1]
         row = places[:, 1, :, None] + self.rays.lifts - self.rays.top
@@ -245,12 +232,10 @@ class _Level:
         return read_spline(image, np.stack([column, row]))
 
     def disagreement(self, values: FloatArray, pairs: npt.NDArray[np.intp]) -> float:
-        """Compute the mean square of the differences of both ends over the variance of
-        the values; infinite for fewer than half of `FEWEST_PAIRS` rays.
+        """Compute the mean square of the differences of both ends over the variance of the
+        values; infinite for fewer than half of `FEWEST_PAIRS` rays.
 
-        Args:
-            values: parameters, (k,).
-            pairs: of views, (q, 2); those off the panel do not count.
+        `values`: parameters, (k,). `pairs`: of views, (q, 2); those off the panel do not count.
         """
         places, inside = self.rays._places(values, pairs)
         if inside.sum() < FEWEST_PAIRS // 2:
@@ -362,20 +347,15 @@ class _Level:
         pairs: npt.NDArray[np.intp],
         values: FloatArray,
     ) -> float:
-        """Bound the sum of slopes times differences that are no noise: in phase within a
-        patch (Cauchy-Schwarz), at random from patch to patch.
+        """Bound the sum of slopes times differences that are no noise: in phase within a patch
+        (Cauchy-Schwarz), at random from patch to patch.
 
         A patch is `PATCH` sigmas of the distance between both columns by one of `SECTORS`
         sectors.
-
-        Args:
-            slope: of the differences with the column, (m,).
-            excess: squares of the differences less those of noise, (m,). Noise alone gives
-                as many patches too little as too much, so negative ones count as such.
-            w: weights, (m,).
-            pairs: of views, (q, 2).
-            values: parameters, (k,).
-        """
+        `slope`: of the differences with the column, (m,). `excess`: squares of the differences
+        less those of noise, (m,). Noise alone gives as many patches too little as too much, so
+        negative ones count as such. `w`: weights, (m,). `pairs`: of views, (q, 2). `values`:
+        parameters, (k,)."""
         column = self.rays._places(values, pairs)[0][:, 0]
         near = ((column[0] - column[1]) / (PATCH * self.sigma)).astype(np.intp)
         sector = pairs[:, 0] * SECTORS // len(self.rays.frames)

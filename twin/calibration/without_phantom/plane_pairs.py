@@ -252,11 +252,10 @@ class PlanePairs:
         return np.asarray(np.sqrt(worst))
 
     def noise(self, random: np.random.Generator) -> Float32Array:
-        """Draw images of noise as large as that of the frames, summed down their columns
-        like `sums`, (n, cols, rows + 1).
+        """Draw images of noise as large as that of the frames, summed down their columns like
+        `sums`, (n, cols, rows + 1).
 
-        Args:
-            random: generator, advanced.
+        `random`: generator, advanced.
         """
         out = np.zeros_like(self.sums)
         np.cumsum(
@@ -286,16 +285,9 @@ class PlanePairs:
         for v in (here[self.pairs[:, 0]], here[self.pairs[:, 1]]):
 
             def heights(at: FloatArray, v: FloatArray = v) -> FloatArray:
-                """Compute dz over the distance inwards, times `away`, of rays from each
-                source to points on its panel.
-
-                Args:
-                    at: (k, 2) columns and rows from the panel's centre.
-                    v: (q, 12) views.
-
-                Returns:
-                    (q, k) [mm].
-                """
+                """Compute dz over the distance inwards, times `away`, of rays from each source
+                to points on its panel. `at`: (k, 2) columns and rows from the panel's centre;
+                `v`: (q, 12) views. Returns (q, k) [mm]."""
                 to = v[:, None, 3:6] - v[:, None, :3] + at[:, :1] * v[:, None, 6:9]
                 to = to + at[:, 1:] * v[:, None, 9:12]
                 inward = (to[..., :2] * self.inwards[:, None]).sum(axis=2)
@@ -315,19 +307,10 @@ class PlanePairs:
 
 
 def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Array:
-    """Draw noise as large as that of images.
-
-    Its variance grows as 1 / exp(-g), as that of counted photons, up to `DARKEST`; its
-    size is the median over all pixels of second differences along the second axis, so
-    mostly of air.
-
-    Args:
-        images: line integrals (n, cols, rows).
-        random: generator, advanced.
-
-    Returns:
-        New images of that shape.
-    """
+    """Draw noise as large as that of images. Its variance grows as 1 / exp(-g), as that of
+    counted photons, up to `DARKEST`; its size is the median over all pixels of second
+    differences along the second axis, so mostly of air. `images`: line integrals (n, cols,
+    rows); `random`: generator, advanced. Returns new images of that shape."""
     power = np.exp(np.minimum(images, DARKEST))
     change = np.square(np.diff(images, 2, axis=1)) / 6
     size = math.sqrt(float(np.median(change / power[:, 1:-1])) / MEDIAN_OF_CHI_SQUARE)
@@ -338,17 +321,13 @@ def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Arra
 def spread(parts: FloatArray, pairs: npt.NDArray[np.intp], n: int) -> FloatArray:
     """Estimate standard deviations of sums over pairs of frames.
 
-    Pairs that share a frame, or one of `SECTORS` sectors, are not independent: of squares
-    of the sums over all that do, those that count pairs twice are taken away. The largest
-    of three counts: independent pairs, frames, sectors.
+    Pairs that share a frame, or one of `SECTORS` sectors, are not independent: of squares of the
+    sums over all that do, those that count pairs twice are taken away. The largest of three
+    counts: independent pairs, frames, sectors.
 
-    Args:
-        parts: (..., q) terms of the sums.
-        pairs: (q, 2) frames of each term.
-        n: number of frames.
-
-    Returns:
-        (...) standard deviations.
+    `parts`: (..., q) terms of the sums; `pairs`: (q, 2) frames of each term; `n`: number of
+    frames.
+    Returns (...) standard deviations.
     """
     own = parts - parts.mean(axis=-1, keepdims=True)
     worst = np.square(own).sum(axis=-1)
@@ -368,13 +347,8 @@ def without(
 ) -> FloatArray:
     """Subtract from `whole`, where it is used, its part along `part`.
 
-    Args:
-        part: (..., k).
-        whole: (..., k).
-        used: (..., k); None: all.
-
-    Returns:
-        (..., k); 0 where not used, and for all with fewer than `FEWEST_BINS` used.
+    `part`: (..., k). `whole`: (..., k). `used`: (..., k); None: all.
+    Returns (..., k); 0 where not used, and for all with fewer than `FEWEST_BINS` used.
     """
     if used is not None:
         used = used & (used.sum(axis=-1) >= FEWEST_BINS)[..., None]
@@ -392,8 +366,7 @@ def _columns(here: FloatArray, cols: int, radius: float) -> npt.NDArray[np.intp]
         cols: number of columns.
         radius: of the object about the axis [mm].
 
-    Returns:
-        (n, 2) first column, and the one after the last; (0, cols) if it reaches none.
+    Returns (n, 2) first column, and the one after the last; (0, cols) if it reaches none.
     """
     i = np.arange(cols) - (cols - 1) / 2
     x, y = (

@@ -232,16 +232,12 @@ def _first_column(scan: CircularScan, random: np.random.Generator) -> FirstColum
 
 
 def _first_in_turn(scan: CircularScan, turn: Turn) -> FirstColumn:
-    """Search for the axis's column in the mean image of a full turn, and set the start
-    values to it; yaw alone has a prior.
+    """Search for the axis's column in the mean image of a full turn, and set the start values to
+    it; yaw alone has a prior.
 
-    Args:
-        scan: to align.
-        turn: its frames.
-
-    Returns:
-        With three parameters; ratio 0 if the best column is at the end of the search (not
-        raised here).
+    `scan`: to align; `turn`: its frames.
+    Returns with three parameters; ratio 0 if the best column is at the end of the search (not
+    raised here).
     """
     nominal = scan.column(scan.start)
     values = scan.start[:OF_TURN]
@@ -318,18 +314,10 @@ def _require_one_column(scan: CircularScan, first: FirstColumn) -> None:
 def _gap(scan: CircularScan, first: FirstColumn, panel: Panel | None) -> GapFound:
     """Look for a gap between two panel tiles that the known panel does not close already.
 
-    Args:
-        scan: to align.
-        first: the axis, and the turn.
-        panel: known distortion; None: none.
-
-    Returns:
-        Nothing found without a full turn, or where the machine's file says that the panel
-        is in one piece (`gap = 0` in its priors).
-
-    Raises:
-        NotIdentifiableError: there are two gaps.
-    """
+    `scan`: to align. `first`: the axis, and the turn. `panel`: known distortion; None: none.
+    Returns nothing found without a full turn, or where the machine's file says that the panel is
+    in one piece (`gap = 0` in its priors).
+    Raises NotIdentifiableError: there are two gaps."""
     if first.turn is None or scan.priors.get("gap") == 0.0:
         return GapFound(None, None)
     borders = panel.model.borders if panel else ()
@@ -351,16 +339,14 @@ def _closes(found: Symmetry, gap: Gap) -> bool:
 
 
 def _with_gap(first: FirstColumn, gap: Gap, behind: FloatArray | None) -> FirstColumn:
-    """Start at the plane with the gap between two panel tiles closed: the mean's own axis
-    is off by half of its width.
+    """Start at the plane with the gap between two panel tiles closed: the mean's own axis is off
+    by half of its width.
 
-    The width becomes the last parameter, with its prior; not if the gap lies beside the
-    axis, where the plane does not determine it. Errors begin with the gap's text.
+    The width becomes the last parameter, with its prior; not if the gap lies beside the axis,
+    where the plane does not determine it. Errors begin with the gap's text.
 
-    Args:
-        first: the start without a gap.
-        gap: its column and width.
-        behind: parameters of the plane with it closed; None: those of `first`.
+    `first`: the start without a gap. `gap`: its column and width. `behind`: parameters of the
+    plane with it closed; None: those of `first`.
     """
     values = first.values if behind is None else behind
     if gap.beside_axis:
@@ -496,17 +482,10 @@ def _plane(
 def _gap_of_fit(
     gap: Gap, found: Symmetry, widths: Sequence[tuple[float, float]]
 ) -> tuple[Gap, float]:
-    """Give a gap the width that was fitted.
-
-    Args:
-        gap: as it was found.
-        found: the plane, with the gap's width as the last parameter [px].
-        widths: by other means, with their standard deviations [px].
-
-    Returns:
-        The gap, its sigma raised as far as the other widths contradict it, and what that
-        adds to the sigma of the axis column [px].
-    """
+    """Give a gap the width that was fitted. `gap`: as it was found; `found`: the plane, with the
+    gap's width as the last parameter [px]; `widths`: by other means, with their standard
+    deviations [px]. Returns the gap, its sigma raised as far as the other widths contradict it,
+    and what that adds to the sigma of the axis column [px]."""
     sigma = float(np.sqrt(found.covariance[-1, -1]))
     fitted = gap._replace(width=float(found.values[-1]), sigma=sigma)
     raised = contradicted(fitted, widths)
@@ -520,17 +499,12 @@ def _opposite_column(
     covariance: FloatArray,
     gap: Gap | None,
 ) -> OppositeColumn | None:
-    """Compare the column of the mean with that of opposite rays, in the row that these
-    are read in.
+    """Compare the column of the mean with that of opposite rays, in the row that these are read
+    in.
 
-    Args:
-        scan: the scan.
-        first: start of the fit.
-        values, covariance: of the parameters, (k,) and (k, k).
-        gap: between two tiles, closed in the rays; or None.
-
-    Returns:
-        Their distance and both sigmas [px]; None without a full turn.
+    `scan`: the scan. `first`: start of the fit. `values` and `covariance`: of the parameters,
+    (k,) and (k, k). `gap`: between two tiles, closed in the rays; or None.
+    Returns their distance and both sigmas [px]; None without a full turn.
     """
     if first.turn is None:
         return None
@@ -572,14 +546,9 @@ def _beside_rows(scan: CircularScan, rays: OppositeRays, roll_rad: float) -> flo
 def _keep_roll(
     values: FloatArray, covariance: FloatArray, roll_rad: float, sigma_rad: float
 ) -> None:
-    """Replace, in place, the roll's value and variance by those in force, and its
-    covariances by 0: few rows gave values up to six sigma off.
-
-    Args:
-        values: (k,), the roll second.
-        covariance: (k, k).
-        roll_rad, sigma_rad: in force [rad].
-    """
+    """Replace, in place, the roll's value and variance by those in force, and its covariances by
+    0: few rows gave values up to six sigma off. `values`: (k,), the roll second; `covariance`:
+    (k, k); `roll_rad` and `sigma_rad`: in force [rad]."""
     values[1] = roll_rad
     covariance[1] = 0.0
     covariance[:, 1] = 0.0
@@ -587,15 +556,11 @@ def _keep_roll(
 
 
 def _require_precise(plane: SymmetryPlane, preface: str) -> None:
-    """Check the uncertainty of the column (`MOST_COLUMN`), and of the roll (`MOST_ROLL`)
-    if the images determine it.
+    """Check the uncertainty of the column (`MOST_COLUMN`), and of the roll (`MOST_ROLL`) if the
+    images determine it.
 
-    Args:
-        plane: of symmetry.
-        preface: beginning of errors.
-
-    Raises:
-        NotIdentifiableError: it is too large.
+    `plane`: of symmetry; `preface`: beginning of errors.
+    Raises NotIdentifiableError: it is too large.
     """
     sigma = plane.column_sigma_px
     (roll, _) = plane.sigmas_deg

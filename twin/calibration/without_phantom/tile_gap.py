@@ -71,16 +71,10 @@ class Gap(NamedTuple):
         )
 
     def panel(self, shape: tuple[int, int], undone: Panel | None = None) -> Panel:
-        """Make the panel of images with this gap, in addition to the distortion undone
-        already.
+        """Make the panel of images with this gap, in addition to the distortion undone already.
 
-        Args:
-            shape: (rows, cols) of the images.
-            undone: that distortion; None: a flat panel.
-
-        Returns:
-            A new panel with one border more, at its place before the distortion was
-            undone.
+        `shape`: (rows, cols) of the images. `undone`: that distortion; None: a flat panel.
+        Returns a new panel with one border more, at its place before the distortion was undone.
         """
         one = undone or Panel.flat(shape)
         at = np.array([self.column - 0.5, (shape[0] - 1) / 2])
@@ -158,10 +152,7 @@ def local_gaps(
 
 def dead_columns(table: FloatArray) -> npt.NDArray[np.bool_]:
     """Mark columns that hardly change from frame to frame, as those about them do, (c,).
-
-    Args:
-        table: rows of frames without the mean of the frames, (m, c).
-    """
+    `table`: rows of frames without the mean of the frames, (m, c)."""
     spread = table.std(axis=0)
     return np.asarray(spread < 0.1 * median_filter(spread, 4 * SIDE + 1))
 
@@ -169,24 +160,19 @@ def dead_columns(table: FloatArray) -> npt.NDArray[np.bool_]:
 def local_sigma(width: FloatArray | float) -> FloatArray:
     """Return the standard deviation of a width that single frames show [px].
 
-    Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of it.
-    """
+    Sharper edges than the usual ones look like a wider gap: drawn ones are off by half of it."""
     return np.asarray(0.2 + 0.3 * np.asarray(width))
 
 
 def _gains(
     edges: FloatArray, place: npt.NDArray[np.intp], shape: tuple[int, int]
 ) -> FloatArray:
-    """Compute gains in log likelihood of gaps of all WIDTHS at each border over none,
-    less the scatter of frames.
+    """Compute gains in log likelihood of gaps of all WIDTHS at each border over none, less the
+    scatter of frames.
 
-    Args:
-        edges: differences of neighbouring columns, (k, 2 SIDE - 1).
-        place: of each in a table of frames and borders, (k,).
-        shape: of that table.
-
-    Returns:
-        (w, b).
+    `edges`: differences of neighbouring columns, (k, 2 SIDE - 1); `place`: of each in a table of
+    frames and borders, (k,); `shape`: of that table.
+    Returns (w, b).
     """
     of_distance = squares_by_distance(edges)
     without = likelihood(edges, of_distance, 0.0)

@@ -174,18 +174,13 @@ def read_turn(
 
 
 def _groups(rows: int, cols: int, middle: float) -> list[tuple[int, int]]:
-    """Divide the rows about `middle`, where the plane of the source meets the panel, into
-    at most `GROUPS` groups.
+    """Divide the rows about `middle`, where the plane of the source meets the panel, into at
+    most `GROUPS` groups.
 
-    `BAND` rows or a `BAND_PART` of the columns on either side are used, moved inwards at
-    the panel's edges.
-
-    Args:
-        rows, cols: of the panel.
-        middle: row [px].
-
-    Returns:
-        (top, end) of each, of a row at least.
+    `BAND` rows or a `BAND_PART` of the columns on either side are used, moved inwards at the
+    panel's edges.
+    `rows` and `cols`: of the panel; `middle`: row [px].
+    Returns (top, end) of each, of a row at least.
     """
     half = max(BAND, cols // BAND_PART)
     centre = min(
@@ -257,12 +252,10 @@ def _coefficients(angle: FloatArray, gaps: FloatArray, usual: float) -> FloatArr
 
 
 def _weights(angle: FloatArray, keep: npt.NDArray[np.bool_]) -> FloatArray:
-    """Compute weights of the trapezoidal rule on the circle for the kept angles, of sum
-    1; 0 for the others.
+    """Compute weights of the trapezoidal rule on the circle for the kept angles, of sum 1; 0 for
+    the others.
 
-    Args:
-        angle: (n,) sorted modulo a turn [rad].
-        keep: (n,).
+    `angle`: (n,) sorted modulo a turn [rad]; `keep`: (n,).
     """
     around = angle[keep] % (2 * np.pi)
     gaps = np.diff(around, append=around[:1] + 2 * np.pi)

@@ -161,13 +161,10 @@ class TurnPlanes:
     def motion(self, corrected: Offsets, random: np.random.Generator) -> Motion:
         """Estimate shifts of single frames as shifts of the sample, dO_x and dO_y.
 
-        Args:
-            corrected: offsets; only the panel's height and angle_scale are used.
-            random: for the image of noise.
-
-        Raises:
-            NotIdentifiableError: the images have too few pairs of views, or there are
-                more than `MOST_SHIFTS` frames.
+        `corrected`: offsets; only the panel's height and angle_scale are used. `random`: for the
+        image of noise.
+        Raises NotIdentifiableError: the images have too few pairs of views, or there are more
+        than `MOST_SHIFTS` frames.
         """
         n = len(self.sorted)
         refuse_if(

@@ -28,18 +28,13 @@ BAND_ROWS = 16
 
 @kernel
 def cut_by_slab(t0, t1, at, low, high, rate, step, first):
-    """Cut the pieces [t0, t1] of the rays to a run of columns down to a slab, in place;
-    t1 < t0 where nothing is left. A ray along the slab keeps all or loses all.
+    """Cut the pieces [t0, t1] of the rays to a run of columns down to a slab, in place; t1 < t0
+    where nothing is left. A ray along the slab keeps all or loses all.
 
-    Args:
-        t0: (k,) beginnings, in lengths of the rays.
-        t1: (k,) ends.
-        at: the source's height above the slab's plane.
-        low: lower limit, low <= at + t (rate + column * step).
-        high: upper limit.
-        rate: height of the ray to column 0.
-        step: change of it by a column.
-        first: the first ray's column.
+    `t0`: (k,) beginnings, in lengths of the rays; `t1`: (k,) ends; `at`: the source's height
+    above the slab's plane; `low`: lower limit, low <= at + t (rate + column * step); `high`:
+    upper limit; `rate`: height of the ray to column 0; `step`: change of it by a column;
+    `first`: the first ray's column.
     """
     # A ray along the slab gets TINY: both quotients are huge, of one sign where it runs outside
     # (no chord is left) and of two where it runs inside (nothing is cut). No branch, so it
@@ -101,14 +96,9 @@ def cut_by_quadric(t0, t1, q, d, e, first):
 def add_chords(row, t0, t1, weight, d, e, first):
     """Add weight * chord length [mm] to a row of pixels.
 
-    Args:
-        row: (k,) changed in place.
-        t0: (k,) beginnings of the chords, in lengths of the rays.
-        t1: (k,) ends; no chord where t1 < t0.
-        weight: factor.
-        d: (3,) ray from source to pixel of column 0 [mm].
-        e: (3,) its change by a column [mm].
-        first: the first pixel's column.
+    `row`: (k,) changed in place. `t0`: (k,) beginnings of the chords, in lengths of the rays.
+    `t1`: (k,) ends; no chord where t1 < t0. `weight`: factor. `d`: (3,) ray from source to pixel
+    of column 0 [mm]. `e`: (3,) its change by a column [mm]. `first`: the first pixel's column.
     """
     for i in range(row.size):
         c = first + i

@@ -334,8 +334,7 @@ def sources(*modules: ModuleType) -> int:
 
     The name under which a function's code is kept follows from the function's own file. An
     entry point that calls kernels of other files refers to this number as a free variable,
-    which is part of the name, too; otherwise the old form of an edited kernel would stay in use.
-    """
+    which is part of the name, too; otherwise the old form of an edited kernel would stay in use."""
     text = "".join(inspect.getsource(module) for module in modules)
     return zlib.crc32(text.encode())
 

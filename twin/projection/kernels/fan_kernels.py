@@ -101,14 +101,10 @@ def carry_fan(box, g, grid, collected, rays, work, n, buffer, transposed):
 def put(image, buffer, starts, ends, width, top, bottom, share):
     """Copy a job's buffer, times `share`, into its columns of an image; zeros outside its rows.
 
-    Args:
-        image: (rows, cols) changed in place.
-        buffer: rows top to bottom - 1, `width` values each.
-        starts: (rows,) first column of the job in each row.
-        ends: (rows,) column after the last.
-        width: columns of the buffer.
-        top: first row that the box can reach.
-        bottom: row after the last.
+    `image`: (rows, cols) changed in place; `buffer`: rows top to bottom - 1, `width` values
+    each; `starts`: (rows,) first column of the job in each row; `ends`: (rows,) column after the
+    last; `width`: columns of the buffer; `top`: first row that the box can reach; `bottom`: row
+    after the last.
     """
     for r in range(starts.size):
         row = image[r, starts[r] : ends[r]]

@@ -118,16 +118,11 @@ def oriented(box, g, lines, line, rows):
 def columns_of(lines, first, last, cols, starts, ends):
     """Find the columns between two lines in each row.
 
-    Args:
-        lines: (m, 2) column of each line in row 0, and its slope.
-        first: number of the first line.
-        last: number of the last line.
-        cols: of the image.
-        starts: (rows,) filled with the first column, 0 to cols.
-        ends: (rows,) filled with the column after the last, 0 to cols.
-
-    Returns:
-        The largest number of columns in a row, 1 at least.
+    `lines`: (m, 2) column of each line in row 0, and its slope; `first`: number of the first
+    line; `last`: number of the last line; `cols`: of the image; `starts`: (rows,) filled with
+    the first column, 0 to cols; `ends`: (rows,) filled with the column after the last, 0 to
+    cols.
+    Returns the largest number of columns in a row, 1 at least.
     """
     a = lines[first]
     b = lines[last]

@@ -134,9 +134,7 @@ else:
 
     @cuda.jit(device=True, inline=True)
     def meet_lanes():
-        """Wait for the lanes of the warp; what they wrote into shared memory is seen by
-        all.
-        """
+        """Wait for the lanes of the warp; what they wrote into shared memory is seen by all."""
         cuda.syncwarp(LANES)
 
     @cuda.jit(device=True, inline=True)
@@ -213,12 +211,8 @@ def anchor(position, rate, k):
 
 @cuda.jit(device=True, inline=True)
 def crossing(t, slope, distance, steps):
-    """Compute the state t slabs after an anchor.
-
-    Returns:
-        the bits that number the voxel, and the share of the slab before that is behind
-        the last plane crossed.
-    """
+    """Compute the state t slabs after an anchor. Returns the bits that number the voxel, and the
+    share of the slab before that is behind the last plane crossed."""
     y = fused(t, slope, distance)
     floor, bits = floor_bits(y)
     return bits, clamped((y - floor) * steps)
@@ -632,17 +626,11 @@ def enter_box(s, d, n, enter, leave):
 def first_crossing(s, d, n, enter, unit):
     """Find the first crossing of an axis after the entry, in `unit`s of t.
 
-    Args:
-        s: the source's place along the axis [voxels].
-        d: the ray's length along it [voxels].
-        n: voxels along it.
-        enter: t of the entry into the box.
-        unit: factor on t.
-
-    Returns:
-        voxel at entry, distance of the first crossing after it, distance between
-        crossings, and crossings until the box ends. Along an axis that the ray does not
-        move on: infinity, 0 and 1.
+    `s`: the source's place along the axis [voxels]; `d`: the ray's length along it [voxels];
+    `n`: voxels along it; `enter`: t of the entry into the box; `unit`: factor on t.
+    Returns voxel at entry, distance of the first crossing after it, distance between crossings,
+    and crossings until the box ends. Along an axis that the ray does not move on: infinity, 0
+    and 1.
     """
     at = plus(s, times(enter, d))
     # On the device, floor gives a float.

@@ -99,12 +99,10 @@ def unfit_parts(bits):
 
 @parallel
 def touch(flat):
-    """Write a zero into every page of fresh zeros, so that each thread brings in pages of
-    its own.
+    """Write a zero into every page of fresh zeros, so that each thread brings in pages of its
+    own.
 
-    Args:
-        flat: (k,) float32 zeros; every 1024th number is written.
-    """
+    `flat`: (k,) float32 zeros; every 1024th number is written."""
     chunk = 1 << 19
     for part in prange((flat.size + chunk - 1) // chunk):
         for i in range(part * chunk, min(flat.size, (part + 1) * chunk), 1024):

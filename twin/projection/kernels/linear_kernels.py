@@ -95,13 +95,9 @@ def prepare(box, g, main, along, across, factor):
 def width_across(g, c, m, rows, across, there):
     """Compute the width of a column's pixels on a plane, across it [voxels].
 
-    Args:
-        g: (12,) of the view.
-        c: column.
-        m: axis of the planes.
-        rows: of the detector.
-        across: (rows + 1,) of the column.
-        there: distance of the plane from the source along its axis.
+    `g`: (12,) of the view; `c`: column; `m`: axis of the planes; `rows`: of the detector;
+    `across`: (rows + 1,) of the column; `there`: distance of the plane from the source along its
+    axis.
     """
     a = 1 - m
     r = 0.5 * (rows - 1)

@@ -58,17 +58,10 @@ def clip_to_box(nx, ny, nz, sx, sy, sz, dx, dy, dz):
 def first_step(s, d, n, enter, hop):
     """Find the start of the walk along one axis.
 
-    Args:
-        s: the source's place along the axis [voxels].
-        d: the ray's length along it [voxels].
-        n: voxels along it.
-        enter: t of the entry into the box.
-        hop: places in memory from one voxel to the next.
-
-    Returns:
-        voxel at entry, steps left until the box ends, t of the next crossing, t between
-        crossings, and the memory step signed by direction.
-    """
+    `s`: the source's place along the axis [voxels]; `d`: the ray's length along it [voxels];
+    `n`: voxels along it; `enter`: t of the entry into the box; `hop`: places in memory from one
+    voxel to the next. Returns voxel at entry, steps left until the box ends, t of the next
+    crossing, t between crossings, and the memory step signed by direction."""
     # Rounding at the entry may give the voxel before the box or behind it.
     i = min(max(math.floor(s + enter * d), 0), n - 1)
     # Rounding, or a ray within a voxel plane, may put a first crossing before the entry.
@@ -81,12 +74,9 @@ def first_step(s, d, n, enter, hop):
 
 @kernel
 def open_column(flat, marks, at, first, nz):
-    """Set a voxel column, flat[first : first + nz], to zero before the first addition to
-    it.
-
-    marks[at] is set once that has been done, so memory with old values needs no pass of
-    its own.
-    """
+    """Set a voxel column, flat[first : first + nz], to zero before the first addition to it.
+    marks[at] is set once that has been done, so memory with old values needs no pass of its
+    own."""
     if marks[at] == 0:
         marks[at] = 1
         flat[first : first + nz] = np.float32(0)
@@ -183,14 +173,10 @@ def walk_ray(box, g, r, c, value, transposed):
 def project_rays(box, views, chosen, out, tile, first_job, last_job):
     """Fill the chosen views of `out` with line integrals, each ray on its own.
 
-    Args:
-        box: voxels.
-        views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the box.
-        chosen: (k,) indices of views.
-        out: (n, rows, cols).
-        tile: columns of a job; of each chosen view one job after the other.
-        first_job: number of the first job.
-        last_job: number of the job after the last.
+    `box`: voxels. `views`: (n, 12) source, first pixel centre minus source, u, v in voxel units
+    of the box. `chosen`: (k,) indices of views. `out`: (n, rows, cols). `tile`: columns of a
+    job; of each chosen view one job after the other. `first_job`: number of the first job.
+    `last_job`: number of the job after the last.
     """
     rows, cols = out.shape[1:]
     tiles = (cols + tile - 1) // tile

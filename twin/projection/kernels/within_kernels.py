@@ -767,14 +767,11 @@ def raise_marks(marks, x, y, need):
 
 @kernel
 def slopes_of(p, face, g, out):
-    """Compute the plane of a face as a form of the pixel, (3,): a ray meets it at a distance
-    in proportion to 1 / form.
+    """Compute the plane of a face as a form of the pixel, (3,): a ray meets it at a distance in
+    proportion to 1 / form.
 
-    Args:
-        p: (k, 3) vertices seen from the source.
-        face: (3,) numbers of vertices.
-        g: (12,) the view's rays.
-        out: (3,) filled.
+    `p`: (k, 3) vertices seen from the source; `face`: (3,) numbers of vertices; `g`: (12,) the
+    view's rays; `out`: (3,) filled.
     """
     i, j, k = face[0], face[1], face[2]
     ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]

@@ -177,13 +177,8 @@ def ends_not_seen_mm(cone_vec: ConeVec) -> float:
     """Compute how much of the field of view at either end of a helix FDK cannot fill.
 
     A layer needs the views of a turn, and of the taper at both ends, which rise so far.
-
-    Args:
-        cone_vec: the scan.
-
-    Returns:
-        [mm] along z; 0 for scans that are no helix.
-    """
+    `cone_vec`: the scan.
+    Returns [mm] along z; 0 for scans that are no helix."""
     try:
         circle = circle_of(cone_vec)
     except GeometryError:
@@ -260,8 +255,7 @@ class Sharing:
 
     def columns(self) -> FloatArray:
         """Compute the columns that a helix adds to the kernel's table of views, (n, 2):
-        the first tabulated depth [mm], and tabulated depths a mm.
-        """
+        the first tabulated depth [mm], and tabulated depths a mm."""
         first, last = self.depth.T
         return np.column_stack([first, (DEPTHS - 1) / (last - first)])
 

@@ -104,13 +104,9 @@ def rectified(
 
     Pixels beyond an image's edge repeat its last pixel.
 
-    Args:
-        images: (n, rows, cols).
-        cone_vec, target: n rows each.
-        cols: of the target's panels; default: as many as in images.
-
-    Returns:
-        New images (n, rows, cols).
+    `images`: (n, rows, cols). `cone_vec` and `target`: n rows each. `cols`: of the target's
+    panels; default: as many as in images.
+    Returns new images (n, rows, cols).
     """
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
@@ -141,13 +137,10 @@ def homography(
     """
 
     def plane(row: FloatArray, rows: int, cols: int) -> FloatArray:
-        """Compute the matrix (3, 3) that takes a pixel (column, row, 1) to its ray:
-        columns u, v, first pixel minus source.
+        """Compute the matrix (3, 3) that takes a pixel (column, row, 1) to its ray: columns u,
+        v, first pixel minus source.
 
-        Args:
-            row: cone_vec row (12,).
-            rows, cols: of its panel.
-        """
+        `row`: cone_vec row (12,); `rows` and `cols`: of its panel."""
         first = (
             row[3:6] - row[0:3] - (cols - 1) / 2 * row[6:9] - (rows - 1) / 2 * row[9:12]
         )
@@ -220,19 +213,13 @@ def field_of_view(
 def rows_needed(
     cone_vec: ConeVec, shape: tuple[int, int], like: Volume
 ) -> tuple[int, int]:
-    """Find rows first <= r < last with the volume's shadow in some view, with 2 rows to
-    spare at least.
+    """Find rows first <= r < last with the volume's shadow in some view, with 2 rows to spare at
+    least.
 
-    Both are limited to one row beyond the panel on either side, as pixels see beyond
-    their centres: -1 to rows + 1. All rows if a corner of the volume has no finite image.
-
-    Args:
-        cone_vec: n views.
-        shape: detector (rows, cols).
-        like: the volume.
-
-    Returns:
-        (first, last), at least two rows.
+    Both are limited to one row beyond the panel on either side, as pixels see beyond their
+    centres: -1 to rows + 1. All rows if a corner of the volume has no finite image.
+    `cone_vec`: n views; `shape`: detector (rows, cols); `like`: the volume.
+    Returns (first, last), at least two rows.
     """
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     corners = np.array(like.center_mm) + signs * np.array(like.size_mm) / 2
@@ -252,11 +239,8 @@ def window(
 ) -> ConeVec:
     """Compute the geometry of a part of the panel.
 
-    Args:
-        cone_vec: n views.
-        shape: (rows, cols) of the whole panel.
-        rows: first row, and the one after the last; they may be off the panel.
-        cols: first column, and the one after the last.
+    `cone_vec`: n views. `shape`: (rows, cols) of the whole panel. `rows`: first row, and the one
+    after the last; they may be off the panel. `cols`: first column, and the one after the last.
     """
     down, right = (
         (sum(part) - size) / 2 for part, size in zip((rows, cols), shape, strict=True)

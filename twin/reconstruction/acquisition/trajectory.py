@@ -176,16 +176,10 @@ def _circle_of(sources: bytes) -> Circle:
 def distinct_angles(circle: Circle) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Find the first views of different angles, and which of them each view repeats.
 
-    Angles are equal to 1e-9 rad; on a circle modulo a turn, on a helix not. Neither
-    result depends on the order of views, except in which of equal ones is the first.
-
-    Args:
-        circle: n views.
-
-    Returns:
-        Views of different angles in order of angle, (k,), and the position in that list
-        for each view, (n,).
-    """
+    Angles are equal to 1e-9 rad; on a circle modulo a turn, on a helix not. Neither result
+    depends on the order of views, except in which of equal ones is the first. `circle`: n views.
+    Returns views of different angles in order of angle, (k,), and the position in that list for
+    each view, (n,)."""
     if circle.rise:
         angle = circle.angle.round(9)
     else:
@@ -206,9 +200,7 @@ def mean_image(
 
     A single image may share its memory with the given one.
 
-    Args:
-        image: gives a view's image by its number.
-        views: numbers, at least one.
+    `image`: gives a view's image by its number; `views`: numbers, at least one.
     """
     total = np.asarray(image(int(views[0])), np.float32)
     if len(views) == 1:
@@ -221,18 +213,12 @@ def mean_image(
 def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     """Make a circle from its sources' angles, with steps and gaps.
 
-    A gap is an arc without views, wider than `GAP_STEPS` usual steps or a third of a
-    turn; if the gaps leave lines unseen, as for random angles, it must be wider than
-    `RANDOM_GAP_STEPS`.
+    A gap is an arc without views, wider than `GAP_STEPS` usual steps or a third of a turn; if
+    the gaps leave lines unseen, as for random angles, it must be wider than `RANDOM_GAP_STEPS`.
 
-    Args:
-        azimuth: (n,) from 0 to 2 pi [rad].
-        centre: (2,) [mm].
-        radius: [mm].
-
-    Returns:
-        The circle; a view's step is half the way to its neighbour on either side, views
-        at one angle share it equally, and gaps belong to no view.
+    `azimuth`: (n,) from 0 to 2 pi [rad]; `centre`: (2,) [mm]; `radius`: [mm].
+    Returns the circle; a view's step is half the way to its neighbour on either side, views at
+    one angle share it equally, and gaps belong to no view.
     """
     at, same = np.unique(_on_circle(azimuth), return_inverse=True)
     # From each place to the next one; views at one place share what it stands for.
@@ -252,15 +238,11 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
 
 
 def _usual(steps: FloatArray) -> float:
-    """Find the usual step: narrower ones make up a third of the total, so that repeated
-    turns do not matter.
+    """Find the usual step: narrower ones make up a third of the total, so that repeated turns do
+    not matter.
 
-    Args:
-        steps: (k,) [rad].
-
-    Returns:
-        [rad]; a full turn if there are no steps.
-    """
+    `steps`: (k,) [rad].
+    Returns [rad]; a full turn if there are no steps."""
     ordered = np.sort(steps)
     covered = np.cumsum(ordered)
     if len(steps):
@@ -368,34 +350,23 @@ def redundancy(
 
 
 def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
-    """Return whether a panel moved aside sees few columns beyond the axis: fewer than
-    twice `MIN_TAPER_COLS` on its near side. False for a panel centred within a column.
-
-    Args:
-        circle: of the sources.
-        cone_vec: n upright views.
-        cols: columns of the panel.
-    """
+    """Return whether a panel moved aside sees few columns beyond the axis: fewer than twice
+    `MIN_TAPER_COLS` on its near side. False for a panel centred within a column. `circle`: of
+    the sources; `cone_vec`: n upright views; `cols`: columns of the panel."""
     low, high = panel_reach(circle, cone_vec, cols)
     column = (low + high) / cols
     return abs(high - low) > column and min(low, high) < 2 * MIN_TAPER_COLS * column
 
 
 def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> ConeVec:
-    """Move panels along their rows, by up to a quarter of a column, so that the axis is
-    on a column or halfway between two.
+    """Move panels along their rows, by up to a quarter of a column, so that the axis is on a
+    column or halfway between two.
 
     Where the weights of a ray and its opposite change within few columns, the weights'
-    contribution to the filtered rows is large, odd about the axis, and cancels only if
-    both are sampled alike.
-
-    Args:
-        circle: of the sources.
-        cone_vec: n views.
-        shape: detector (rows, cols).
-
-    Returns:
-        New geometry; each view is moved by its own amount.
+    contribution to the filtered rows is large, odd about the axis, and cancels only if both are
+    sampled alike.
+    `circle`: of the sources; `cone_vec`: n views; `shape`: detector (rows, cols).
+    Returns new geometry; each view is moved by its own amount.
     """
     axis = np.array([[*circle.centre, 0.0]])
     at = cone_vec.project_points(axis, shape)[:, 0, 0]
@@ -409,16 +380,10 @@ def axis_between(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> C
 
 
 def _confidence(circle: Circle, angle: FloatArray) -> FloatArray:
-    """Compute the confidence in views at some angles: it falls smoothly, as a squared
-    sine over `GAP_RAMP_RAD`, towards an arc without views ("gap").
-
-    Args:
-        circle: with its gaps.
-        angle: of any shape [rad].
-
-    Returns:
-        Of the same shape, 1e-12 in a gap to 1; 1 everywhere on a full circle.
-    """
+    """Compute the confidence in views at some angles: it falls smoothly, as a squared sine over
+    `GAP_RAMP_RAD`, towards an arc without views ("gap"). `circle`: with its gaps; `angle`: of
+    any shape [rad]. Returns of the same shape, 1e-12 in a gap to 1; 1 everywhere on a full
+    circle."""
     from_gap = circle.from_gap(angle)
     return np.asarray(
         np.sin(np.pi / 2 * np.minimum(from_gap / GAP_RAMP_RAD, 1.0)) ** 2 + 1e-12
@@ -456,17 +421,12 @@ def _check_covered(circle: Circle, widest: float) -> None:
 
 
 def _unseen(gaps: FloatArray, widest: float) -> float:
-    """Compute the largest overlap of an arc without views with the opposite of any such
-    arc, widened by the fan.
+    """Compute the largest overlap of an arc without views with the opposite of any such arc,
+    widened by the fan.
 
-    Args:
-        gaps: (k, 2) first and last angle [rad].
-        widest: fan angle to either side [rad].
-
-    Returns:
-        Overlap [rad]; at most 0 if every line of a gap is seen from its other side, minus
-        a turn without gaps.
-    """
+    `gaps`: (k, 2) first and last angle [rad]; `widest`: fan angle to either side [rad].
+    Returns overlap [rad]; at most 0 if every line of a gap is seen from its other side, minus a
+    turn without gaps."""
     width = np.diff(gaps)[:, 0]
     middle = gaps.mean(axis=1)
     apart = np.abs(

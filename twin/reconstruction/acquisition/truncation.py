@@ -117,8 +117,7 @@ class Prism:
     @property
     def numbers(self) -> FloatArray:
         """Numbers for the kernels, (6,): centre, elements (0, 0), (1, 0), (1, 1),
-        attenuation.
-        """
+        attenuation."""
         (first, _), (low, second) = self.to_disc
         return np.array([*self.centre, first, low, second, self.attenuation])
 
@@ -171,8 +170,7 @@ class Truncation:
         """The same with rows continued in another way, to see how much depends on it:
         without prisms, fading out, if prisms explained all rows that are cut off; else by
         the best of the prisms that do not explain the images (`others`), the rest fading
-        out over twice the length.
-        """
+        out over twice the length."""
         if self.explained:
             return replace(self, prisms=(None,) * len(self.prisms))
         pairs = zip(self.prisms, self.others or self.prisms, strict=True)
@@ -187,15 +185,11 @@ class Truncation:
         """Count the columns before the first and after the last that the object's shadow
         reaches.
 
-        Half a panel at least, for rows that fade out; 2 more than the prisms' widest
-        shadow in any view.
+        Half a panel at least, for rows that fade out; 2 more than the prisms' widest shadow in
+        any view.
 
-        Args:
-            cone_vec: upright views.
-            cols: columns of the panel.
-
-        Returns:
-            (before, after), at most twice the panel's columns each.
+        `cone_vec`: upright views; `cols`: columns of the panel.
+        Returns (before, after), at most twice the panel's columns each.
         """
         most = 2.0 * cols
         before = 0.5 * cols
@@ -488,15 +482,10 @@ def _open_beam(seen: FloatArray) -> bool:
 
 
 def _noise(lines: npt.NDArray[np.floating]) -> float:
-    """Estimate the standard deviation of noise in lines that are otherwise smooth, from
-    the median second difference along the last axis.
+    """Estimate the standard deviation of noise in lines that are otherwise smooth, from the
+    median second difference along the last axis.
 
-    Args:
-        lines: (..., k).
-
-    Returns:
-        0 for fewer than 3 values.
-    """
+    `lines`: (..., k). Returns 0 for fewer than 3 values."""
     bend = lines[..., 2:] - 2.0 * lines[..., 1:-1] + lines[..., :-2]
     # Of normal noise, a second difference's median is 1.65 standard deviations.
     if bend.size:
@@ -505,23 +494,16 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
 
 
 def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
-    """Find the edges beyond which the object continues, in some neighbouring views or
-    all.
+    """Find the edges beyond which the object continues, in some neighbouring views or all.
 
-    The middle one of three views counts, and the mean of all, in which less noise hides
-    it. Noise is that of every other bin near an edge, as detectors blur it over some
-    columns, or that from view to view. Few views give a poor estimate, so that the
-    largest counts, of both edges between bins: a view must exceed `SIGNIFICANT_SIGMAS` of
-    it. The mean must exceed as much of its own noise, and pi / 2 times `ACCURACY` of
-    `usual`.
-
-    Args:
-        band: (n, bins) line integrals of a band of rows.
-        least: line integral below which an edge never counts in single views.
-        usual: line integral that is typical of the object.
-
-    Returns:
-        (2,) bool: left, right.
+    The middle one of three views counts, and the mean of all, in which less noise hides it.
+    Noise is that of every other bin near an edge, as detectors blur it over some columns, or
+    that from view to view. Few views give a poor estimate, so that the largest counts, of both
+    edges between bins: a view must exceed `SIGNIFICANT_SIGMAS` of it. The mean must exceed as
+    much of its own noise, and pi / 2 times `ACCURACY` of `usual`.
+    `band`: (n, bins) line integrals of a band of rows; `least`: line integral below which an
+    edge never counts in single views; `usual`: line integral that is typical of the object.
+    Returns (2,) bool: left, right.
     """
     from scipy.ndimage import median_filter
 
@@ -673,15 +655,9 @@ def _columns_of(points: FloatArray, cone_vec: ConeVec) -> FloatArray:
 def _rays(
     cone_vec: ConeVec, rows: FloatArray, columns: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute sources, horizontal rays and heights of rows [mm].
-
-    Args:
-        cone_vec: n upright panels.
-        rows, columns: (r,), (k,) counted from the panel's middle.
-
-    Returns:
-        Sources (n, 1, 2), rays in the plane (n, k, 2), heights above the source (n, r).
-    """
+    """Compute sources, horizontal rays and heights of rows [mm]. `cone_vec`: n upright panels;
+    `rows` and `columns`: (r,), (k,) counted from the panel's middle. Returns sources (n, 1, 2),
+    rays in the plane (n, k, 2), heights above the source (n, r)."""
     panel = cone_vec.detector - cone_vec.source
     across = panel[:, None, :2] + columns[:, None] * cone_vec.u[:, None, :2]
     up = panel[:, 2, None] + rows * cone_vec.v[:, 2, None]

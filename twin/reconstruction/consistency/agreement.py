@@ -98,13 +98,8 @@ class Agreement:
 def looked_at(scan: CoarseScan) -> CauseTable | None:
     """Compare the numbers of a scan that should agree, in its stated geometry alone.
 
-    Args:
-        scan: coarse.
-
-    Returns:
-        None where nothing compares: an object that the panel cuts off at its sides, or no
-        two views that see it.
-    """
+    `scan`: coarse. Returns None where nothing compares: an object that the panel cuts off at its
+    sides, or no two views that see it."""
     truncation = scan.truncation
     if truncation is not None and truncation.cut_off.any():
         return None

@@ -56,9 +56,7 @@ class Cause:
     def whole_unit(self, binned: tuple[int, int]) -> float:
         """Return how many units of the panel one of a binned copy is.
 
-        Args:
-            binned: rows and columns of the panel that are one of the copy.
-        """
+        `binned`: rows and columns of the panel that are one of the copy."""
         if self.unit != "px":
             return 1.0
         return binned[0] if self.name in ("height", "slip") else binned[1]
@@ -216,8 +214,7 @@ def _hazed(images: Float32Array, sizes: FloatArray) -> Float32Array:
     """Compute what a constant adds that is in the beam beside the flat, or was left in by the
     dark image: a scale of small line integrals, and a bend of large ones.
 
-    The constant is at most half of what a pixel has.
-    """
+    The constant is at most half of what a pixel has."""
     share = 0.01 * sizes[:, None, None]
     light = np.exp(-images)
     constant = np.minimum(share * (1.0 - light), 0.5 * light)

@@ -167,20 +167,14 @@ def _plain(cone_vec: ConeVec, mirror: FloatArray) -> FloatArray:
 def fits(image: Image, cone_vec: ConeVec, shape: tuple[int, int]) -> list[Fit]:
     """Compare the images of a scan with every combination, the best first.
 
-    Two copies are compared, a coarse and a finer one, whose errors differ: a combination
-    has the larger of its odds on the two, so that what differs excludes nothing.
+    Two copies are compared, a coarse and a finer one, whose errors differ: a combination has the
+    larger of its odds on the two, so that what differs excludes nothing.
 
-    Args:
-        image: gives the line integrals of a view, (rows, cols), by its number.
-        cone_vec: of all views, the stated geometry.
-        shape: (rows, cols).
-
-    Returns:
-        A fit of each class of combinations; [] for too few views or columns, or images
-        without an object.
-
-    Raises:
-        GeometryError: neither a circle nor a helix.
+    `image`: gives the line integrals of a view, (rows, cols), by its number; `cone_vec`: of all
+    views, the stated geometry; `shape`: (rows, cols).
+    Returns a fit of each class of combinations; [] for too few views or columns, or images
+    without an object.
+    Raises GeometryError: neither a circle nor a helix.
     """
     odds: dict[frozenset[str], float] = {}
     found: list[Fit] = []
@@ -349,8 +343,7 @@ def _ratio(
 
 def level_of(found: list[Fit]) -> float:
     """Return the probability below which a rival is excluded: `MAX_WRONG` for all rivals
-    together.
-    """
+    together."""
     return MAX_WRONG / max(len(found) - 1, 1)
 
 

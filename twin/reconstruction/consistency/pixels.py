@@ -208,17 +208,12 @@ def _outliers(
 
 
 def _short_groups(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Keep marked pixels of short groups in a row: with another one within `NEIGHBOURS`
-    columns, or as near to the panel's side, but not part of a run longer than
-    `MAX_GROUP`.
+    """Keep marked pixels of short groups in a row: with another one within `NEIGHBOURS` columns,
+    or as near to the panel's side, but not part of a run longer than `MAX_GROUP`.
 
     A thin layer of the object gives longer runs.
-
-    Args:
-        mask: (rows, cols) bool.
-
-    Returns:
-        (rows, cols) bool.
+    `mask`: (rows, cols) bool.
+    Returns (rows, cols) bool.
     """
     from scipy.ndimage import binary_opening, convolve1d
 
@@ -275,15 +270,9 @@ class _Beside:
         return cls(row, col, others, known, has_left != has_right)
 
     def residuals(self, view: Float32Array) -> Float32Array:
-        """Subtract from the pixels' transmissions that of their neighbours, (pixels,); 0
-        where these are not known.
-
-        Noise of a transmission does not grow with attenuation, as that of line integrals
-        does.
-
-        Args:
-            view: line integrals (rows, cols).
-        """
+        """Subtract from the pixels' transmissions that of their neighbours, (pixels,); 0 where
+        these are not known. Noise of a transmission does not grow with attenuation, as that of
+        line integrals does. `view`: line integrals (rows, cols)."""
         usual = np.exp(-view[self.row, self.others].mean(axis=0))
         own = np.exp(-view[self.row, self.col])
         return np.where(self.known, own - usual, np.float32(0.0))
@@ -291,18 +280,12 @@ class _Beside:
     def distances(
         self, view: Float32Array, slopes: float = MIN_SLOPE_RATIO
     ) -> Float32Array:
-        """Compute how far pixels are above or below all but one of their neighbours, less
-        how far these may differ as they do among themselves.
+        """Compute how far pixels are above or below all but one of their neighbours, less how
+        far these may differ as they do among themselves.
 
         On one side alone, the range is widened by `EDGE_SLOPE_FACTOR` times itself.
-
-        Args:
-            view: (rows, cols).
-            slopes: part of the neighbours' own range that is subtracted.
-
-        Returns:
-            (pixels,); infinite where no neighbours are known.
-        """
+        `view`: (rows, cols); `slopes`: part of the neighbours' own range that is subtracted.
+        Returns (pixels,); infinite where no neighbours are known."""
         own = view[self.row, self.col]
         least, low, high, most = np.sort(view[self.row, self.others], axis=0)
         span = np.where(self.one_sided, np.float32(EDGE_SLOPE_FACTOR), 0) * (high - low)
@@ -327,9 +310,7 @@ def _nearest(
         steps: columns away, in the order in which they are tried.
         wanted: number of pixels.
 
-    Returns:
-        Their columns, 0 where there are fewer, and whether there are, (wanted, pixels)
-        each.
+    Returns their columns, 0 where there are fewer, and whether there are, (wanted, pixels) each.
     """
     width = allowed.shape[1]
     found = np.zeros((wanted, len(row)), np.intp)
@@ -531,11 +512,8 @@ class _Judged:
         """Compute the probability that of pixels scattered over the panel so many have
         counterparts (Poisson).
 
-        Args:
-            many: number of pixels.
-            paired: number of those with a counterpart, or more, in a part of the panel.
-            share: of the panel's pixels in that part.
-        """
+        `many`: number of pixels; `paired`: number of those with a counterpart, or more, in a
+        part of the panel; `share`: of the panel's pixels in that part."""
         from scipy.special import gammainc
 
         reached = 2 * AXIS_REACH_PX + 1
@@ -631,14 +609,8 @@ def _compared_area(
 
 def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
     """Find where distances are like a pixel's root mean square or larger: above
-    `MIN_DEVIATION_RATIO` of it and twice `MIN_BAD_RESPONSE`.
-
-    Args:
-        distances: (views, pixels).
-
-    Returns:
-        (views, pixels) bool.
-    """
+    `MIN_DEVIATION_RATIO` of it and twice `MIN_BAD_RESPONSE`. `distances`: (views, pixels).
+    Returns (views, pixels) bool."""
     usual = np.sqrt(np.mean(np.square(distances), axis=0))
     least = np.maximum(MIN_DEVIATION_RATIO * usual, 2.0 * MIN_BAD_RESPONSE)
     return np.asarray(distances > least)

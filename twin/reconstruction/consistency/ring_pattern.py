@@ -54,24 +54,15 @@ def ring_errors(
 ) -> Float32Array:
     """Find each pixel's constant error, to be subtracted from all views.
 
-    Pixels and complete columns (means over `COLUMN_ROWS` rows) are judged separately; a
-    pattern shared by the rows above and below, or by the other side of the axis, is the
-    object's.
-
-    Args:
-        views: (rows, cols) line integrals of all views, in order.
-        axis_column: where the axis falls, of a full turn; None where columns on both
-            sides of it do not see the same rays: then complete columns are left
-            unchanged.
-        width: columns of the neighbourhood; made odd, 3 at least.
-
-    Returns:
-        (rows, cols); 0 where nothing stands out from object and noise, and everywhere
-        with fewer than `MIN_GROUPS` groups of `GROUP_VIEWS` views.
-
-    Raises:
-        LimitError: no views.
-    """
+    Pixels and complete columns (means over `COLUMN_ROWS` rows) are judged separately; a pattern
+    shared by the rows above and below, or by the other side of the axis, is the object's.
+    `views`: (rows, cols) line integrals of all views, in order. `axis_column`: where the axis
+    falls, of a full turn; None where columns on both sides of it do not see the same rays: then
+    complete columns are left unchanged. `width`: columns of the neighbourhood; made odd, 3 at
+    least.
+    Returns (rows, cols); 0 where nothing stands out from object and noise, and everywhere with
+    fewer than `MIN_GROUPS` groups of `GROUP_VIEWS` views.
+    Raises LimitError: no views."""
     groups = _group_medians(views, width)
     if len(groups) < MIN_GROUPS:
         return np.zeros_like(groups[0])
@@ -162,12 +153,10 @@ class _Pattern:
 
     @classmethod
     def of(cls, groups: Float32Array) -> _Pattern:
-        """Compute the pattern common to groups of views: their median, with its variance
-        from their spread, averaged over blocks of `BLOCK_PX`.
+        """Compute the pattern common to groups of views: their median, with its variance from
+        their spread, averaged over blocks of `BLOCK_PX`.
 
-        Args:
-            groups: (k, rows, cols).
-        """
+        `groups`: (k, rows, cols)."""
         middle = np.median(groups, axis=0)
         apart = SIGMA_OF_MEDIAN * np.median(np.abs(groups - middle), axis=0)
         noise = MEDIAN_VARIANCE / len(groups) * np.square(apart)
@@ -216,16 +205,11 @@ def _columns_seen_twice(cols: int, axis_column: float) -> npt.NDArray[np.bool_]:
 
 
 def _other_side(values: Float32Array, axis_column: float) -> Float32Array:
-    """Return values of the columns as far from the axis on the other side, 0 off the
-    panel.
+    """Return values of the columns as far from the axis on the other side, 0 off the panel.
 
-    The centre of symmetry is the one within `AXIS_REACH_PX` of the stated axis, in half
-    columns, at which both sides correlate best.
-
-    Args:
-        values: (rows, cols).
-        axis_column: the stated axis [px].
-    """
+    The centre of symmetry is the one within `AXIS_REACH_PX` of the stated axis, in half columns,
+    at which both sides correlate best.
+    `values`: (rows, cols); `axis_column`: the stated axis [px]."""
     stated = round(2.0 * axis_column)
     reach = range(stated - 2 * AXIS_REACH_PX, stated + 2 * AXIS_REACH_PX + 1)
     mirrored = [_mirrored(values, total) for total in reach]

@@ -124,11 +124,8 @@ def moved(
 ) -> ConeVec:
     """Move panels along their rows and down their columns; the source stays.
 
-    Args:
-        cone_vec: n views.
-        along: by so many pixels along u, one number or (n,).
-        down: by so many pixels along v, one number or (n,).
-    """
+    `cone_vec`: n views; `along`: by so many pixels along u, one number or (n,); `down`: by so
+    many pixels along v, one number or (n,)."""
     step = np.broadcast_to(along, len(cone_vec))[:, None] * cone_vec.u
     step = step + np.broadcast_to(down, len(cone_vec))[:, None] * cone_vec.v
     panel = cone_vec.detector + step

@@ -125,13 +125,9 @@ class ViewPairs:
     ) -> tuple[FloatArray, FloatArray]:
         """Integrate the planes in the first and in the second view of each pair.
 
-        Args:
-            images: (n, rows, cols).
-            first: n views, as the first of a pair.
-            second: the same as the second of a pair.
-
-        Returns:
-            (m,) each, of the planes that both see.
+        `images`: (n, rows, cols); `first`: n views, as the first of a pair; `second`: the same
+        as the second of a pair.
+        Returns (m,) each, of the planes that both see.
         """
         found = []
         for side in (0, 1):
@@ -311,16 +307,11 @@ def _interpolated(
 
 
 def sampling_error(images: Float32Array, noise: float) -> FloatArray:
-    """Compute by how much pixels may be off because they stand for what is between them: a
-    jump between two pixels, which bends both, is off by `ROUNDING` in one of them.
+    """Compute by how much pixels may be off because they stand for what is between them: a jump
+    between two pixels, which bends both, is off by `ROUNDING` in one of them.
 
-    Args:
-        images: (n, rows, cols).
-        noise: variance of a pixel, whose second differences are no bends.
-
-    Returns:
-        Standard deviations (n, rows, cols).
-    """
+    `images`: (n, rows, cols); `noise`: variance of a pixel, whose second differences are no
+    bends. Returns standard deviations (n, rows, cols)."""
     squares = np.zeros(images.shape)
     squares[:, :, 1:-1] += np.square(np.diff(images, n=2, axis=2)) - 6.0 * noise
     if images.shape[1] > 2:

@@ -46,12 +46,8 @@ steps."""
 
 def device_takes(like: Volume, shape: tuple[int, int]) -> bool:
     """Return whether a device is present and has room for the grid of `like` (at most
-    `MOST_COLUMNS` voxels along y) and `STACKS` stacks of `CHUNK` images.
-
-    Args:
-        like: place and size of the grid; its values are not read.
-        shape: (rows, cols) of the images.
-    """
+    `MOST_COLUMNS` voxels along y) and `STACKS` stacks of `CHUNK` images. `like`: place and size
+    of the grid; its values are not read. `shape`: (rows, cols) of the images."""
     nz, ny, nx = like.shape
     need = 4 * (nz * ny * nx + STACKS * CHUNK * shape[0] * shape[1])
     return gpu.availability().present and ny <= MOST_COLUMNS and gpu.has_room(need)
@@ -210,18 +206,12 @@ class OnDevice:
         gpu.demand(prepare)
 
     def add(self, views: Views) -> None:
-        """Weigh and filter views, and add them to the volume on the device; does not wait
-        for the last of its work.
+        """Weigh and filter views, and add them to the volume on the device; does not wait for
+        the last of its work.
 
-        Views are sorted by the noise meter's sign (plus, 0, minus), if there is a meter,
-        and then added to its half volumes as well.
-
-        Args:
-            views: the next ones.
-
-        Raises:
-            gpu.DeviceError: the device fails.
-        """
+        Views are sorted by the noise meter's sign (plus, 0, minus), if there is a meter, and
+        then added to its half volumes as well. `views`: the next ones. Raises gpu.DeviceError:
+        the device fails."""
         signs = np.zeros(len(views.images), np.float32)
         if self.meter is not None:
             signs = self.meter.note(views)
@@ -319,9 +309,8 @@ class OnDevice:
             views: with their response.
             length: of the transform, a power of 2.
 
-        Returns:
-            `band` to `sines` of `kernels.filter_rows`, on the device, as the kernel takes
-            them.
+        Returns `band` to `sines` of `kernels.filter_rows`, on the device, as the kernel takes
+        them.
         """
         from numba import cuda
 
@@ -380,14 +369,10 @@ class OnDevice:
         return ready
 
     def _ready(self, n: int, cols: int, rows: int) -> Any:
-        """Reserve device memory for filtered columns, with undefined content.
-
-        One piece of memory is shared by all calls, and replaced by a larger one where too
-        small; each call thus overwrites the result of the one before.
-
-        Returns:
-            float32 (n, cols, rows) on the device.
-        """
+        """Reserve device memory for filtered columns, with undefined content. One piece of
+        memory is shared by all calls, and replaced by a larger one where too small; each call
+        thus overwrites the result of the one before. Returns float32 (n, cols, rows) on the
+        device."""
         from numba import cuda
 
         if self._room is None or self._room.size < n * cols * rows:

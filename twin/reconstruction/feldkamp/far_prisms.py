@@ -59,14 +59,11 @@ class NearColumns:
         return cls(slice(first, last), response)
 
     def far(self, views: Views) -> Float32Array:
-        """Weigh the bands' prisms in all other columns (0 in the near ones) and filter them
-        with the response of whole rows.
+        """Weigh the bands' prisms in all other columns (0 in the near ones) and filter them with
+        the response of whole rows.
 
-        Args:
-            views: n views with whole rows, before they are cut to the near columns.
-
-        Returns:
-            float32 (n, bands, columns that are kept), to be added to the rows by bands.
+        `views`: n views with whole rows, before they are cut to the near columns.
+        Returns float32 (n, bands, columns that are kept), to be added to the rows by bands.
         """
         lengths = views.prism_lengths()
         n, bands, wide = lengths.shape

@@ -70,22 +70,16 @@ class Task:
     def onto(
         self, target: Backprojector, like: Volume, progress: Progress | None
     ) -> tuple[Float32Array, NoiseOfViews | None]:
-        """Reconstruct into one grid: plan, add all views, scale voxels that some views do
-        not see.
+        """Reconstruct into one grid: plan, add all views, scale voxels that some views do not
+        see.
 
-        Args:
-            target: adds the views to a volume; gets a new noise meter if noise is
-                measured.
-            like: place and size of the grid.
-            progress: called with the share of the views that is done.
-
-        Returns:
-            Values (nz, ny, nx), and their noise; None without `errors`, in a helix, or
-            where it cannot be measured.
-
-        Raises:
-            GeometryError: see `plan_fdk`; or images that do not fit.
-            gpu.DeviceError: the target is a device, and failed.
+        `target`: adds the views to a volume; gets a new noise meter if noise is measured.
+        `like`: place and size of the grid. `progress`: called with the share of the views that
+        is done.
+        Returns values (nz, ny, nx), and their noise; None without `errors`, in a helix, or where
+        it cannot be measured.
+        Raises GeometryError: see `plan_fdk`; or images that do not fit; gpu.DeviceError: the
+        target is a device, and failed.
         """
         plan = plan_fdk(self.cone_vec, self.shape, like, self.window, self.truncation)
         meter = None
@@ -193,16 +187,11 @@ def _add_all(
 ) -> None:
     """Add the images of all views to a volume, part by part.
 
-    Args:
-        plan: views, weights and filter.
-        parts: the images in order, (k, rows, cols) each.
-        target: the volume.
-        progress: called after each part with the share of the views that is done; None
-            for nothing.
-
-    Raises:
-        GeometryError: images of another shape, or another number of them.
-        gpu.DeviceError: the target is a device, and failed.
+    `plan`: views, weights and filter. `parts`: the images in order, (k, rows, cols) each.
+    `target`: the volume. `progress`: called after each part with the share of the views that is
+    done; None for nothing.
+    Raises GeometryError: images of another shape, or another number of them; gpu.DeviceError:
+    the target is a device, and failed.
     """
     done = 0
     for part in parts:
@@ -216,15 +205,11 @@ def _add_all(
 
 
 def _slabs(like: Volume, shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """List layers (first, last) of the slabs that fit the device one by one: the number
-    of slabs is doubled until one fits.
+    """List layers (first, last) of the slabs that fit the device one by one: the number of slabs
+    is doubled until one fits.
 
-    Args:
-        like: the complete grid.
-        shape: (rows, cols) of the images.
-
-    Returns:
-        Empty without a device, or if not even one layer fits.
+    `like`: the complete grid; `shape`: (rows, cols) of the images.
+    Returns empty without a device, or if not even one layer fits.
     """
     count = 1
     most = like.shape[0]

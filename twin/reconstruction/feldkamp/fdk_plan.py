@@ -328,16 +328,11 @@ def _panels(circle: Circle, cone_vec: ConeVec, shape: tuple[int, int]) -> Panels
 
 
 def _check_steady(circle: Circle, level: ConeVec, shape: tuple[int, int]) -> None:
-    """Check that all views see the axis at about one column (within `MAX_SIDEWAYS_SHARE`
-    of the columns): redundancy is weighed by columns.
+    """Check that all views see the axis at about one column (within `MAX_SIDEWAYS_SHARE` of the
+    columns): redundancy is weighed by columns.
 
-    Args:
-        circle: of the sources.
-        level: upright views.
-        shape: (rows, cols).
-
-    Raises:
-        GeometryError: the panel moves sideways during the scan, as in a tiled one.
+    `circle`: of the sources; `level`: upright views; `shape`: (rows, cols).
+    Raises GeometryError: the panel moves sideways during the scan, as in a tiled one.
     """
     axis = np.array([[*circle.centre, 0.0]])
     columns = level.project_points(axis, shape)[:, 0, 0]
@@ -380,12 +375,11 @@ def weighing(
     views: slice,
     weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Compute the weights that FDK applies before the filter: cosine, distances,
-    redundancy and the view's arc.
+    """Compute the weights that FDK applies before the filter: cosine, distances, redundancy and
+    the view's arc.
 
-    The cosine is that of the ray with the line from source to axis. Exact fan-beam
-    inversion for a panel at any angle to that line then needs the distance along the
-    panel's normal only.
+    The cosine is that of the ray with the line from source to axis. Exact fan-beam inversion for
+    a panel at any angle to that line then needs the distance along the panel's normal only.
 
     Args:
         shape: (rows, cols).
@@ -394,9 +388,8 @@ def weighing(
         views: which of all views these are.
         weights: (n, cols) of `redundancy`.
 
-    Returns:
-        Factors (n, cols), across (n, cols) and up (n, rows) of `Views`; across and up are
-        squares [mm^2].
+    Returns factors (n, cols), across (n, cols) and up (n, rows) of `Views`; across and up are
+    squares [mm^2].
     """
     rows, cols = shape
     source = cone_vec.source

@@ -84,12 +84,8 @@ def filtered(rows: Float32Array, response: Float32Array) -> Float32Array:
 
     Columns are right within the reach that `ramp` was given; further ones wrap around.
 
-    Args:
-        rows: (..., cols), not changed.
-        response: of `ramp`.
-
-    Returns:
-        (..., cols), at most the padded length.
+    `rows`: (..., cols), not changed; `response`: of `ramp`.
+    Returns (..., cols), at most the padded length.
     """
     from scipy import fft
 

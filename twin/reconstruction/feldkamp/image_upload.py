@@ -83,16 +83,9 @@ class ImageUpload:
     def table(self, name: str, values: FloatArray | Float32Array) -> Any:
         """Upload a table as single precision, without waiting.
 
-        Tables of one name share their memory, which is overwritten by the chunk after the
-        next.
-
-        Args:
-            name: of the table.
-            values: of any shape.
-
-        Returns:
-            Of the same shape, on the device.
-        """
+        Tables of one name share their memory, which is overwritten by the chunk after the next.
+        `name`: of the table; `values`: of any shape.
+        Returns of the same shape, on the device."""
         there = self._room(name, values.shape)
         portion = self._portion(values.size).reshape(values.shape)
         np.copyto(portion, values, casting="same_kind")
@@ -101,15 +94,13 @@ class ImageUpload:
 
     def hand_over(self) -> None:
         """Let the kernels launched from now on wait for the uploads so far; the host does
-        not wait.
-        """
+        not wait."""
         self._handed.record(self._writer)
         self._handed.wait(self._reader)
 
     def end(self) -> None:
         """Record that the last kernel that reads this chunk has been launched, so that
-        its memory may be filled again.
-        """
+        its memory may be filled again."""
         self._read[self._chunk] = _recorded(self._read[self._chunk], self._reader)
 
     def _room(self, name: str, shape: tuple[int, ...], some: slice = slice(None)) -> Any:
@@ -163,8 +154,7 @@ class ImageUpload:
 
     def _fetch(self, portion: Any, there: Any) -> None:
         """Start the copy of a host portion to the device on the upload's stream, and
-        record its end for this turn's portion; does not wait.
-        """
+        record its end for this turn's portion; does not wait."""
         there.copy_to_device(portion, self._writer)
         self._fetched[self._turn] = _recorded(self._fetched[self._turn], self._writer)
 

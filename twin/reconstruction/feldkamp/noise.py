@@ -270,8 +270,7 @@ class NoiseMeter:
     def found(self) -> NoiseOfViews | None:
         """Return the noise after all views, which is computed when it is asked for.
 
-        Returns:
-            None if at most `MIN_ROW_DISTANCE` + 1 rows see the grid, or no voxel is seen.
+        Returns None if at most `MIN_ROW_DISTANCE` + 1 rows see the grid, or no voxel is seen.
         """
         assert self._means is not None
         if self._means.shape[1] <= MIN_ROW_DISTANCE + 1 or np.isnan(self.data).all():
@@ -333,16 +332,14 @@ class NoiseMeter:
 
 
 def _local_variance(values: Float32Array) -> Float32Array:
-    """Compute the variance of zero-mean values about each of them, from the median of
-    their sizes in a window of `WINDOW_NODES`, which few strong edges do not change,
-    smoothed.
+    """Compute the variance of zero-mean values about each of them, from the median of their
+    sizes in a window of `WINDOW_NODES`, which few strong edges do not change, smoothed.
 
     Args:
         values: (nz, ny, nx); NaN is replaced by the nearest value, one at least must be
             finite.
 
-    Returns:
-        (nz, ny, nx) without NaN.
+    Returns (nz, ny, nx) without NaN.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
 

@@ -190,8 +190,7 @@ def resample_lanes(
 @fused
 def mix_one_by_one(out, left, right, first, count, one, other):
     """Compute out[r] = one * left[first + r] + other * right[first + r], 0 <= r < count,
-    one value after the other; `out` is changed in place.
-    """
+    one value after the other; `out` is changed in place."""
     for r in range(count):
         out[r] = one * left[first + r] + other * right[first + r]
 
@@ -199,8 +198,7 @@ def mix_one_by_one(out, left, right, first, count, one, other):
 @kernel
 def mix_wide(out, left, right, first, count, one, other):
     """Apply `mix_one_by_one` to LANES at a time; all need up to LANES - 1 values after
-    their end.
-    """
+    their end."""
     for r in range(0, count, LANES):
         mix_lanes(out, r, left, right, first + r, one, other)
 
@@ -269,15 +267,10 @@ def _times(line, left, right, part):
 def _column(g, cols, x, y):
     """Find the column in which a view sees all voxels above one another at (x, y) [mm].
 
-    Args:
-        g: (11,) row of the views' table, see `backproject`.
-        cols: of the image.
-        x: [mm].
-        y: [mm].
-
-    Returns:
-        depth along the panel's normal [mm], and the column, a fraction from 0 to cols -
-        1. (0, 0) if the voxels are behind the source or beside the image.
+    `g`: (11,) row of the views' table, see `backproject`; `cols`: of the image; `x`: [mm]; `y`:
+    [mm].
+    Returns depth along the panel's normal [mm], and the column, a fraction from 0 to cols - 1.
+    (0, 0) if the voxels are behind the source or beside the image.
     """
     x -= g[0]
     y -= g[1]
@@ -292,18 +285,10 @@ def _column(g, cols, x, y):
 
 @inline
 def _layers(start, step, rows, count):
-    """Find which of the voxels above one another a view sees: those whose rows are on the
-    panel, or beside it by `EDGE_ROWS`.
-
-    Args:
-        start: row of the lowest voxel, a fraction.
-        step: change of the row a voxel, negative.
-        rows: of the image.
-        count: number of voxels.
-
-    Returns:
-        The lowest and the highest one; the highest is below the lowest if there is none.
-    """
+    """Find which of the voxels above one another a view sees: those whose rows are on the panel,
+    or beside it by `EDGE_ROWS`. `start`: row of the lowest voxel, a fraction; `step`: change of
+    the row a voxel, negative; `rows`: of the image; `count`: number of voxels. Returns the
+    lowest and the highest one; the highest is below the lowest if there is none."""
     every = 1.0 / step
     lowest = max(0, math.ceil((rows - 1 + EDGE_ROWS - start) * every))
     highest = min(count - 1, math.floor((-EDGE_ROWS - start) * every))
@@ -415,17 +400,12 @@ def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, r
 
 @fused
 def _add_places(acc, image, rows, at, across, down, weight):
-    """Add a view's values at places, interpolated bilinearly and weighed, to voxels; no
-    bounds are checked.
+    """Add a view's values at places, interpolated bilinearly and weighed, to voxels; no bounds
+    are checked.
 
-    Args:
-        acc: (n,) voxels, changed in place.
-        image: (cols * rows,).
-        rows: of the image.
-        at: (n,) index of the sample before each place.
-        across: (n,) fraction of a column behind it.
-        down: (n,) fraction of a row behind it.
-        weight: (n,).
+    `acc`: (n,) voxels, changed in place; `image`: (cols * rows,); `rows`: of the image; `at`:
+    (n,) index of the sample before each place; `across`: (n,) fraction of a column behind it;
+    `down`: (n,) fraction of a row behind it; `weight`: (n,).
     """
     rows = np.uint64(rows)
     for k in range(at.size):
@@ -618,8 +598,8 @@ backproject = _entry_point(LANES)
 
 @kernel
 def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
-    """Add a view's weight to the voxels above one another at (x, y) that its rows see;
-    see `normalise_coverage`.
+    """Add a view's weight to the voxels above one another at (x, y) that its rows see; see
+    `normalise_coverage`.
 
     Args:
         g: (11,) row of the views' table.
@@ -632,10 +612,9 @@ def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
         seen: (nz + 1,) differences of the weight from one voxel to the next, changed in
             place.
 
-    Returns:
-        The weight (times depth^-1.5), and the angle [rad] of the lines through the voxels
-        that the panel's columns see in this view, 0 off the panel; both 0 if the view
-        does not see them.
+    Returns the weight (times depth^-1.5), and the angle [rad] of the lines through the voxels
+    that the panel's columns see in this view, 0 off the panel; both 0 if the view does not see
+    them.
     """
     depth, c = _column(g, weights.size, x, y)
     if depth == 0.0:
@@ -792,15 +771,9 @@ def add_views(images, first, signs, sums):
 
 @parallel
 def copy_rows(images, order, first, out):
-    """Copy out[n, r, c] = images[order[n], first + r, c], float32, on all cores; the rows
-    must exist.
-
-    Args:
-        images: (any number, rows, cols).
-        order: (n,) numbers of images.
-        first: first row that is copied.
-        out: (n, rows, cols), filled.
-    """
+    """Copy out[n, r, c] = images[order[n], first + r, c], float32, on all cores; the rows must
+    exist. `images`: (any number, rows, cols); `order`: (n,) numbers of images; `first`: first
+    row that is copied; `out`: (n, rows, cols), filled."""
     n, rows, _ = out.shape
     for job in prange(n * rows):
         out[job // rows, job % rows] = images[order[job // rows], first + job % rows]
@@ -810,9 +783,7 @@ def copy_rows(images, order, first, out):
 def respond(spectra, response):
     """Multiply spectra by a filter's response, in place.
 
-    Args:
-        spectra: float32 (n, frequencies, 2), real and imaginary.
-        response: (frequencies,).
+    `spectra`: float32 (n, frequencies, 2), real and imaginary; `response`: (frequencies,).
     """
     for k in prange(len(spectra)):
         for f in range(response.size):
@@ -851,12 +822,9 @@ PARTS = 1024
 
 
 def lanczos() -> Float32Array:
-    """Compute weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1 between
-    samples 0 and 1: Lanczos' kernel of three lobes.
-
-    Returns:
-        float32 (PARTS + 1, TAPS), each row's sum 1.
-    """
+    """Compute weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1 between samples
+    0 and 1: Lanczos' kernel of three lobes. Returns float32 (PARTS + 1, TAPS), each row's sum
+    1."""
     x = np.arange(PARTS + 1)[:, None] / PARTS - np.arange(-2, 4)
     weights = np.sinc(x) * np.sinc(x / 3.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)

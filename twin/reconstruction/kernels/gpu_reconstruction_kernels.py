@@ -49,19 +49,14 @@ else:
 
 @cuda.jit
 def weigh(images, top, factors, across, up, out):
-    """Compute out[n, c, r] = images[n, top + r, c] * factors[n, c] / sqrt(across[n, c] +
-    up[n, r]), one pixel a thread.
+    """Compute out[n, c, r] = images[n, top + r, c] * factors[n, c] / sqrt(across[n, c] + up[n,
+    r]), one pixel a thread.
 
     Rows and columns are swapped; rows off the panel repeat its outermost ones. See
     `fdk_kernels.weigh`.
-
-    Args:
-        images: float32 (n, rows of the panel, cols).
-        top: row of the panel that is the first of `out`.
-        factors, across: float32 (n, cols).
-        up: float32 (n, rows).
-        out: float32 (n, cols, rows), filled.
-    """
+    `images`: float32 (n, rows of the panel, cols); `top`: row of the panel that is the first of
+    `out`; `factors` and `across`: float32 (n, cols); `up`: float32 (n, rows); `out`: float32 (n,
+    cols, rows), filled."""
     r = cuda.blockIdx.x * PLANE[0] + cuda.threadIdx.x
     c = cuda.blockIdx.y * PLANE[1] + cuda.threadIdx.y
     view = cuda.blockIdx.z
@@ -140,16 +135,13 @@ def prism_path(lengths, view, low, share, slant, c):
 def edge_sum(
     images, top, lengths, band, share, across, up, before, edge, view, r, side, part
 ):
-    """Compute a 32nd of the sum, over an edge's columns, of a row less the prisms' path
-    lengths: every 32nd column from `part` on; 0 if there is none.
+    """Compute a 32nd of the sum, over an edge's columns, of a row less the prisms' path lengths:
+    every 32nd column from `part` on; 0 if there is none.
 
     The first arguments are those of `filter_rows`.
 
-    Args:
-        view: number of the image.
-        r: row; off the panel its outermost row is read.
-        side: 0 left, 1 right.
-        part: which 32nd.
+    `view`: number of the image. `r`: row; off the panel its outermost row is read. `side`: 0
+    left, 1 right. `part`: which 32nd.
     """
     row = min(max(top + r, 0), images.shape[1] - 1)
     first = images.shape[2] - edge if side else 0
@@ -466,18 +458,12 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @cuda.jit(device=True, inline=True)
 def differences(x, i, k, column, counts, stride, scale):
-    """Compute the scaled differences of a voxel to the next along z, y and x, a tuple of
-    three; 0 for the last of an axis.
+    """Compute the scaled differences of a voxel to the next along z, y and x, a tuple of three;
+    0 for the last of an axis.
 
-    Args:
-        x: flat voxels.
-        i: index of the voxel.
-        k: its z.
-        column: number of its voxel column.
-        counts: voxels along z, y, x.
-        stride: places from one voxel column to the next.
-        scale: (3,) factors.
-    """
+    `x`: flat voxels; `i`: index of the voxel; `k`: its z; `column`: number of its voxel column;
+    `counts`: voxels along z, y, x; `stride`: places from one voxel column to the next; `scale`:
+    (3,) factors."""
     # The next along z is the next in memory, along x a column further, along y nx columns.
     nz, ny, nx = counts
     here = x[i]
@@ -543,20 +529,15 @@ def primal_step(z, dual, theta, counts, stride, scale, lowest, allowed, x):
 
 @cuda.jit
 def dual_step(x, ahead, dual, rate, momentum, counts, stride, scale):
-    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate:
-    ahead = dual + momentum times the change of dual; one voxel a thread.
+    """Compute dual = ahead + rate D x, shortened to length 1 a voxel, and extrapolate: ahead =
+    dual + momentum times the change of dual; one voxel a thread.
 
     Places between voxel columns stay. D x are the `differences`.
 
-    Args:
-        x: flat voxels.
-        ahead: three arrays of that size, one after the other; changed in place.
-        dual: likewise; changed in place.
-        rate: length of the step.
-        momentum: of the extrapolation.
-        counts: voxels along z, y, x.
-        stride: places from one voxel column to the next.
-        scale: (3,) factors on the differences.
+    `x`: flat voxels. `ahead`: three arrays of that size, one after the other; changed in place.
+    `dual`: likewise; changed in place. `rate`: length of the step. `momentum`: of the
+    extrapolation. `counts`: voxels along z, y, x. `stride`: places from one voxel column to the
+    next. `scale`: (3,) factors on the differences.
     """
     i = cuda.grid(1)
     if i >= x.size or i % stride >= counts[0]:

@@ -32,16 +32,12 @@ itself it is infinite."""
 
 @kernel
 def _chord(prism, source_x, source_y, x, y):
-    """Compute path length times attenuation through a prism, over the ray's horizontal
-    length; 0 for a ray that misses it.
+    """Compute path length times attenuation through a prism, over the ray's horizontal length; 0
+    for a ray that misses it.
 
-    Args:
-        prism: (6,) centre x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc;
-            attenuation.
-        source_x: [mm].
-        source_y: [mm].
-        x: horizontal direction of the ray, of any length.
-        y: likewise.
+    `prism`: (6,) centre x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc;
+    attenuation. `source_x`: [mm]. `source_y`: [mm]. `x`: horizontal direction of the ray, of any
+    length. `y`: likewise.
     """
     # In the frame where the ellipse is the unit disc, a ray p + t d is inside for 2
     # sqrt(|d|^2 - (p x d)^2) / |d|^2 of t. The cross product there is the one here times the
@@ -97,18 +93,12 @@ def _continue_side(
 
     All arrays are of these columns.
 
-    Args:
-        out: filled.
-        near: first column in which some of the rest is left, and the one after the last;
-            used for weighed rows only.
-        lower, upper: prisms' lengths of the row's two bands.
-        share: how much the upper band counts.
-        across: squares of the ray's horizontal part.
-        high: square of its vertical part.
-        rest: residual of the prisms at the panel's edge.
-        fade: part of it that is left in each column.
-        factors: of the columns, used for weighed rows only.
-        weighed: multiply by factors over the rays' lengths.
+    `out`: filled. `near`: first column in which some of the rest is left, and the one after the
+    last; used for weighed rows only. `lower` and `upper`: prisms' lengths of the row's two
+    bands. `share`: how much the upper band counts. `across`: squares of the ray's horizontal
+    part. `high`: square of its vertical part. `rest`: residual of the prisms at the panel's
+    edge. `fade`: part of it that is left in each column. `factors`: of the columns, used for
+    weighed rows only. `weighed`: multiply by factors over the rays' lengths.
     """
     # Counted from 0, an index needs no check for a negative one, and loops are vectorised.
     if not weighed:

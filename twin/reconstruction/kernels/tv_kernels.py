@@ -35,15 +35,11 @@ def differences(x, k, j, i, scale):
 
 @parallel
 def variation(x, scale, layers, first, last):
-    """Compute the total variation of layers first <= k < last, each in double precision,
-    which the caller adds up.
+    """Compute the total variation of layers first <= k < last, each in double precision, which
+    the caller adds up.
 
-    Args:
-        x: (nz, ny, nx).
-        scale: (3,) factors on the differences.
-        layers: (nz,) float64; elements first to last - 1 are filled.
-        first: first layer.
-        last: layer after the last.
+    `x`: (nz, ny, nx). `scale`: (3,) factors on the differences. `layers`: (nz,) float64;
+    elements first to last - 1 are filled. `first`: first layer. `last`: layer after the last.
     """
     ny, nx = x.shape[1:]
     for k in prange(first, last):

@@ -148,13 +148,8 @@ def _aggregate(view: View, bad: BoolArray, code: ScriptCode, text: str) -> Findi
     """Make one warning for all `bad` images of a view, at the first of their lines.
 
     The text ends with the number of further lines, if there are any.
-
-    Args:
-        view: with the line of each image.
-        bad: (n,) which images; at least one.
-        code: of the warning.
-        text: of the warning.
-    """
+    `view`: with the line of each image. `bad`: (n,) which images; at least one. `code`: of the
+    warning. `text`: of the warning."""
     lines = sorted({line for line, b in zip(view.lines, bad.tolist(), strict=True) if b})
     more = ""
     if len(lines) > 1:
@@ -243,12 +238,8 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
 
     A cylinder that contains the source is touched beside it: the sine is at most 1.
 
-    Args:
-        p: n poses.
-        radius: of the cylinder about the rotation axis [mm].
-
-    Returns:
-        Two arrays of (n, 3) [mm], one for each side.
+    `p`: n poses; `radius`: of the cylinder about the rotation axis [mm].
+    Returns two arrays of (n, 3) [mm], one for each side.
     """
     to_source = p.source - p.axis
     flat = to_source[:, :2]
@@ -262,15 +253,12 @@ def _tangents(p: Poses, radius: float) -> list[FloatArray]:
 
 
 def _rims(p: Poses, rims_mm: Sequence[tuple[float, float]]) -> list[FloatArray]:
-    """Compute the points of circles about the rotation axis nearest to and farthest from
-    the source.
+    """Compute the points of circles about the rotation axis nearest to and farthest from the
+    source.
 
-    Args:
-        p: n poses.
-        rims_mm: (radius, height) of each circle, height above the axis's origin [mm].
-
-    Returns:
-        For each circle the nearest and the farthest point, (n, 3) [mm].
+    `p`: n poses; `rims_mm`: (radius, height) of each circle, height above the axis's origin
+    [mm].
+    Returns for each circle the nearest and the farthest point, (n, 3) [mm].
     """
     along = (p.source - p.axis)[:, :2]
     along = along / np.linalg.norm(along, axis=1, keepdims=True)

@@ -23,9 +23,7 @@ MIN_CUT_PX: Final = 0.5
 def cut_off(sides: Mapping[str, float]) -> str:
     """Describe how far the sample is cut off; "" if it is not.
 
-    Args:
-        sides: left, right, top, bottom -> pixels.
-    """
+    `sides`: left, right, top, bottom -> pixels."""
     return ", ".join(
         f"{s} by {px:.0f} {CUT_AT_SIDE[s]}" for s, px in sides.items() if px > MIN_CUT_PX
     )

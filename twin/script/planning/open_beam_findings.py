@@ -34,18 +34,14 @@ Setting = tuple[ExposureSettings, CameraSettings]
 
 
 def open_beam_problems(plan: ScanPlan, physics: Physics = "poly") -> Findings:
-    """Warn once for each setting of tube and camera whose open beam is saturated or
-    starved.
+    """Warn once for each setting of tube and camera whose open beam is saturated or starved.
 
     Settings whose beam the physics cannot predict, or with X-rays off, get no warning.
 
-    Args:
-        plan: with the saved images, their settings and positions.
-        physics: how counts are predicted.
-
-    Returns:
-        Warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that
-        would do, at the first line that uses the setting.
+    `plan`: with the saved images, their settings and positions; `physics`: how counts are
+    predicted.
+    Returns warnings `saturated_open_beam` and `starved_open_beam`, each with an exposure that
+    would do, at the first line that uses the setting.
     """
     problems: list[Finding] = []
     for (exposure, camera), (line, indices) in lit_settings(plan).items():
@@ -70,9 +66,8 @@ def lit_settings(
         plan: with its groups of images.
         kinds: of the images that are listed; default: all.
 
-    Returns:
-        (exposure, camera) -> the line that first uses it, and the indices of its images
-        among all of the plan; in the order of first use.
+    Returns (exposure, camera) -> the line that first uses it, and the indices of its images
+    among all of the plan; in the order of first use.
     """
     settings: dict[Setting, tuple[int, list[int]]] = {}
     first = 0
@@ -97,16 +92,9 @@ def brightest_beam(
     """Predict the brightest open beam of some images of a setting.
 
     It is the one with the most counts among at most `SAMPLED_IMAGES` of them.
-
-    Args:
-        plan: with the positions.
-        exposure: of the setting.
-        camera: of the setting.
-        indices: of the images, at least one.
-        physics: how counts are predicted.
-
-    Returns:
-        The beam; None if the physics cannot predict it.
+    `plan`: with the positions; `exposure`: of the setting; `camera`: of the setting; `indices`:
+    of the images, at least one; `physics`: how counts are predicted.
+    Returns the beam; None if the physics cannot predict it.
     """
     beams = [
         beam

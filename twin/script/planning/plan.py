@@ -155,12 +155,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     def plot(self, report: CheckReport | None = None) -> Any:
         """Plot motors, X-rays, exposures and clearance over time (needs the extra `plots`).
 
-        Args:
-            report: from `check`; None checks now.
-
-        Returns:
-            matplotlib's figure.
-        """
+        `report`: from `check`; None checks now. Returns matplotlib's figure."""
         return backend("plots").plot_plan(
             self, self.check() if report is None else report
         )
@@ -201,16 +196,14 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
     def subframe_positions(self, samples: int) -> dict[str, FloatArray]:
         """Compute positions spread over each image's exposure.
 
-        The samples are symmetric about the nominal pose (assumed: the trigger's place
-        within the exposure is not published), so their mean has no bias against it at
-        constant speed. An exposure covers all averages; images of a group that stands
-        have equal samples.
+        The samples are symmetric about the nominal pose (assumed: the trigger's place within the
+        exposure is not published), so their mean has no bias against it at constant speed. An
+        exposure covers all averages; images of a group that stands have equal samples.
 
         Args:
             samples: number of moments in an exposure.
 
-        Returns:
-            Axis -> (n, samples) positions [mm, deg] of all images, saved or not.
+        Returns axis -> (n, samples) positions [mm, deg] of all images, saved or not.
         """
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         of_group = [
@@ -266,8 +259,7 @@ def saved_images(plan: ScanPlan) -> Iterator[tuple[ExposureGroup, dict[str, Floa
 
     Groups without files are skipped.
 
-    Yields:
-        The group, and axis -> (n,) positions of its images [mm, deg].
+    Yields the group, and axis -> (n,) positions of its images [mm, deg].
     """
     first = 0
     for group in plan.groups:

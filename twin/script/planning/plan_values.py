@@ -221,12 +221,8 @@ class SampleSize:
         """Make the cylinder, and the rims, that contain points at every angle.
 
         The cylinder is as high above the stage's origin as below it.
-
-        Args:
-            points_mm: (k, 3) in the object frame, k > 0: corners of the sample's shape,
-                as it stands on the stage.
-            source: of the size, for people.
-        """
+        `points_mm`: (k, 3) in the object frame, k > 0: corners of the sample's shape, as it
+        stands on the stage; `source`: of the size, for people."""
         radius = np.hypot(points_mm[:, 0], points_mm[:, 1])
         height = points_mm[:, 2]
         diameter_mm = 2.0 * float(radius.max())
@@ -253,8 +249,7 @@ def _outer_rims(
     Args:
         radius, height: of its circles, (k,) each [mm].
 
-    Returns:
-        (radius, height) of those that the others' hull does not contain.
+    Returns (radius, height) of those that the others' hull does not contain.
     """
     order = np.lexsort((-radius, height))
     _, first = np.unique(height[order], return_index=True)

@@ -148,9 +148,9 @@ def _averages(
 ) -> tuple[int, str] | None:
     """Infer the number of averages, and how.
 
-    From the period of an image: the length over the steps, if there are two frames or
-    more and a positive length, else from the run-up less the way to full speed, which
-    covers `MARGIN_IMAGES` images.
+    From the period of an image: the length over the steps, if there are two frames or more and a
+    positive length, else from the run-up less the way to full speed, which covers
+    `MARGIN_IMAGES` images.
 
     Args:
         trigger: of the sequence, with its motion.
@@ -158,9 +158,8 @@ def _averages(
         frames: number of images, if it is known.
         length: of the motion [mm, deg].
 
-    Returns:
-        The number of averages, and the figures that it follows from; None if that is
-        below 1, or not a whole number within 2 %.
+    Returns the number of averages, and the figures that it follows from; None if that is below
+    1, or not a whole number within 2 %.
     """
     speed = trigger.speed
     acceleration = trigger.acceleration
@@ -226,20 +225,10 @@ class ImageCollector:
     # commands ------------------------------------------------------------------------------
 
     def take(self, command: c.TakeImage, now: float, step: int) -> planned.Span:
-        """Simulate `take image`: add one image, not saved yet; the number of frames is
-        for sequences.
-
-        The camera is busy for the exposure times the averages, and the command's
-        overhead.
-
-        Args:
-            command: without arguments.
-            now: moment of the script [s].
-            step: index of the command's step.
-
-        Returns:
-            The time that the command takes.
-        """
+        """Simulate `take image`: add one image, not saved yet; the number of frames is for
+        sequences. The camera is busy for the exposure times the averages, and the command's
+        overhead. `command`: without arguments; `now`: moment of the script [s]; `step`: index of
+        the command's step. Returns the time that the command takes."""
         self._add_images(np.array([now], dtype=np.float64), now, step, command.line)
         settings = self.camera.settings
         length = settings.exposure_ms * settings.averages / 1000.0
@@ -581,13 +570,11 @@ class ImageCollector:
             self._default("power_W", "the tube power", f"{draft.power_W:g} W")
 
     def _default(self, name: str, what: str, value: str) -> None:
-        """Warn, once, that the script states no value of setting `name`; `value` of the
-        machine file is assumed. Do nothing if it is stated.
+        """Warn, once, that the script states no value of setting `name`; `value` of the machine
+        file is assumed. Do nothing if it is stated.
 
-        Args:
-            name: of the setting.
-            what: the setting in words, for the message.
-            value: with its unit, for the message.
+        `name`: of the setting; `what`: the setting in words, for the message; `value`: with its
+        unit, for the message.
         """
         if name not in self.camera.said | self.tube.said | self._reported:
             self._reported.add(name)

@@ -84,18 +84,13 @@ class Motor:
     def move(
         self, target: float, time: float, speed: float, acceleration: float
     ) -> Trajectory:
-        """Start a move to `target` at `time`, from the position and velocity of that
-        moment.
+        """Start a move to `target` at `time`, from the position and velocity of that moment.
 
         A move that is under way is replaced from then on.
 
-        Args:
-            target: position at rest [mm, deg].
-            time: of the command [s].
-            speed, acceleration: of the move [per s, per s2].
-
-        Returns:
-            The trajectory; it is recorded unless it takes no time.
+        `target`: position at rest [mm, deg]; `time`: of the command [s]; `speed` and
+        `acceleration`: of the move [per s, per s2].
+        Returns the trajectory; it is recorded unless it takes no time.
         """
         v = 0.0
         if self.moves:

@@ -109,15 +109,11 @@ def sample_probes(plan: ScanPlan) -> tuple[SampleProbe, ...]:
 def shares_behind(
     chain: Chain, probe: SampleProbe, paths_mm: Float32Array, rows: FloatArray
 ) -> CountShares:
-    """Count the saturated and the starved pixels of a probe's views, as shares of all
-    pixels.
+    """Count the saturated and the starved pixels of a probe's views, as shares of all pixels.
 
-    Args:
-        chain: tube, materials of the sample, panel.
-        probe: the views.
-        paths_mm: path through each material along its rays, float32 (m, n, rows, cols)
-            [mm].
-        rows: cone_vec of the views, (n, 12).
+    `chain`: tube, materials of the sample, panel; `probe`: the views; `paths_mm`: path through
+    each material along its rays, float32 (m, n, rows, cols) [mm]; `rows`: cone_vec of the views,
+    (n, 12).
     """
     counts = [
         counts_behind(
@@ -133,14 +129,10 @@ def predicted_exposures(
 ) -> tuple[PredictedExposure, ...]:
     """Predict each setting of a plan's projections, with what speaks against it.
 
-    Args:
-        plan: that the forecast is of.
-        forecast: of the pixels behind the sample.
-        physics: how counts are made.
-
-    Returns:
-        One for each probe of the forecast, in its order. Where pixels behind the sample
-        are not predicted it has the forecast's reason.
+    `plan`: that the forecast is of; `forecast`: of the pixels behind the sample; `physics`: how
+    counts are made.
+    Returns one for each probe of the forecast, in its order. Where pixels behind the sample are
+    not predicted it has the forecast's reason.
     """
     made = [
         _predicted(plan, probe, seen, physics)
@@ -155,11 +147,10 @@ def predicted_exposures(
 def _predicted(
     plan: ScanPlan, probe: SampleProbe, seen: CountShares | None, physics: Physics
 ) -> PredictedExposure:
-    """Predict the exposure of one setting: open beam, pixels behind the sample, and
-    doubts about both.
+    """Predict the exposure of one setting: open beam, pixels behind the sample, and doubts about
+    both.
 
-    Pixels that are saturated (or starved) as the open beam already is are no further
-    doubt.
+    Pixels that are saturated (or starved) as the open beam already is are no further doubt.
 
     Args:
         plan: of the scan.
@@ -167,8 +158,7 @@ def _predicted(
         seen: predicted pixels behind the sample; None if unknown.
         physics: how counts are predicted.
 
-    Returns:
-        The prediction; without the open beam's fill if the physics cannot predict it.
+    Returns the prediction; without the open beam's fill if the physics cannot predict it.
     """
     lit = probe.exposure
     made = PredictedExposure(lit.kV, lit.power_W, lit.exposure_ms, shares=seen)

@@ -53,12 +53,9 @@ _CAMERA: Final = (c.CameraSetting, c.TakeImage, c.SaveImage, c.TakeSequence)
 def sample_size(data: bytes) -> SampleSize | None:
     """Decode the sample's diameter from the argument of `set sample info`.
 
-    Args:
-        data: a big-endian double [mm] at its beginning.
-
-    Returns:
-        The size, without a height. None for less than 12 bytes, or a diameter that is not
-        above 0 and at most `_MAX_DIAMETER_MM`.
+    `data`: a big-endian double [mm] at its beginning.
+    Returns the size, without a height. None for less than 12 bytes, or a diameter that is not
+    above 0 and at most `_MAX_DIAMETER_MM`.
     """
     if len(data) < 12:
         return None
@@ -172,16 +169,10 @@ class Simulation:
                 assert_never(command.wait)
 
     def timed(self, kind: str, length: float = 0.0, note: str = "") -> planned.Span:
-        """Make the span of a command that starts now: its length and the machine's time
-        for its kind.
-
-        The script's own expected duration (column 7) is no prediction but a bound.
-
-        Args:
-            kind: of command, as in `Timing`.
-            length: of motion, pause or exposures [s].
-            note: added to the step's description.
-        """
+        """Make the span of a command that starts now: its length and the machine's time for its
+        kind. The script's own expected duration (column 7) is no prediction but a bound. `kind`:
+        of command, as in `Timing`; `length`: of motion, pause or exposures [s]; `note`: added to
+        the step's description."""
         overhead = self.machine.timing.seconds(kind)
         return planned.Span(
             self.now, self.now + length + overhead, overhead, kind, note=note
@@ -238,11 +229,9 @@ class Simulation:
     def _xray_on(self, _command: c.XrayOn) -> planned.Span:
         """Switch X-rays on at the end of the command, and set when they are ready.
 
-        If they are on already nothing changes, and the command takes the time of any
-        other.
+        If they are on already nothing changes, and the command takes the time of any other.
 
-        Returns:
-            The time that the command takes; X-rays are ready later.
+        Returns the time that the command takes; X-rays are ready later.
         """
         if self.tube.on:
             return self.timed("command", note=" (already on)")
@@ -255,9 +244,7 @@ class Simulation:
         """Switch X-rays off at once; if they are known to be off, only the time of asking
         counts.
 
-        Returns:
-            The time that the command takes.
-        """
+        Returns the time that the command takes."""
         if not self.tube.on and self.tube.known:
             return self.timed("xrayoff_again", note=" (already off)")
         self.tube.switch(False, self.now)

@@ -68,8 +68,7 @@ def room_of(machine: Machine) -> Room:
     its scale over the FleX-ray, and the floor's height [mm].
 
     The scale is the smaller ratio of horizontal and vertical reach to `DRAWN_FOR_MM`; the
-    floor lies `BELOW_MM` times the scale below the lowest part.
-    """
+    floor lies `BELOW_MM` times the scale below the lowest part."""
     low, high = reach_of(machine)
     across = (high - low)[:2].max()
     tall = (high - low)[2]

@@ -29,11 +29,9 @@ def bare(solid: ConvexSolid) -> trimesh.Trimesh:
 
 
 def grown(body: trimesh.Trimesh, margin_mm: float) -> trimesh.Trimesh:
-    """Build the convex body of all points within `margin_mm` of a convex body [mm].
-
-    It is the hull of the body's vertices, each with the corners of an icosphere of that
-    radius, so slightly within the exact one.
-    """
+    """Build the convex body of all points within `margin_mm` of a convex body [mm]. It is the
+    hull of the body's vertices, each with the corners of an icosphere of that radius, so
+    slightly within the exact one."""
     ball = trimesh.creation.icosphere(subdivisions=FINENESS, radius=margin_mm).vertices
     corners = np.asarray(body.vertices)[:, None, :] + np.asarray(ball)[None, :, :]
     return _hull(corners.reshape(-1, 3))

@@ -76,14 +76,8 @@ def cylinder(
 ) -> PaintedMesh:
     """Build a cylinder about an axis through its centre, as a painted mesh [mm].
 
-    Args:
-        diameter: [mm].
-        height: along its axis [mm].
-        center: [mm].
-        paint: colour and gloss.
-        axis: "z" or "y".
-        sections: sides of the mesh.
-    """
+    `diameter`: [mm]; `height`: along its axis [mm]; `center`: [mm]; `paint`: colour and gloss;
+    `axis`: "z" or "y"; `sections`: sides of the mesh."""
     mesh = trimesh.creation.cylinder(
         radius=diameter / 2, height=height, sections=sections
     )
@@ -96,8 +90,7 @@ def lathe(
     """Build a body of revolution of 64 sections as a painted mesh [mm].
 
     `profile` holds points (radius, height) from bottom to top, relative to `center`;
-    `axis` is "z", or "y" for a body turned to lie along y.
-    """
+    `axis` is "z", or "y" for a body turned to lie along y."""
     mesh = trimesh.creation.revolve(np.asarray(profile, dtype=float), sections=64)
     return _standing(mesh, center, paint, axis)
 
@@ -108,8 +101,7 @@ def _standing(
     """Turn a mesh made about z, move it to its centre and paint it.
 
     The mesh is changed in place: turned by -90 degrees about x (z becomes y) only if
-    `axis` is "y", then moved by `center` (x, y, z) [mm].
-    """
+    `axis` is "y", then moved by `center` (x, y, z) [mm]."""
     if axis == "y":
         mesh.apply_transform(turn_matrix((1, 0, 0), -np.pi / 2))
     mesh.apply_translation(center)

@@ -41,15 +41,9 @@ def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
     A .glb file is passed on unchanged, with its colours; any other mesh [mm] is painted
     `ALUMINIUM` and encoded as GLB [m]. Parts without a mesh are left out.
 
-    Args:
-        machine: with the parts.
-        folder: of its machine file and the meshes.
-
-    Returns:
-        Part -> GLB file, for those that have a mesh.
-
-    Raises:
-        PhantomError: a file cannot be read any more.
+    `machine`: with the parts; `folder`: of its machine file and the meshes.
+    Returns part -> GLB file, for those that have a mesh.
+    Raises PhantomError: a file cannot be read any more.
     """
     looks = {}
     for part in machine.components:

@@ -61,15 +61,11 @@ def read_data_exchange(
 ) -> DataSet:
     """Read a Data Exchange file into memory; the file is closed again.
 
-    Args:
-        path: the file.
-        geometry: one view for each projection, in place of the file's.
-        distances: source to axis and to panel [mm], in place of the file's.
-        angles: of the projections [deg], where the file has none.
-
-    Raises:
-        DatasetFormatError: no images, or no geometry that is possible.
-        TwinError: the package h5py is not installed.
+    `path`: the file; `geometry`: one view for each projection, in place of the file's;
+    `distances`: source to axis and to panel [mm], in place of the file's; `angles`: of the
+    projections [deg], where the file has none.
+    Raises DatasetFormatError: no images, or no geometry that is possible; TwinError: the package
+    h5py is not installed.
     """
     with hdf5_file(path, "Data Exchange") as file:
         said = Ledger(DATA_EXCHANGE, str(path))

@@ -122,14 +122,9 @@ def _scale(
 ) -> float:
     """Return the size of the unit that a dataset states.
 
-    Args:
-        dataset: with or without a unit.
-        usual: unit of one without.
-        known: gives the size of a unit, None of an unknown one.
-        names: of known units, for the message.
-
-    Raises:
-        DatasetFormatError: the unit is unknown.
+    `dataset`: with or without a unit; `usual`: unit of one without; `known`: gives the size of a
+    unit, None of an unknown one; `names`: of known units, for the message.
+    Raises DatasetFormatError: the unit is unknown.
     """
     unit = unit_of(dataset, usual)
     scale = known(unit)

@@ -189,13 +189,8 @@ def _from_middle(scan: NxScan, place: str, count: int) -> float | None:
 
     Values of 0 and below count from the middle, as ESRF's nxtomomill writes them.
 
-    Args:
-        scan: of the file.
-        place: of the value.
-        count: of columns, or rows.
-
-    Raises:
-        DatasetFormatError: it is beyond the panel by more than its width.
+    `scan`: of the file; `place`: of the value; `count`: of columns, or rows.
+    Raises DatasetFormatError: it is beyond the panel by more than its width.
     """
     value = scan.figure(place)
     if value is None:

@@ -42,18 +42,12 @@ def read_nxtomo(
 ) -> DataSet:
     """Read an NXtomo file into memory; the file is closed again.
 
-    Args:
-        path: the file.
-        geometry: one view for each projection; None: the rows of cone_vec in the file, or
-            its angles, pixels and distances.
-        distances: source to axis and to panel [mm], in place of the file's; ignored where
-            `geometry` or the file's cone_vec is used.
-        angles: of the projections [deg], where the file has none.
-
-    Raises:
-        DatasetFormatError: no HDF5, no NXtomo, missing images, no geometry, or one that
-            the file's own figures contradict.
-        TwinError: the package h5py is not installed.
+    `path`: the file. `geometry`: one view for each projection; None: the rows of cone_vec in the
+    file, or its angles, pixels and distances. `distances`: source to axis and to panel [mm], in
+    place of the file's; ignored where `geometry` or the file's cone_vec is used. `angles`: of
+    the projections [deg], where the file has none.
+    Raises DatasetFormatError: no HDF5, no NXtomo, missing images, no geometry, or one that the
+    file's own figures contradict; TwinError: the package h5py is not installed.
     """
     try:
         with hdf5_file(path, "NXtomo") as file:

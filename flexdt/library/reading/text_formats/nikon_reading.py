@@ -206,12 +206,9 @@ def _if_stated(said: Ledger, key: str, scale: float) -> float | None:
 
 
 def _axis(roll: float, tilt: float) -> FloatArray:
-    """Compute the matrix (3, 3) that takes row vectors into the frame whose z is the
-    axis.
+    """Compute the matrix (3, 3) that takes row vectors into the frame whose z is the axis.
 
-    Args:
-        roll: turn about y [rad], applied second.
-        tilt: turn about x [rad], applied first.
+    `roll`: turn about y [rad], applied second; `tilt`: turn about x [rad], applied first.
     """
     c = np.cos([roll, tilt])
     s = np.sin([roll, tilt])

@@ -125,11 +125,8 @@ def compared(
 ) -> None:
     """Set the figures of a file aside for a given geometry, and tell where they differ.
 
-    Args:
-        said: what the file states.
-        given: geometry in its place.
-        pitch: of the columns by the file [mm].
-        angles_deg: of the views by the file.
+    `said`: what the file states; `given`: geometry in its place; `pitch`: of the columns by the
+    file [mm]; `angles_deg`: of the views by the file.
     """
     said.give((GEOMETRY, ANGLES), "geometry=")
     for found in (
@@ -164,13 +161,8 @@ def stated_size(said: Ledger, rows: str, columns: str) -> tuple[int, int]:
 def require_turn(said: Ledger, field: str, angles: FloatArray) -> None:
     """Require that the views turn.
 
-    Args:
-        said: what the file states.
-        field: from which the turn follows.
-        angles: of the views.
-
-    Raises:
-        DatasetFormatError: all of several views are at one angle.
+    `said`: what the file states; `field`: from which the turn follows; `angles`: of the views.
+    Raises DatasetFormatError: all of several views are at one angle.
     """
     if len(angles) > 1 and not np.ptp(angles):
         problem = (
@@ -183,9 +175,7 @@ def require_turn(said: Ledger, field: str, angles: FloatArray) -> None:
 def assume_sense(said: Ledger, why: str) -> None:
     """Tell that the sense of rotation is assumed.
 
-    Args:
-        said: what the file states.
-        why: what it is taken from.
+    `said`: what the file states; `why`: what it is taken from.
     """
     said.warnings.append(
         f"{said.file}: the sense of rotation is assumed ({why}); the wrong one mirrors the"
@@ -256,12 +246,8 @@ def under_a_level(
 def stated_voltage(said: Ledger, name: str) -> ScanSettings | None:
     """Take the tube's voltage [kV], which `material=` of reconstruct needs.
 
-    Args:
-        said: what the file states.
-        name: of its field.
-
-    Returns:
-        Settings with it alone; None where it is missing or no number above 0.
+    `said`: what the file states; `name`: of its field.
+    Returns settings with it alone; None where it is missing or no number above 0.
     """
     value = as_number(said.stated(name) or "")
     if not 0.0 < value < math.inf:

@@ -163,8 +163,7 @@ def explained(fit: FitResult, known: Known) -> Explained:
 
 def _never_exact(table: Linearised, known: Known) -> tuple[str, ...]:
     """Name the groups that are there however little the residuals show of them: places of so
-    few beads that any displacement is a strain. No phantom has its beads exactly in place.
-    """
+    few beads that any displacement is a strain. No phantom has its beads exactly in place."""
     few = table.k <= bead_places.MOST_STRAINED and known.bead_tolerance_mm is None
     return (bead_places.ALL,) if few else ()
 
@@ -358,11 +357,8 @@ def _stated(
 ) -> Certificate:
     """Return a certificate that states another covariance.
 
-    Args:
-        certificate: of the fit by itself.
-        wide: (p, p) of the mixture, edge units.
-        own: (p, p) of the best model.
-        rivals: its explanations.
+    `certificate`: of the fit by itself; `wide`: (p, p) of the mixture, edge units; `own`: (p, p)
+    of the best model; `rivals`: its explanations.
     """
     out = widened(certificate, wide - certificate.covariance)
     sigma = np.sqrt(np.maximum(np.diag(own), 0.0))

@@ -223,8 +223,7 @@ class Linearised:
     @cached_property
     def upper_beads(self) -> list[npt.NDArray[np.intp]]:
         """Beads above a height, of each height between two beads, two on either side at
-        least.
-        """
+        least."""
         order = np.argsort(self.problem.model.beads[:, 2])
         return [order[i:] for i in range(2, self.k - 1)]
 
@@ -301,8 +300,7 @@ def weights(
     lengths: FloatArray, seen: npt.NDArray[np.bool_], spread: float
 ) -> FloatArray:
     """Weigh positions by the lengths of their whitened residuals, (n, k): 1 up to
-    `OUTLIER_SPREADS`, less beyond.
-    """
+    `OUTLIER_SPREADS`, less beyond."""
     out = seen * np.minimum(1.0, OUTLIER_SPREADS * spread / np.maximum(lengths, 1e-12))
     return np.asarray(out, dtype=np.float64)
 

@@ -209,8 +209,7 @@ class Search:
 
     def chance(self, group: Group) -> float:
         """Return the logarithm of the odds of a group before the scan, with the part of the
-        grid that its width takes.
-        """
+        grid that its width takes."""
         return float(self.products.families[group[0]].chances[group[1]]) + OCCAM
 
     def _between(self, one: int, other: int) -> FloatArray:
@@ -408,8 +407,7 @@ class Search:
 
     def keep_shapes(self) -> None:
         """Take the eigenvalues of the first model for all: of draws that differ in their noise
-        alone.
-        """
+        alone."""
         self._shapes = {}
 
     def best_further(

@@ -217,16 +217,10 @@ def largest_residual(fit: FitResult, chance: float, sigmas_known: bool = False) 
 
     Positions scatter by their stated sigmas and, from image to image, by
     `certificate.POSITION_SPREAD_PX` with SPREAD_FREEDOM degrees of freedom.
-
-    Args:
-        fit: whose residuals are judged.
-        chance: probability of more.
-        sigmas_known: the positions' sigmas were measured, and are no more than compared;
-            else the stated ones are ignored.
-
-    Returns:
-        [px].
-    """
+    `fit`: whose residuals are judged. `chance`: probability of more. `sigmas_known`: the
+    positions' sigmas were measured, and are no more than compared; else the stated ones are
+    ignored.
+    Returns [px]."""
     usual = SPREAD_FREEDOM / float(chdtri(SPREAD_FREEDOM, 1.0 - chance))
     certificate = fit.certificate
     measured = sigmas_known and certificate.noise > 0.0

@@ -93,8 +93,7 @@ class Evidence:
 
     def trusted(self) -> Evidence:
         """Return the evidence as far as single frames count: a wall passes for a gap to
-        them (`trusted`).
-        """
+        them (`trusted`)."""
         return replace(self, found=trusted(self.found))
 
     @property
@@ -199,11 +198,8 @@ class Compared(NamedTuple):
         return cls(taken, of_distance, likelihood(taken.steps, of_distance, 0.0))
 
     def gain(self, width: float, blur: float) -> FloatArray:
-        """Compute log likelihoods of a gap over none, (k,).
-
-        Args:
-            width, blur: of the gap [px].
-        """
+        """Compute log likelihoods of a gap over none, (k,). `width` and `blur`: of the gap
+        [px]."""
         of_gap = likelihood(self.taken.steps, self.of_distance, width, blur)
         return of_gap - self.without
 
@@ -250,16 +246,9 @@ def frame_evidence(images: FloatArray) -> Evidence:
 
 
 def _about_borders(table: FloatArray, gap: int) -> FloatArray:
-    """Give the differences of neighbouring columns about each border, with the columns
-    left out that a gap there would hide.
-
-    Args:
-        table: rows of frames, (m, c + 2 SIDE - 1).
-        gap: number of columns.
-
-    Returns:
-        (m, c - gap, 2 SIDE - 1).
-    """
+    """Give the differences of neighbouring columns about each border, with the columns left out
+    that a gap there would hide. `table`: rows of frames, (m, c + 2 SIDE - 1); `gap`: number of
+    columns. Returns (m, c - gap, 2 SIDE - 1)."""
     border = np.arange(SIDE, table.shape[1] - SIDE + 1 - gap)
     beside = np.arange(2 * SIDE)
     columns = border[:, None] + beside - SIDE + gap * (beside >= SIDE)
@@ -267,15 +256,10 @@ def _about_borders(table: FloatArray, gap: int) -> FloatArray:
 
 
 def _is_smooth(here: Differences) -> npt.NDArray[np.bool_]:
-    """Mark all places but those that change most from one side of the border to the
-    other, as many as there are places with most change.
-
-    What both sides have in common, and the step across the border, are not looked at:
-    noise and a gap in them are the same in the places that are left.
-
-    Returns:
-        (m, c).
-    """
+    """Mark all places but those that change most from one side of the border to the other, as
+    many as there are places with most change. What both sides have in common, and the step
+    across the border, are not looked at: noise and a gap in them are the same in the places that
+    are left. Returns (m, c)."""
     around = here.around
     apart = around[:, :, SIDE:] - around[:, :, SIDE - 2 :: -1]
     change = np.square(apart).sum(axis=2)
@@ -381,13 +365,9 @@ def _shown(gains: Sequence[Gain], behind: Sequence[Compared], blur: float) -> Fl
 def _found(gain: Gain, shown: FloatArray) -> FloatArray:
     """Compute log likelihoods of a gap over none by the excess of each border, (c,).
 
-    Positive evidence is for a gap; it is against one as far as the excess is short of
-    what a gap would show.
-
-    Args:
-        gain: of gaps of a width.
-        shown: excess behind such a gap, (c,).
-    """
+    Positive evidence is for a gap; it is against one as far as the excess is short of what a gap
+    would show.
+    `gain`: of gaps of a width; `shown`: excess behind such a gap, (c,)."""
     excess = gain.excess
     short = np.minimum(excess - EVIDENCE_SHARES[:, None] * shown, 0.0)
     of_gap = np.logaddexp.reduce(log_student(short), axis=0)
@@ -418,16 +398,9 @@ def evidence_of_widths(
     width: FloatArray, sigma: FloatArray, share: float = 0.0
 ) -> FloatArray:
     """Compute log likelihood ratios of a gap of each width to none from a measured width
-    (Student).
-
-    Args:
-        width: measured at each column, (c,) [px].
-        sigma: standard deviation of each where there is no gap, (c,) [px].
-        share: standard deviation that a gap adds, as a share of its width.
-
-    Returns:
-        (w, c).
-    """
+    (Student). `width`: measured at each column, (c,) [px]; `sigma`: standard deviation of each
+    where there is no gap, (c,) [px]; `share`: standard deviation that a gap adds, as a share of
+    its width. Returns (w, c)."""
     of_gap = np.hypot(sigma, share * WIDTHS_PX[:, None])
     left = (width - WIDTHS_PX[:, None]) / of_gap
     none = log_student(width / sigma) - np.log(sigma)

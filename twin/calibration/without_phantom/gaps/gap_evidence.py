@@ -146,8 +146,7 @@ def _shown_apart(
     frames: Sequence[Float32Array], axis: float, closed: Sequence[float]
 ) -> list[Gap]:
     """List the gaps that single frames show away from their own mirror images
-    (`OWN_MIRROR_PX`).
-    """
+    (`OWN_MIRROR_PX`)."""
     shown = local_gaps(frames, axis, closed)
     return [gap for gap in shown if _from_axis(gap, axis) > OWN_MIRROR_PX]
 
@@ -158,14 +157,9 @@ def _from_axis(gap: Gap, axis: float) -> float:
 
 
 def contradicted(gap: Gap, widths: Sequence[tuple[float, float]]) -> Gap:
-    """Raise the sigma of a gap's width as far as other measurements contradict it.
-
-    Few distances from the axis, or few places of the mean, are less sure than they say.
-
-    Args:
-        gap: by rays, by frames or by the symmetry of the mean.
-        widths: each with its standard deviation [px].
-    """
+    """Raise the sigma of a gap's width as far as other measurements contradict it. Few distances
+    from the axis, or few places of the mean, are less sure than they say. `gap`: by rays, by
+    frames or by the symmetry of the mean; `widths`: each with its standard deviation [px]."""
     apart = [
         abs(gap.width - width) / math.hypot(gap.sigma, sigma) for width, sigma in widths
     ]
@@ -188,8 +182,8 @@ def _measured(
     step: Step,
     axis: float,
 ) -> Gap | None:
-    """Measure the width of a gap by both ends of rays: of the first one known, or else of
-    a significant step.
+    """Measure the width of a gap by both ends of rays: of the first one known, or else of a
+    significant step.
 
     Args:
         rays: of a turn.
@@ -198,10 +192,9 @@ def _measured(
         step: the most significant one of both ends of rays.
         axis: column of the rotation axis [px].
 
-    Returns:
-        None if nothing is known, or if the width is below `SIGMAS`; a gap whose width
-        both ends of rays do not determine is returned as it is known. One from a step
-        has at least the step's sigma.
+    Returns None if nothing is known, or if the width is below `SIGMAS`; a gap whose width both
+    ends of rays do not determine is returned as it is known. One from a step has at least the
+    step's sigma.
     """
     first = next((gap for gap in known if gap is not None), None)
     if first is not None:
@@ -271,14 +264,9 @@ def _left_behind(
 
 
 def _certified(gap: Gap, profile: Profile, axis: float) -> bool:
-    """Check whether both ends of rays agree with a gap that single frames show: a step of
-    its sign, beyond `SIGMAS`.
-
-    Args:
-        gap: column and width [px].
-        profile: steps that both ends of rays show.
-        axis: its column [px].
-    """
+    """Check whether both ends of rays agree with a gap that single frames show: a step of its
+    sign, beyond `SIGMAS`. `gap`: column and width [px]; `profile`: steps that both ends of rays
+    show; `axis`: its column [px]."""
     beside = gap.column - 0.5 - axis
     step = profile.at(abs(beside))
     return step.width * float(np.sign(beside)) > SIGMAS * step.sigma
@@ -334,8 +322,7 @@ def _require_one(gap: Gap, other: Gap | None) -> None:
         gap: the one that is closed.
         other: another one; None: none.
 
-    Raises:
-        NotIdentifiableError: there is another; names the columns of both.
+    Raises NotIdentifiableError: there is another; names the columns of both.
     """
     if other is None:
         return

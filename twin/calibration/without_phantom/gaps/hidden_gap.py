@@ -197,13 +197,9 @@ def _judged_about(
 ) -> tuple[npt.NDArray[np.intp], Evidence] | None:
     """Judge the borders about a column by single frames.
 
-    Args:
-        stack: line integrals, (n, rows, cols).
-        middle: column.
-        reach: distance from it up to which borders are judged, LEAST_COLUMNS at least [px].
-
-    Returns:
-        First columns beyond the borders, (c,), and their evidence; None for too few columns.
+    `stack`: line integrals, (n, rows, cols); `middle`: column; `reach`: distance from it up to
+    which borders are judged, LEAST_COLUMNS at least [px].
+    Returns first columns beyond the borders, (c,), and their evidence; None for too few columns.
     """
     half = max(float(LEAST_COLUMNS), reach) + SIDE
     low = math.floor(max(middle - half, 0.0))
@@ -217,17 +213,12 @@ def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
     """Check whether single frames leave a gap that both ends of rays show its odds of
     `REPORTED_ODDS`.
 
-    Where both ends of rays differ by what is smooth in the columns (hardening, an object
-    that is not symmetric), a step passes for a gap, by `FOOLED_CHANCE`; frames do not
-    show one.
+    Where both ends of rays differ by what is smooth in the columns (hardening, an object that is
+    not symmetric), a step passes for a gap, by `FOOLED_CHANCE`; frames do not show one.
 
-    Args:
-        frames: line integrals of `tile_gap.averaged_rows`, some of a turn.
-        gap: by both ends of rays.
-        about: distance from its column within which frames may show it [px].
-
-    Returns:
-        Also True where the images have too few columns about the gap to judge it.
+    `frames`: line integrals of `tile_gap.averaged_rows`, some of a turn; `gap`: by both ends of
+    rays; `about`: distance from its column within which frames may show it [px].
+    Returns also True where the images have too few columns about the gap to judge it.
     """
     stack = np.asarray(frames, dtype=np.float64)
     judged = _judged_about(stack, gap.column, 0.0)
@@ -243,20 +234,14 @@ def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
 
 def possible_gap(gap: Gap) -> HiddenGap:
     """Return a gap that both ends of rays show and single frames do not, as one that is not
-    excluded.
-    """
+    excluded."""
     return HiddenGap(gap.column, gap.column, 0.5, gap.width, None, True)
 
 
 def _gap_at(column: int, share: FloatArray, doubted: FloatArray) -> Gap:
     """Make the gap at a column: mean width and standard deviation, at least that of
-    `local_sigma`.
-
-    Args:
-        column: first column beyond the gap.
-        share: probabilities of WIDTHS_PX by the images, (w,).
-        doubted: those of the standard deviation, (w,).
-    """
+    `local_sigma`. `column`: first column beyond the gap; `share`: probabilities of WIDTHS_PX by
+    the images, (w,); `doubted`: those of the standard deviation, (w,)."""
     width = float(share @ WIDTHS_PX)
     spread = math.sqrt(float(doubted @ np.square(WIDTHS_PX - width)))
     return Gap(column, width, max(spread, float(local_sigma(width))))
@@ -286,16 +271,10 @@ def _hidden_radius(profile: Profile, smoothing: float) -> float:
 
 
 def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
-    """Compute the evidence that outlines leave, where edges turn back at both sides of
-    the axis: the largest about the mirrored border, 0 or more.
-
-    Args:
-        found: logarithm of the likelihood of a gap over none, (w, c).
-        beside: of each border from the axis, even steps of a column, (c,) [px].
-
-    Returns:
-        (w, c); 0 for borders within `SIDE` of the axis or without a mirrored one.
-    """
+    """Compute the evidence that outlines leave, where edges turn back at both sides of the axis:
+    the largest about the mirrored border, 0 or more. `found`: logarithm of the likelihood of a
+    gap over none, (w, c); `beside`: of each border from the axis, even steps of a column, (c,)
+    [px]. Returns (w, c); 0 for borders within `SIDE` of the axis or without a mirrored one."""
     places = np.arange(len(beside))
     mirror = np.rint(-2.0 * beside).astype(np.intp) + places
     known = (np.abs(beside) > SIDE) & (mirror >= 0) & (mirror < len(places))
@@ -306,16 +285,12 @@ def _of_outlines(found: FloatArray, beside: FloatArray) -> FloatArray:
 def _evidence_of_rays(
     columns: npt.NDArray[np.intp], axis: float, profile: Profile
 ) -> FloatArray:
-    """Compute log likelihood ratios of a gap of each width at each column to none, from
-    the steps of both ends of rays (Student).
+    """Compute log likelihood ratios of a gap of each width at each column to none, from the
+    steps of both ends of rays (Student).
 
-    Args:
-        columns: (c,) first columns beyond a gap.
-        axis: column of the axis [px].
-        profile: steps that both ends of rays show.
-
-    Returns:
-        (w, c).
+    `columns`: (c,) first columns beyond a gap; `axis`: column of the axis [px]; `profile`: steps
+    that both ends of rays show.
+    Returns (w, c).
     """
     beside = columns - 0.5 - axis
     certain = np.abs(beside) <= profile.last
@@ -331,12 +306,8 @@ def _evidence_of_rays(
 def _of_modes(columns: npt.NDArray[np.intp], steps: ModeSteps) -> FloatArray:
     """Compute the log likelihood ratios of gaps by the turn's modes.
 
-    Args:
-        columns: (c,) first columns beyond a gap.
-        steps: widths by the modes.
-
-    Returns:
-        (w, c); 0 for columns that the modes do not judge.
+    `columns`: (c,) first columns beyond a gap; `steps`: widths by the modes.
+    Returns (w, c); 0 for columns that the modes do not judge.
     """
     judged = np.isin(columns, steps.columns)
     place = np.searchsorted(steps.columns, columns[judged])
@@ -375,16 +346,10 @@ def _beside_told(
     """Compare gaps with those where both ends of rays tell steps: the mean shows one that rays
     show, too, some columns further as well.
 
-    Args:
-        columns: first columns that are judged, (c,).
-        evidence: of gaps there.
-        hidden: whether rays do not reveal a gap there, (c,).
-        axis: its column [px].
-        profile: steps that rays show.
-        of_mean: evidence of the mean.
-
-    Returns:
-        Evidence of gaps over none and over the likeliest one that is not hidden.
+    `columns`: first columns that are judged, (c,); `evidence`: of gaps there; `hidden`: whether
+    rays do not reveal a gap there, (c,); `axis`: its column [px]; `profile`: steps that rays
+    show; `of_mean`: evidence of the mean.
+    Returns evidence of gaps over none and over the likeliest one that is not hidden.
     """
     every = np.arange(of_mean.free.shape[1])
     told = np.abs(every - 0.5 - axis) <= profile.last
@@ -400,18 +365,9 @@ def _shown_at_rim(
     of_mean: MirrorSteps, axis: float, profile: Profile
 ) -> npt.NDArray[np.intp]:
     """Find the columns beyond the last distance at which both ends of rays are certain of a
-    step, where they and the mean show one by `REPORTED_ODDS`.
-
-    Others there are nobody's: hardly anything turns beyond them.
-
-    Args:
-        of_mean: evidence of the mean.
-        axis: its column [px].
-        profile: steps that rays show.
-
-    Returns:
-        (c,) first columns beyond a gap, perhaps none.
-    """
+    step, where they and the mean show one by `REPORTED_ODDS`. Others there are nobody's: hardly
+    anything turns beyond them. `of_mean`: evidence of the mean; `axis`: its column [px];
+    `profile`: steps that rays show. Returns (c,) first columns beyond a gap, perhaps none."""
     columns = np.arange(of_mean.found.shape[1])
     columns = columns[np.abs(columns - 0.5 - axis) > profile.last]
     of_rays = trusted(_evidence_of_rays(columns, axis, profile))

@@ -398,14 +398,8 @@ def _ratios(radius: FloatArray, squares: FloatArray, border: FloatArray) -> Floa
 def _least(inside: FloatArray, beyond: FloatArray, step: int) -> FloatArray:
     """Find the least sums of squares over common displacements, with a step.
 
-    Args:
-        inside: sums over the distances nearer than each border, (d, c).
-        beyond: over the others, (d, c).
-        step: displacements by which the others differ.
-
-    Returns:
-        (c,).
-    """
+    `inside`: sums over the distances nearer than each border, (d, c); `beyond`: over the others,
+    (d, c); `step`: displacements by which the others differ. Returns (c,)."""
     low, high = max(-step, 0), max(step, 0)
     count = len(inside) - low - high
     whole = inside[low : low + count] + beyond[high : high + count]

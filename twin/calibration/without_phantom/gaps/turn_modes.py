@@ -304,12 +304,8 @@ def _integrals(
 def _modes_of_covariance(radius: FloatArray, most: int) -> FloatArray:
     """Compute the modes 0 to `most` of an exponential covariance between circles.
 
-    Args:
-        radius: of the circles, (r,) [columns].
-        most: the last mode.
-
-    Returns:
-        (r, r, most + 1) float32.
+    `radius`: of the circles, (r,) [columns]; `most`: the last mode.
+    Returns (r, r, most + 1) float32.
     """
     count = 2 ** math.ceil(math.log2(4 * most))
     cosine = np.cos(2.0 * math.pi * np.arange(count // 2 + 1) / count)

@@ -388,8 +388,7 @@ def _moves(seen: Seen) -> Moves:
 
 def _reach(seen: Sequence[Seen]) -> tuple[float, FloatArray]:
     """Return the range of what some groups of one mover do together, and its course, internal
-    units.
-    """
+    units."""
     course = sum(s.courses[0] for s in seen if s.courses is not None)
     return float(np.ptp(course)), np.asarray(course)
 

@@ -108,13 +108,8 @@ def _along_axes(
 ) -> FloatArray:
     """Make the courses of a place along three axes, 0 in other scans' frames.
 
-    Args:
-        n: number of all frames.
-        frames: of the scan.
-        course: (g, frames, m).
-
-    Returns:
-        (g, 3, n, 3 m).
+    `n`: number of all frames; `frames`: of the scan; `course`: (g, frames, m).
+    Returns (g, 3, n, 3 m).
     """
     g, _, m = course.shape
     out = np.zeros((g, 3, n, 3 * m))

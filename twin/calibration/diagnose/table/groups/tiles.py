@@ -86,12 +86,8 @@ def _borders_of(found: Iterable[object]) -> set[Border]:
 def torn(table: Linearised, found: Iterable[object]) -> npt.NDArray[np.bool_] | None:
     """Find the positions of spots that lie across a border: half of such a spot is shifted.
 
-    Args:
-        table: of the fit.
-        found: what groups are about that are there.
-
-    Returns:
-        (n, k); None where there are none.
+    `table`: of the fit; `found`: what groups are about that are there.
+    Returns (n, k); None where there are none.
     """
     per_mm = np.broadcast_to(table.problem.poses.pixels_per_mm, table.n)
     radii = np.outer(per_mm, np.asarray(table.problem.model.bead_radius_mm))
