@@ -124,6 +124,19 @@ def test_what_no_report_has_is_kept_and_what_is_gone_is_not(tmp_path: Path) -> N
     assert durations.merged(known, durations.means([second])) == {here + slow: 3.0}
 
 
+def test_what_a_modules_tests_share_counts_for_each_of_them_alike(
+    tmp_path: Path,
+) -> None:
+    here = Path(__file__).relative_to(ROOT).as_posix() + "::"
+    made = report(tmp_path / "1.xml", runs=[1.0], report=[2.0])
+    shared = (
+        '<property name="shared_s" value="3.0"/></properties></testcase></testsuites>'
+    )
+    text = made.read_text()
+    made.write_text(text.replace("</properties></testcase></testsuites>", shared))
+    assert durations.means([made]) == {here + "runs": 2.5, here + "report": 3.5}
+
+
 def test_measured_tests_exist() -> None:
     """A renamed test runs all its cases until it is measured: `durations.py --write`."""
     known = json.loads(suite.MEASURED.read_text())

@@ -2,8 +2,9 @@
 
 `make test`, `test-extensions`, `studies` and `page` write what each test took to
 build/durations/: processor time, which other work on the machine does not change, of the test,
-its fixtures and the processes that ended in it. The files that took more than `--over` seconds
-are listed, the longest first, with their longest test.
+its fixtures and the processes that ended in it; what a module's tests share, its servers and
+browsers, counts for each of them alike. The files that took more than `--over` seconds are listed,
+the longest first, with their longest test.
 
 `--write` keeps the means of tests whose cases take a third of a second or more together, for
 `tests/support/suite.py`, which leaves in `make test` what its budget allows. Tests that are in no
@@ -30,11 +31,20 @@ LEAST_S = 0.3
 def seconds(report: Path) -> dict[str, dict[str, float]]:
     """Test file -> test -> seconds of processor time, set-up and tear-down included."""
     found: dict[str, dict[str, float]] = defaultdict(dict)
+    shared: dict[str, float] = defaultdict(float)
     for case in ElementTree.parse(report).iter("testcase"):
         name = case.get("name", "")
-        tests = found[case.get("classname", "")]
-        for spent in case.iterfind("properties/property[@name='processor_s']"):
-            tests[name] = tests.get(name, 0.0) + float(spent.get("value", "0"))
+        module = case.get("classname", "")
+        tests = found[module]
+        for spent in case.iterfind("properties/property"):
+            value = float(spent.get("value", "0"))
+            if spent.get("name") == "processor_s":
+                tests[name] = tests.get(name, 0.0) + value
+            elif spent.get("name") == "shared_s":
+                shared[module] += value
+    for module, value in shared.items():
+        for name in found[module]:
+            found[module][name] += value / len(found[module])
     return found
 
 

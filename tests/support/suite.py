@@ -169,6 +169,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 BEGUN = pytest.StashKey[float]()
+ENDED = pytest.StashKey[float]()
+NEXT = pytest.StashKey[Path | None]()
+"""Module of the test that follows a test in its process; None after the last."""
 
 
 def processor_s() -> float:
@@ -182,16 +185,27 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     item.stash[BEGUN] = processor_s()
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    item.stash[ENDED] = processor_s()
+    item.stash[NEXT] = None if nextitem is None else nextitem.path
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """What a test takes of the processor, fixtures included, goes into the file of
-    durations; a skip that CI does not allow is a failure."""
+    """What a test takes of the processor goes into the file of durations, and as `shared_s`
+    what a module's servers and browsers had taken when they ended with its last test; those
+    that end with the process belong to no module. A skip that CI does not allow is a failure.
+    """
     if call.when == "teardown":
-        item.user_properties.append(
-            ("processor_s", round(processor_s() - item.stash[BEGUN], 2))
-        )
+        following = item.stash.get(NEXT, item.path)
+        ended = processor_s() if following == item.path else item.stash[ENDED]
+        spent = {"processor_s": ended - item.stash[BEGUN]}
+        if following not in (item.path, None):
+            spent["shared_s"] = processor_s() - ended
+        item.user_properties += [(name, round(s, 2)) for name, s in spent.items()]
     return judged((yield))
 
 
