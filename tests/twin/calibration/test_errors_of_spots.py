@@ -1,17 +1,23 @@
-"""Errors of each bead's spots that repeat with the turn are no distortion of the panel."""
+"""Errors of spots that repeat with the turn or from pixel to pixel, or that are noise alone, are
+no distortion of the panel and no motion."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from causes_named import calibrated as scored_calibration
+from faults_drawn import right_draft, taken
 from prior_coverage import PIXEL, SDD, SHAPE, pixels
 
 from flexdt.twin.calibration import SIX
 from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.detect.detection import Detections
+from flexdt.twin.calibration.diagnose import CalibrationCode
+from flexdt.twin.calibration.diagnose.table import explained
 from flexdt.twin.calibration.fit.priors import exact
 from flexdt.twin.calibration.frame_source import FrameSpots, FrameState, SpotFrames
 from flexdt.twin.calibration.pipeline import (
@@ -62,16 +68,40 @@ def shadows(rng: np.random.Generator, places: np.ndarray) -> np.ndarray:
     return out
 
 
-KINDS = {"waves": waves, "own_places": own_places, "shadows": shadows}
+def still(rng: np.random.Generator, places: np.ndarray) -> np.ndarray:
+    """No errors but noise."""
+    return np.zeros_like(places)
 
 
-def calibrated(kind: str, seed: int) -> tuple[Calibration, dict[str, float]]:
-    """A calibration of 120 frames of three exact beads, six offsets unknown, and the truth."""
+EXPECTED = {CalibrationCode.BEAD_ERRORS, CalibrationCode.HELD_UNCHECKED}
+"""What may be said of a right scan whose spots err, with values that are held."""
+KINDS = {
+    "waves": waves,
+    "own_places": own_places,
+    "shadows": shadows,
+    "in a row": still,
+}
+
+
+def calibrated(
+    kind: str, seed: int, frames: int = 120, rows: tuple[float, ...] = (-18.0, 0.0, 18.0)
+) -> tuple[Calibration, dict[str, float]]:
+    """A calibration of exact beads, six offsets unknown, and the truth.
+
+    Args:
+        kind: of errors.
+        seed: of all draws.
+        frames: number of frames.
+        rows: heights of the beads, up to 2 mm [mm].
+    """
     rng = np.random.default_rng([580, seed])
-    frames, k = 120, 3
+    k = len(rows)
     beads = rng.uniform(-9.0, 9.0, (k, 3))
-    beads[:, 2] = np.linspace(-18.0, 18.0, k) + rng.uniform(-2.0, 2.0, k)
+    beads[:, 2] = np.array(rows) + rng.uniform(-2.0, 2.0, k)
     truth = {n: float(rng.uniform(-r, r)) for n, r in REACH.items()}
+    if kind == "in a row":
+        # In the plane of source and axis a bead stays in its row.
+        beads[k // 2, 2] = -truth["dO_y"]
     angles = 360.0 / frames * np.arange(frames)
     places = pixels(beads, angles, SOD, truth)
     found = places + KINDS[kind](rng, places) + NOISE_PX * rng.normal(size=places.shape)
@@ -100,3 +130,62 @@ def test_what_repeats_with_the_turn_is_no_panel_and_in_the_sigmas(kind: str) -> 
         for name, value in truth.items():
             off = abs(estimates[name].value - value)
             assert off < 4.0 * estimates[name].sigma, (seed, name)
+
+
+def test_a_bead_that_stays_in_its_row_is_no_border(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A border that passed through the noise of its row was found in each second table, and
+    its spots, left out for it, made causes of what they had held.
+    """
+    made: list[object] = []
+
+    class Counted(explained.Linearised):
+        def __init__(self, *given: Any) -> None:
+            made.append(self)
+            super().__init__(*given)
+
+    monkeypatch.setattr(explained, "Linearised", Counted)
+    for seed in range(4):
+        made.clear()
+        result, _ = calibrated("in a row", seed, 360, (-40.0, -20.0, 0.0, 20.0, 40.0))
+        assert {f.code for f in result.findings} <= EXPECTED, seed
+        assert len(made) < explained.MOST_TABLES, seed
+
+
+@pytest.mark.campaign(4)
+@pytest.mark.parametrize("seed", range(16))
+def test_what_sampling_by_pixels_does_to_spots_is_no_motion(seed: int) -> None:
+    rng = np.random.default_rng([77, seed])
+    draft = right_draft(rng)
+    n = int(rng.choice([120, 240, 360]))
+    noise, size = rng.uniform(0.002, 0.006), rng.uniform(0.0, 0.006)
+    angles = 360.0 * np.arange(n) / n
+    shown = np.ones((n, len(draft.world.beads)), dtype=bool)
+    begin = rng.random(2)
+
+    def after(frames: list[np.ndarray | None]) -> list[np.ndarray | None]:
+        """Spots are drawn towards places within their pixels."""
+        return [
+            None
+            if spots is None
+            else np.column_stack(
+                [
+                    spots[:, :2] + size * np.sin(2 * math.pi * (spots[:, :2] + begin)),
+                    spots[:, 2],
+                ]
+            )
+            for spots in frames
+        ]
+
+    world = replace(draft.world, angles=angles, spot=np.zeros((n, 3)), shown=shown)
+    scan = replace(
+        draft,
+        world=world,
+        believed=replace(draft.believed, angles=angles),
+        noise_px=float(noise),
+        after=after,
+    )
+    result = scored_calibration(taken(scan, rng))
+    assert result.fit is not None
+    assert {f.code for f in result.findings} <= EXPECTED

@@ -1,4 +1,6 @@
-"""Errors of spots: each bead's positions err smoothly as the object turns, or slowly."""
+"""Errors of spots: each bead's positions err smoothly as the object turns, or slowly, or all
+err with their place within a pixel.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ WORDS: Final = "errors of single spots that change slowly"
 LOG_CHANCE_OF_ERRORS: Final = math.log(0.5)
 """Logarithm of the probability that spots have such errors: by far more often than anything moves
 or distorts, however small they are (assumed)."""
-KINDS: Final = 3
+KINDS: Final = 4
 """Kinds of errors, which share the odds."""
 HARMONICS: Final = 3
 LEAST_FRAMES: Final = 16
@@ -33,6 +35,11 @@ MOST_WAVES: Final = 16
 """Half waves over the scan, of slow errors."""
 MOST_COLUMNS: Final = 360
 """Columns of slow errors, from which the waves of many beads are fewer."""
+WITHIN: Final = "within their pixels"
+PIXEL_HARMONICS: Final = 2
+"""Of the distance between pixels, of errors that repeat from pixel to pixel."""
+MOST_WITHIN_PX: Final = 0.5
+"""Largest of them: a centre lies in its pixel."""
 BEAD_ERROR_SPREADS: Final = 1.0
 """Errors, in standard deviations of a position, up to which they widen the intervals alone and are
 no finding."""
@@ -41,7 +48,7 @@ no finding."""
 def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make errors that repeat with the turn, errors that follow a spot's column (its size,
     its distance, a slope), and errors that are slow, of each coordinate of each bead's
-    positions.
+    positions; and errors of all spots that repeat from pixel to pixel.
     """
     if table.n < LEAST_FRAMES:
         return
@@ -84,6 +91,29 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             courses=_each_by_itself(each)[None],
             widest=radius,  # A spot is not found beside its ball.
         )
+    yield Family(
+        NAME,
+        (f"spots err {WITHIN}",),
+        Acts.IMAGE,
+        (WITHIN,),
+        LOG_CHANCE_OF_ERRORS - math.log(KINDS),
+        table.rows_of(_within_pixels(table.places))[None],
+        widest=MOST_WITHIN_PX,
+    )
+
+
+def _within_pixels(places: FloatArray) -> FloatArray:
+    """Make shifts of spots (n, k, 2, c) that repeat from pixel to pixel along each axis: what
+    sampling by pixels does to the centre of a shadow.
+    """
+    phase = 2.0 * math.pi * places[..., None] * np.arange(1, PIXEL_HARMONICS + 1)
+    waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=3)
+    out = np.zeros((*places.shape, 2 * waves.shape[3]))
+    for axis in (0, 1):
+        out[:, :, axis, axis * waves.shape[3] :][..., : waves.shape[3]] = waves[
+            :, :, axis
+        ]
+    return out
 
 
 def _each_by_itself(courses: FloatArray) -> FloatArray:
@@ -97,6 +127,8 @@ def _each_by_itself(courses: FloatArray) -> FloatArray:
 def told(found: Found) -> list[Finding]:
     """Tell errors of spots that exceed the noise of a position."""
     seen = found.of(NAME)
+    within = all(s.place == WITHIN for s in seen)
+    how = "with their place within a pixel" if within else "smoothly as the object turns"
     size = math.sqrt(sum(s.effect_px**2 for s in seen))
     spread = found.fit.certificate.rms_px  # which contains them
     if not seen or 2.0 * size**2 < BEAD_ERROR_SPREADS**2 * spread**2:
@@ -104,7 +136,7 @@ def told(found: Found) -> list[Finding]:
     return [
         warning(
             CalibrationCode.BEAD_ERRORS,
-            f"single beads err by about {size:.2g} px, smoothly as the object turns (bead "
-            "positions, background, distortion): the intervals allow for it",
+            f"single beads err by about {size:.2g} px, {how} (bead positions, background, "
+            "distortion, sampling): the intervals allow for it",
         )
     ]

@@ -1,4 +1,8 @@
-"""Tiles: a part of the panel is shifted against the rest."""
+"""Tiles: a part of the panel is shifted against the rest.
+
+On which side of a border a spot lies is said by its predicted place: measured ones would divide
+spots that stay in a row by their noise, and such a border explains it.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +47,10 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     if shape is None:
         return
     counted = table.weight > 0
+    radii = _radii(table)
     known_borders = sorted(_borders_of(table.state.found), key=lambda b: b.at)
     for axis in (0, 1):
-        place = table.measured[..., axis]
+        place = table.places[..., axis]
         found = [b.at for b in known_borders if b.axis == axis]
         across = any(b.axis != axis for b in known_borders)
         places, shares = _borders(place[counted], shape[1 - axis], found)
@@ -53,14 +58,13 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             yield _family(
                 table,
                 [Border(axis, at) for at in places.tolist()],
-                [np.where(place >= at, 1.0, 0.0) for at in places.tolist()],
+                [_beyond(place, radii, at) for at in places.tolist()],
                 (LOG_CHANCE_OF_MORE if across else LOG_CHANCE) + np.log(shares),
             )
     # Four tiles are two borders, and a quarter that is neither.
     quarters = {
-        (one, other): np.where(
-            (table.measured >= (one.at, other.at)).all(axis=2), 1.0, 0.0
-        )
+        (one, other): _beyond(table.places[..., 0], radii, one.at)
+        * _beyond(table.places[..., 1], radii, other.at)
         for one in known_borders
         for other in known_borders
         if one.axis == 0 and other.axis == 1
@@ -89,12 +93,27 @@ def torn(table: Linearised, found: Iterable[object]) -> npt.NDArray[np.bool_] | 
     `table`: of the fit; `found`: what groups are about that are there.
     Returns (n, k); None where there are none.
     """
-    per_mm = np.broadcast_to(table.problem.poses.pixels_per_mm, table.n)
-    radii = np.outer(per_mm, np.asarray(table.problem.model.bead_radius_mm))
+    radii = _radii(table)
     out = np.zeros(table.problem.seen.shape, dtype=bool)
     for one in _borders_of(found):
-        out |= np.abs(table.measured[..., one.axis] - one.at) < radii
+        out |= np.abs(table.places[..., one.axis] - one.at) < radii
     return out if out.any() else None
+
+
+def _radii(table: Linearised) -> FloatArray:
+    """Return the radius of each spot, (n, k) [px]."""
+    per_mm = np.broadcast_to(table.problem.poses.pixels_per_mm, table.n)
+    return np.outer(per_mm, np.asarray(table.problem.model.bead_radius_mm))
+
+
+def _beyond(place: FloatArray, radii: FloatArray, at: float) -> FloatArray:
+    """Return the part of each spot, (n, k), that lies beyond a border: 0, 1, or half of one
+    that lies across it, which is as much on one side as on the other as far as is known.
+
+    A border is so told by spots beside it alone, those that still count when it is found.
+    """
+    across = np.abs(place - at) < radii
+    return np.where(across, 0.5, np.where(place >= at, 1.0, 0.0))
 
 
 def _borders(
