@@ -38,6 +38,14 @@ def cases(
     return [case(number) for number in range(count)]
 
 
+@pytest.fixture(autouse=True)
+def stated_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rule is tested, not the budgets of the day."""
+    monkeypatch.setattr(suite, "BUDGET_S", 0.5)
+    monkeypatch.setattr(suite, "CI_BUDGET_S", 1.5)
+    monkeypatch.setattr(suite, "MODULE_BUDGET_S", 3.0)
+
+
 def runs(every: list[Any]) -> str:
     """A letter for each case: t in `make test`, s in `make studies`, n in campaigns."""
     suite.spread_out(every)

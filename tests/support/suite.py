@@ -51,9 +51,9 @@ MEASURED = Path(__file__).with_name("processor_s.json")
 BUDGET_S = 0.5
 """Processor time that the cases of one test may take together in `make test`; the others are
 slow."""
-CI_BUDGET_S = 1.5
+CI_BUDGET_S = 1.0
 """The same in CI, where one case is always run; the others are `night`."""
-MODULE_BUDGET_S = 3.0
+MODULE_BUDGET_S = 2.0
 """Processor time that the slow tests of one module may take together in CI, the shortest
 first. One is always run, and of one with `campaign(n)` as many cases as it says; the others
 are `night`."""
