@@ -90,10 +90,12 @@ class SceneClients:
         self._who: dict[int, Who] = {}
         self._sent: dict[int, Put] = {}
         """Client -> its camera as put last; a person may have moved it since."""
-        self._due: dict[int, Standpoint] = {}
-        """Client -> the camera it was told and has not reported yet."""
+        self._due: dict[int, list[Standpoint]] = {}
+        """Client -> the cameras that it was told and has not reported yet, oldest first."""
+        self._at: dict[int, Standpoint] = {}
+        """Client -> the camera it reported last, once it has reported one that it was told."""
         self._elsewhere: set[int] = set()
-        """Clients that have reported another camera than the one due: a frame may lose one
+        """Clients that have reported another camera than the one due last: a frame may lose one
         that comes while it opens."""
         self._theme: dict[str, tuple[bool, bool]] = {}
         """Page -> whether its frames are dark, and finely lit."""
@@ -195,7 +197,7 @@ class SceneClients:
                         self._put(client, preset.at(aspect))
         clients = self._server.get_clients()
         for id in self._elsewhere & clients.keys() & self._due.keys():
-            self._tell(clients[id], self._due[id])
+            self._tell(clients[id], self._camera(clients[id]))
 
     def reset(self, page: str, view: str) -> None:
         """Set a page's view back to its preset for the client's aspect ratio; nothing
@@ -301,18 +303,37 @@ class SceneClients:
         self._tell(client, camera)
 
     def _tell(self, client: viser.ClientHandle, camera: Standpoint) -> None:
-        """Set a client's camera; it is due until a report of the client has it."""
-        self._due[client.client_id] = camera
-        self._elsewhere.discard(client.client_id)
+        """Set a client's camera; it is due until a report of the client has it, or has one
+        that a person has moved."""
+        with self._lock:
+            due = self._due.setdefault(client.client_id, [])
+            if due[-1:] != [camera]:
+                due.append(camera)
+            self._elsewhere.discard(client.client_id)
         set_camera(client, camera)
 
     def _reported(self, client: viser.ClientHandle) -> None:
-        """Take a client's report of its camera: what was due has arrived, or was lost."""
-        camera = self._due.get(id := client.client_id)
-        if camera is not None and _stands(_now(client), camera):
-            self._due.pop(id, None)
-        else:
-            self._elsewhere.add(id)
+        """Take a client's report of its camera: what was due has arrived, is still on its way
+        or lost, or a person has moved the camera.
+
+        Only a person puts a camera where it was neither told to be nor before; a frame that
+        opens does so by itself, too.
+        """
+        now, id = _now(client), client.client_id
+        with self._lock:
+            due = self._due.get(id, [])
+            arrived = [k for k, camera in enumerate(due) if _stands(now, camera)]
+            if arrived:
+                del due[: arrived[-1] + 1]
+            elif id in self._at and not _stands(now, self._at[id]):
+                due.clear()
+            if due:
+                self._elsewhere.add(id)
+            else:
+                self._due.pop(id, None)
+                self._elsewhere.discard(id)
+            if arrived or id in self._at:
+                self._at[id] = now
 
     def _untouched(self, client: viser.ClientHandle) -> bool:
         """Check that a client's camera is still where it was put, or on its way there;
@@ -324,7 +345,9 @@ class SceneClients:
 
     def _camera(self, client: viser.ClientHandle) -> Standpoint:
         """Return the camera that a client is on its way to, or else the one it reported."""
-        return self._due.get(client.client_id) or _now(client)
+        with self._lock:
+            due = self._due.get(client.client_id)
+            return due[-1] if due else _now(client)
 
     def _connected(self, client: viser.ClientHandle) -> None:
         """Register a new client with its page and view, set its camera and theme, and
@@ -363,6 +386,7 @@ class SceneClients:
             self._who.pop(client.client_id, None)
             self._sent.pop(client.client_id, None)
             self._due.pop(client.client_id, None)
+            self._at.pop(client.client_id, None)
             self._elsewhere.discard(client.client_id)
             self._shown.pop(client.client_id, None)
 

@@ -202,6 +202,83 @@ def test_a_camera_that_nobody_moved_is_the_one_of_its_pane(seed: int) -> None:
     assert (pane.position, pane.told) == (moved, told)
 
 
+class Dragged(Pane):
+    """The same; what it is told comes at once, later or never, also while a person drags."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        super().__init__(rng)
+        self.late: list[list[Any]] = []
+
+    @contextlib.contextmanager
+    def atomic(self) -> Iterator[None]:
+        self.told += 1
+        self.batch: list[Any] = []
+        yield
+        fate = self.rng.integers(3)
+        if fate < 2:
+            self.late.append(self.batch)
+        if fate < 1:
+            self.hear()
+        else:
+            self.report(self)
+
+    def queue_message(self, message: Any) -> None:
+        self.batch.append(message)
+
+    def hear(self) -> None:
+        self.heard = True
+        for batch in self.late:
+            for message in batch:
+                super().queue_message(message)
+            self.report(self)
+        self.late = []
+
+    def drag(self) -> None:
+        if self.rng.integers(2):
+            self.hear()
+        far = self.rng.choice([1e-3, 0.1]) * self.rng.normal(size=3)
+        far[0] += 2e-3  # a pixel at least
+        self.position = tuple((np.asarray(self.position) + far).tolist())
+        self.report(self)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_camera_stays_where_a_person_lets_it_go(seed: int) -> None:
+    """Whatever it is told meanwhile; until that person asks for its preset, which it then gets
+    whatever it loses."""
+    rng = np.random.default_rng(seed)
+    pane = Dragged(rng)
+    clients = SceneClients(pane)  # type: ignore[arg-type]
+    clients.cameras = presets(world_at(), 45.0)
+    pane.connect(pane)
+
+    def resized() -> None:
+        pane.aspect = float(rng.uniform(0.4, 3.0))
+        clients.fit()
+
+    def at_home() -> bool:
+        wanted = clients.cameras["iso"].at(pane.aspect).position
+        return bool(np.allclose(pane.position, wanted, atol=2e-4))
+
+    for _ in range(30):
+        for _ in range(60):
+            clients.fit()
+        pane.hear()
+        assert at_home()
+        for _ in range(rng.integers(1, 5)):
+            for _ in range(rng.integers(3)):
+                resized()
+            pane.drag()
+        pane.hear()
+        pane.drag()
+        let_go = pane.position
+        for _ in range(10):
+            resized()
+            pane.hear()
+            assert pane.position == let_go
+        clients.reset("0123456789abcdef", "iso")
+
+
 EYE = Standpoint((0.3, -2.0, 0.4), (0.1, 0.1, 0.05), (0.0, 0.0, 1.0), 0.6)
 
 

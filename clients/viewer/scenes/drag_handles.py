@@ -23,10 +23,9 @@ from flexdt.twin.machine.description import Machine
 COORDINATES: Final = ("x", "y", "z")
 SIZE_M: Final = 0.16
 STAGES: Final = ("source", "object", "detector")
-TURNED: Final = {"detector": (0.0, 0.0, 0.0, 1.0)}
-"""Stage -> quaternion (w, x, y, z) of its handle at rest, where it is not along the world's axes:
-half a turn about z has the detector's arrows point to the source, within every view."""
 UPRIGHT: Final = (1.0, 0.0, 0.0, 0.0)
+HALF_TURN: Final = (0.0, 0.0, 0.0, 1.0)
+"""Quaternions (w, x, y, z) of handles at rest: along the world's axes, and turned about z."""
 
 Drag = Callable[[int | None, Mapping[str, float]], None]
 """Called with viser's client and the targets axis -> value."""
@@ -73,18 +72,19 @@ class Gizmos:
             self._rest(handle)
 
     def _rest(self, handle: _Handle) -> None:
-        """Put a handle back to its stage's place, that of the object also to no rotation;
-        nothing while it is dragged or the place is unknown.
+        """Put a handle back to its stage's place, its arrows within every view; nothing while
+        it is dragged or the place is unknown.
 
-        The position is sent only if it differs.
+        The arrow along the beam points to the object from either side of it. Place and turn
+        are sent only if they differ.
         """
         at = self._at.get(handle.stage)
         if handle.dragging or at is None:
             return
-        if tuple(handle.control.position) != at:
-            handle.control.position = at
-        if handle.stage == "object":
-            handle.control.wxyz = UPRIGHT
+        beyond = at[1] > self._at["object"][1]
+        for name, value in (("position", at), ("wxyz", HALF_TURN if beyond else UPRIGHT)):
+            if tuple(getattr(handle.control, name)) != value:
+                setattr(handle.control, name, value)
 
     def _add(self, server: viser.ViserServer, stage: str) -> _Handle:
         """Add the handle of a stage, with arrows for its motors.
@@ -106,7 +106,6 @@ class Gizmos:
             disable_rotations=not turns,
             depth_test=False,
             line_width=3.0,
-            wxyz=TURNED.get(stage, UPRIGHT),
         )
         handle = _Handle(stage, control)
 
