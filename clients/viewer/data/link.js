@@ -32,7 +32,6 @@ export const store = {
   },
   received: { state: 0, image: 0 },
   age: 0,
-  /** @type {number | null} */ fresh: null,
   /** @type {Quantities | null} */ now: null,
   imageAge: 0,
   /** @type {Quantity[]} */ imageDiffers: [],
@@ -439,7 +438,6 @@ function look() {
   const behind = toldAgo(now, trip / 2);
   // Nobody is blamed for the time that the page itself stood still ...
   store.age = Math.max(0, Math.max(silent, behind) - delay(now) / 1000);
-  store.fresh = store.age > OLD_S ? null : (store.fresh ?? now);
   const image = store.image;
   store.imageAge = 0;
   store.imageDiffers = [];

@@ -58,7 +58,8 @@
     clear.call(this, mask);
   };
   let touched = -Infinity;
-  for (const kind of ["pointerdown", "pointermove", "wheel", "keydown"])
+  // A canvas that has another size is empty until it is drawn.
+  for (const kind of ["pointerdown", "pointermove", "wheel", "keydown", "resize"])
     window.addEventListener(
       kind,
       () => {

@@ -55,13 +55,6 @@ on("state", (s) => {
   if (s.safety.estop && s.safety.stop !== pressed?.after) {
     pressed = null;
     for (const n of $$("#notes .note")) if (n.dataset.key?.startsWith(UNCONFIRMED)) n.remove();
-  } else if (
-    pressed !== null &&
-    store.fresh !== null &&
-    performance.now() - Math.max(pressed.at, store.fresh) > 2000 * OLD_S
-  ) {
-    pressed = null;
-    note("error", "The emergency stop did not take effect", "press it again");
   }
   holder();
 });
@@ -95,13 +88,14 @@ me.value = person();
 me.addEventListener("change", () => rename(me.value));
 $button("#skip").addEventListener("click", () => $("#film-canvas").focus());
 const UNCONFIRMED = "E-stop not confirmed";
-// Pressed when [ms], after which stop, and not confirmed by a newer one yet.
+// Pressed when [ms], after which stop, and neither answered nor confirmed by a newer one yet: only
+// the twin's answer tells that a press came to nothing, however long states show no stop.
 /** @type {{ at: number; after: number | undefined } | null} */
 let pressed = null;
 export async function estop() {
   const mine = (pressed = { at: performance.now(), after: store.state?.safety.stop });
-  const answer = await command("safety.estop", {}, UNCONFIRMED);
-  if (answer?.safety.estop && pressed === mine) pressed = null;
+  await command("safety.estop", {}, UNCONFIRMED);
+  if (pressed === mine) pressed = null;
 }
 $button("#estop").addEventListener("click", () => void estop());
 

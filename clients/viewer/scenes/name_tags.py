@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import viser
@@ -169,7 +169,8 @@ class NameTags:
     """Names in the scene of each client, as its own camera sees them."""
 
     def __init__(self) -> None:
-        self._drawn: dict[int, object] = {}
+        self._drawn: dict[int, tuple[str, set[str]]] = {}
+        """Client -> what its names were placed for, and the words that are drawn."""
 
     def draw(self, client: viser.ClientHandle, names: Sequence[Name]) -> None:
         """Put the names where they have room now; nothing is sent while nothing has
@@ -177,7 +178,8 @@ class NameTags:
 
         No names are drawn in a picture narrower than `LEAST_PX`; names behind the camera
         are left out. Names that no longer have room are removed. A leader joins each name
-        to its point; at most 64 former names are looked for.
+        to its point. A node keeps its words for good: a browser takes a while to set
+        others, and would show those before at the new place.
 
         Args:
             client: with its camera.
@@ -199,9 +201,9 @@ class NameTags:
             axes.round(4),
             [(w, p.round(4)) for w, p in names],
         ]
-        if self._drawn.get(client.client_id) == (seen := str(key)):
+        before, drawn = self._drawn.get(client.client_id, ("", set()))
+        if before == (seen := str(key)):
             return
-        self._drawn[client.client_id] = seen
         points = np.array([point for _, point in names]).reshape(-1, 3)
         x, y, depth = axes @ (points - eye).T
         depth[depth < 0.02] = np.nan
@@ -220,18 +222,16 @@ class NameTags:
             return np.asarray(eye + flat @ axes)
 
         with client.atomic():
-            for old in range(len(there), 64):
-                handle: Any = client.scene.get_handle_by_name(f"/names/{old}")
-                if handle is None:
-                    break
-                handle.remove()
+            for gone in drawn - {names[k][0] for k in there}:
+                client.scene.remove_by_name(f"/names/{gone}")
             lines = []
-            for n, k in enumerate(there.tolist()):
+            for k in there.tolist():
                 place = in_space(corners[k] + 0.5 * sizes[k], k)
                 end = leader_end(anchors[k], corners[k], sizes[k])
                 lines.append([in_space(end, k), points[k]])
+                words = names[k][0]
                 client.scene.add_label(
-                    f"/names/{n}", names[k][0], position=place, anchor="center-center"
+                    f"/names/{words}", words, position=place, anchor="center-center"
                 )
             client.scene.add_line_segments(
                 "/names/leaders",
@@ -240,3 +240,4 @@ class NameTags:
                 thickness=2.0,
                 thickness_units="screen",
             )
+        self._drawn[client.client_id] = seen, {names[k][0] for k in there}

@@ -7,7 +7,9 @@ and is not read.
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -16,9 +18,11 @@ from scipy import ndimage
 
 from flexdt.library.data_set import DataSet
 from flexdt.phantoms import load_phantom
+from flexdt.phantoms.placement import placed
 from flexdt.phantoms.samples import is_shipped
+from flexdt.phantoms.voxelise import voxelise
 from flexdt.twin.errors import TwinError
-from flexdt.twin.geometry.conventions import Float32Array
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume
 from flexdt.twin.scanner.state import StagePlacement
 
@@ -62,20 +66,28 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
             {"asked": name, "allowed": "a phantom that ships with flexdt"},
         )
     phantom = load_phantom(name)
-    voxel = min(like.voxel_xyz)
+    stands = (document.sample.offset if document else None) or StagePlacement()
+    back = stands.rotation.T
+    shift = np.array([stands.x, stands.y, stands.z])
     if phantom.is_voxels:
         whole = phantom.volume()
         data = phantom.volume().data
         half = 0.0
     else:  # means over two voxels a side, centred half a voxel before the later one
-        whole = phantom.volume(voxel / 2)
+        voxel = min(like.voxel_xyz)
+        low, high = _seen(like, back, shift, voxel)
+        reach = np.array(phantom.size_mm) / 2 + voxel
+        low, high = np.maximum(low, -reach), np.minimum(high, reach)
+        if (low >= high).any():
+            return np.zeros(like.shape, np.float32)
+        middle = (low + high) / 2
+        around = placed(phantom, "keep", -middle)
+        fine = voxelise(around.scene, around.surfaces, high - low, voxel / 2, 2)
+        whole = replace(fine, center_mm=tuple(middle.tolist()))
         data = np.pad(whole.data, (1, 1))
         half = 0.5
         for axis in range(3):
             data = _means_of_pairs(data, axis)
-    stands = (document.sample.offset if document else None) or StagePlacement()
-    back = stands.rotation.T
-    shift = np.array([stands.x, stands.y, stands.z])
     nz, ny, nx = like.shape
     axes = [
         (np.arange(n) - (n - 1) / 2) * step + center
@@ -96,6 +108,24 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
         )
         out[k] = ndimage.map_coordinates(data, at[::-1], order=1, mode="constant")
     return np.maximum(out, 0.0, out=out)  # a hole leaves a rounding error
+
+
+def _seen(
+    like: Volume, back: FloatArray, shift: FloatArray, margin: float
+) -> tuple[FloatArray, FloatArray]:
+    """Compute the box of a phantom, low and high corner (3,) [mm], that a grid holds, with a
+    margin [mm] around it.
+
+    Args:
+        like: the grid.
+        back: (3, 3), turn of the stage's frame to that of the phantom.
+        shift: (3,), place of the phantom's origin on the stage [mm].
+        margin: around the box [mm].
+    """
+    half = np.array(like.shape[::-1]) * like.voxel_xyz / 2
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    corners = (signs * half + like.center_mm - shift) @ back.T
+    return corners.min(axis=0) - margin, corners.max(axis=0) + margin
 
 
 def _means_of_pairs(data: Float32Array, axis: int) -> Float32Array:
