@@ -35,6 +35,33 @@ def test_estop_reaches_the_twin_right_after_a_name_was_typed(
     )
 
 
+STANDS_STILL = """
+async () => {
+  const until = (ms) => { const end = performance.now() + ms; while (performance.now() < end); };
+  const said = [];
+  const notes = document.querySelector('#notes');
+  const look = () => said.push(...[...notes.querySelectorAll('.error')].map((n) => n.innerText));
+  new MutationObserver(look).observe(notes, { childList: true });
+  until(700);
+  document.querySelector('#estop').click();
+  until(3500);
+  await new Promise((done) => setTimeout(done, 2500));
+  return said;
+}
+"""
+"""A state waits unread when the button is pressed, and the answer for as long; what errors say."""
+
+
+def test_a_page_that_stands_still_never_says_that_a_stop_came_to_nothing(
+    page: Any, twin: TwinClient
+) -> None:
+    assert not twin.state().safety.estop
+    said = page.evaluate(STANDS_STILL)
+    page.locator("#emergency").wait_for()
+    assert twin.state().safety.estop
+    assert said == []
+
+
 def test_control_stays_with_who_takes_another_name(page: Any, twin: TwinClient) -> None:
     page.fill("#person", "Emmy")
     page.click("#take")
