@@ -22,6 +22,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = Path(__file__).with_name("weekly.toml")
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
+"""Of BLAS, whose threads wait for each other in products of a few hundred columns: calibrating
+takes a tenth of the processor time."""
 
 
 def jobs(table: Path = TABLE) -> dict[str, dict[str, Any]]:
@@ -41,7 +44,11 @@ def run(command: str) -> int:
     code = subprocess.run(
         ["bash", "-e", "-c", command],
         cwd=ROOT,
-        env={**os.environ, "PATH": f"{here}{os.pathsep}{os.environ['PATH']}"},
+        env={
+            **ONE_THREAD,
+            **os.environ,
+            "PATH": f"{here}{os.pathsep}{os.environ['PATH']}",
+        },
         check=False,
     ).returncode
     print(f"exit code {code} after {time.monotonic() - begun:.0f} s\n", flush=True)

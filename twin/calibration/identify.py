@@ -27,8 +27,14 @@ from flexdt.twin.calibration.bead_model import (
 from flexdt.twin.calibration.detect.detection import Detections
 from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN, Solver, solve
 from flexdt.twin.calibration.fit.forecast import visible_beads
-from flexdt.twin.calibration.fit.priors import OFFSETS
-from flexdt.twin.calibration.fit.problem import SIX, FitProblem, as_poses, build_problem
+from flexdt.twin.calibration.fit.priors import OFFSETS, STRAIN
+from flexdt.twin.calibration.fit.problem import (
+    SIX,
+    UNSTRAINED,
+    FitProblem,
+    as_poses,
+    build_problem,
+)
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
@@ -49,6 +55,9 @@ LEAST_GAIN = 0.01
 SETTLED_PX = 1e-3
 """Change of the residuals' rms below which a hypothesis is settled, well below the error of a
 spot. The fit of the geometry goes on from there."""
+ASLANT = (STRAIN, 0.06)
+"""Standard deviations of the stretches of a phantom that stands aslant, as assumed, and of its
+shears: 0.06 are 3.4 deg."""
 MAX_FINALISTS = 4
 """Number of hypotheses finished on all frames."""
 STARTS_BETWEEN = 4.0
@@ -206,6 +215,7 @@ def identify(
     start: Offsets = NOMINAL,
     search: Search | None = None,
     loose: Mapping[str, float] | None = None,
+    aslant: bool = False,
 ) -> Identification:
     """Assign spots to beads.
 
@@ -221,6 +231,7 @@ def identify(
         start: offsets to begin with.
         search: settings; None is the default.
         loose: standard deviations [mm, deg, 1] of other offsets that may be off.
+        aslant: the phantom may be sheared (`ASLANT`).
 
     Returns:
         The best assignment, its quality, and rivals that fit as well.
@@ -277,7 +288,7 @@ def identify(
     finals = _best_first(
         _finish(whole, scene, h, how) for h in _finalists(hypotheses, base, how)
     )
-    if finals and (loose or finals[0].loss > LOOSE_PX**2):
+    if finals and (loose or aslant or finals[0].loss > LOOSE_PX**2):
         # A rolled panel or a leaning axis looks like another phantom: only loose priors tell.
         # Where the six explain the spots, this is not needed.
         whole = build_problem(
@@ -288,6 +299,7 @@ def identify(
             shape=shapes,
             start=start,
             priors={n: LOOSE_FACTOR * w for n, w in OFFSETS.items()} | dict(loose or {}),
+            strain=ASLANT if aslant else UNSTRAINED,
         )
         finals = _best_first(_finish(whole, scene, h, how, wide_px=60.0) for h in finals)
     finals = _with_turned(whole, scene, finals, alike, how)

@@ -43,8 +43,9 @@ def test_a_right_scan_is_offered() -> None:
     [
         *(("bent_phantom", s) for s in (501, 502, 503, 509)),
         *(("twisted", s) for s in (701, 705, 803)),
-        ("slanted", 701),
-        ("dropped_end", 703),
+        *(("slanted", s) for s in (701, 2000)),
+        *(("dropped_end", s) for s in (703, 803)),
+        ("bowed", 805),
     ],
 )
 def test_a_bent_phantom_has_no_place_of_its_own(kind: str, seed: int) -> None:
@@ -103,6 +104,21 @@ def test_a_phantom_that_grows_is_held_somewhere_in_it(seed: int) -> None:
     assert found.offered, found.said
     assert any("grows or shrinks" in words for words in found.said), found.said
     assert not any("_y by" in words for words in found.said), found.said
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(1)
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [("breathing+bent_phantom", 704), ("breathing", 704), ("encoder", 704)],
+)
+def test_a_swing_has_a_period_of_its_own(kind: str, seed: int) -> None:
+    """A panel that came and went .9 times a turn was a phantom that grows, or an object that swings
+    aside alone: tau was 32 sigmas off.
+    """
+    found = scored(kind, seed)
+    assert found.offered, found.said
+    assert found.worst < FAR_SIGMAS, found.where
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """What is there where a scan's spots are not those of the phantom as it was said to stand.
 
 The balls that turn together (`constellation`) are compared with the phantom's beads. A phantom
-that leans, one that was moved between two frames, and two of them are recognised and identified;
-another unit, other pixels and a mirror image are named.
+that leans or is aslant, one that was moved between two frames, and two of them are recognised and
+identified; another unit, other pixels and a mirror image are named.
 """
 
 from __future__ import annotations
@@ -146,7 +146,11 @@ def recognise(
     if balls is None:
         return _otherwise_turned(detections, model, poses, name, start)
     like = likeness(model.beads, balls.places)
+    scan = _Spots(detections, model, poses, name, start)
     if like is None:
+        aslant = scan.aslant()
+        if aslant is not None:
+            return aslant
         some = found is not None and found.explained >= MIN_EXPLAINED
         left = {CalibrationCode.BEAD_DISPLACED} if some else set()
         return Recognised(model, right_angles=True, mistakes=frozenset(left))
@@ -154,7 +158,6 @@ def recognise(
         return Recognised(model, right_angles=True, mistakes=MIRRORING)
     if like.lean > ON_ITS_HEAD:
         return Recognised(model, right_angles=True, mistakes=UPENDING)
-    scan = _Spots(detections, model, poses, name, start)
     off = _of_scale(like.scale)
     if off:
         text = (
@@ -174,7 +177,7 @@ def recognise(
         leaning = scan.leaning(like)
         if leaning is not None:
             return leaning
-    return Recognised(model, right_angles=True)
+    return scan.aslant() or Recognised(model, right_angles=True)
 
 
 def doubtful(found: Identification | None, poses: Poses) -> bool:
@@ -336,6 +339,17 @@ class _Spots:
         if found is None or not convincing(found):
             return None
         return Recognised(model, found, self._leans(lean_of(turn)), True, True)
+
+    def aslant(self) -> Recognised | None:
+        """Identify the beads of a phantom that is sheared, which the fit tells; None if that does
+        not fit either.
+        """
+        found = attempt(
+            self.detections, self.model, self.poses, start=self.start, aslant=True
+        )
+        if found is None or not convincing(found):
+            return None
+        return Recognised(self.model, found, None, True, True)
 
     def _measured(self, found: Identification, model: BeadModel) -> FloatArray:
         """Measure by how much the beads are turned against a model, (3, 3)."""

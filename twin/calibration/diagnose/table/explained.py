@@ -143,10 +143,9 @@ def explained(fit: FitResult, known: Known) -> Explained:
         if settled and (not names or before == (names, factor)):
             break
         before = (names, factor)
-    moves = [some[f].places[g] for f, g in model.widths if some[f].cause == moving.NAME]
     held = {
         at[name]: 0.0
-        for name in (*_never_exact(table, known), *moving.confused(moves, table))
+        for name in _never_exact(table, known)
         if name in at and at[name] not in model.widths
     }
     for name, width in moving.apart(_courses(search, model)).items():

@@ -30,8 +30,8 @@ from flexdt.twin.geometry.conventions import FloatArray
 
 NAME: Final = "bend"
 WORDS: Final = "a bent phantom"
-KINDS: Final = 1 + 2 + 3
-"""Of bends, equally likely: everywhere, along an axis across, and a twist about each."""
+KINDS: Final = 1 + 1 + 3
+"""Of bends, equally likely: everywhere, of a rod, and a twist about each axis."""
 ROUNDING: Final = 1e-9
 """Part of a displacement's variance that keeps the displacements of near beads apart."""
 
@@ -40,8 +40,9 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make a phantom's bend: beads are displaced together, as they are near each other.
 
     The displacement is a normal process in space that is the same everywhere and in every
-    direction, or along one axis across the phantom's length; or a twist about some line. Weights
-    are root mean squares of slopes; what is an affine map alone is `strain`.
+    direction; or, of a rod, one that changes along the phantom's length alone; or a twist about
+    some line. Weights are root mean squares of slopes; what is an affine map
+    alone is `strain`.
     """
     if known.bead_tolerance_mm == 0 or table.k <= MOST_STRAINED:
         return
@@ -58,12 +59,10 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
 
 def _kinds(model: BeadModel) -> Iterator[tuple[str, npt.NDArray[np.floating]]]:
     """Yield each bend's name and displacements, (3 k, c)."""
-    smooth = _smooth(model.beads)
     axes = np.eye(3)
-    yield NAME, np.kron(smooth, axes)
-    # Bodies bend across their length.
-    for i in np.argsort(np.ptp(model.beads, axis=0))[:2]:
-        yield f"{NAME} along {'xyz'[i]}", np.kron(smooth, axes[:, i : i + 1])
+    yield NAME, np.kron(_smooth(model.beads), axes)
+    long = int(np.argmax(np.ptp(model.beads, axis=0)))
+    yield f"{NAME} of a rod", np.kron(_smooth(model.beads[:, [long]]), axes)
     for i, axis in enumerate(axes):
         yield f"twist about {'xyz'[i]}", _twist(model, axis)
 

@@ -23,6 +23,9 @@ NAME: Final = "growth"
 WORDS: Final = "a phantom that grows or shrinks"
 MOST_WAVES: Final = 6
 """Half waves in a scan."""
+WIDEST: Final = 5e-3
+"""Largest standard deviation of a growth: plastics expand by 1e-4 a kelvin, of which a cabinet may
+change by 20, and cured resin shrinks by 0.2 % in two days."""
 
 
 def families(table: Linearised, known: Known) -> Iterator[Family]:
@@ -58,6 +61,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
                 LOG_CHANCE - math.log(2),
                 slopes=np.array([[table.growth_slope, *table.place_slopes]]),
                 courses=courses,
+                widest=WIDEST,
             )
 
 

@@ -1,21 +1,22 @@
 """Motion: object, source, panel or angle are elsewhere from frame to frame.
 
-A motion is a ramp, a jump, a wander (half waves that fade with their number), a swing (harmonics
-of the turn) or a jitter (each frame by itself), of object, source or panel along an axis, or of
-the angle. All have a mean of zero over the scan: the geometry is that of the mean. A swing once
-a turn aside looks like a phantom aside on its mount: where nothing else of it is seen, it is taken
-for that; of what is seen to move aside, that part is left open (`confused`).
+A motion is a ramp, a jump, a wander (half waves that fade with their number, as those of a random
+walk do or as those of what slows down), a swing (of a period of its own, which need not be the
+turn's, and with an amplitude that may change), or a jitter (each frame by itself), of object,
+source or panel along an axis, or of the angle. What moves along the beam moves aside, too, and
+what turns back aside goes along the beam: a mount goes in a direction of its own. All have a mean
+of zero over the scan: the geometry is that of the mean.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Final, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.legendre import legvander
 
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.frame_numbers import named_turn
@@ -43,6 +44,7 @@ MOVERS: Final = {
     "alpha": {"alpha": 1.0},
     "dD_x": {"dD_x": 1.0},
     "dD_y": {"dD_y": 1.0},
+    "dD_z": {"dD_z": 1.0},
     "dS_x": {"dS_x": 1.0},
     "dS_y": {"dS_y": 1.0},
     # Seen from a source that comes nearer, object and panel go away.
@@ -81,27 +83,38 @@ MOST_WAVES: Final = 60
 """Half waves in a scan, of a wander."""
 MOST_JUMPS: Final = 60
 """Frames before which a jump is looked for."""
-HARMONICS: Final = 3
-"""Of the turn, that a swing follows."""
+MOST_SWINGS: Final = 16
+"""Half periods in a scan, of a swing."""
 LEAST_SWINGING: Final = 12
 """Frames of which a swing is told."""
-ONCE: Final = "swings once a turn"
-TURNING: Final = ("swings", "wanders", "ramps")
-"""Ways of motion of which a swing once a turn may be a part; a jump is all that it is."""
-LEAVING: Final = ("jumps", "wanders", "ramps")
-"""Ways of motion after which a thing is elsewhere than before."""
+SWELLS: Final = (1.0, 0.7, 0.2, 0.03)
+"""Of an amplitude that changes as Legendre's polynomials do: the parts of a swing whose period lies
+in the middle between two that are tried."""
+ASIDE: Final[Mapping[str, tuple[str, ...]]] = {
+    f"{body}_z": (f"{body}_x", f"{body}_y") for body in ("dO", "dS", "dD")
+}
+"""What moves along the beam -> what else it does by as much: the images do not tell where the beam
+is."""
+ALONG: Final[Mapping[str, tuple[str, ...]]] = {
+    f"{body}_x": (f"{body}_z",) for body in ("dO", "dS", "dD")
+}
+"""What moves aside -> what else it does by as much, where it turns back: once a turn, both are what
+a phantom does that is aside on its mount."""
 DIFFERS: Final = "differs between scans"
-ASLANT: Final = "aside"
-ALONG: Final = ("dO_z", "dD_z")
-ASIDE: Final = ("dO_x", "dO_y")
-SLANT: Final = 1.0
-"""Of the way aside over the way along the beam: nothing is known of it."""
-KINDS: Final = 4
+JUMPING: Final = ("jumps", "jitters", DIFFERS)
+"""Ways of motion of which that is no part."""
+FIRST_COLUMNS: Final = 8
+"""Columns of a course, with which it does: the slow ones."""
+LEAVING: Final = ("jumps", "wanders", "slows down", "ramps")
+"""Ways of motion after which a thing is elsewhere than before."""
+KINDS: Final = 5
 """Smooth kinds of motion, which share the odds."""
 
 
 class Moves(NamedTuple):
-    """What a group of motion is: what moves, how, in which scan, and at which frame."""
+    """What a group of motion is: what moves, how, in which scan, and at which frame, or with how
+    many half periods.
+    """
 
     what: str
     how: str
@@ -113,66 +126,27 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     """Make each kind of motion of all that may move, in each scan, and shifts from scan to
     scan.
     """
-    yield from _aside(table)
     movers = tuple(dict.fromkeys((*MOVERS, *known.asked)))
     many = len(table.scans) > 1
     for number, frames in enumerate(table.scans):
-        count = len(frames)
-        if count < LEAST_FRAMES:
+        if len(frames) < LEAST_FRAMES:
             continue
-        place = (np.arange(count) + 0.5) / count
         where = f" in scan {number + 1}" if many else ""
-        waves = np.arange(1, min(count - 1, MOST_WAVES) + 1)
-        # A random walk of as many steps: of slow waves this is their number.
-        steep = 2.0 * count / math.pi * np.sin(0.5 * math.pi * waves / count)
-        wander = np.cos(math.pi * place[:, None] * waves) / steep
-        ramp = (place - 0.5)[:, None]
-        # Of all half waves alike: frames by themselves, but for their mean.
-        every = np.arange(1, count)
-        jitter = np.cos(math.pi * place[:, None] * every) * math.sqrt(2.0 / count)
-        turn = table.problem.poses.angle[frames, None] * np.arange(1, HARMONICS + 1)
-        swing = np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
-        swing -= swing.mean(axis=0)
-        chance = LOG_CHANCE - math.log(KINDS)
-        for how, course in (
-            ("wanders", wander),
-            ("ramps", ramp),
-            ("jitters", jitter),
-            ("swings", swing),
-        ):
-            if how == "swings" and count < LEAST_SWINGING:
-                continue
+        for how, places, courses in _kinds(len(frames)):
             some = movers
             if how == "jitters":
                 some = tuple(dict.fromkeys((*JITTERS, *known.asked)))
             if how == "ramps":
                 # Of even angles this is a factor on them.
                 some = tuple(what for what in movers if what != "alpha")
-            for names in _alike(some):
+            each = np.stack([_in(table.n, frames, course) for course in courses])
+            chance = LOG_CHANCE - math.log(KINDS * len(courses))
+            at = [int(frames[i]) if how == "jumps" else i for i in places]
+            for names in _alike(some, how, known):
                 yield _family(
-                    table, [Moves(name, how, number) for name in names], where,
-                    np.stack([_in(table.n, frames, course)]), chance + _doubt(names, known),
+                    table, [Moves(m, how, number, i) for i in at for m in names], where,
+                    each, chance + np.tile(_doubt(names, known), len(courses)), known,
                 )  # fmt: skip
-        # Never chosen: held open beside what moves.
-        once = swing[:, [0, HARMONICS]]
-        size = float(np.ptp(table.problem.model.beads, axis=0).max())
-        aside = [Moves(name, ONCE, number) for name in MOVERS if name.endswith("x")]
-        courses = np.stack([_in(table.n, frames, once)])
-        yield replace(_family(table, aside, where, courses, NEVER), widest=size)
-        jumps = np.unique(
-            np.linspace(1, count - 1, min(count - 1, MOST_JUMPS)).round().astype(int)
-        )
-        late = (np.arange(count)[:, None] >= jumps) - (1 - jumps / count)
-        courses = np.stack(
-            [_in(table.n, frames, late[:, i : i + 1]) for i in range(len(jumps))]
-        )
-        chance = LOG_CHANCE - math.log(KINDS * len(jumps))
-        for names in _alike(movers):
-            moves = [
-                Moves(m, "jumps", number, int(frames[at])) for at in jumps for m in names
-            ]
-            each = chance + np.tile(_doubt(names, known), len(jumps))
-            yield _family(table, moves, where, courses, each)
     if many:
         group = table.problem.group
         differs = np.where(np.equal.outer(group, np.arange(group.max() + 1)), 1.0, 0.0)
@@ -183,48 +157,45 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         # geometry has its place.
         placed = {n[-1] for n in own if n.startswith("place")}
         shared = tuple(what for what, part in MOVERS.items() if own.isdisjoint(part))
-        for names in _alike(shared):
+        for names in _alike(shared, DIFFERS, known):
             still = [what != "alpha" and what[-1] in placed for what in names]
             yield _family(
                 table, [Moves(name, DIFFERS, -1) for name in names], "",
                 differs[None], np.where(still, NEVER, LOG_CHANCE - math.log(KINDS)),
+                known,
             )  # fmt: skip
 
 
-def _aside(table: Linearised) -> Iterator[Family]:
-    """Make what goes aside with all that moves along the beam: a mount moves in a direction of
-    its own, and a beam that lies in it would look alike.
+def _kinds(count: int) -> Iterator[tuple[str, list[int], FloatArray]]:
+    """Yield the ways in which something moves in a scan of a number of frames: its name, the
+    frames or half periods of its courses, -1 without, and the courses, (m, count, c).
     """
-    for name in ALONG:
-        course = table.state.frames.get(name, np.zeros(table.n))
-        if np.ptp(course) <= 0.0:
-            continue
-        courses = np.zeros((1, len(ASIDE), table.n, len(ASIDE)))
-        for i in range(len(ASIDE)):
-            courses[0, i, :, i] = course - course.mean()
-        yield Family(
-            NAME, (f"aside with {name}",), Acts.FRAMES, ((ASIDE, Moves("dO_x", ASLANT, -1)),),
-            0.0, slopes=np.array([[PER_FRAME.index(p) for p in ASIDE]]), courses=courses,
-            always=SLANT,
-        )  # fmt: skip
-
-
-def confused(places: Iterable[object], table: Linearised) -> list[str]:
-    """Name the swings once a turn of all that swings, wanders or drifts aside: how much of the
-    phantom's place on its mount is theirs is open, but for its magnification.
-
-    Args:
-        places: of the groups of motion that are there.
-        table: of their scans.
-    """
-    many = len(table.scans) > 1
-    return sorted(
-        {
-            f"{move.what} {ONCE}{f' in scan {move.scan + 1}' if many else ''}"
-            for _, move in cast("Iterable[tuple[object, Moves]]", places)
-            if move.what.endswith("x") and move.scan >= 0 and move.how in TURNING
-        }
+    place = (np.arange(count) + 0.5) / count
+    waves = np.arange(1, min(count - 1, MOST_WAVES) + 1)
+    # A random walk of as many steps: of slow waves this is their number.
+    steep = 2.0 * count / math.pi * np.sin(0.5 * math.pi * waves / count)
+    half_waves = np.cos(math.pi * place[:, None] * waves)
+    yield "wanders", [-1], (half_waves / steep)[None]
+    yield "slows down", [-1], (half_waves / steep**2)[None]
+    yield "ramps", [-1], (place - 0.5)[None, :, None]
+    # Of all half waves alike: frames by themselves, but for their mean.
+    every = np.arange(1, count)
+    jitter = np.cos(math.pi * place[:, None] * every) * math.sqrt(2.0 / count)
+    yield "jitters", [-1], jitter[None]
+    if count >= LEAST_SWINGING:
+        halves = np.arange(1, min(MOST_SWINGS, count // 2) + 1)
+        phase = math.pi * halves[:, None] * place
+        swells = legvander(2.0 * place - 1.0, len(SWELLS) - 1) * SWELLS
+        waves_of = np.stack([np.cos(phase), np.sin(phase)], axis=2)
+        swings = np.einsum("hnw,nq->hnqw", waves_of, swells).reshape(
+            len(halves), count, -1
+        )
+        yield "swings", halves.tolist(), swings - swings.mean(axis=1, keepdims=True)
+    jumps = np.unique(
+        np.linspace(1, count - 1, min(count - 1, MOST_JUMPS)).round().astype(int)
     )
+    late = (np.arange(count) >= jumps[:, None]) - (1 - jumps[:, None] / count)
+    yield "jumps", jumps.tolist(), late[:, :, None]
 
 
 def apart(courses: Iterable[tuple[object, FloatArray]]) -> dict[str, float]:
@@ -245,33 +216,46 @@ def apart(courses: Iterable[tuple[object, FloatArray]]) -> dict[str, float]:
 
 
 def mover(place: object) -> str:
-    """Return what a group moves, of its place; "" where it is no motion, or is never shown."""
+    """Return what a group moves, of its place; "" where it is no motion."""
     if isinstance(place, tuple) and len(place) > 1 and isinstance(place[1], Moves):
-        return "" if place[1].how in (ONCE, ASLANT) else place[1].what
+        return place[1].what
     return ""
 
 
-def _alike(names: tuple[str, ...]) -> list[list[str]]:
-    """Group movers by the number of their parameters, the angle by itself."""
-    kinds = sorted({_kind(name) for name in names})
-    return [[n for n in names if _kind(n) == kind] for kind in kinds]
+def _alike(names: tuple[str, ...], how: str, known: Known) -> list[list[str]]:
+    """Group movers by the numbers of their parameters, the angle by itself."""
+    alike: dict[tuple[tuple[int, ...], bool], list[str]] = {}
+    for name in names:
+        parts = _parts(name, how, known)
+        kind = tuple(len(part) for part in parts), name == "alpha"
+        alike.setdefault(kind, []).append(name)
+    return list(alike.values())
 
 
-def _kind(name: str) -> tuple[int, bool]:
-    return len(_parts(name)), name == "alpha"
+def _parts(name: str, how: str, known: Known) -> list[dict[str, float]]:
+    """Return the parameters of a frame that stand for what moves in a way, with their factors,
+    and those of what else it does: nothing that is stated to be exactly known, and of what is
+    asked for, only what is asked for as well.
+    """
+    others = ASIDE.get(name, () if how in JUMPING else ALONG.get(name, ()))
+    if name in known.asked:
+        others = tuple(o for o in others if o in known.asked)
+    exact = _exact(known)
+    others = tuple(o for o in others if exact.isdisjoint(MOVERS[o]))
+    return [MOVERS.get(one, {one: 1.0}) for one in (name, *others)]
 
 
-def _parts(name: str) -> dict[str, float]:
-    """Return the parameters of a frame that stand for what moves, with their factors."""
-    return MOVERS.get(name, {name: 1.0})
+def _exact(known: Known) -> frozenset[str]:
+    return known.exact - set(known.asked)
 
 
 def _doubt(names: Sequence[str], known: Known) -> FloatArray:
     """Return the logarithm of the odds of movers against others, (names,): of what is stated to
     be exactly known, and of what is not asked for where others are.
     """
-    exact = known.exact - set(known.asked)
-    out = np.array([0.0 if exact.isdisjoint(_parts(name)) else EXACT for name in names])
+    exact = _exact(known)
+    own = [MOVERS.get(name, {name: 1.0}) for name in names]
+    out = np.array([0.0 if exact.isdisjoint(part) else EXACT for part in own])
     if known.asked:
         out += [0.0 if name in known.asked else NOT_ASKED for name in names]
     return out
@@ -289,6 +273,7 @@ def _family(
     where: str,
     courses: FloatArray,
     chance: float | FloatArray,
+    known: Known,
 ) -> Family:
     """Make a family of motions of as many parameters each.
 
@@ -298,22 +283,39 @@ def _family(
         where: words on the scan.
         courses: (m, n, c) of the frames, each with all movers.
         chance: of each.
+        known: what is asked for, and what is exact.
     """
-    parts = [_parts(move.what) for move in moves]
+    parts = [_parts(move.what, move.how, known) for move in moves]
     first = parts[: len(parts) // len(courses)]
-    (factors,) = {tuple(part.values()) for part in first}
     names = tuple(
         f"{m.what} {m.how}{f' at {m.at}' if m.at >= 0 else ''}{where}" for m in moves
     )
+    every = [tuple(name for one in part for name in one) for part in parts]
     return Family(
         NAME,
         names,
         Acts.FRAMES,
-        tuple((tuple(part), move) for part, move in zip(parts, moves, strict=True)),
+        tuple(zip(every, moves, strict=True)),
         chance,
-        slopes=np.array([[PER_FRAME.index(p) for p in part] for part in first]),
-        courses=np.array(factors)[:, None, None] * courses[:, None],
+        slopes=np.array(
+            [[PER_FRAME.index(p) for p in part] for part in every[: len(first)]]
+        ),
+        courses=_side_by_side(courses, first[0]),
     )
+
+
+def _side_by_side(
+    courses: FloatArray, parts: Sequence[Mapping[str, float]]
+) -> FloatArray:
+    """Give each part of a mover columns of its own for its courses: (m, n, c) to (m, s, n, c') of
+    its s parameters.
+    """
+    columns = [courses, *[courses[:, :, :FIRST_COLUMNS]] * (len(parts) - 1)]
+    rows: list[FloatArray] = []
+    for i, part in enumerate(parts):
+        each = [own if i == j else np.zeros_like(own) for j, own in enumerate(columns)]
+        rows += [factor * np.concatenate(each, axis=2) for factor in part.values()]
+    return np.stack(rows, axis=1)
 
 
 def told(found: Found) -> list[Finding]:
