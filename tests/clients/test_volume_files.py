@@ -150,6 +150,27 @@ def test_a_reconstruction_says_whose_sample_it_is(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.parametrize("algorithm", ["fdk", "sirt"])
+@pytest.mark.parametrize("ending", [".nrrd", ".tif"])
+@pytest.mark.filterwarnings("ignore")
+def test_python_and_the_command_write_the_same_file(
+    ending: str, algorithm: str, tmp_path: Path
+) -> None:
+    """Down to the byte: values, place and all that is said."""
+    scan = fx.ConeVec.circular(sod=100, sdd=200, angles=24, shape=(4, 9), pixel=1)
+    counts, flat = np.full((24, 4, 9), 500), np.full((4, 9), 1000)
+    counts[:, :, [0, 8]] = 1000
+    data = fx.DataSet.from_arrays(counts, scan, flat=flat, name="tray 3")
+    data = replace(data, settings=ScanSettings(sample_name="bone 7", kV=90.0))
+    one, two = tmp_path / f"one{ending}", tmp_path / f"two{ending}"
+    iterations = None if algorithm == "fdk" else 1
+    reconstruct_dataset(data, one, VolumeRequest(algorithm, iterations=iterations))
+    options = {} if iterations is None else {"iterations": iterations}
+    data.reconstruct(algorithm, progress=False, **options).save(two)
+    assert one.read_bytes() == two.read_bytes()
+    assert b"bone 7" in two.read_bytes()
+
+
 def test_imagej_sees_a_stack_with_its_scale(tmp_path: Path) -> None:
     """By tifffile's reader of ImageJ's lines: layers, mm, the edges of a voxel."""
     import tifffile

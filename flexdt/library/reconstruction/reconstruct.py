@@ -46,6 +46,7 @@ from flexdt.library.reconstruction.slab_fdk import StandingImages, Work, fdk_sla
 from flexdt.library.reconstruction.volume_files import (
     MiddleSlices,
     check_name,
+    labelled,
     read_volume,
     volume_writer,
 )
@@ -709,7 +710,7 @@ def reconstruct_volume(
             and of FDK `sigma`.
 
     Returns:
-        The volume, attenuation [1/mm].
+        The volume, attenuation [1/mm]; its files say what those of `reconstruct_dataset` do.
 
     Raises:
         TwinError: as `reconstruct_dataset`.
@@ -735,7 +736,8 @@ def reconstruct_volume(
             if errors:
                 copies = copies_of(views.cone_vec, views.shape)
                 views = replace(views, copies=copies)
-            return _iterative(views, grid, task.request, tell)
+            made = _iterative(views, grid, task.request, tell)
+            return labelled(made, about_volume(views, task.request))
         if errors:
             views = _copied(views)
         slabs = _fdk_slabs(
@@ -752,7 +754,7 @@ def reconstruct_volume(
         doubts = [*bias_warnings(bias, volume), *doubts]
     for doubt in doubts:
         warn_caller(doubt)
-    return volume
+    return labelled(volume, about_volume(views, task.request))
 
 
 def _in_a_file(slabs: Iterator[Volume], grid: Grid, folder: Path) -> Volume:

@@ -29,6 +29,7 @@ from flexdt.library.reconstruction.volume_formats import (
 from flexdt.runtime.files.whole_files import require_bytes, room_named
 from flexdt.twin.errors import GeometryError, LimitError, TwinError, words_of
 from flexdt.twin.projection import Grid, Volume
+from flexdt.twin.reconstruction.volume_errors import with_errors
 from flexdt.twin.signatures import File
 
 NO_PLACE: Final = (
@@ -126,9 +127,24 @@ def _format(path: Path) -> VolumeFormat:
     return form
 
 
+def labelled(volume: Volume, about: Mapping[str, str]) -> Volume:
+    """Return a volume whose files say what it is of and how it was made; the data are shared.
+
+    Volumes derived from it say nothing of it: it is no field.
+
+    Args:
+        volume: not changed; keeps its errors.
+        about: word -> one line, as `volume_writer` takes it.
+    """
+    told = with_errors(volume)
+    object.__setattr__(told, "_about", dict(about))
+    return told
+
+
 def save_volume(volume: Volume, file: File) -> None:
-    """Write a volume to a file; see `Volume.save`."""
-    with volume_writer(Path(file), VoxelPlaces.of(volume)) as write:
+    """Write a volume to a file, with its label (`labelled`); see `Volume.save`."""
+    about: Mapping[str, str] = getattr(volume, "_about", {})
+    with volume_writer(Path(file), VoxelPlaces.of(volume), about) as write:
         write(volume.data)
 
 
