@@ -1,18 +1,20 @@
 """A bound of the bias in a volume of FDK, from the geometry and some of the images.
 
-A coarse volume of the object is projected and reconstructed on a ladder of scans: from
-one without a flaw (parallel rays from everywhere, a panel that sees all) to the one at
-hand, one flaw a rung. The difference of two rungs is the effect of that flaw on such an
-object, as far as its nodes show it: what a copy of half as many nodes shows less, or more, is
-expected once more of the finest nodes, and may be wrong by as much (Richardson's extrapolation to
-the first order, that of edges between nodes). Two flaws show in the images alone, and get a
-reconstruction each: what lies beyond the panel's edges, continued in another way, and the drift of
-the flat, which is seen beside the object. A voxel's bound is what all of them come to about it.
+A coarse volume of the object is projected and reconstructed on ladders of scans: from
+ones without a flaw (a panel that sees all, each layer from its own height) to the one at
+hand, one flaw a rung, with the same pixels. The difference of two rungs is the effect of that
+flaw on such an object, as far as its nodes show it: what a copy of half as many nodes shows less,
+or more, is expected once more of the finest nodes, and may be wrong by as much (Richardson's
+extrapolation to the first order, that of edges between nodes). Two flaws show in the images
+alone, and get a reconstruction each: what lies beyond the panel's edges, continued in another
+way, and the drift of the flat, which is seen beside the object. A voxel's bound is what all of
+them come to about it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -315,7 +317,7 @@ class BiasOnDemand:
 
         If the images fit another geometry better, nothing is bounded. The coarse volume's
         change by each flaw, extrapolated (`_extrapolated`), is the standard deviation of its
-        error: missing angles, the rungs of `ladder`, and pixels that stand for what is
+        error: missing angles, the rungs of `ladders`, and pixels that stand for what is
         between them ("sampling"). Another continuation of truncated rows ("beyond"), or for
         complete rows their level beside the object ("drift"), errors that the images tell and
         a known spectrum ("hardening") shift values. Standard errors of those, and of what the
@@ -652,11 +654,13 @@ class Flaw:
         cause: of `flexdt.twin.projection.volume.CAUSES`.
         change: of the volume, (nz, ny, nx) [1/mm].
         weights: of its nodes, (nz, ny, nx), above 0.
+        finite: it is one of finite pixels alone: the scan's own, finer ones, have less of it.
     """
 
     cause: str
     change: Float32Array
     weights: FloatArray
+    finite: bool = False
 
 
 Flaws = Callable[[CoarseScan, UniformNodes], dict[str, Flaw]]
@@ -684,14 +688,17 @@ def _extrapolated(
     if not found:
         return {}
     half = scan.halved
-    try:
-        coarser = flaws(half, UniformNodes.of(half.volume, half.rim))
-    except GeometryError:  # such as an axis within half a column of the panel's edge
-        coarser = {}
+    coarser: dict[str, Flaw] = {}
+    if not all(one.finite for one in found.values()):
+        # Not where the axis is within half a column of the panel's edge.
+        with suppress(GeometryError):
+            coarser = flaws(half, UniformNodes.of(half.volume, half.rim))
     squares: dict[str, FloatArray] = {}
     for name, one in found.items():
         more, whole = one.change, one.change
-        if name in coarser:
+        if one.finite:
+            more = np.zeros_like(whole)
+        elif name in coarser:
             known = half.grid.like(np.asarray(coarser[name].change, np.float32))
             more = one.change - interpolated(known, scan.grid)
             whole = one.change + more
@@ -715,23 +722,24 @@ def _angles(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
     best, ours = (
         scan.seen(nodes.sharp, scan.parallel("", wide, t)) for t in (None, scan.angles)
     )
-    return {"streaks": Flaw("angles", ours - best, nodes.even)}
+    return {"angles": Flaw("angles", ours - best, nodes.even, finite=not scan.few)}
 
 
 def _flaws(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
-    """Compute what the flaws of a scan do: few views, and the rungs of its ladder.
+    """Compute what the flaws of a scan do: few views, and the rungs of its ladders.
 
     Args:
         scan: a coarse copy.
         nodes: of its volume.
     """
     found = _angles(scan, nodes)
-    rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in scan.ladder()]
-    for (_, before), (flaw, after) in pairwise(rungs):
-        # Ends that few rays see blur no edge: they count as the middle does.
-        weights = np.where(nodes.inside, 1.0, 1e-3)
-        name = "fan" if flaw in ("cone", "angles") else flaw
-        found[name] = Flaw(flaw, after - before, weights)
+    # Ends that few rays see blur no edge: they count as the middle does.
+    weights = np.where(nodes.inside, 1.0, 1e-3)
+    for ladder in scan.ladders():
+        rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in ladder]
+        for (_, before), (flaw, after) in pairwise(rungs):
+            # A panel aside sees every ray of a circle once: only steps of weights are a flaw.
+            found[flaw] = Flaw(flaw, after - before, weights, finite=flaw == "aside")
     return found
 
 

@@ -1,4 +1,4 @@
-"""A coarse copy of a scan, and a ladder of scans that leads to it from one without a flaw."""
+"""A coarse copy of a scan, and scans that lead to it from ones without a flaw."""
 
 from __future__ import annotations
 
@@ -84,17 +84,19 @@ class Clipped:
 
 @dataclass(frozen=True, eq=False)
 class Rung:
-    """One scan of the ladder.
+    """One scan of a ladder.
 
     Attributes:
         flaw: the flaw that the rung before does not have.
         cone_vec: its views.
         shape: (rows, cols).
+        layered: each layer is seen by itself, from its own height.
     """
 
     flaw: str
     cone_vec: ConeVec
     shape: tuple[int, int]
+    layered: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +353,7 @@ class CoarseScan:
         return int(min(np.ceil(count * max(self.ends) / nearest), count))
 
     @cached_property
-    def sparse(self) -> bool:
+    def few(self) -> bool:
         """True if a circle's views leave directions out (gaps, or steps that differ by
         more than the median), or are fewer than pi / 2 times the columns; False for a
         helix.
@@ -359,7 +361,12 @@ class CoarseScan:
         step = self.circle.step
         apart = float(np.ptp(step)) > float(np.median(step))
         few = len(self.angles) < 0.5 * np.pi * self.images.shape[2]
-        return not self.circle.rise and (apart or few or not self.circle.full)
+        return not self.circle.rise and (apart or few)
+
+    @property
+    def sparse(self) -> bool:
+        """True if views are `few`, or a circle is not full: then FDK weighs its two ends."""
+        return self.few or not (self.circle.rise or self.circle.full)
 
     @cached_property
     def easy(self) -> bool:
@@ -395,25 +402,26 @@ class CoarseScan:
         images: Float32Array,
         cone_vec: ConeVec,
         truncation: Truncation | None = None,
+        grid: Volume | None = None,
     ) -> Float32Array:
-        """Reconstruct the grid by FDK on the processor; voxels that only continued rows show are
-        kept.
+        """Reconstruct by FDK on the processor; voxels that only continued rows show are kept.
 
         The images are not changed.
 
         `images`: (n, rows, cols) line integrals; `cone_vec`: n views; `truncation`: continues
-        the images beyond the panel.
+        the images beyond the panel; `grid`: that of the field of view without.
         Returns (nz, ny, nx) [1/mm], NaN where no data cover it.
         Raises GeometryError: FDK cannot use the views.
         """
         shape = (images.shape[1], images.shape[2])
+        grid = self.grid if grid is None else grid
         volume = fdk_parts(
             lambda: [images.copy()],
             cone_vec,
             shape,
-            self.grid,
+            grid,
             truncation=truncation,
-            target=OnProcessor(self.grid),
+            target=OnProcessor(grid),
             outside=True,
         )
         return volume.data
@@ -422,7 +430,7 @@ class CoarseScan:
         """Project values on the grid in a rung's geometry and reconstruct them by FDK.
 
         A shifted panel's hidden part (`truncation.beyond`) is weighed as in the scan, but
-        only in a rung with a flaw; rows are never continued.
+        not in parallel views without a flaw; rows are never continued.
 
         Args:
             thing: (nz, ny, nx).
@@ -431,9 +439,31 @@ class CoarseScan:
         Returns:
             (nz, ny, nx), 0 where unseen.
         """
+        if rung.layered:
+            return self._layer_by_layer(thing, rung)
         truncation = self.complete if rung.flaw else None
         images = self.projected(thing, rung.cone_vec, rung.shape)
         return np.nan_to_num(self.fdk(images, rung.cone_vec, truncation))
+
+    def _layer_by_layer(self, thing: Float32Array, rung: Rung) -> Float32Array:
+        """Reconstruct each layer from a fan of one row in its own plane: as the cone does
+        where nothing changes along the axis, whatever its pixels do to the layer.
+
+        Layers of zeros stay so.
+        """
+        side_x, side_y, tall = self.grid.voxel_xyz
+        centre = (*self.grid.center_mm[:2], float(rung.cone_vec.source[0, 2]))
+        blank = np.zeros((1, *thing.shape[1:]), np.float32)
+        like = Volume(blank, (side_x, side_y, tall), centre)
+        endless = (side_x, side_y, 1e3 * tall)
+        seen = np.zeros_like(thing)
+        for k in np.flatnonzero(thing.any(axis=(1, 2))):
+            layer = Volume(thing[k : k + 1], endless, centre)
+            images = two_rays(layer, rung.cone_vec, rung.shape)
+            seen[k] = np.nan_to_num(
+                self.fdk(images, rung.cone_vec, self.complete, like)[0]
+            )
+        return seen
 
     def projected(
         self,
@@ -455,9 +485,7 @@ class CoarseScan:
         volume = Volume(thing, self.grid.voxel_mm, self.grid.center_mm)
         if not fine:
             return forward(volume, views, shape)
-        finer = ConeVec.from_vectors(views.source, views.detector, 0.5 * views.u, views.v)
-        rays = forward(volume, finer, (shape[0], 2 * shape[1]))
-        return np.asarray(0.5 * (rays[:, :, ::2] + rays[:, :, 1::2]), np.float32)
+        return two_rays(volume, views, shape)
 
     def parallel(
         self, flaw: str, ends: tuple[float, float], turn: FloatArray | None = None
@@ -489,40 +517,57 @@ class CoarseScan:
         cols = int(sum(ends) / side + 1e-6) + 2  # often an integer, except for rounding
         return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))
 
-    def ladder(self) -> list[Rung]:
-        """List scans from parallel rays of a centred panel to the real scan, each with
-        one flaw more.
+    def ladders(self) -> list[list[Rung]]:
+        """List rows of scans, each from one without a flaw to one with, of the same sampling.
 
-        Flaws in order: "" (none), "aside" (a panel shifted by more than a column), "cone"
-        ("angles" for a sparse fan), "rows" (the object goes on above or below). Flaws
-        that the scan does not have are left out; a helix has "" and the last alone.
+        Parallel rays of a centred panel, then of one that is "aside" by more than a column;
+        layers that are seen by themselves, then in the "cone" and without the "rows" that the
+        panel does not have, if the object goes on above or below. A helix has "rows" alone.
 
         Returns:
-            Rungs with their flaw's name, geometry and panel's shape; empty if the scan
-            has no flaw.
+            Rungs with their flaw's name, geometry and panel's shape; no row for flaws that the
+            scan has not.
         """
         rows, cols = self.images.shape[1:]
         low, high = self.ends
-        if self.circle.rise:
-            turn = None
-        else:
-            turn = self.angles
-        rungs = [self.parallel("", (max(low, high),) * 2, turn)]
-        # Rays that climb less than a row across the object are a fan, whose flaw are its
-        # angles.
-        climb = 0.5 * self.grid.size_mm[2] / self.circle.radius * 2.0 * max(low, high)
-        fan = self.sparse and climb < self.grid.voxel_xyz[2]
-        cone = "angles" if fan else "cone"
-        if not self.circle.rise:
-            if abs(high - low) > (low + high) / cols:
-                rungs.append(self.parallel("aside", self.ends, turn))
-            if self.more:
-                reached = (-self.more, rows + self.more)
-                taller = window(self.level, (rows, cols), reached, (0, cols))
-                rungs.append(Rung(cone, taller, (rows + 2 * self.more, cols)))
-        if rows > 1:
-            rungs.append(Rung("rows" if self.more else cone, self.level, (rows, cols)))
-        return rungs if len(rungs) > 1 else []
+        found: list[list[Rung]] = []
+        if not self.circle.rise and abs(high - low) > (low + high) / cols:
+            sides = ("", (max(low, high),) * 2), ("aside", self.ends)
+            found.append([self.parallel(*one, self.angles) for one in sides])
+        if rows == 1:
+            return found
+        rising = [self._fan]
+        if self.more and not self.circle.rise:
+            reached = (-self.more, rows + self.more)
+            taller = window(self.level, (rows, cols), reached, (0, cols))
+            rising.append(Rung("cone", taller, (rows + 2 * self.more, cols)))
+        last = "rows" if self.more else "cone"
+        rising.append(Rung(last, self.level, (rows, cols)))
+        return [*found, rising]
+
+    @property
+    def _fan(self) -> Rung:
+        """One row in the plane of the sources, of a helix with all its turns on one."""
+        source, panel = self.level.source.copy(), self.level.detector.copy()
+        source[:, 2] = panel[:, 2] = self.grid.center_mm[2]
+        views = ConeVec.from_vectors(source, panel, self.level.u, self.level.v)
+        return Rung("", views, (1, self.images.shape[2]), layered=True)
+
+
+def two_rays(volume: Volume, views: ConeVec, shape: tuple[int, int]) -> Float32Array:
+    """Project a volume by the mean of two rays a column: the steps of its voxels would show.
+
+    Args:
+        volume: to project.
+        views: n of them.
+        shape: (rows, cols).
+
+    Returns:
+        (n, rows, cols) line integrals.
+    """
+    finer = ConeVec.from_vectors(views.source, views.detector, 0.5 * views.u, views.v)
+    rays = forward(volume, finer, (shape[0], 2 * shape[1]))
+    return np.asarray(0.5 * (rays[:, :, ::2] + rays[:, :, 1::2]), np.float32)
 
 
 class CoarseCopy:

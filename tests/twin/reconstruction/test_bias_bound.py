@@ -14,6 +14,7 @@ from flexdt.twin.projection import Grid
 from flexdt.twin.reconstruction import bias_of, fdk, fdk_parts, truncation_of
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
 from flexdt.twin.reconstruction.coarse_scan import CoarseScan
+from flexdt.twin.reconstruction.uniform_nodes import smoothed
 
 SHAPE = (24, 48)
 LADDER = {"angles", "aside", "cone", "rows", "beyond", "drift"}
@@ -305,3 +306,34 @@ def test_some_views_leave_arcs_out_only_where_all_do(seed: int, aside: float) ->
     scan = CoarseScan.of(lambda _: blank, geometry, (30, 60), None)
     assert circle_of(scan.cone_vec).full == scan.circle.full
     assert circle_of(scan.thinned().cone_vec).full == scan.circle.full
+
+
+@pytest.mark.parametrize("sod", [60.0, 100.0])
+@pytest.mark.daily(1)
+def test_a_body_that_goes_on_all_along_the_axis_has_no_error_of_the_cone(
+    sod: float,
+) -> None:
+    """FDK is exact of it, whatever pixels do; of one that ends the cone's error grows from
+    the plane of the source."""
+    scan = scan_of(TURN, sod)
+    images = images_of(scan, (10.0, 8.0, 90.0))
+    copy = CoarseScan.of(lambda i: images[i], scan, SHAPE, None)
+    fan, cone, *_ = copy.ladders()[-1]
+    assert (fan.layered, cone.flaw) == (True, "cone")
+    layers, _, wide = copy.grid.shape
+    rod = np.zeros(copy.grid.shape, np.float32)
+    rod[:, wide // 3 : -(wide // 3), wide // 3 : -(wide // 3)] = 1.0
+    change = copy.seen(smoothed(rod), cone) - copy.seen(smoothed(rod), fan)
+    inside = np.s_[layers // 3 : -(layers // 3), wide // 2 - 1 : wide // 2 + 2, wide // 2]
+    assert np.abs(change[inside]).max() < 0.003
+
+    blank = np.zeros_like(images[:, :6])
+    short = np.concatenate([blank, images[:, 6:-6], blank], axis=1)
+    copy = CoarseScan.of(lambda i: short[i], scan, SHAPE, None)
+    fan, cone = copy.ladders()[-1]
+    rod[: layers // 4] = rod[-(layers // 4) :] = 0.0
+    change = copy.seen(smoothed(rod), cone) - copy.seen(smoothed(rod), fan)
+    middle, end = (
+        float(np.abs(change[k][inside[1:]]).max()) for k in (layers // 2, layers // 4 + 1)
+    )
+    assert end > 3.0 * middle

@@ -228,12 +228,15 @@ def test_what_nodes_do_not_show_is_extrapolated() -> None:
         return {
             "falls": Flaw("cone", 0.3 + falls, even),
             "stays": Flaw("rows", np.full(copy.grid.shape, 0.2, np.float32), even),
+            "pixels": Flaw("aside", 0.0 * even + falls, even, finite=True),
         }
 
     spread = _extrapolated(seen, nodes, flaws)
     # 0.3 + 8 / n without end is 0.3; it was 0.4 and 0.5, so that it may be 0.1 off.
     np.testing.assert_allclose(spread["cone"], np.hypot(0.3, 0.1), rtol=1e-4)
     np.testing.assert_allclose(spread["rows"], 0.2, rtol=1e-4)
+    # What finer pixels have less of is not extrapolated.
+    np.testing.assert_allclose(spread["aside"], 0.1, rtol=1e-4)
 
 
 def test_the_effect_of_an_error_that_fdk_cannot_take_back_is_taken_in_proportion() -> (
