@@ -29,10 +29,10 @@ from flexdt.protocol import (
     Role,
     RpcError,
 )
+from flexdt.protocol.methods.session_messages import SESSION_PING
 from flexdt.twin import long_work
 
 READ_BYTES: Final = 1 << 18
-PING: Final = "session.ping"
 ASK_AFTER_S: Final = 2.0
 """Time without an answer after which a server is asked what it works at, and again [s]."""
 
@@ -317,7 +317,7 @@ class Link:
                 except Exception:
                     sent = False
                     raise
-                if timeout_s is not None and method != PING:
+                if timeout_s is not None and method != SESSION_PING.name:
                     await self._while_worked_at(method, waiter, timeout_s, limit)
                 return (await waiter).result()
         except TimeoutError:
@@ -352,7 +352,7 @@ class Link:
                 if waiter.done():
                     return
                 try:
-                    pong = await self.request(PING, {}, timeout_s)
+                    pong = await self.request(SESSION_PING.name, {}, timeout_s)
                 except (RpcError, ConnectionLost, TimeoutError):
                     return
                 # Requests of a connection are worked at one after the other.

@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Callable, Coroutine
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from in_process import Lab, run
 
 from flexdt.clients.client import transport as module
 from flexdt.clients.client.transport import Link
 from flexdt.protocol import Message, Request, Response
+from flexdt.server.imaging.projector_watch import ProjectorWatch
 from flexdt.testing.in_process import SimulatedLoop
 from flexdt.twin import long_work
 
@@ -117,3 +120,32 @@ def test_what_takes_long_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown == [
         "waiting for projection.get: the projector is compiling mark_convex, once on this machine"
     ]
+
+
+def test_a_twin_says_what_it_works_at(tmp_path: Path) -> None:
+    """What the cases above are told, asked of a twin whose projector takes long."""
+    looks = iter([None, "compiling project_rays"])
+    said: str | None = None
+
+    class Compiles:
+        port, host = 1, "lab"
+
+        async def health(self) -> SimpleNamespace:
+            return SimpleNamespace(working=said)
+
+    async def body(lab: Lab) -> None:
+        nonlocal said
+        client, other = lab.client(), lab.client()
+        for said in looks:
+            lab.projector.limit = lab.projector.views
+            image = asyncio.create_task(client.call("projection.get", binning=8))
+            await asyncio.sleep(3.0)  # the watch looks every second
+            pong = await client.call("session.ping")
+            assert pong["serving"] == ["projection.get"]
+            assert pong["working"] == said
+            assert (await other.call("session.ping"))["serving"] == []
+            lab.projector.limit = None
+            await image
+            assert (await client.call("session.ping"))["serving"] == []
+
+    run(tmp_path, body, virtual=True, projector_watch=ProjectorWatch([Compiles()]))
