@@ -347,7 +347,7 @@ def test_the_wheel_carries_its_data(installed: Path) -> None:
 
 
 def test_the_demos_script_is_the_example() -> None:
-    example = ROOT / "examples" / "scripts" / "lego-fly-360.txt"
+    example = ROOT / "examples" / "scripts" / "lego-fly-180.txt"
     assert (ROOT / "clients" / "data" / example.name).read_bytes() == example.read_bytes()
 
 

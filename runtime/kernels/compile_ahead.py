@@ -3,8 +3,8 @@
 
 numba compiles under one lock, so each group of kernels has a process of its own, which
 runs it on a tiny problem and leaves it where kernels are kept. Groups that are there
-already cost nothing; other kernels compile at their first use. Names of groups may follow
-the command.
+already cost nothing; other kernels compile at their first use, and so do those of a group
+that failed, about which there is a line. Names of groups may follow the command.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.long_work import Rhythm, time_span
@@ -86,27 +87,34 @@ def _fit() -> None:
 
 
 def _reconstruction() -> None:
-    """Compile the kernels of FDK by reconstructing eight tiny views, and that of warping by
-    a call.
+    """Compile the kernels of FDK of what lies within the panel, by reconstructing eight tiny
+    views, and that of warping by a call.
     """
-    from flexdt.twin.reconstruction import fdk
     from flexdt.twin.reconstruction.kernels import fdk_kernels
 
-    scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
-    images = np.ones((8, 4, 6), np.float32)
-    fdk(
-        images, scan, Grid((2, 3, 4), 0.5).blank()
-    )  # which go on beyond the panel's edges
+    images = _fdk(0.0, errors=False)
     fdk_kernels.warp(images, np.ones((8, 3, 3)), fdk_kernels.lanczos(), images.copy())
 
 
+def _fdk(edge: float, *, errors: bool) -> npt.NDArray[np.float32]:
+    """Reconstruct eight tiny views, `edge` at the panel's edges and 1 within; return them."""
+    from flexdt.twin.reconstruction import fdk
+
+    scan = ConeVec.circular(sod=10, sdd=20, angles=8, shape=(4, 6), pixel=1.0)
+    images = np.full((8, 4, 6), edge, np.float32)
+    images[:, 1:-1, 2:-2] = 1.0
+    fdk(images, scan, Grid((2, 3, 4), 0.5).blank(), errors=errors)
+    return images
+
+
 def _truncation() -> None:
-    """Compile the fit of a prism to what a panel cuts off, and the search for parts that do
-    not fit into a layout, by a call each.
+    """Compile FDK of what goes on beyond a panel's edges, with the volume's errors, the fit of
+    a prism to it, and the search for parts that do not fit into a layout.
     """
     from flexdt.twin.projection.kernels import layout_kernels
     from flexdt.twin.reconstruction.kernels import truncation_kernels
 
+    _fdk(1.0, errors=True)
     layout_kernels.unfit_parts(np.zeros(8, np.uint32))
     one = np.ones((1, 1))
     six = np.zeros(truncation_kernels.PARAMETERS)
@@ -173,7 +181,8 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
     """Compile the missing groups, each in a process of its own, as many at a time as
     there are cores; block until all have ended.
 
-    Nothing is noted if none is missing. A group that fails is not an error here.
+    Nothing is noted if none is missing. A group that fails is no error: its line says why,
+    and its kernels compile at their first use.
 
     Args:
         groups: names, of `GROUPS`.
@@ -192,6 +201,8 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
             until_line = max(rhythm.due_s - time.monotonic(), 0.0)
             done = wait(left, until_line, return_when="FIRST_COMPLETED").done
             ended = [left.pop(each) for each in done]
+            for failure in filter(None, (each.result() for each in done)):
+                note(failure)
             now = time.monotonic()
             if ended or rhythm.write(now):
                 compiled = len(missing) - len(left)
@@ -199,29 +210,45 @@ def compile_ahead(groups: Sequence[str], note: Callable[[str], None]) -> None:
                 note(f"compiled {compiled} of {len(missing)} ({words})")
 
 
-def elsewhere(group: str) -> None:
-    """Compile a group in a process that ends with this one; failures appear at
-    the first use."""
-    with start(["--here", group]) as process:
-        process.wait()
+def elsewhere(*groups: str) -> str:
+    """Compile groups in a process that ends with this one, one after the other; return the
+    sentence on a failure, or "".
+    """
+    with start(*groups) as process:
+        return failure_of(process)
 
 
-def start(words: Sequence[str], **streams: Any) -> subprocess.Popen[bytes]:
-    """Start this module as a process that ends with the present one."""
-    command = [sys.executable, "-P", "-m", "flexdt.runtime.child", MODULE, *words]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen(command, stdin=subprocess.PIPE, **{**quiet, **streams})
+def start(*groups: str) -> subprocess.Popen[bytes]:
+    """Start a process that compiles groups and ends with the present one; see `failure_of`."""
+    words = ["-P", "-m", "flexdt.runtime.child", MODULE, "--here", *groups]
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}
+    return subprocess.Popen([sys.executable, *words], stderr=subprocess.PIPE, **streams)
+
+
+def failure_of(process: subprocess.Popen[bytes]) -> str:
+    """Wait for a process of `start`; return "", or a sentence on its failure with the last
+    line of its standard error.
+    """
+    assert process.stderr is not None
+    lines = process.stderr.read().decode(errors="replace").strip().splitlines()
+    if process.wait() == 0:
+        return ""
+    why = lines[-1] if lines else f"exit status {process.returncode}"
+    return f"kernels were not compiled ahead, but will be at their first use: {why}"
 
 
 def main() -> None:
     """Compile the groups named on the command line, or all, each in another process, and
     print the progress.
 
-    With `--here GROUP` that group is compiled in this process, without output.
+    With `--here GROUP...` the missing ones of these groups are compiled in this process,
+    without output.
     """
     match sys.argv[1:]:
-        case ["--here", group]:
-            GROUPS[group][0]()
+        case ["--here", *groups]:
+            for group in groups:
+                if not is_compiled(group):
+                    GROUPS[group][0]()
         case groups:
             compile_ahead(
                 groups or list(GROUPS), lambda line: print(f"flexdt: {line}", flush=True)

@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from flexdt.library.data_set import DataSet
 
 SAMPLE: Final = "lego"
-SCRIPT: Final = "lego-fly-360.txt"
+SCRIPT: Final = "lego-fly-180.txt"
 PROGRAM: Final = "flexdt"
 """Name of the command, where it is on the path."""
 CALIBRATION: Final = "calibration.json"
@@ -53,8 +54,8 @@ PICTURE_ROWS: Final = 380
 PICTURE_VOXEL_MM: Final = 0.1
 PICTURE_MARGIN: Final = 30
 """Voxels of air beside the phantom in the picture."""
-PICTURE_EVERY: Final = 1
-"""Of the frames that its volumes take."""
+PICTURE_BINNING: Final = 2
+"""Of the images that its volumes take: a pixel is 0.17 mm at the axis then."""
 PICTURE_GAP: Final = 8
 """Distance of the images in the picture [pixels]."""
 STAY_S: Final = 3600.0
@@ -140,14 +141,16 @@ def run_demo(
             "starting the servers; a new installation compiles what the first image needs"
         )
         # Kernels of calibration and reconstruction compile during the servers' start and the
-        # scan.
-        compiling = running.enter_context(compile_ahead.start(compile_ahead.ANALYSIS))
+        # scan, in one process: each more costs some seconds of its own.
+        compiling = running.enter_context(compile_ahead.start(*compile_ahead.ANALYSIS))
         options = {"data": data.absolute(), "truth": path.absolute(), "speed-up": "max"}
         servers = running.enter_context(
             _running_servers(options, out, tell, viewer=stay is not None)
         )
         with TwinClient(*servers.address) as client:
-            document = _main_job(client, compiling.wait, truth, out, tell)
+            document = _main_job(
+                client, partial(compile_ahead.failure_of, compiling), truth, out, tell
+            )
         write_json(out / "demo.json", document)
         write_json(out / CALIBRATION, document["calibration"])
         _print_summary(document, out, tell)
@@ -211,19 +214,20 @@ def _running_servers(
 
 def _main_job(
     client: TwinClient,
-    compiled: Callable[[], object],
+    compiled: Callable[[], str],
     truth: Mapping[str, float],
     out: Path,
     tell: Tell,
 ) -> dict[str, Any]:
-    """Scan, calibrate, put the correction in force and preview.
+    """Scan, calibrate, put the correction in force and draw the picture.
 
-    Only the hidden truth is compared, after the correction is in force. Preview and
-    picture are written into `out`.
+    Only the hidden truth is compared, after the correction is in force. The picture is
+    written into `out`.
 
     Args:
         client: connected to the twin.
-        compiled: returns once the kernels of calibration and reconstruction are compiled.
+        compiled: returns once the kernels of calibration and reconstruction are compiled,
+            "" or a sentence on what failed.
         truth: hidden misalignment, to compare with.
         out: folder for all files.
         tell: called with each line of progress.
@@ -233,7 +237,9 @@ def _main_job(
     """
     dataset, seconds = _scan(client, out / "data", tell)
     with long_work.during("compiling the kernels of calibration and reconstruction"):
-        compiled()
+        failure = compiled()
+    if failure:
+        tell(failure)
     begun = time.monotonic()
     outcome = _calibrate(dataset, tell)
     document: dict[str, Any] = {
@@ -247,7 +253,6 @@ def _main_job(
     push_correction(client, outcome.correction, outcome.sources)
     tell(f"correction in force on the twin: {outcome.correction.name}")
     document["inside_95"] = _compare_with_truth(outcome, truth, tell)
-    document["preview"] = _reconstruct_preview(dataset, outcome, out / "preview.tif")
     document["picture"] = str(_draw_picture(dataset, outcome, out / PICTURE))
     return document
 
@@ -331,26 +336,12 @@ def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
     return outcome
 
 
-def _reconstruct_preview(
-    dataset: DataSet, outcome: Outcome[DataSet], out: Path
-) -> dict[str, object]:
-    """Reconstruct a small volume with the calibrated geometry into the file `out`; returns
-    its report. The calibration must have a fit.
-    """
-    from flexdt.library.reconstruction.reconstruct import preview
-
-    fit = outcome.calibration.fit
-    assert fit is not None
-    with long_work.during("making a preview"):
-        return preview(dataset, out, parameters=fit.parameters)
-
-
 def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Path:
     """Draw the layer of one bead as the scanner believes its geometry, as calibrated, and
     as it is, at one scale and in one window.
 
-    Both volumes are FDK of the same images. Each is `PICTURE_ROWS` rows high, by nearest
-    pixels, with white gaps of `PICTURE_GAP` columns.
+    Both volumes are FDK of the same images, binned, with Hann's window. Each is `PICTURE_ROWS`
+    rows high, by nearest pixels, with white gaps of `PICTURE_GAP` columns.
 
     Args:
         dataset: the scan, without a correction in force.
@@ -364,6 +355,7 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
 
     from flexdt.library.datasets.labelled_pictures import labelled
     from flexdt.library.datasets.pictures import png_of, windowed
+    from flexdt.twin.dataset.normalise import binned_mean
     from flexdt.twin.projection import Grid
     from flexdt.twin.reconstruction import fdk
     from flexdt.twin.reconstruction.acquisition.rectify import rows_needed, window
@@ -375,7 +367,7 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
     layer = int(np.argmin(np.abs(truth.centers()[2] - outcome.phantom.beads[0, 2])))
     z = float(truth.centers()[2][layer])
     grid = Grid((1, rows, cols), PICTURE_VOXEL_MM, (0.0, 0.0, z)).blank()
-    frames = dataset.present[::PICTURE_EVERY]
+    frames = dataset.present
     geometries = [
         dataset.corrected(parameters)[np.array(frames)]
         for parameters in (None, fit.parameters)
@@ -385,12 +377,21 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
     last = min(dataset.shape[0], max(part[1] for part in parts))
     with long_work.during("drawing the picture"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the picture shows what they say
-        images = np.stack([dataset.line_integrals(i)[first:last] for i in frames])
+        images = np.stack(
+            [
+                binned_mean(dataset.line_integrals(i)[first:last], PICTURE_BINNING)
+                for i in frames
+            ]
+        )
+        sides = (first, last), (0, dataset.shape[1])
         believed, calibrated = (
             fdk(
                 images,
-                window(geometry, dataset.shape, (first, last), (0, dataset.shape[1])),
+                window(geometry, dataset.shape, *sides).binned(
+                    PICTURE_BINNING, (last - first, dataset.shape[1])
+                ),
                 grid,
+                window="hann",
                 errors=False,
             ).data[0]
             for geometry in geometries

@@ -70,7 +70,9 @@ def test_a_group_names_a_kernel(group: str) -> None:
 def test_what_is_missing_is_named_and_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[str] = []
     monkeypatch.setattr(compile_ahead, "is_compiled", lambda group: group == "FDK")
-    monkeypatch.setattr(compile_ahead, "elsewhere", lambda group: compiled.append(group))
+    monkeypatch.setattr(
+        compile_ahead, "elsewhere", lambda group: compiled.append(group) or ""
+    )
     told: list[str] = []
     compile_ahead.compile_ahead(["FDK"], told.append)
     assert (compiled, told) == ([], [])
@@ -78,6 +80,24 @@ def test_what_is_missing_is_named_and_compiled(monkeypatch: pytest.MonkeyPatch) 
     assert compiled == ["calibration"]
     assert "calibration" in told[0]
     assert "FDK" not in told[0]
+
+
+def test_a_group_that_fails_is_told_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda group: False)
+    monkeypatch.setattr(compile_ahead, "start", lambda *groups: broken())
+    told: list[str] = []
+    compile_ahead.compile_ahead(["FDK"], told.append)
+    assert [
+        line for line in told if "ValueError: a kernel" in line and "first use" in line
+    ]
+
+
+def broken() -> subprocess.Popen[bytes]:
+    program = "import sys; print('x', file=sys.stderr); raise ValueError('a kernel')"
+    words = [sys.executable, "-c", program]
+    return subprocess.Popen(words, stderr=subprocess.PIPE)
 
 
 def test_who_waits_for_one_kernel_is_told_which(

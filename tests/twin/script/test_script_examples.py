@@ -29,6 +29,7 @@ def check(
     ("check", "frames", "steps"),
     [
         ("lego-fly-360", 360, 360 / 359),
+        ("lego-fly-180", 180, 360 / 179),
         ("calibration-two-positions", 146, 5.0),
         ("step-72", 72, 5.0),
         ("tiled-two", 722, 1.0),
@@ -52,7 +53,7 @@ def test_examples_check_without_a_word(
     assert cut == [frames in (722, 541)] * len(cut)
 
 
-@pytest.mark.parametrize("check", ["lego-fly-360"], indirect=True)
+@pytest.mark.parametrize("check", ["lego-fly-180"], indirect=True)
 def test_the_demo_s_script(
     check: CheckReport, flexray: Machine, profile: Profile
 ) -> None:
