@@ -278,8 +278,7 @@ class Rhythm:
         return cls(begun_s + LINE_INTERVALS_S[0])
 
     def after(self, begun_s: float) -> Rhythm:
-        """Go on with work of the same name that follows this one's: a thousand short works
-        write as few lines as a long one."""
+        """Go on with work of one name: a thousand short works write as few lines as a long one."""
         return Rhythm(max(self.due_s, begun_s + LINE_INTERVALS_S[0]), self.lines)
 
     def write(self, now_s: float) -> bool:

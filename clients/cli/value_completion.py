@@ -43,8 +43,7 @@ def bead_phantom_names(typed: str) -> list[str]:
 
 
 def calibration_targets(typed: str) -> list[str]:
-    """List the subjects of a calibration, as completions: phantoms with beads, and the
-    word for markers at unknown places."""
+    """List completions: phantoms with beads, and the word for unknown markers."""
     return [*bead_phantom_names(typed), *_beginning(typed, [UNKNOWN_MARKERS])]
 
 
@@ -61,8 +60,7 @@ def axis_names(typed: str) -> list[str]:
 
 
 def axis_values(typed: str) -> list[str]:
-    """List axes of the configured machine, each with the sign before its value, as
-    completions."""
+    """List completions: the machine's axes, each with the sign before its value."""
     return _beginning(typed, (name + AXIS_VALUE for name in _axes()))
 
 

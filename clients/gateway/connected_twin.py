@@ -171,8 +171,7 @@ class ConnectedTwin:
             raise Refusal(f"the twin cannot be reached: {error}") from None
 
     async def run(self, flow: Flow[_R]) -> _R:
-        """Run one of the client's methods (`twin_methods`) and return its result;
-        raises as `ask`."""
+        """Run a method of the client (`twin_methods`), return its result; raises as `ask`."""
         return await adrive(flow, lambda asked: self.ask(asked.method, asked.params))
 
     async def state(self) -> State:

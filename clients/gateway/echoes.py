@@ -86,8 +86,7 @@ class Echoes:
     _line: Exchange | None = None
 
     def adopt(self, state: State, component: str) -> None:
-        """Store a component's state after a command of the interface, so that it is
-        not echoed."""
+        """Store a component's state after a command, so that it is not echoed."""
         self._known |= {k: v for k, v in told(state).items() if k[0] == component}
 
     def see(

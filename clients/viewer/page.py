@@ -385,8 +385,7 @@ class Page:
 
 
 def person_name(text: str) -> str:
-    """Return a person's name as others see it: printable, at most `MAX_NAME` characters, or
-    "a visitor"."""
+    """Return a person's printable name of at most `MAX_NAME` characters, or "a visitor"."""
     return "".join(c for c in text if c.isprintable()).strip()[:MAX_NAME] or "a visitor"
 
 

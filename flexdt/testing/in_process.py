@@ -398,8 +398,7 @@ class InProcessTwin:
         )
 
     def advance(self, seconds: float) -> None:
-        """Let virtual seconds of the laboratory pass, and whatever happens in them
-        happen."""
+        """Let virtual seconds of the laboratory pass, with all that happens in them."""
         self.run(asyncio.sleep(seconds))
 
     def connect(self, name: str = "flexdt.testing") -> TwinClient:
@@ -407,8 +406,7 @@ class InProcessTwin:
         return _Client(self, name)
 
     def transport(self) -> Transport:
-        """Make a connection of its own, for `AsyncTwinClient` and for Bluesky's
-        `TwinLab`."""
+        """Make a connection of its own, for `AsyncTwinClient` and Bluesky's `TwinLab`."""
         return InProcessTransport(self.loop, self._shell.connection)
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:

@@ -226,8 +226,7 @@ class Corrections:
             self._sources[correction.name] = source
 
     def in_state(self, history: History) -> History:
-        """Return the part of a history that the state has: what is in force, or all if it
-        has no file."""
+        """Return what the state has of a history: what is in force, or all without a file."""
         return history[-1:] if self.filed else history
 
     def store_history(self, changes: documents.Changes, history: History) -> None:

@@ -122,8 +122,7 @@ class JobFiles:
                 self._folder.unlink(file)
 
     def settle(self) -> None:
-        """Clean the folders at the start: delete the rest of killed writers; set aside
-        other entries in place of folders."""
+        """Delete what killed writers left; set aside other entries in place of folders."""
         documents.settle(self._records, [FOLDER])
 
 

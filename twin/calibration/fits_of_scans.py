@@ -197,6 +197,5 @@ def refit_scans(
 
 
 def positions_weighed(state: Calibration) -> bool:
-    """Check whether positions have sigmas of their own: those of the first measurement
-    count alike."""
+    """Check whether positions have sigmas of their own, which first measurements lack."""
     return bool(state.measured) or all(scan.index is not None for scan in state.scans)

@@ -107,8 +107,7 @@ class Search:
     near: float | None = None
 
     def allows(self, x: FloatArray, start: FloatArray) -> bool:
-        """Check whether the six parameters `x` turn the phantom as far from `start`, (6,),
-        as `turn` says."""
+        """Check that the parameters `x` (6,) turn the phantom from `start` by at most `turn`."""
         return not math.isinf(self.turn) and _turn_between(x, start) <= self.turn
 
 

@@ -214,6 +214,5 @@ def _log_student(deviation: FloatArray, sigma: FloatArray) -> FloatArray:
 
 
 def _unexplained(deviation: FloatArray, sigma: FloatArray) -> float:
-    """Compute the factor on standard deviations that explains the scatter of most
-    frames, 1 or more."""
+    """Compute the factor on sigmas that explains most frames' scatter, at least 1."""
     return max(ROBUST * float(np.median(np.abs(deviation / sigma))), 1.0)

@@ -49,8 +49,7 @@ class ConvexSolid(Protocol):
         """Return a point of the solid farthest along each direction, (..., 3) both."""
 
     def support(self, directions: FloatArray) -> FloatArray:
-        """Compute the largest p . direction over the solid's points p, (...) [mm,
-        for unit directions]."""
+        """Compute the largest p . direction over the solid's points p, (...) [mm]."""
         return np.asarray((directions * self.farthest(directions)).sum(axis=-1))
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:

@@ -283,8 +283,7 @@ class ScanRecord(ArrayValue):
         return sum(len(b) for b in self.blocks if b.kind == kind)
 
     def poses_of(self, block: FrameBlock) -> Poses:
-        """Compute nominal poses of a block's images, without limits and correction
-        (`motor_poses`)."""
+        """Compute nominal poses of a block's images, without limits and correction."""
         return motor_poses(self.machine, self.profile, block.camera, block.positions)
 
     def cone_vec(self, blocks: Iterable[FrameBlock] | None = None) -> ConeVec:

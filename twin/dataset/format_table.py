@@ -132,8 +132,7 @@ def refused(
     neutral: tuple[str, ...] = OFF,
     of: Part = Part.NONE,
 ) -> Field:
-    """Make a field whose value makes a scan impossible to read, unless what it states is
-    given in its place."""
+    """Make a field whose value makes a scan unreadable, unless another states the same."""
     return Field(name, meaning, Role.REFUSED, because, neutral=neutral, of=of)
 
 

@@ -309,8 +309,7 @@ class ConeVec:
         return converted
 
     def to_tomosipo(self) -> Any:
-        """Convert to tomosipo's `ts.cone_vec` geometry; needs tomosipo and
-        the detector's shape."""
+        """Convert to tomosipo's `ts.cone_vec`; needs tomosipo and the detector's shape."""
         return _formats().to_tomosipo(self)
 
     def to_cil(self) -> Any:

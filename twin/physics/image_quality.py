@@ -108,8 +108,7 @@ def pixel_reading(
 
 
 def contrast_to_noise(background: PixelValue, detail: PixelValue) -> float:
-    """Compute the difference of two readings over the background's noise, for one pixel
-    of one image."""
+    """Compute the difference of two readings over the background's noise, of one pixel."""
     return abs(background.signal - detail.signal) / background.noise
 
 

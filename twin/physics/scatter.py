@@ -419,8 +419,7 @@ class ScanScatter:
         return len(self.way)
 
     def __getitem__(self, index: int) -> Scattered:
-        """Interpolate the scatter of a view at every pixel; never negative, though
-        splines may overshoot."""
+        """Interpolate a view's scatter at every pixel; never negative, as splines may be."""
         return Scattered(self.signal(index), self._spread_out(index, "spread"))
 
     def of_views(self, chosen: npt.NDArray[np.intp]) -> ScanScatter:

@@ -455,8 +455,7 @@ class Volume:
         return np.asarray(self.data, dtype=dtype)
 
     def __dlpack__(self, **options: Any) -> Any:
-        """Export the values to another library, such as `torch.from_dlpack(volume)`,
-        read-only."""
+        """Export the values read-only, as for `torch.from_dlpack(volume)`."""
         return self.data.__dlpack__(**options)
 
     def __dlpack_device__(self) -> Any:

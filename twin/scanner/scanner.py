@@ -180,8 +180,7 @@ class ScannerTwin:
     def poses_at(
         self, positions: Mapping[str, npt.ArrayLike], camera: CameraSettings
     ) -> Poses:
-        """Compute nominal poses for positions [mm, deg], scalars or (n,), and
-        any camera settings."""
+        """Compute nominal poses for positions [mm, deg], scalars or (n,), and any camera."""
         return motor_poses(self.machine, self.profile, camera, positions)
 
     def corrected(

@@ -183,8 +183,7 @@ class LogComparison:
 
     @classmethod
     def of(cls, log: Log, machine: Machine) -> LogComparison:
-        """Predict each line of `log` on `machine`, and warn of axes that are not the
-        machine's (`unlike`)."""
+        """Predict each line of `log` on `machine`; warn of axes that it lacks (`unlike`)."""
         return cls(machine, tuple(against_log(log, machine)), unlike(log, machine))
 
     @property

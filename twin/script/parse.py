@@ -379,8 +379,7 @@ def _nothing(problem: Finding) -> tuple[c.Script, Findings]:
 
 
 def read_row(row: CodeLine, problems: list[Finding]) -> c.Command | None:
-    """Read the command of one row; add its problems to `problems` and return None
-    after an error."""
+    """Read the command of a row; None after an error, which is added to `problems`."""
     return _Line(row, problems).command()
 
 

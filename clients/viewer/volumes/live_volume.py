@@ -437,8 +437,7 @@ class Served:
         self._lock = threading.Lock()
 
     def say(self, document: dict[str, Any]) -> None:
-        """Print a document: its surface, for the viewer, apart from the rest, which
-        goes to pages."""
+        """Print a document; its surface apart, for the viewer, the rest for pages."""
         self._write(json.dumps(document.pop("surface", None)), json.dumps(document))
 
     def answer(self, told: object, content: bytes = b"") -> None:

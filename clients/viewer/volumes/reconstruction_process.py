@@ -28,8 +28,7 @@ Wish = tuple[str, ...]
 
 
 def wish(folder: Path, side: int, past: bool) -> Wish:
-    """Make the request for the volume of a data set, with so many voxels a side; a
-    past scan's is complete."""
+    """Make the request for a data set's volume of so many voxels; past scans' are complete."""
     return str(folder.absolute()), str(side), *(["past"] if past else [])
 
 

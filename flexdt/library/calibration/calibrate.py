@@ -440,8 +440,7 @@ def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
 
 
 def explained_by(saturated: Sequence[Finding], findings: Findings) -> Findings:
-    """List findings on saturated images first, and leave out those that saturation
-    falsifies (`explains` of its code); unchanged if none is saturated."""
+    """List findings on saturated images first, without those that saturation falsifies."""
     return Findings(saturated).and_also(findings.unexplained_by(saturated))
 
 

@@ -558,8 +558,7 @@ def _copied(views: ScanFrames) -> ScanFrames:
 
 
 def _bias(views: ScanFrames) -> BiasOnDemand | None:
-    """Find what the copies of all views tell of FDK's errors; None where the scan cannot
-    be copied."""
+    """Find what copies of all views tell of FDK's errors; None where no copy can be made."""
     return BiasOnDemand.of(views.copies, sides_known=views.sides_known, known=views.known)
 
 

@@ -338,8 +338,7 @@ class Certificate:
 
     @property
     def determined(self) -> bool:
-        """Whether the data determine every requested parameter, if their errors are white;
-        `identifiable` counts what their residuals show, too."""
+        """Whether the data, if their errors are white, determine every requested parameter."""
         return self.spectrum.full
 
     @property
@@ -365,8 +364,7 @@ class Certificate:
 
     @property
     def identifiable(self) -> bool:
-        """Whether the data determine every requested parameter within the bound, with what
-        their residuals show."""
+        """Whether data and residuals determine every requested parameter within the bound."""
         return self.determined and not self.beyond
 
     @property
@@ -467,8 +465,7 @@ class Certificate:
         return float(weights @ np.array(levels) / weights.sum())
 
     def inside_95(self, truth: Mapping[str, float]) -> bool:
-        """Check whether values are in the joint 95 % region of their columns; arguments as
-        `mahalanobis2`."""
+        """Check that values are in the joint 95 % region; arguments as `mahalanobis2`."""
         return self.level(truth) <= 0.95
 
     def _places(self, truth: Mapping[str, float]) -> tuple[list[int], FloatArray]:

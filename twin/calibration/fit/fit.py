@@ -417,8 +417,7 @@ class FitResult:
 
     @property
     def determined(self) -> bool:
-        """Every free parameter is determined, if nothing but white noise is in the data:
-        the other steps of a calibration can go on from the fit."""
+        """Whether white noise alone leaves every free parameter determined."""
         return self.certificate.determined
 
     @property

@@ -547,8 +547,7 @@ class FitProblem:
     def jacobian(
         self, x: FloatArray, use: npt.NDArray[np.bool_] | None = None
     ) -> FloatArray:
-        """Compute whitened rows d(column, row)/dx, (2 n k, columns); rows of unused
-        positions are 0."""
+        """Compute whitened rows d(column, row)/dx, (2 n k, columns), 0 if unused."""
         return self._evaluate(x, self.seen if use is None else use, 2)[2]
 
     def _evaluate(
@@ -1013,8 +1012,7 @@ def whitening(
 
 
 def values_in(p: Offsets) -> FloatArray:
-    """List values in the order of PARAMETERS, internal units: those of `p`, and told lengths
-    that are right."""
+    """List values of `p` in the order of PARAMETERS, internal units; told lengths are right."""
     return np.array([getattr(p, name) for name in NAMES] + [0.0] * len(TOLD))
 
 

@@ -71,8 +71,7 @@ class CircularScan:
         return cls(image, poses, present, shape, base, priors, _standing(poses, present))
 
     def offsets(self, values: FloatArray) -> Offsets:
-        """Put parameters, the first ones of `FREE`, into a copy of the offsets in force;
-        missing ones stay."""
+        """Put the first parameters of `FREE` into a copy of the offsets in force."""
         return replace(self.base, **dict(zip(FREE, values.tolist(), strict=False)))
 
     def view(self, values: FloatArray) -> FloatArray:

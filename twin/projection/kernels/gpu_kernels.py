@@ -139,8 +139,7 @@ else:
 
     @cuda.jit(device=True, inline=True)
     def packed(jump, share):
-        """Pack an integer of 32 bits and a float into one number, which one instruction
-        reads."""
+        """Pack a 32-bit integer and a float into one number, read by one instruction."""
         return np.int64(jump) << 32 | np.int64(np.uint32(libdevice.float_as_int(share)))
 
     @cuda.jit(device=True, inline=True)

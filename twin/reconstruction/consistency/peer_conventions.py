@@ -342,8 +342,7 @@ def _ratio(
 
 
 def level_of(found: list[Fit]) -> float:
-    """Return the probability below which a rival is excluded: `MAX_WRONG` for all rivals
-    together."""
+    """Return the probability below which one of all rivals is excluded (`MAX_WRONG`)."""
     return MAX_WRONG / max(len(found) - 1, 1)
 
 

@@ -151,8 +151,7 @@ class Reprojection:
 
     @cached_property
     def _noise(self) -> float:
-        """Variance of white noise in the images, at least 0: differences between
-        neighbours that the reprojection has as well are the object's."""
+        """Variance of white noise: differences of neighbours that the reprojection lacks."""
         return max(self.image_noise - self.noise_again, 0.0)
 
     @cached_property

@@ -99,8 +99,7 @@ class ImageUpload:
         self._handed.wait(self._reader)
 
     def end(self) -> None:
-        """Record that the last kernel that reads this chunk has been launched, so that
-        its memory may be filled again."""
+        """Record that the chunk's last kernel is launched, so its memory may be refilled."""
         self._read[self._chunk] = _recorded(self._read[self._chunk], self._reader)
 
     def _room(self, name: str, shape: tuple[int, ...], some: slice = slice(None)) -> Any:

@@ -79,8 +79,7 @@ class View:
 
 
 def _beyond(low: FloatArray, high: FloatArray, size: int) -> FloatArray:
-    """Compute how far a projection reaches beyond the image's low and high edge
-    [pixels], (n, 2)."""
+    """Compute how far a projection is beyond the image's low and high edge [pixels], (n, 2)."""
     return np.maximum(np.stack([-0.5 - low, high - (size - 0.5)], axis=1), 0.0)
 
 

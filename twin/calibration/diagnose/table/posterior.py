@@ -208,8 +208,7 @@ class Search:
         self._squares: dict[tuple[Group, ...], tuple[FloatArray, FloatArray]] = {}
 
     def chance(self, group: Group) -> float:
-        """Return the logarithm of the odds of a group before the scan, with the part of the
-        grid that its width takes."""
+        """Return the log odds of a group before the scan, with its width's share of the grid."""
         return float(self.products.families[group[0]].chances[group[1]]) + OCCAM
 
     def _between(self, one: int, other: int) -> FloatArray:
@@ -406,8 +405,7 @@ class Search:
         return found
 
     def keep_shapes(self) -> None:
-        """Take the eigenvalues of the first model for all: of draws that differ in their noise
-        alone."""
+        """Take the first model's eigenvalues for all draws that differ in noise alone."""
         self._shapes = {}
 
     def best_further(

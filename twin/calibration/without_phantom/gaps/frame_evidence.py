@@ -92,8 +92,7 @@ class Evidence:
         return Evidence(self.found + more, self.width + width, self.free + both)
 
     def trusted(self) -> Evidence:
-        """Return the evidence as far as single frames count: a wall passes for a gap to
-        them (`trusted`)."""
+        """Return the evidence as far as frames count, to which walls look like gaps."""
         return replace(self, found=trusted(self.found))
 
     @property

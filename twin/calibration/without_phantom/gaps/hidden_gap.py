@@ -233,8 +233,7 @@ def frames_show(frames: Sequence[Float32Array], gap: Gap, about: float) -> bool:
 
 
 def possible_gap(gap: Gap) -> HiddenGap:
-    """Return a gap that both ends of rays show and single frames do not, as one that is not
-    excluded."""
+    """Return a gap shown by both ends of rays but not by frames: it is not excluded."""
     return HiddenGap(gap.column, gap.column, 0.5, gap.width, None, True)
 
 
