@@ -221,8 +221,12 @@ def elsewhere(*groups: str) -> str:
 def start(*groups: str) -> subprocess.Popen[bytes]:
     """Start a process that compiles groups and ends with the present one; see `failure_of`."""
     words = ["-P", "-m", "flexdt.runtime.child", MODULE, "--here", *groups]
-    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}
-    return subprocess.Popen([sys.executable, *words], stderr=subprocess.PIPE, **streams)
+    return subprocess.Popen(
+        [sys.executable, *words],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
 
 
 def failure_of(process: subprocess.Popen[bytes]) -> str:
