@@ -61,8 +61,11 @@ def opened(browser: Any, url: str) -> Iterator[Any]:
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("stripped", [True, False])
-@pytest.mark.parametrize("host_kept", [True, False])
+@pytest.mark.campaign(2)
+@pytest.mark.parametrize(
+    ("host_kept", "stripped"),
+    [(True, True), (True, False), (False, False), (False, True)],
+)
 def test_the_page_works_below_a_path(
     browser: Any, lab: Any, twin: TwinClient, host_kept: bool, stripped: bool
 ) -> None:
