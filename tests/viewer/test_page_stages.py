@@ -100,3 +100,28 @@ def test_pictures_of_the_sample_are_asked_for_once_a_second_at_most(
     assert failed == []
     page.evaluate("flexdt.call('axes.stop')")
     page.close()
+
+
+@pytest.mark.slow
+def test_a_picture_of_the_sample_that_a_busy_viewer_had_not_is_asked_for_again(
+    open_page: Callable[..., Any],
+) -> None:
+    """Nothing moves any more; meanwhile there is no empty box."""
+    page = open_page("iso", SIZE)
+    inset = page.locator(".view .inset")
+    page.wait_for_function("document.querySelector('.inset img').naturalWidth > 0")
+    answers: list[str] = []
+
+    def busy(route: Any) -> None:
+        answers.append(route.request.url)
+        if len(answers) > 1:
+            route.continue_()
+        else:
+            route.fulfill(status=204)
+
+    page.route("**/still.jpg?*view=sample*", busy)
+    page.evaluate("document.documentElement.dataset.theme = 'dark'")
+    inset.wait_for(state="hidden")
+    inset.wait_for()
+    assert len(answers) > 1
+    page.close()

@@ -112,6 +112,7 @@ function frame(view) {
   const sample = el("img", { alt: "" });
   sample.addEventListener("error", () => {
     sample.hidden = true;
+    posed = ""; // a busy viewer has none: it is asked again
   });
   sample.addEventListener("load", () => {
     sample.hidden = false;
