@@ -110,7 +110,7 @@ def explained(fit: FitResult, known: Known) -> Explained:
     widths: dict[str, float] = {}
     factor = 0
     noise2 = 0.0
-    before: tuple[frozenset[str], int] | None = None
+    before: set[tuple[frozenset[str], int]] = set()
     for turn in range(MOST_TABLES):
         table = Linearised(plain, state, known.floor)
         some = every_family(table, known)
@@ -140,9 +140,10 @@ def explained(fit: FitResult, known: Known) -> Explained:
         noise2 = model.noise2
         factor = model.factor
         settled = change < SETTLED_PART * math.sqrt(noise2) or change < known.floor**2
-        if settled and (not names or before == (names, factor)):
+        # Tables that name one of two in turn go on for ever; the mixture has both.
+        if settled and (not names or (names, factor) in before):
             break
-        before = (names, factor)
+        before.add((names, factor))
     held = {
         at[name]: 0.0
         for name in _never_exact(table, known)

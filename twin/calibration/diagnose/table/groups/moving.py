@@ -83,8 +83,8 @@ MOST_WAVES: Final = 60
 """Half waves in a scan, of a wander."""
 MOST_JUMPS: Final = 60
 """Frames before which a jump is looked for."""
-MOST_SWINGS: Final = 16
-"""Half periods in a scan, of a swing."""
+SWINGS: Final = (2, 16)
+"""Least and most half periods in a scan, of a swing: with fewer it is a drift."""
 LEAST_SWINGING: Final = 12
 """Frames of which a swing is told."""
 SWELLS: Final = (1.0, 0.7, 0.2, 0.03)
@@ -183,7 +183,7 @@ def _kinds(count: int) -> Iterator[tuple[str, list[int], FloatArray]]:
     jitter = np.cos(math.pi * place[:, None] * every) * math.sqrt(2.0 / count)
     yield "jitters", [-1], jitter[None]
     if count >= LEAST_SWINGING:
-        halves = np.arange(1, min(MOST_SWINGS, count // 2) + 1)
+        halves = np.arange(SWINGS[0], min(SWINGS[1], count // 2) + 1)
         phase = math.pi * halves[:, None] * place
         swells = legvander(2.0 * place - 1.0, len(SWELLS) - 1) * SWELLS
         waves_of = np.stack([np.cos(phase), np.sin(phase)], axis=2)
