@@ -35,6 +35,7 @@ from flexdt.library.reconstruction.volume_formats import VoxelPlaces
 from flexdt.message_words import problem_words, reason_of
 from flexdt.runtime.files.dataset_folder import tiff_bytes
 from flexdt.runtime.files.whole_files import free_bytes, write_whole
+from flexdt.runtime.process_settings import rays_a_side
 
 __all__ = [
     "Answer",
@@ -59,6 +60,7 @@ __all__ = [
     "package",
     "position",
     "problem_words",
+    "rays_a_side",
     "reason_of",
     "size",
     "table",

@@ -39,9 +39,9 @@ from flexdt.twin.physics.chain import (
     Chain,
     PixelPaths,
     Radiograph,
+    beam_of,
     expected_signal,
     flux_of,
-    mean_attenuation,
     open_noise,
     radiographs,
     without_spot,
@@ -49,7 +49,7 @@ from flexdt.twin.physics.chain import (
 from flexdt.twin.physics.detector import EXPOSURES_MS, Detector, detector_of
 from flexdt.twin.physics.exposure import Counts, ExposureSettings, frame_rng
 from flexdt.twin.physics.readout import Expected, read_out
-from flexdt.twin.physics.sampled_views import permitted_error, spot_views
+from flexdt.twin.physics.sampled_views import edges_needed, spot_views
 from flexdt.twin.physics.scatter import (
     Beam,
     ScanScatter,
@@ -64,7 +64,6 @@ from flexdt.twin.projection.analytic_solids import Vector
 from flexdt.twin.projection.finer_pixels import voxel_rays_a_side
 from flexdt.twin.projection.operators import as_cone_vec
 from flexdt.twin.projection.pixel_areas import (
-    FEWEST_NEEDED,
     Need,
     area_means,
     needed,
@@ -199,21 +198,19 @@ class Truth:
     def _need(self) -> Need | None:
         """Compute what the pixels need for an error below the noise of the exposure; None
         for one ray a pixel."""
-        if self.rays == 1 or not self.parts or not len(self.geometry):
+        if not self.parts or not len(self.geometry):
             return None
-        if self.rays != "auto":
-            return Need(FEWEST_NEEDED, counts=True, rays=self.rays)
         view = self.geometry.rows[0]
         blur = 0.0
         if self.spot_points == 1:
             spot_mm = self.chain.tube.focal_spot_mm(self.exposure.power_W)
             blur = spot_blur_px(view, spot_mm)
         noise = open_noise(self.chain, view, self.exposure)
-        return Need(permitted_error(noise, blur, self.spot_points), counts=True)
+        return edges_needed(self.rays, noise, blur, self.spot_points)
 
     def _areas(self, cone: ConeVec, need: Need) -> PixelPaths:
         """Compute the paths along the rays of the pixels that need several."""
-        mu = mean_attenuation(self.chain, self.exposure.kV).tolist()
+        mu = beam_of(self.chain, self.exposure.kV).mean_mu().tolist()
         parts = [(part.body, x) for part, x in zip(self.parts, mu, strict=True)]
         shape = self.camera.shape
         within = needed(parts, cone, shape, need)
@@ -325,7 +322,7 @@ def simulate(
     material: str | Mapping[int, str] | None = None,
     voxel_mm: float | Vector | None = None,
     place: Place = "keep",
-    rays: Rays | None = None,
+    rays: Rays = "auto",
     spot_points: int = 1,
     progress: Progress = None,
 ) -> DataSet:
@@ -358,7 +355,7 @@ def simulate(
         place: the sample stays where it is; "centred" puts the middle of its box on the
             axis.
         rays: along each side of a pixel that an edge of the sample reaches, 1 to 16, or
-            "auto", the default but for scenarios (3); their signals are averaged, as a
+            "auto", the default; their signals are averaged, as a
             pixel does. "auto" keeps the error on an edge below the exposure's
             noise (docs/physics.md). With 1 edges along rows or columns come out in
             steps, of which `align` has wider sigmas.
@@ -391,12 +388,12 @@ def simulate(
     if geometry is None:
         given = (tube, detector, machine, shape, material, voxel_mm, exposure_ms)
         other = scatter != "off" or spot_points != 1 or given != (None,) * 7
-        return _of_scenario(sample, noise, 3 if rays is None else rays, alone=not other)
+        return _of_scenario(sample, noise, rays, alone=not other)
     from flexdt.library.data_set import DataSet
     from flexdt.library.datasets.image_doubts import image_doubts
     from flexdt.library.machines import machine as machine_of
 
-    rays = check_rays("auto" if rays is None else rays)
+    rays = check_rays(rays)
     _check_sampling(noise, spot_points)
     cone = as_cone_vec(geometry)
     size = cone.of_shape(shape)

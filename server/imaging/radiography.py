@@ -41,7 +41,7 @@ from flexdt.twin.physics.chain import (
     Chain,
     Radiograph,
     Scattered,
-    mean_attenuation,
+    beam_of,
     open_noise,
     radiographs,
     without_spot,
@@ -50,9 +50,9 @@ from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.exposure import ExposureSettings
 from flexdt.twin.physics.predicted_beam import CountShares, Physics, only_keV
 from flexdt.twin.physics.readout import Expected, expected_counts, read_out
-from flexdt.twin.physics.sampled_views import permitted_error
+from flexdt.twin.physics.sampled_views import edges_needed
 from flexdt.twin.physics.tube import TubeModel, tube_of, voltages
-from flexdt.twin.projection.pixel_areas import FEWEST_NEEDED, Need
+from flexdt.twin.projection.pixel_areas import Need
 from flexdt.twin.rays_a_pixel import Rays
 from flexdt.twin.scanner.state import Sample
 from flexdt.twin.script.planning.sample_findings import SampleProbe, shares_behind
@@ -238,7 +238,8 @@ class Radiography:
         """
         count = len(exposures)
         if not self.photons:
-            wanted = self._need([self._ideal_noise(one) for one in exposures])
+            noise = min(self._ideal_noise(one) for one in exposures)
+            wanted = edges_needed(self.rays, noise, 0.0)
             lines = await self.imaging.line_integrals(
                 sample, poses, camera, truth=truth, need=wanted
             )
@@ -263,10 +264,10 @@ class Radiography:
             view = poses[:1].cone_vec().rows[0]
             noise = [open_noise(chain, view, exposure) for exposure in exposures]
             blur = spot_blur_px(view, spot[0]) if points == 1 else 0.0
-            wanted = self._need(noise, blur, points)
+            wanted = edges_needed(self.rays, min(noise), blur, points)
             if wanted is None:
                 return None
-            return wanted, mean_attenuation(chain, exposures[0].kV).tolist()
+            return wanted, beam_of(chain, exposures[0].kV).mean_mu().tolist()
 
         channels, paths, views, areas = await self.imaging.path_lengths(
             sample, poses, camera, truth=truth, spot=spot, need=need
@@ -285,20 +286,6 @@ class Radiography:
         return await asyncio.to_thread(
             radiographs, chain, paths, views, exposures, moments, added, areas
         )
-
-    def _need(
-        self, noise: Sequence[float], blur_px: float = 0.0, points: int = 1
-    ) -> Need | None:
-        """Compute what the pixels of images need; None for one ray a pixel.
-
-        `noise`: of each image's open beam, relative to its signal; `blur_px`: standard deviation
-        of the spot's blur [pixels]; `points`: of the spot.
-        """
-        if self.rays == 1:
-            return None
-        if self.rays != "auto":
-            return Need(FEWEST_NEEDED, counts=True, rays=self.rays)
-        return Need(permitted_error(min(noise), blur_px, points), counts=True)
 
     def _ideal_noise(self, exposure: ExposureSettings) -> float:
         """Compute the noise of an open pixel by the ideal model, relative to its signal;

@@ -2,7 +2,14 @@
 panel, image quality."""
 
 from flexdt.twin.physics.blur import FWHM, blurred, spot_blur_px
-from flexdt.twin.physics.chain import Chain, expected_signal, flux_of, weights_of
+from flexdt.twin.physics.chain import (
+    Chain,
+    PixelPaths,
+    expected_signal,
+    flux_of,
+    transmitted,
+    weights_of,
+)
 from flexdt.twin.physics.detector import Detector, detector_of
 from flexdt.twin.physics.effective import EffectiveBeam, effective_beam
 from flexdt.twin.physics.exposure import (
@@ -14,6 +21,7 @@ from flexdt.twin.physics.exposure import (
     open_beam,
 )
 from flexdt.twin.physics.readout import read_out
+from flexdt.twin.physics.sampled_views import edges_needed
 from flexdt.twin.physics.scatter import Beam, ScanScatter, ScatterSettings, scan_scatter
 from flexdt.twin.physics.scintillator import deposited
 from flexdt.twin.physics.tube import (
@@ -24,7 +32,7 @@ from flexdt.twin.physics.tube import (
     tube_of,
     tube_spectrum,
 )
-from flexdt.twin.rays_a_pixel import MAX_RAYS, check_rays
+from flexdt.twin.rays_a_pixel import MAX_RAYS, Rays, check_rays
 
 __all__ = [
     "FWHM",
@@ -36,6 +44,8 @@ __all__ = [
     "EffectiveBeam",
     "ExposureSettings",
     "Filter",
+    "PixelPaths",
+    "Rays",
     "ScanScatter",
     "ScatterSettings",
     "Spectrum",
@@ -44,6 +54,7 @@ __all__ = [
     "check_rays",
     "deposited",
     "detector_of",
+    "edges_needed",
     "effective_beam",
     "expected_signal",
     "expose",
@@ -55,6 +66,7 @@ __all__ = [
     "read_out",
     "scan_scatter",
     "spot_blur_px",
+    "transmitted",
     "tube_of",
     "tube_spectrum",
     "weights_of",

@@ -107,6 +107,28 @@ class PixelPaths:
         return PixelPaths(within, self.paths_mm[:, rays])
 
 
+def transmitted(
+    beam: EffectiveBeam, paths_mm: Float32Array, areas: PixelPaths | None = None
+) -> tuple[Float32Array, Float32Array]:
+    """Compute the signal behind path lengths, and its variance, averaged over the rays of the
+    pixels that have several.
+
+    Args:
+        beam: its effective energies.
+        paths_mm: float32 (m, ..., rows, cols), to the pixels' centres [mm].
+        areas: pixels of (..., rows, cols) that have several rays.
+
+    Returns:
+        Two float32 arrays (..., rows, cols), in the units of `EffectiveBeam.transmit`.
+    """
+    mean, variance = beam.transmit(paths_mm)
+    if areas is not None and len(areas.within.pixels):
+        several = beam.transmit(areas.paths_mm)
+        for whole, rays in zip((mean, variance), several, strict=True):
+            whole.reshape(-1)[areas.within.pixels] = areas.within.means(rays)
+    return mean, variance
+
+
 def expected_signal(
     chain: Chain,
     paths_mm: Float32Array,
@@ -140,13 +162,7 @@ def expected_signal(
     else:
         count = 1
     moments = paths_mm.reshape(len(chain.substances), count, *shape)
-    beam = beam_of(chain, exposure.kV)
-    mean, variance = beam.transmit(moments)
-    if areas is not None and len(areas.within.pixels):
-        for whole, rays in zip(
-            (mean, variance), beam.transmit(areas.paths_mm), strict=True
-        ):
-            whole.reshape(-1)[areas.within.pixels] = areas.within.means(rays)
+    mean, variance = transmitted(beam_of(chain, exposure.kV), moments, areas)
     one = mean.mean(axis=0)
     spread = variance.mean(axis=0)
     spot = spot_blur_px(row, chain.tube.focal_spot_mm(exposure.power_W))
@@ -170,13 +186,6 @@ def open_noise(chain: Chain, view: npt.ArrayLike, exposure: ExposureSettings) ->
     if mean <= 0.0:
         return math.inf
     return math.sqrt(float(variance.sum()) * charge / exposure.averages) / mean
-
-
-def mean_attenuation(chain: Chain, kV: float) -> FloatArray:
-    """Compute the attenuation of each substance, weighted by the open beam's signal [1/mm]:
-    behind a thickness it is less."""
-    beam = beam_of(chain, kV)
-    return np.asarray(beam.mu @ beam.signal / beam.signal.sum())
 
 
 def without_spot(chain: Chain) -> Chain:

@@ -86,6 +86,11 @@ class EffectiveBeam:
         mean, variance = out.reshape(2, *paths_mm.shape[1:])
         return mean, variance
 
+    def mean_mu(self) -> FloatArray:
+        """Compute the attenuation of each material, weighted by the open beam's signal, (m,)
+        [1/mm]: behind a thickness it is less."""
+        return np.asarray(self.mu @ self.signal / self.signal.sum())
+
 
 def effective_beam(
     signal: FloatArray,

@@ -1,4 +1,4 @@
-"""Views from several points of the focal spot, and the error that a pixel on an edge may have."""
+"""Views from several points of the focal spot, and the rays that a pixel on an edge needs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.physics.blur import FWHM
+from flexdt.twin.projection.pixel_areas import FEWEST_NEEDED, Need
+from flexdt.twin.rays_a_pixel import Rays
 
 NOISE_SHARE = 1.0
 """Error of a pixel on an edge, at most, as a part of the noise of the exposure in an open
@@ -35,6 +37,23 @@ def spot_views(rows: FloatArray, spot_mm: float, points: int) -> FloatArray:
     out = np.repeat(rows[:, None], points, axis=1)
     out[:, :, :3] += np.einsum("ak,nax->nkx", places, edges)
     return out.reshape(-1, 12)
+
+
+def edges_needed(
+    rays: Rays, noise: float, blur_px: float, points: int = 1
+) -> Need | None:
+    """Say what the pixels on edges need, of which signals are averaged; None for one ray a
+    pixel.
+
+    Args:
+        rays: along each side of such a pixel; "auto" for an error below the noise.
+        noise, blur_px, points: as of `permitted_error`.
+    """
+    if rays == 1:
+        return None
+    if rays != "auto":
+        return Need(FEWEST_NEEDED, counts=True, rays=rays)
+    return Need(permitted_error(noise, blur_px, points), counts=True)
 
 
 def permitted_error(noise: float, blur_px: float, points: int = 1) -> float:

@@ -21,7 +21,7 @@ from flexdt.twin.projection.operators import (
     geometry_change,
     geometry_gradient,
 )
-from flexdt.twin.projection.pixel_areas import ray_offsets
+from flexdt.twin.projection.pixel_areas import Within, paths_within, rays_needed
 from flexdt.twin.projection.volume import Grid, Volume, as_volume, room_like
 
 __all__ = [
@@ -35,16 +35,18 @@ __all__ = [
     "Sphere",
     "TriangleMesh",
     "Volume",
+    "Within",
     "as_volume",
     "back",
     "forward",
     "geometry_change",
     "geometry_gradient",
+    "paths_within",
     "project_body",
     "project_materials",
     "project_mesh",
     "project_scene",
-    "ray_offsets",
+    "rays_needed",
     "room_like",
     "warm_up",
 ]

@@ -159,6 +159,10 @@ class Within:
         sums = np.add.reduceat(values, self.starts[:-1], axis=-1, dtype=np.float64)
         return np.asarray(sums / rays_of(self.marks))
 
+    def repeated(self, values: npt.NDArray[np.floating]) -> Float32Array:
+        """Give each ray the value of its pixel, (k,) to float32 (rays,)."""
+        return np.repeat(values, rays_of(self.marks)).astype(np.float32, copy=False)
+
     def mean_signals(self, values: Float32Array) -> FloatArray:
         """Compute the line integral of the mean signal of each pixel, -log of the mean of
         exp(-values): what a panel that counts photons shows. (rays,) to float64 (k,)."""
@@ -167,7 +171,7 @@ class Within:
         if values.min() > -PLAIN_INTEGRAL and values.max() < PLAIN_INTEGRAL:
             return np.asarray(-np.log(self.means(np.exp(-values))))
         least = np.minimum.reduceat(values, self.starts[:-1])
-        beyond = values - np.repeat(least, rays_of(self.marks))
+        beyond = values - self.repeated(least)
         return np.asarray(least - np.log(self.means(np.exp(-beyond))))
 
 

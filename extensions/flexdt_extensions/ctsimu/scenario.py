@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -34,21 +34,30 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.physics import (
     FWHM,
-    MAX_RAYS,
     Beam,
     Counts,
     EffectiveBeam,
+    PixelPaths,
+    Rays,
     ScanScatter,
     ScatterSettings,
     blurred,
     check_rays,
+    edges_needed,
     effective_beam,
     flux_of,
     frame_rng,
     scan_scatter,
     spot_blur_px,
+    transmitted,
 )
-from flexdt.twin.projection import TriangleMesh, project_mesh, ray_offsets
+from flexdt.twin.projection import (
+    TriangleMesh,
+    Within,
+    paths_within,
+    project_mesh,
+    rays_needed,
+)
 from flexdt_extensions.ctsimu.ctsimu_scan import MeshSample, Reference, read_scenario
 
 KEV_J: Final = 1.602176634e-16
@@ -61,7 +70,9 @@ class ScenarioImages:
     Args:
         path: the scenario; the files that it names are in its folder.
         seed: of the noise, >= 0; None for images without noise.
-        rays: along each side of a pixel; their signals are averaged.
+        rays: along each side of a pixel that an edge of a sample reaches, whose signals
+            are averaged; "auto" keeps the error on an edge below the scenario's noise, or
+            the rounding to grey values, as `flexdt.simulate` does.
 
     Raises:
         ExchangeError, TwinError: a request of the scenario that is not possible, and its
@@ -70,14 +81,14 @@ class ScenarioImages:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], seed: int | None = None, rays: int = 3
+        self, path: str | os.PathLike[str], seed: int | None = None, rays: Rays = "auto"
     ) -> None:
         """Read a scenario and the meshes of its samples.
 
         Args:
             path: file.
             seed: of the noise; None: without noise.
-            rays: along each side of a pixel.
+            rays: along each side of a pixel that an edge reaches, or "auto".
 
         Raises:
             LimitError: seed or rays out of their range.
@@ -85,12 +96,9 @@ class ScenarioImages:
         """
         if not 0 <= (seed or 0) <= 2**63:
             raise LimitError(f"seed is {seed}; allowed: 0 to 2^63", {"asked": seed})
-        checked = check_rays(rays)
-        if checked == "auto":
-            raise LimitError.instead("rays is auto", rays, f"1 to {MAX_RAYS}")
+        self._rays = check_rays(rays)
         self.path = Path(path)
         self._seed = seed
-        self._rays = checked
         self.scan = read_scenario(
             text_of(self.path), str(self.path), self._read_named_file
         )
@@ -155,37 +163,49 @@ class ScenarioImages:
         pixels = row[3:6] - row[0:3] + u * row[6:9] + v * row[9:12]
         return np.asarray(np.linalg.norm(pixels, axis=2), dtype=np.float32)
 
-    def _paths(self, frame: int, ray: int, samples: bool) -> Float32Array:
-        """Compute path lengths through each substance, and the rest through air if there
-        is an environment.
+    def _with_air(self, paths: Float32Array, distance: Float32Array) -> Float32Array:
+        """Add the environment, if there is one, as the last layer: what the samples leave
+        of the distance to the pixel's centre, at least 0 [mm]."""
+        if self.scan.environment is None:
+            return paths
+        rest = np.maximum(distance - paths.sum(axis=0), np.float32(0.0))
+        return np.concatenate([paths, rest[None]])
 
-        The environment is the last layer: what the samples leave of the distance to the
-        pixel's centre, at least 0.
+    def _through(
+        self, frame: int, project: Callable[[TriangleMesh, ConeVec], Float32Array]
+    ) -> Float32Array:
+        """Sum what `project` finds of the meshes of each substance in a frame, one layer a
+        substance, in the order of `_thickest` [mm]."""
+        layers = {one: np.zeros((), np.float32) for one in self._thickest}
+        for sample, mesh in zip(self.scan.samples, self._meshes, strict=True):
+            found = project(mesh, ConeVec(sample.views[frame][None]))
+            layers[sample.substance] = layers[sample.substance] + found
+        return np.stack(list(layers.values()))
 
-        Args:
-            frame: number of the frame.
-            ray: number of the ray in its pixel.
-            samples: False: the open beam.
-
-        Returns:
-            (substances, rows, cols) [mm].
-        """
+    def _areas(self, frame: int) -> PixelPaths | None:
+        """Compute paths along the rays of the pixels of a frame that need several; None for
+        one ray a pixel."""
         shape = self.scan.shape
-        order = {one: i for i, one in enumerate(self._thickest)}
-        air = self.scan.environment is not None
-        across, down = ray_offsets(2 * self._rays - 1)
-        out = np.zeros((len(order) + air, *shape), np.float32)
-        for sample, mesh in (
-            zip(self.scan.samples, self._meshes, strict=True) if samples else ()
-        ):
-            row = sample.views[frame].copy()
-            row[3:6] += across[ray] * row[6:9] + down[ray] * row[9:12]
-            out[order[sample.substance]] += project_mesh(mesh, ConeVec(row[None]), shape)[
-                0
-            ]
-        if air:
-            out[-1] = np.maximum(self._distance(frame) - out[:-1].sum(axis=0), 0.0)
-        return out
+        view = self.scan.views[frame]
+        blur = min(spot_blur_px(view, one * FWHM) for one in self.scan.spot_mm)
+        need = edges_needed(self._rays, self._open_noise, blur)
+        if need is None:
+            return None
+        beam = self._beams[self.scan.spectrum_of[frame]]
+        mu = beam.mean_mu()
+        if self.scan.environment is not None:
+            mu = mu[:-1] - mu[-1]  # samples are in place of the environment
+        weights = dict(zip(self._thickest, mu.tolist(), strict=True))
+        marks = [
+            rays_needed(
+                mesh, ConeVec(one.views[frame][None]), shape, need, weights[one.substance]
+            )
+            for one, mesh in zip(self.scan.samples, self._meshes, strict=True)
+        ]
+        within = Within.joined([Within.of(some) for some in marks])
+        paths = self._through(frame, lambda m, cone: paths_within(m, cone, shape, within))
+        distance = self._distance(frame).reshape(-1)[within.pixels]
+        return PixelPaths(within, self._with_air(paths, within.repeated(distance)))
 
     def _collected_energy(
         self, frame: int, samples: bool = True
@@ -193,8 +213,8 @@ class ScenarioImages:
         """Compute the energy in each pixel of one frame, and its variance, before the
         detector blurs.
 
-        Rays per pixel (one in the open beam) are averaged and blurred by the focal spot;
-        with samples scatter is added. Both are scaled by distance and mAs.
+        The signals of a pixel's rays are averaged and blurred by the focal spot; with
+        samples scatter is added. Both are scaled by distance and mAs.
 
         Args:
             frame: number of the frame.
@@ -204,17 +224,17 @@ class ScenarioImages:
             Mean [keV] and variance [keV^2], (rows, cols) each.
         """
         scan = self.scan
-        n = self._rays if samples else 1
         beam = self._beams[scan.spectrum_of[frame]]
-        # In double precision: rays that meet nothing then average to the open beam's very
-        # value.
-        sums: list[Any] = [np.zeros(scan.shape) for _ in range(2)]
-        for k in range(n * n):
-            for total, one in zip(
-                sums, beam.transmit(self._paths(frame, k, samples)), strict=True
-            ):
-                total += one
-        mean, spread = ((total / n**2).astype(np.float32) for total in sums)
+        areas = None
+        paths = np.zeros((len(self._thickest), *scan.shape), np.float32)
+        if samples and scan.samples:
+            paths = self._through(
+                frame, lambda mesh, cone: project_mesh(mesh, cone, scan.shape)[0]
+            )
+            areas = self._areas(frame)
+        mean, spread = transmitted(
+            beam, self._with_air(paths, self._distance(frame)), areas
+        )
         view = scan.views[frame]
         u, v = (float(np.linalg.norm(view[i : i + 3])) for i in (6, 9))
         spot = [spot_blur_px(view, one * FWHM) for one in scan.spot_mm]
@@ -268,6 +288,18 @@ class ScenarioImages:
         if not min(energy.max(), variance.max()) > 0.0:
             raise nothing
         return energy, variance
+
+    @cached_property
+    def _open_noise(self) -> float:
+        """Noise of the brightest open pixel in a projection relative to its grey value, that
+        of rounding included (standard deviation)."""
+        grey = self.scan.grey
+        ratio = grey.snr
+        if grey.noise is not None:
+            ratio = float(np.interp(self.brightest, grey.noise[:, 0], grey.noise[:, 1]))
+        counted = 0.0 if ratio is None else 1.0 / max(ratio, 1e-9)
+        rounded = 1.0 / (np.sqrt(12.0) * max(self.brightest, 1.0))
+        return float(np.hypot(counted / np.sqrt(self.scan.averages), rounded))
 
     @property
     def brightest(self) -> float:
@@ -597,6 +629,6 @@ def _made_of(substance: Substance) -> Material:
     return Material(substance.name, "", substance, 0.0, "")
 
 
-def dataset(path: str | os.PathLike[str], seed: int | None, rays: int) -> DataSet:
+def dataset(path: str | os.PathLike[str], seed: int | None, rays: Rays) -> DataSet:
     """Simulate a scenario for `flexdt.simulate`; see `ScenarioImages`."""
     return ScenarioImages(path, seed, rays).dataset()

@@ -6,8 +6,9 @@ The work is in `flexdt_extensions.ctsimu.scenario`; this command passes options 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from flexdt.extending import Answer, argument, option, warn
+from flexdt.extending import Answer, argument, option, rays_a_side, warn
 from flexdt.twin.errors import TwinError
 
 
@@ -17,8 +18,12 @@ def simulate(
         None, "Write to this new folder; default: the scenario's name.", metavar="DIR"
     ),
     seed: int = option(0, "Draw the noise from this seed.", min=0),
-    rays: int = option(
-        3, "Trace so many rays along each side of a pixel.", min=1, max=16
+    rays: Any = option(
+        "auto",
+        "Trace so many rays along each side of a pixel that an edge reaches; auto: so many "
+        "that the error stays below the noise.",
+        metavar="N or auto",
+        parser=rays_a_side,
     ),
 ) -> Answer:
     """Simulate a CTSimU scenario: projections, dark and flat images as TIFF, and metadata.

@@ -21,7 +21,7 @@ from flexdt.twin.attenuation.substances import Substance, tables
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt_extensions.ctsimu.ctsimu_scan import read_scenario
-from flexdt_extensions.ctsimu.scenario import ScenarioImages
+from flexdt_extensions.ctsimu.scenario import Rays, ScenarioImages
 
 ctsimu = pytest.importorskip("ctsimu.scenario")
 
@@ -47,12 +47,13 @@ def chord(
     center: FloatArray,
     axes: FloatArray,
     size: FloatArray,
-) -> float:
-    """Path through a box, slab by slab."""
-    start, way = axes.T @ (source - center), axes.T @ (pixel - source)
+) -> FloatArray:
+    """Paths through a box to pixels (..., 3), slab by slab."""
+    start, way = (source - center) @ axes, (pixel - source) @ axes
     with np.errstate(divide="ignore"):
         ends = np.sort([(-size / 2 - start) / way, (size / 2 - start) / way], axis=0)
-    return max(0.0, float(ends[1].min() - ends[0].max())) * float(np.linalg.norm(way))
+    inside = np.maximum(ends[1].min(axis=-1) - ends[0].max(axis=-1), 0.0)
+    return np.asarray(inside * np.linalg.norm(way, axis=-1))
 
 
 def coordinates(v: Any) -> FloatArray:
@@ -67,9 +68,14 @@ def pose(part: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def expected(
-    document: dict[str, Any], sizes: list[FloatArray], mu: list[float], air: float
+    document: dict[str, Any],
+    sizes: list[FloatArray],
+    mu: list[float],
+    air: float,
+    parts: int = 1,
 ) -> FloatArray:
-    """Transmitted energy of the unbinned pixels, (n, rows, cols), up to one factor for all."""
+    """Transmitted energy of the unbinned pixels, (n, rows, cols), up to one factor for all; the
+    mean of parts x parts places in each."""
     seen = ctsimu.Scenario(json_dict=copy.deepcopy(document))
     rows, cols = (int(document["detector"][k]["value"]) for k in ("rows", "columns"))
     pitch = [document["detector"]["pixel_pitch"][a]["value"] for a in "uv"]
@@ -85,17 +91,18 @@ def expected(
             if one.attached_to_stage:
                 center, axes = stage + turn @ center, turn @ axes
             placed.append((center, axes))
-        for r, c in np.ndindex(rows, cols):
-            x, y = (c - (cols - 1) / 2) * pitch[0], (r - (rows - 1) / 2) * pitch[1]
-            pixel = panel + x * along[:, 0] + y * along[:, 1]
-            ray = pixel - source
-            far = float(np.linalg.norm(ray))
-            paths = [
-                chord(source, pixel, *p, s) for p, s in zip(placed, sizes, strict=True)
-            ]
-            depth = sum(m * d for m, d in zip(mu, paths, strict=True))
-            depth += air * (far - sum(paths))
-            out[i, r, c] = np.exp(-depth) * abs(ray @ along[:, 2]) / far**3
+        y, x = (
+            ((np.arange(n * parts) + 0.5) / parts - n / 2) * p
+            for n, p in zip((rows, cols), pitch[::-1], strict=True)
+        )
+        pixel = panel + x[:, None] * along[:, 0] + y[:, None, None] * along[:, 1]
+        ray = pixel - source
+        far = np.linalg.norm(ray, axis=-1)
+        depth = air * far
+        for where, size, m in zip(placed, sizes, mu, strict=True):
+            depth = depth + (m - air) * chord(source, pixel, *where, size)
+        energy = np.exp(-depth) * np.abs(ray @ along[:, 2]) / far**3
+        out[i] = energy.reshape(rows, parts, cols, parts).mean(axis=(1, 3))
     return out
 
 
@@ -175,6 +182,35 @@ def test_images_are_those_of_boxes_where_ctsimu_places_them(
         assert np.median(difference) < 30.0
     else:
         assert difference.max() < 2.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_have_the_error_that_the_scenarios_noise_allows(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside 24 x 24 places a pixel of the boxes; without any noise, grey values are right
+    to a few."""
+    rng = np.random.default_rng(seed)
+    document, sizes, mu, air = random_case(rng, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    first = expected({**document, "samples": []}, [], [], air)[0].max()
+    told, centres = (
+        49800 * expected(document, sizes, mu, air, parts) / first for parts in (24, 1)
+    )
+    edges = np.abs(told - centres) > 50  # the open beam bends by less within a pixel
+    assert edges.sum() > 50
+
+    def error(rays: Rays, ratio: float | None) -> float:
+        document["detector"]["noise"]["snr_at_imax"]["value"] = ratio
+        images = ScenarioImages(write(tmp_path, document), rays=rays).projections()
+        return float((np.stack(list(images)) - 200.0 - told)[edges].std())
+
+    one = error(1, None)
+    for ratio in (40.0, 200.0):
+        allowed = 49800 / ratio
+        assert error("auto", ratio) < min(allowed, 0.7 * one)
+    assert error("auto", None) < 0.03 * one
+    assert error(3, None) < 0.4 * one
 
 
 def test_the_command_writes_images_and_metadata_that_ctsimu_reads(
