@@ -3,10 +3,11 @@ seconds, milliseconds and peak memory.
 
 `python tests/studies/first_use.py` prints a table and marks with ! a first call that takes more
 than 1.5 times the second and 0.5 s. What the first call adds is imports and kernels loaded from
-numba's disk cache; kernels are compiled beforehand, by a round that does not count. Processor
-time is the least of `--repeats` processes. `--beside TREE` runs another tree of flexdt in turns
-and shows how the second call and the peak of memory compare: its modules must be importable from
-TREE/src or TREE.
+numba's disk cache; kernels and Python's own files are compiled beforehand, by a round that does
+not count. Take a Python that has flexdt's dependencies alone: numba and SciPy import coverage,
+yaml and more where they are. Processor time is the least of `--repeats` processes. `--beside
+TREE` runs another tree of flexdt in turns and shows how the second call and the peak of memory
+compare: its modules must be importable from TREE/src or TREE.
 """
 
 from __future__ import annotations
@@ -92,6 +93,7 @@ def measured(tree: Path, name: str, folder: Path) -> dict[str, float]:
     roots = [tree / "src", tree / "extensions" / "src", tree]
     path = os.pathsep.join(str(root) for root in roots if root.is_dir())
     environment = {**os.environ, "PYTHONPATH": path}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     command = [sys.executable, __file__, "--here", name, "--folder", str(folder)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
