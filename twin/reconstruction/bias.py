@@ -740,11 +740,14 @@ def _flaws(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
     found = _angles(scan, nodes)
     # Ends that few rays see blur no edge: they count as the middle does.
     weights = np.where(nodes.inside, 1.0, 1e-3)
-    for ladder in scan.ladders():
+    compared = nodes.inside.any(axis=(1, 2), keepdims=True)
+    layers = np.flatnonzero(compared)
+    for ladder in scan.ladders(layers):
         rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in ladder]
         for (_, before), (flaw, after) in pairwise(rungs):
+            change = np.where(compared, after - before, np.float32(0.0))
             # A panel aside sees every ray of a circle once: only steps of weights are a flaw.
-            found[flaw] = Flaw(flaw, after - before, weights, finite=flaw == "aside")
+            found[flaw] = Flaw(flaw, change, weights, finite=flaw == "aside")
     return found
 
 

@@ -30,6 +30,7 @@ from flexdt.twin.reconstruction.acquisition.trajectory import (
 from flexdt.twin.reconstruction.acquisition.truncation import ACCURACY, Truncation
 from flexdt.twin.reconstruction.feldkamp.backprojection import OnProcessor
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
+from flexdt.twin.reconstruction.feldkamp.fdk_plan import plan_fdk
 from flexdt.twin.reconstruction.white_noise import noise_of
 
 NODES: Final = 40
@@ -90,13 +91,14 @@ class Rung:
         flaw: the flaw that the rung before does not have.
         cone_vec: its views.
         shape: (rows, cols).
-        layered: each layer is seen by itself, from its own height.
+        layers: (m,) layers that are seen each by itself, from their own heights; None for a scan
+            of the whole.
     """
 
     flaw: str
     cone_vec: ConeVec
     shape: tuple[int, int]
-    layered: bool = False
+    layers: npt.NDArray[np.intp] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -402,26 +404,25 @@ class CoarseScan:
         images: Float32Array,
         cone_vec: ConeVec,
         truncation: Truncation | None = None,
-        grid: Volume | None = None,
     ) -> Float32Array:
-        """Reconstruct by FDK on the processor; voxels that only continued rows show are kept.
+        """Reconstruct the grid by FDK on the processor; voxels that only continued rows show are
+        kept.
 
         The images are not changed.
 
         `images`: (n, rows, cols) line integrals; `cone_vec`: n views; `truncation`: continues
-        the images beyond the panel; `grid`: that of the field of view without.
+        the images beyond the panel.
         Returns (nz, ny, nx) [1/mm], NaN where no data cover it.
         Raises GeometryError: FDK cannot use the views.
         """
         shape = (images.shape[1], images.shape[2])
-        grid = self.grid if grid is None else grid
         volume = fdk_parts(
             lambda: [images.copy()],
             cone_vec,
             shape,
-            grid,
+            self.grid,
             truncation=truncation,
-            target=OnProcessor(grid),
+            target=OnProcessor(self.grid),
             outside=True,
         )
         return volume.data
@@ -439,30 +440,40 @@ class CoarseScan:
         Returns:
             (nz, ny, nx), 0 where unseen.
         """
-        if rung.layered:
-            return self._layer_by_layer(thing, rung)
+        if rung.layers is not None:
+            return self._layer_by_layer(thing, rung, rung.layers)
         truncation = self.complete if rung.flaw else None
         images = self.projected(thing, rung.cone_vec, rung.shape)
         return np.nan_to_num(self.fdk(images, rung.cone_vec, truncation))
 
-    def _layer_by_layer(self, thing: Float32Array, rung: Rung) -> Float32Array:
-        """Reconstruct each layer from a fan of one row in its own plane: as the cone does
-        where nothing changes along the axis, whatever its pixels do to the layer.
+    def _layer_by_layer(
+        self, thing: Float32Array, rung: Rung, wanted: npt.NDArray[np.intp]
+    ) -> Float32Array:
+        """Reconstruct each of some layers from a fan of one row in its own plane: as the cone
+        does where nothing changes along the axis, whatever its pixels do to the layer.
 
-        Layers of zeros stay so.
+        Others are zeros.
         """
-        side_x, side_y, tall = self.grid.voxel_xyz
-        centre = (*self.grid.center_mm[:2], float(rung.cone_vec.source[0, 2]))
+        fan, count = rung.cone_vec, len(rung.cone_vec)
+        up = self.grid.centers()[2][wanted] - fan.source[0, 2]
+        rise = np.zeros((len(wanted) * count, 3))
+        rise[:, 2] = np.repeat(up, count)
+        source, panel, u, v = (
+            np.tile(part, (len(wanted), 1))
+            for part in (fan.source, fan.detector, fan.u, fan.v)
+        )
+        views = ConeVec.from_vectors(source + rise, panel + rise, u, v)
+        rays = two_rays(self.grid.like(thing), views, rung.shape)
+        centre = (*self.grid.center_mm[:2], float(fan.source[0, 2]))
         blank = np.zeros((1, *thing.shape[1:]), np.float32)
-        like = Volume(blank, (side_x, side_y, tall), centre)
-        endless = (side_x, side_y, 1e3 * tall)
+        like = Volume(blank, self.grid.voxel_mm, centre)
+        plan = plan_fdk(fan, rung.shape, like, truncation=self.complete)
         seen = np.zeros_like(thing)
-        for k in np.flatnonzero(thing.any(axis=(1, 2))):
-            layer = Volume(thing[k : k + 1], endless, centre)
-            images = two_rays(layer, rung.cone_vec, rung.shape)
-            seen[k] = np.nan_to_num(
-                self.fdk(images, rung.cone_vec, self.complete, like)[0]
-            )
+        for k, images in zip(wanted, np.split(rays, len(wanted)), strict=True):
+            target = OnProcessor(like)
+            target.add(plan.views_of(images, 0))
+            plan.cover(target.volume(), like, outside=True)
+            seen[k] = np.nan_to_num(target.volume()[:, :, 0])
         return seen
 
     def projected(
@@ -517,12 +528,15 @@ class CoarseScan:
         cols = int(sum(ends) / side + 1e-6) + 2  # often an integer, except for rounding
         return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))
 
-    def ladders(self) -> list[list[Rung]]:
+    def ladders(self, layers: npt.NDArray[np.intp]) -> list[list[Rung]]:
         """List rows of scans, each from one without a flaw to one with, of the same sampling.
 
         Parallel rays of a centred panel, then of one that is "aside" by more than a column;
         layers that are seen by themselves, then in the "cone" and without the "rows" that the
         panel does not have, if the object goes on above or below. A helix has "rows" alone.
+
+        Args:
+            layers: (m,) that are to be seen by themselves; others are not compared.
 
         Returns:
             Rungs with their flaw's name, geometry and panel's shape; no row for flaws that the
@@ -534,9 +548,9 @@ class CoarseScan:
         if not self.circle.rise and abs(high - low) > (low + high) / cols:
             sides = ("", (max(low, high),) * 2), ("aside", self.ends)
             found.append([self.parallel(*one, self.angles) for one in sides])
-        if rows == 1:
+        if rows == 1 or not len(layers):
             return found
-        rising = [self._fan]
+        rising = [Rung("", self._fan, (1, cols), layers)]
         if self.more and not self.circle.rise:
             reached = (-self.more, rows + self.more)
             taller = window(self.level, (rows, cols), reached, (0, cols))
@@ -546,12 +560,11 @@ class CoarseScan:
         return [*found, rising]
 
     @property
-    def _fan(self) -> Rung:
+    def _fan(self) -> ConeVec:
         """One row in the plane of the sources, of a helix with all its turns on one."""
         source, panel = self.level.source.copy(), self.level.detector.copy()
         source[:, 2] = panel[:, 2] = self.grid.center_mm[2]
-        views = ConeVec.from_vectors(source, panel, self.level.u, self.level.v)
-        return Rung("", views, (1, self.images.shape[2]), layered=True)
+        return ConeVec.from_vectors(source, panel, self.level.u, self.level.v)
 
 
 def two_rays(volume: Volume, views: ConeVec, shape: tuple[int, int]) -> Float32Array:
