@@ -74,7 +74,7 @@ RIGHT: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "forward": (fx.forward, {"volume": VOLUME, "cone_vec": SCAN, "shape": (6, 8)}),
     "machine": (fx.machine, {"word": "flexray"}),
     "open": (fx.open, {"folder": "nowhere", "ignore_document": False}),
-    "phantoms.beads": (fx.phantoms.beads, {"name": "normal", "beads": 5}),
+    "phantoms.beads": (fx.phantoms.beads, {"name_or_dims": "normal", "beads": 5}),
     "phantoms.shepp_logan": (fx.phantoms.shepp_logan, {"size_mm": 50.0}),
     "plan": (fx.plan, {"script": "rot_obj move absolute 90 ACK", "machine": "flexray"}),
     "project": (fx.project, {"sample": VOLUME, "geometry": SCAN, "shape": (6, 8)}),
