@@ -342,12 +342,12 @@ class _Spots:
 
     def aslant(self) -> Recognised | None:
         """Identify the beads of a phantom that is sheared, which the fit tells; None if that does
-        not fit either.
+        not explain all spots either.
         """
         found = attempt(
             self.detections, self.model, self.poses, start=self.start, aslant=True
         )
-        if found is None or not convincing(found):
+        if found is None or doubtful(found, self.poses):
             return None
         return Recognised(self.model, found, None, True, True)
 
