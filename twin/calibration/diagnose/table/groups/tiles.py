@@ -47,7 +47,6 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
     if shape is None:
         return
     counted = table.weight > 0
-    radii = _radii(table)
     known_borders = sorted(_borders_of(table.state.found), key=lambda b: b.at)
     for axis in (0, 1):
         place = table.places[..., axis]
@@ -58,13 +57,12 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             yield _family(
                 table,
                 [Border(axis, at) for at in places.tolist()],
-                [_beyond(place, radii, at) for at in places.tolist()],
+                [np.where(place >= at, 1.0, 0.0) for at in places.tolist()],
                 (LOG_CHANCE_OF_MORE if across else LOG_CHANCE) + np.log(shares),
             )
     # Four tiles are two borders, and a quarter that is neither.
     quarters = {
-        (one, other): _beyond(table.places[..., 0], radii, one.at)
-        * _beyond(table.places[..., 1], radii, other.at)
+        (one, other): np.where((table.places >= (one.at, other.at)).all(axis=2), 1.0, 0.0)
         for one in known_borders
         for other in known_borders
         if one.axis == 0 and other.axis == 1
@@ -93,27 +91,12 @@ def torn(table: Linearised, found: Iterable[object]) -> npt.NDArray[np.bool_] | 
     `table`: of the fit; `found`: what groups are about that are there.
     Returns (n, k); None where there are none.
     """
-    radii = _radii(table)
+    per_mm = np.broadcast_to(table.problem.poses.pixels_per_mm, table.n)
+    radii = np.outer(per_mm, np.asarray(table.problem.model.bead_radius_mm))
     out = np.zeros(table.problem.seen.shape, dtype=bool)
     for one in _borders_of(found):
         out |= np.abs(table.places[..., one.axis] - one.at) < radii
     return out if out.any() else None
-
-
-def _radii(table: Linearised) -> FloatArray:
-    """Return the radius of each spot, (n, k) [px]."""
-    per_mm = np.broadcast_to(table.problem.poses.pixels_per_mm, table.n)
-    return np.outer(per_mm, np.asarray(table.problem.model.bead_radius_mm))
-
-
-def _beyond(place: FloatArray, radii: FloatArray, at: float) -> FloatArray:
-    """Return the part of each spot, (n, k), that lies beyond a border: 0, 1, or half of one
-    that lies across it, which is as much on one side as on the other as far as is known.
-
-    A border is so told by spots beside it alone, those that still count when it is found.
-    """
-    across = np.abs(place - at) < radii
-    return np.where(across, 0.5, np.where(place >= at, 1.0, 0.0))
 
 
 def _borders(
