@@ -255,7 +255,7 @@ def _levenberg(
         """Evaluate cost, norms of the residuals, and Hessian and gradient with the priors in
         them.
 
-        Returns the cost is inf if a bead is at or behind the source."""
+        The cost is inf if a bead is at or behind the source."""
         cost, _, norms, _, hess, grad = p.evaluate(x, use, 1, huber)
         off = x - p.prior_mean
         hess.flat[:: len(x) + 1] += weight
