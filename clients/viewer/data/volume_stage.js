@@ -16,7 +16,7 @@ let made = null;
  */
 export function follow(volume) {
   if (!volume) ghost.checked = false;
-  made = volume?.made ?? null;
+  made = (volume?.size && volume.made) ?? null; // before that nothing stands anywhere
   draw();
 }
 
