@@ -36,34 +36,16 @@ NOT_IMPORTED = {
     },
 }  # fmt: skip
 
-# The same of calls, with the kernels that they run.
-SCAN = "import flexdt as f; s = f.ConeVec.circular(sod=30, sdd=60, angles=2, shape=(9, 9), pixel=2)"
-BALL = 'b = {"kind": "sphere", "center": [0, 0, 0], "radius": 5, "material": "pmma"}'
-NOT_RUN = {
-    f"{SCAN}; {BALL}; f.simulate(b, s)": {"scipy.special", "scipy.optimize"},
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("statement", NOT_RUN)
-def test_a_call_imports_only_what_it_runs(statement: str) -> None:
-    assert_not_imported(statement, NOT_RUN[statement])
-
 
 @pytest.mark.parametrize("statement", NOT_IMPORTED)
 def test_a_name_imports_only_what_it_runs(statement: str) -> None:
-    assert_not_imported(statement, NOT_IMPORTED[statement])
-
-
-def assert_not_imported(statement: str, wanted: set[str]) -> None:
-    """In a process of its own."""
     code = f"{statement}\nimport json, sys; print(json.dumps(sorted(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     loaded = json.loads(done.stdout)
     found = {
         name
         for name in loaded
-        for kept_out in wanted
+        for kept_out in NOT_IMPORTED[statement]
         if name == kept_out or name.startswith(kept_out + ".")
     }
     assert not found, statement

@@ -11,8 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import scipy.optimize
-import scipy.special
 from image_quality import edge_mtf, photon_transfer, region
 
 from flexdt.twin.attenuation.substances import Substance
@@ -28,7 +26,7 @@ from flexdt.twin.physics.chain import (
     weights_of,
 )
 from flexdt.twin.physics.detector import Detector, pattern
-from flexdt.twin.physics.effective import effective_beam, non_negative
+from flexdt.twin.physics.effective import effective_beam
 from flexdt.twin.physics.exposure import ExposureSettings, frame_rng
 from flexdt.twin.physics.readout import Expected, read_out
 from flexdt.twin.physics.tube import tube_spectrum
@@ -464,31 +462,3 @@ def test_the_brightest_flux_is_the_largest_of_the_map() -> None:
         shape = (int(random.integers(1, 40)), int(random.integers(1, 40)))
         expected = float(flux_of(row, shape).max())
         assert brightest_flux(row, shape) == pytest.approx(expected, rel=1e-6)
-
-
-def test_weights_that_are_not_negative_leave_as_little_as_scipys() -> None:
-    """Exponentials that are nearly alike, of any scale, some of them twice; begun at nothing
-    or at weights of another problem."""
-    rng = np.random.default_rng(3)
-    for _ in range(60):
-        m, p = int(rng.integers(1, 120)), int(rng.integers(1, 16))
-        mu = rng.uniform(0.1, 3.0, p)
-        mu[rng.integers(p)] = mu[0]
-        columns = np.exp(-rng.uniform(0, 4, (m, 1)) * mu) * 10.0 ** rng.uniform(-9, 3, p)
-        wanted = np.exp(-rng.uniform(0, 4, m)) * rng.normal(1, 0.3, m)
-        begin = rng.uniform(0, 1, p) * (rng.random(p) < 0.5)
-        best = scipy.optimize.nnls(columns, wanted)[1]
-        for weights in (
-            non_negative(columns, wanted),
-            non_negative(columns, wanted, begin),
-        ):
-            assert weights.min() >= 0.0
-            left = float(np.linalg.norm(columns @ weights - wanted))
-            assert left <= best + 1e-9 * float(np.linalg.norm(wanted))
-
-
-@pytest.mark.parametrize("sigma", [0.02, 0.1, 0.35, 0.699])
-def test_narrow_blurs_are_the_discrete_gaussian(sigma: float) -> None:
-    n = len(kernel(sigma)) // 2
-    bessel = scipy.special.ive(np.abs(np.arange(-n, n + 1)), sigma**2)
-    assert np.abs(kernel(sigma) - bessel / bessel.sum()).max() < 1e-7

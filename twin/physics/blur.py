@@ -28,8 +28,6 @@ MIN_SIGMA_PX = 0.02
 """Standard deviation below which an image is not blurred [pixels]."""
 MAX_SIGMA_PX = 1000.0
 """Largest standard deviation of a blur [pixels]."""
-DISCRETE_LENGTH = 64
-"""Length of the transform of a discrete Gaussian, whose weights vanish long before half of it."""
 MIN_FREQUENCIES = 512
 FOLDED_SPECTRA = 20
 """Samples of a noise spectrum at least, and spectra on either side that are folded into it."""
@@ -38,16 +36,16 @@ FOLDED_SPECTRA = 20
 def kernel(sigma_px: float) -> Float32Array:
     """Compute the weights of a Gaussian blur by `sigma_px` > 0, float32 (2 r + 1,),
     adding up to 1: samples of the Gaussian, below `MIN_SAMPLED_SIGMA_PX` the discrete
-    Gaussian, of which the transform is exp(t (cos w - 1)). r is 4 sigma + 1, rounded up."""
+    Gaussian (Bessel functions). r is 4 sigma + 1, rounded up."""
     t = sigma_px * sigma_px
     reach = max(1, int(np.ceil(4.0 * sigma_px + 1.0)))
     n = np.arange(-reach, reach + 1)
     if sigma_px >= MIN_SAMPLED_SIGMA_PX:
         weights = np.exp(n * n / (-2.0 * t))
     else:
-        # exp(-t) I_n(t), without the import of Bessel functions.
-        turns = 2.0 * np.pi * np.fft.rfftfreq(DISCRETE_LENGTH)
-        weights = np.fft.irfft(np.exp(t * (np.cos(turns) - 1.0)), DISCRETE_LENGTH)[n]
+        from scipy.special import ive  # half of what this module would cost
+
+        weights = ive(np.abs(n), t)
     return np.asarray(weights / weights.sum(), dtype=np.float32)
 
 

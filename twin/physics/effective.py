@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.twin.attenuation.substances import Substance
 from flexdt.twin.errors import LimitError, TwinError
@@ -40,8 +39,6 @@ CHECKS_PER_PATH = 5
 """Number of thicknesses that are checked for each one of the fit."""
 MAX_ROUNDS = 6
 """Largest number of rounds in which thicknesses outside the tolerance are added."""
-MAX_CHANGES = 30
-"""Largest number of changes of the set of weights that are not 0, for each weight."""
 BLOCK_PIXELS = 1 << 15
 """Number of pixels in a step, so that they stay in the cache."""
 
@@ -154,7 +151,7 @@ def effective_beam(
     spread, truth = _relative(paths, mu, noise[used])
     heavy = np.ones(len(truth))
     heavy[0] = OPEN_BEAM_WEIGHT
-    variance = non_negative(spread[:, bins] * heavy[:, None], truth * heavy)
+    variance = _non_negative(spread[:, bins] * heavy[:, None], truth * heavy)
     return EffectiveBeam(
         tuple(s.name for s in substances),
         mu[:, bins],
@@ -243,14 +240,10 @@ def _pursue(
     heavy[0] = OPEN_BEAM_WEIGHT
     weights = np.zeros(len(chosen))
     chosen = list(chosen)
-    known = np.zeros(columns.shape[1])
     rest = wanted
     while True:
         if chosen:
-            weights = non_negative(
-                columns[:, chosen] * heavy[:, None], wanted * heavy, known[chosen]
-            )
-            known[chosen] = weights
+            weights = _non_negative(columns[:, chosen] * heavy[:, None], wanted * heavy)
             rest = wanted - columns[:, chosen] @ weights
             enough = len(chosen) >= min(MAX_ENERGIES, columns.shape[1])
             if enough or float(np.abs(rest).max()) <= tolerance:
@@ -260,75 +253,17 @@ def _pursue(
         chosen = sorted([*chosen, int(np.argmax(gain))])
 
 
-def non_negative(
-    columns: FloatArray, wanted: FloatArray, begin: FloatArray | None = None
-) -> FloatArray:
-    """Solve a least squares problem with weights that are not negative, by Lawson and
-    Hanson's sets of free weights (Solving Least Squares Problems, 1974, chapter 23).
+def _non_negative(columns: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Solve a least squares problem with weights that are not negative; by a slower method
+    (BVLS) where NNLS does not converge.
 
-    scipy.optimize has it; to import that takes longer than a whole effective beam.
-    `columns`: (m, p) what each weight adds; `wanted`: (m,); `begin`: (p,) weights of a similar
-    problem, at least 0. Returns (p,) weights.
+    `columns`: (m, p) what each weight adds; `wanted`: (m,).
+    Returns (p,) weights.
     """
-    corner = _corner(np.column_stack([columns, wanted]))  # the same problem, of few rows
-    norms = np.maximum(np.linalg.norm(corner[:, :-1], axis=0), 1e-300)
-    columns, wanted = corner[:, :-1] / norms, corner[:, -1]
-    count = columns.shape[1]
-    least = 10.0 * len(corner) * float(np.finfo(float).eps * np.linalg.norm(wanted))
-    weights = np.zeros(count) if begin is None else begin * norms
-    free = weights > 0.0
-    weights = _towards(_of_free(columns, wanted, free), weights, free, columns, wanted)
-    useless = np.zeros(count, dtype=bool)  # freed, they would turn negative at once
-    for _ in range(MAX_CHANGES * count):
-        gain = columns.T @ (wanted - columns @ weights)
-        gain[free | useless] = -np.inf
-        chosen = int(np.argmax(gain))
-        if gain[chosen] <= least:
-            break
-        free[chosen] = True
-        asked = _of_free(columns, wanted, free)
-        if asked[chosen] <= 0.0:
-            free[chosen], useless[chosen] = False, True
-            continue
-        weights = _towards(asked, weights, free, columns, wanted)
-        useless[:] = False
-    return np.asarray(weights / norms)
+    from scipy.optimize import lsq_linear, nnls
 
-
-def _corner(matrix: FloatArray) -> FloatArray:
-    """Compute R of a QR decomposition, of blocks of rows: of a whole matrix LAPACK's threads
-    would wait for one another for longer than they work."""
-    wide = matrix.shape[1]
-    while len(matrix) > 2 * wide:
-        rest = np.zeros((-len(matrix) % (2 * wide), wide))
-        blocks = np.concatenate([matrix, rest]).reshape(-1, 2 * wide, wide)
-        matrix = np.asarray(np.linalg.qr(blocks, mode="r")).reshape(-1, wide)
-    return np.asarray(np.linalg.qr(matrix, mode="r"))
-
-
-def _towards(
-    asked: FloatArray,
-    weights: FloatArray,
-    free: npt.NDArray[np.bool_],
-    columns: FloatArray,
-    wanted: FloatArray,
-) -> FloatArray:
-    """Go from weights, at least 0, towards those that the free ones ask for, (p,); each that
-    reaches 0 on the way stays there, and is free no longer (`free` is changed)."""
-    while (asked[free] <= 0.0).any():
-        down = np.flatnonzero(free & (asked <= 0.0))
-        share = weights[down] / (weights[down] - asked[down])
-        weights = weights + share.min() * (asked - weights)
-        free[down[share == share.min()]] = False
-        weights[~free] = 0.0
-        asked = _of_free(columns, wanted, free)
-    return asked
-
-
-def _of_free(
-    columns: FloatArray, wanted: FloatArray, free: npt.NDArray[np.bool_]
-) -> FloatArray:
-    """Solve for the weights that are free, the others are 0, (p,)."""
-    weights = np.zeros(columns.shape[1])
-    weights[free] = np.linalg.lstsq(columns[:, free], wanted, rcond=None)[0]
-    return weights
+    try:
+        weights, _ = nnls(columns, wanted, maxiter=30 * columns.shape[1])
+    except RuntimeError:  # nearly equal columns can send it round in circles
+        weights = lsq_linear(columns, wanted, (0.0, np.inf), method="bvls").x
+    return np.asarray(weights)

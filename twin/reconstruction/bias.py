@@ -94,8 +94,6 @@ FLOOR: Final = 0.001
 REGION_SIGMA: Final = 0.447
 """Standard deviation along an axis of a ball of radius 1, 1 / sqrt(5): a region is a ball of a
 node's radius."""
-WITHIN_TOLERANCE: Final = 1e-3
-"""Relative error of a width within which a share of errors is."""
 MAX_VOXEL_NODES: Final = 4.0
 """Largest edge of a voxel for which a grid can hold uniform regions [nodes]."""
 
@@ -229,17 +227,14 @@ def _within(share: float, shift: FloatArray, spread: FloatArray) -> float:
         share: of them, 0 to 1.
         shift, spread: mean, at least 0, and standard deviation, above 0, of each (m,).
     """
+    from scipy.optimize import brentq
     from scipy.special import ndtr
 
-    def inside(size: float) -> float:
-        held = ndtr((size - shift) / spread) - ndtr((-size - shift) / spread)
-        return float(held.mean())
+    def more(size: float) -> float:
+        inside = ndtr((size - shift) / spread) - ndtr((-size - shift) / spread)
+        return float(inside.mean()) - share
 
-    least, most = 0.0, float((shift + 9.0 * spread).max())
-    while most - least > WITHIN_TOLERANCE * most:
-        size = 0.5 * (least + most)
-        least, most = (size, most) if inside(size) < share else (least, size)
-    return 0.5 * (least + most)
+    return float(brentq(more, 0.0, float((shift + 9.0 * spread).max()), rtol=1e-3))
 
 
 def too_coarse(grid: Grid | Volume, nodes: Volume) -> bool:

@@ -505,13 +505,13 @@ def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.boo
     edge never counts in single views; `usual`: line integral that is typical of the object.
     Returns (2,) bool: left, right.
     """
+    from scipy.ndimage import median_filter
+
     ends = band[:, [0, -1]]
     between_bins = max(_noise(band[:, :5:2]), _noise(band[:, :-6:-2]))
     between_views = np.array([_noise(end) for end in ends.T])
     noise = SIGNIFICANT_SIGMAS * np.maximum(between_bins, between_views)
-    beside = np.concatenate([ends[:1], ends, ends[-1:]])
-    middle = np.sort([beside[:-2], ends, beside[2:]], axis=0)[1]
-    some = middle > np.maximum(least, noise)
+    some = median_filter(ends, (min(3, len(band)), 1)) > np.maximum(least, noise)
     # In the mean the flat's drift and noise show, too, and the logarithm of noise: what counts
     # is what would change densities by the accuracy. Two edges add a pi-th of their sum, at
     # most.
