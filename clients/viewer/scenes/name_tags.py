@@ -215,7 +215,7 @@ class NameTags:
         )
         sizes = sizes.reshape(-1, 2)
         corners = laid_out(anchors, sizes, area, covered_by_page(area))
-        there = np.flatnonzero(~np.isnan(corners[:, 0]))
+        there = np.flatnonzero(~np.isnan(corners[:, 0])).tolist()
 
         def in_space(places: FloatArray, k: int) -> FloatArray:
             flat = np.append((places - middle) * depth[k] / scale, depth[k])
@@ -225,7 +225,7 @@ class NameTags:
             for gone in drawn - {names[k][0] for k in there}:
                 client.scene.remove_by_name(f"/names/{gone}")
             lines = []
-            for k in there.tolist():
+            for k in there:
                 place = in_space(corners[k] + 0.5 * sizes[k], k)
                 end = leader_end(anchors[k], corners[k], sizes[k])
                 lines.append([in_space(end, k), points[k]])

@@ -82,7 +82,10 @@ def truth_of(dataset: DataSet, like: Volume) -> Float32Array:
             return np.zeros(like.shape, np.float32)
         middle = (low + high) / 2
         around = placed(phantom, "keep", -middle)
-        fine = voxelise(around.scene, around.surfaces, high - low, voxel / 2, 2)
+        width, depth, height = (high - low).tolist()
+        fine = voxelise(
+            around.scene, around.surfaces, (width, depth, height), voxel / 2, 2
+        )
         whole = replace(fine, center_mm=tuple(middle.tolist()))
         data = np.pad(whole.data, (1, 1))
         half = 0.5
