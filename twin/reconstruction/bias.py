@@ -1,7 +1,7 @@
 """A bound of the bias in a volume of FDK, from the geometry and some of the images.
 
-A coarse volume of the object is projected and reconstructed on ladders of scans: from
-ones without a flaw (a panel that sees all, each layer from its own height) to the one at
+A coarse volume of the object is projected and reconstructed on a ladder of scans: from one
+without a flaw (a panel that sees all, each layer from its own height) to the one at
 hand, one flaw a rung, with the same pixels. The difference of two rungs is the effect of that
 flaw on such an object, as far as its nodes show it: what a copy of half as many nodes shows less,
 or more, is expected once more of the finest nodes, and may be wrong by as much (Richardson's
@@ -317,7 +317,7 @@ class BiasOnDemand:
 
         If the images fit another geometry better, nothing is bounded. The coarse volume's
         change by each flaw, extrapolated (`_extrapolated`), is the standard deviation of its
-        error: missing angles, the rungs of `ladders`, and pixels that stand for what is
+        error: missing angles, the rungs of `ladder`, and pixels that stand for what is
         between them ("sampling"). Another continuation of truncated rows ("beyond"), or for
         complete rows their level beside the object ("drift"), errors that the images tell and
         a known spectrum ("hardening") shift values. Standard errors of those, and of what the
@@ -722,11 +722,15 @@ def _angles(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
     best, ours = (
         scan.seen(nodes.sharp, scan.parallel("", wide, t)) for t in (None, scan.angles)
     )
-    return {"angles": Flaw("angles", ours - best, nodes.even, finite=not scan.few)}
+    return {
+        "angles": Flaw(
+            "angles", ours - best, nodes.even, finite=scan.whole and not scan.few
+        )
+    }
 
 
 def _flaws(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
-    """Compute what the flaws of a scan do: few views, and the rungs of its ladders.
+    """Compute what the flaws of a scan do: few views, and the rungs of its ladder.
 
     Args:
         scan: a coarse copy.
@@ -737,12 +741,11 @@ def _flaws(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
     weights = np.where(nodes.inside, 1.0, 1e-3)
     compared = nodes.inside.any(axis=(1, 2), keepdims=True)
     layers = np.flatnonzero(compared)
-    for ladder in scan.ladders(layers):
-        rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in ladder]
-        for (_, before), (flaw, after) in pairwise(rungs):
-            change = np.where(compared, after - before, np.float32(0.0))
-            # A panel aside sees every ray of a circle once: only steps of weights are a flaw.
-            found[flaw] = Flaw(flaw, change, weights, finite=flaw == "aside")
+    rungs = [(rung.flaw, scan.seen(nodes.found, rung)) for rung in scan.ladder(layers)]
+    for (_, before), (flaw, after) in pairwise(rungs):
+        change = np.where(compared, after - before, np.float32(0.0))
+        # A panel aside sees every ray of a whole scan: only steps of weights are a flaw.
+        found[flaw] = Flaw(flaw, change, weights, finite=flaw == "aside" and scan.whole)
     return found
 
 

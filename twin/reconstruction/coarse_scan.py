@@ -370,6 +370,17 @@ class CoarseScan:
         """True if views are `few`, or a circle is not full: then FDK weighs its two ends."""
         return self.few or not (self.circle.rise or self.circle.full)
 
+    @property
+    def aside(self) -> bool:
+        """True if the axis is off the middle of the panel by more than half a column."""
+        low, high = self.ends
+        return abs(high - low) > (low + high) / self.images.shape[2]
+
+    @property
+    def whole(self) -> bool:
+        """False if a panel aside sees less than a turn: then it never sees some rays."""
+        return bool(self.circle.rise or self.circle.full or not self.aside)
+
     @cached_property
     def easy(self) -> bool:
         """True if nothing of the trajectory and the panel's edges can be a large error:
@@ -377,10 +388,9 @@ class CoarseScan:
         `MAX_EASY_CLIMB`, and an object that ends within the panel, with the open beam
         beside it within `MAX_EASY_LEVEL`.
         """
-        low, high = self.ends
-        cols = self.images.shape[2]
-        aside = abs(high - low) > (low + high) / cols
-        if self.circle.rise or not self.circle.full or aside or self.cut_off or self.more:
+        if self.circle.rise or not self.circle.full or self.aside:
+            return False
+        if self.cut_off or self.more:
             return False
         level = self.level
         away = np.linalg.norm((level.detector - level.source)[:, :2], axis=1)
@@ -528,36 +538,39 @@ class CoarseScan:
         cols = int(sum(ends) / side + 1e-6) + 2  # often an integer, except for rounding
         return Rung(flaw, views, (self.grid.shape[0] + 2 * self.more, cols))
 
-    def ladders(self, layers: npt.NDArray[np.intp]) -> list[list[Rung]]:
-        """List rows of scans, each from one without a flaw to one with, of the same sampling.
+    def ladder(self, layers: npt.NDArray[np.intp]) -> list[Rung]:
+        """List scans of the same sampling, from one without a flaw to this one.
 
-        Parallel rays of a centred panel, then of one that is "aside" by more than a column;
-        layers that are seen by themselves, then in the "cone" and without the "rows" that the
-        panel does not have, if the object goes on above or below. A helix has "rows" alone.
+        Some layers are seen by themselves, from their own heights: by a panel that reaches as far
+        on both sides, then by one that is "aside"; then in the "cone" and without the "rows"
+        that the panel does not have, if the object goes on above or below. A helix has "rows"
+        alone.
 
         Args:
             layers: (m,) that are to be seen by themselves; others are not compared.
 
         Returns:
-            Rungs with their flaw's name, geometry and panel's shape; no row for flaws that the
-            scan has not.
+            Rungs with their flaw's name, geometry and panel's shape; one rung has no flaw.
         """
         rows, cols = self.images.shape[1:]
-        low, high = self.ends
-        found: list[list[Rung]] = []
-        if not self.circle.rise and abs(high - low) > (low + high) / cols:
-            sides = ("", (max(low, high),) * 2), ("aside", self.ends)
-            found.append([self.parallel(*one, self.angles) for one in sides])
+        rungs = []
+        if not self.circle.rise and self.aside:
+            low, high = self.ends
+            more = round(abs(high - low) * cols / (low + high))
+            part = (-more, cols) if high < low else (0, cols + more)
+            wide = window(self._fan, (1, cols), (0, 1), part)
+            rungs.append(Rung("", wide, (1, cols + more), layers))
+        if len(layers):
+            flaw = "aside" if rungs else ""
+            rungs.append(Rung(flaw, self._fan, (1, cols), layers))
         if rows == 1 or not len(layers):
-            return found
-        rising = [Rung("", self._fan, (1, cols), layers)]
+            return rungs
         if self.more and not self.circle.rise:
             reached = (-self.more, rows + self.more)
             taller = window(self.level, (rows, cols), reached, (0, cols))
-            rising.append(Rung("cone", taller, (rows + 2 * self.more, cols)))
+            rungs.append(Rung("cone", taller, (rows + 2 * self.more, cols)))
         last = "rows" if self.more else "cone"
-        rising.append(Rung(last, self.level, (rows, cols)))
-        return [*found, rising]
+        return [*rungs, Rung(last, self.level, (rows, cols))]
 
     @property
     def _fan(self) -> ConeVec:

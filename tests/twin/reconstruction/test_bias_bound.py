@@ -319,7 +319,7 @@ def test_a_body_that_goes_on_all_along_the_axis_has_no_error_of_the_cone(
     images = images_of(scan, (10.0, 8.0, 90.0))
     copy = CoarseScan.of(lambda i: images[i], scan, SHAPE, None)
     layers, _, wide = copy.grid.shape
-    fan, cone, *_ = copy.ladders(np.arange(layers))[-1]
+    fan, cone, *_ = copy.ladder(np.arange(layers))
     assert (fan.flaw, cone.flaw) == ("", "cone")
     rod = np.zeros(copy.grid.shape, np.float32)
     rod[:, wide // 3 : -(wide // 3), wide // 3 : -(wide // 3)] = 1.0
@@ -330,7 +330,7 @@ def test_a_body_that_goes_on_all_along_the_axis_has_no_error_of_the_cone(
     blank = np.zeros_like(images[:, :6])
     short = np.concatenate([blank, images[:, 6:-6], blank], axis=1)
     copy = CoarseScan.of(lambda i: short[i], scan, SHAPE, None)
-    fan, cone = copy.ladders(np.arange(layers))[-1]
+    fan, cone = copy.ladder(np.arange(layers))
     rod[: layers // 4] = rod[-(layers // 4) :] = 0.0
     change = copy.seen(smoothed(rod), cone) - copy.seen(smoothed(rod), fan)
     middle, end = (
