@@ -33,6 +33,7 @@ from flexdt.twin.calibration.diagnose.table.groups import (
     CAUSES,
     bead_places,
     bend,
+    growth,
     moving,
     positions,
     rows,
@@ -87,6 +88,7 @@ POLICY: Final[Mapping[CalibrationCode, Use]] = {
 TOLD_TOGETHER: Final[Mapping[str, tuple[str, ...]]] = {
     rows.NAME: (bend.NAME,),
     bead_places.NAME: (bend.NAME,),
+    growth.NAME: (moving.NAME,),
 }
 """Cause -> causes of which its sentence holds, too."""
 UNEXPLAINED_MOTION: Final = ("dO_x", "dO_y", "alpha")

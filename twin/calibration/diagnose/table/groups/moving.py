@@ -136,8 +136,8 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             some = movers
             if how == "jitters":
                 some = tuple(dict.fromkeys((*JITTERS, *known.asked)))
-            if how == "ramps":
-                # Of even angles this is a factor on them.
+            if how in ("ramps", "slows down"):
+                # Of even angles this is a factor on them, or looks like one.
                 some = tuple(what for what in movers if what != "alpha")
             each = np.stack([_in(table.n, frames, course) for course in courses])
             chance = LOG_CHANCE - math.log(KINDS * len(courses))
