@@ -261,7 +261,8 @@ class Front:
             asked = {k: v[-1] for k, v in parse_qs(url.query).items()}
             picture = None
             with contextlib.suppress(TimeoutError):
-                picture = await asyncio.wait_for(self._still(asked), STILL_S)
+                async with asyncio.timeout(STILL_S):
+                    picture = await self._still(asked)
             if picture is None:
                 return _response(b"", "image/jpeg", status=http.HTTPStatus.NO_CONTENT)
             return _kept(request, picture, "image/jpeg")

@@ -425,7 +425,8 @@ class Viewer:
             pause_s = max(0.0, begun + 0.8 / most_hz - loop.time())
             self._looked.clear()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._looked.wait(), pause_s)
+                async with asyncio.timeout(pause_s):
+                    await self._looked.wait()
 
     def _somebody_looks(self) -> None:
         """Ask for states at the rate of the pages that are open, and draw the next one at
@@ -628,7 +629,8 @@ class Viewer:
             self._placed.clear()  # until the state of now, which the subscription brings
             self._somebody_looks()
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._placed.wait(), STILL_S)
+            async with asyncio.timeout(STILL_S):
+                await self._placed.wait()
         lab = self.lab
         world = self.world
         camera = self.clients.cameras.get(asked.get("view", ""))

@@ -441,7 +441,8 @@ async def _room_of(member: _Member) -> int | None:
     volumes.
     """
     try:
-        health = await asyncio.wait_for(member.client.health(), LATE_S)
+        async with asyncio.timeout(LATE_S):
+            health = await member.client.health()
     except (ProjectorUnavailable, RpcError, TimeoutError):
         return None  # it may answer when the scan runs
     if health.memory_evictable is None:
