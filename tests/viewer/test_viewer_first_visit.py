@@ -23,6 +23,7 @@ import pytest
 import trimesh
 from looking import drawn, picture, point_at, settled, until
 
+from flexdt.clients.client.twin_methods import FINAL_STATES
 from flexdt.twin.machine.description import builtin_machine, profile_of
 from flexdt.twin.script.compose import compose_script
 from flexdt.twin.script.scan_request import ScanRequest
@@ -284,9 +285,12 @@ def past(lab: Any) -> None:
 
 @pytest.fixture
 def quiet(lab: Any, past: None) -> None:
-    """The machine at home, with small images and a phantom."""
+    """The machine at home, with small images and a phantom, and no scan of the visit before."""
     with lab.client() as twin:
         twin.control("force")
+        for job in twin.jobs().jobs:
+            if job.state not in FINAL_STATES:
+                twin.wait_job(job.job)
         twin.set_sample("lego")
         twin.set_camera(roi=(32, 8, 1943, 1527), mode="HW4SW1High", exposure_ms=100)
         twin.set_tube(on=False, kV=90, power_W=20)
