@@ -374,7 +374,7 @@ class CoarseScan:
     def aside(self) -> bool:
         """True if the axis is off the middle of the panel by more than half a column."""
         low, high = self.ends
-        return abs(high - low) > (low + high) / self.images.shape[2]
+        return bool(abs(high - low) > (low + high) / self.images.shape[2])
 
     @property
     def whole(self) -> bool:
