@@ -389,6 +389,7 @@ def test_a_snapshot_with_x_rays_off_shows_the_sample_or_says_it_is_dark(
 
     flexdt("tube", "--off")
     flexdt("sample", "lego")
+    flexdt("camera", "--mode", "HW2SW1High", "--roi", "32", "8", "1943", "1527")
     assert flexdt("move", "mag_obj=600", "mag_det=1000", "tra_obj=0.5", "ver_tube=26.3",
                   "ver_det=20", "tra_tube=0", "tra_det=25.3")[0] == 0  # fmt: skip
     png, tif = tmp_path / "view.png", tmp_path / "view.tif"
