@@ -55,7 +55,10 @@ def scanned(tree: Path, *options: str) -> dict[str, float]:
     """Scan once with servers of a tree; their processor seconds and peaks of memory."""
     roots = [tree / "src", tree]
     path = os.pathsep.join(str(root) for root in roots if root.is_dir())
-    env = {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}  # the tree alone, wherever this runs
+    env = {
+        "PYTHONPATH": path,
+        "PYTHONSAFEPATH": "1",
+    }  # the tree alone, wherever this runs
     with tempfile.TemporaryDirectory() as data:
         rays = projector(env=env)
         server = twin(rays.port, Path(data), "--speed-up", "max", *options, env=env)
