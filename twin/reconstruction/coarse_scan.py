@@ -1,4 +1,4 @@
-"""A coarse copy of a scan, and scans that lead to it from ones without a flaw."""
+"""A coarse copy of a scan, and a ladder of scans that leads to it from one without a flaw."""
 
 from __future__ import annotations
 
@@ -550,8 +550,11 @@ class CoarseScan:
             layers: (m,) that are to be seen by themselves; others are not compared.
 
         Returns:
-            Rungs with their flaw's name, geometry and panel's shape; one rung has no flaw.
+            Rungs with their flaw's name, geometry and panel's shape; the first has no flaw.
+            Without layers, none.
         """
+        if not len(layers):
+            return []
         rows, cols = self.images.shape[1:]
         rungs = []
         if not self.circle.rise and self.aside:
@@ -560,10 +563,9 @@ class CoarseScan:
             part = (-more, cols) if high < low else (0, cols + more)
             wide = window(self._fan, (1, cols), (0, 1), part)
             rungs.append(Rung("", wide, (1, cols + more), layers))
-        if len(layers):
-            flaw = "aside" if rungs else ""
-            rungs.append(Rung(flaw, self._fan, (1, cols), layers))
-        if rows == 1 or not len(layers):
+        flaw = "aside" if rungs else ""
+        rungs.append(Rung(flaw, self._fan, (1, cols), layers))
+        if rows == 1:
             return rungs
         if self.more and not self.circle.rise:
             reached = (-self.more, rows + self.more)

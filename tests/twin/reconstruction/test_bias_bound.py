@@ -337,3 +337,14 @@ def test_a_body_that_goes_on_all_along_the_axis_has_no_error_of_the_cone(
         float(np.abs(change[k][inside[1:]]).max()) for k in (layers // 2, layers // 4 + 1)
     )
     assert end > 3.0 * middle
+
+
+def test_a_copy_without_layers_to_compare_has_no_ladder() -> None:
+    """A panel aside that sees nothing divided by the number of its layers."""
+    geometry = ConeVec.circular(
+        sod=110, sdd=220, angles=130, shape=(30, 60), pixel=1.6, offset=(20.0, 0.0)
+    )
+    blank = np.zeros((30, 60), np.float32)
+    scan = CoarseScan.of(lambda _: blank, geometry, (30, 60), None)
+    assert scan.aside
+    assert scan.ladder(np.array([], dtype=np.intp)) == []

@@ -108,11 +108,10 @@ def _within_pixels(places: FloatArray) -> FloatArray:
     """
     phase = 2.0 * math.pi * places[..., None] * np.arange(1, PIXEL_HARMONICS + 1)
     waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=3)
-    out = np.zeros((*places.shape, 2 * waves.shape[3]))
+    count = waves.shape[3]
+    out = np.zeros((*places.shape, 2 * count))
     for axis in (0, 1):
-        out[:, :, axis, axis * waves.shape[3] :][..., : waves.shape[3]] = waves[
-            :, :, axis
-        ]
+        out[:, :, axis, axis * count : (axis + 1) * count] = waves[:, :, axis]
     return out
 
 
