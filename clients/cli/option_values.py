@@ -72,10 +72,12 @@ def span(word: str, what: str) -> tuple[float, float]:
     Raises typer.BadParameter: another form, an end that is no finite number, or the lower is
     above the upper."""
     ends = [number(part, what) for part in word.split(":")]
-    if len(ends) > 2 or ends[0] > ends[-1]:
+    if len(ends) > 2:
         raise typer.BadParameter(
             f"{what}: {word!r} is not of the form VALUE or LOWER:UPPER"
         )
+    if ends[0] > ends[-1]:
+        raise typer.BadParameter(f"{what}: the lower end of {word!r} is above the upper")
     return ends[0], ends[-1]
 
 

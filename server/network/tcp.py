@@ -850,10 +850,12 @@ class _Link(asyncio.BufferedProtocol):
             self.broken = self.broken + 1
         else:
             self.broken = 0
-        if self.broken >= (
-            self.limits.malformed if self.let_in else MAX_STRANGE_MESSAGES
-        ):
-            self.loop.call_soon(self.close, f"{self.broken} broken messages in a row")
+        limit = self.limits.malformed if self.let_in else MAX_STRANGE_MESSAGES
+        if self.broken >= limit:
+            what = (
+                "broken messages in a row" if self.let_in else "messages without a token"
+            )
+            self.loop.call_soon(self.close, f"{self.broken} {what}")
 
     async def _call(self, id: m.Id, name: str, given: Given) -> m.Response | m.Failure:
         """Serve a call by `_handle`, and count and log it under a trace of its own.

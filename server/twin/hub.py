@@ -287,6 +287,8 @@ class Hub:
         # While a timer runs, later events wait with it even if the interval is over: sent at
         # once they would overtake the pending ones.
         if new.slot is not None and (wait > 0.0 or subscription.timer is not None):
+            # Taken out first: a replaced value would keep its place, before older events.
+            subscription.pending.pop(new.slot, None)
             subscription.pending[new.slot] = new
             # One timer for all slots: the rate is the subscription's.
             if subscription.timer is None:

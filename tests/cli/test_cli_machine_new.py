@@ -72,7 +72,8 @@ def test_a_terminal_is_asked_for_what_is_not_said(
     [
         (["--base", "nix"], 1, "no machine called 'nix' ships"),
         (["--detector", "big"], 2, "not of the form NUMBERxNUMBER"),
-        (["--sod", "9:3"], 2, "not of the form VALUE or LOWER:UPPER"),
+        (["--sod", "9:3"], 2, "the lower end of '9:3' is above the upper"),
+        (["--sod", "3:9:12"], 2, "not of the form VALUE or LOWER:UPPER"),
         (
             ["--base", "micro_ct", "--sod", "3:9"],
             3,
@@ -83,7 +84,7 @@ def test_a_terminal_is_asked_for_what_is_not_said(
         (["--pitch", "nan"], 2, "not finite"),
         (["--power", "nan"], 2, "not finite"),
         (["--sod", "60:500", "--limit", "Z=100:400"], 3, "are both said"),
-        (["--kv", "200:100"], 2, "not of the form VALUE or LOWER:UPPER"),
+        (["--kv", "200:100"], 2, "the lower end of '200:100' is above the upper"),
         (["--kv", "20"], 1, "tube.kV: must be from min_kV to max_kV, [30, 20]"),
         (
             ["--sod=-20:500"],

@@ -50,6 +50,15 @@ def test_whole_numbers_that_no_panel_has(digits, key):
         assert "mine.json" in error.message  # noqa: PT017
 
 
+@pytest.mark.parametrize("key", ["rows", "columns"])
+def test_a_panel_with_one_side_misses_the_other(key):
+    document = json.loads(geometry_text(SCAN))
+    document["detector"] = {"rows": 7, "columns": 9}
+    del document["detector"][key]
+    with pytest.raises(TwinError, match=f"{key} is missing"):
+        read_geometry_text(json.dumps(document), "mine.json")
+
+
 def test_a_byte_order_mark_says_nothing():
     again = read_geometry_text(MARK + geometry_text(SCAN))
     assert (again.cone_vec.rows == SCAN.cone_vec.rows).all()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from flexdt.twin.dataset.flexdt_json import DatasetDocument, ScanRecord, parse_document
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.machine.description import builtin_machine, builtin_profile
@@ -109,9 +109,11 @@ def test_a_plan_s_document_of_another_form_is_an_error(plan: ScanPlan) -> None:
     document = plan.to_dict()
     with pytest.raises(ValueError, match="duration_s"):
         ScanPlan.from_dict({**document, "duration_s": "long"})
-    step = {**document["steps"][0], "command": {"command": "Explode"}}
-    with pytest.raises(ValueError, match="unknown command"):
-        ScanPlan.from_dict({**document, "steps": [step]})
+    for wrong in ({"command": "Explode"}, {"command": "Command"}, {"command": []}, {},
+                  {"command": "MotorCommand", "motor": "Z"}, None, 5, "Pause", []):  # fmt: skip
+        step = {**document["steps"][0], "command": wrong}
+        with pytest.raises(TwinError, match="command"):
+            ScanPlan.from_dict({**document, "steps": [step]})
     with pytest.raises(ValueError, match="machine"):
         ScanPlan.from_dict({k: v for k, v in document.items() if k != "machine"})
 

@@ -386,7 +386,8 @@ def read_geometry_text(text: str, file: str = "<geometry>") -> ScanGeometry:
     real = content.real_cone_vec
     if (rows is None) != (columns is None):
         raise ExchangeError(
-            f"{file}: detector: rows and columns must be whole numbers above 0"
+            f"{file}: detector: rows and columns are stated together or not at all; "
+            f"{'rows' if rows is None else 'columns'} is missing"
         )
     geometry = ScanGeometry(
         cone_vec_of(content.cone_vec, f"{file}: cone_vec"),

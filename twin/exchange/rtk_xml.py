@@ -11,7 +11,8 @@ negative distances. Curved detectors are not supported.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 from xml.etree import ElementTree
 
@@ -388,13 +389,32 @@ def _take(entry: ElementTree.Element, values: dict[str, str], file: str) -> None
     Raises:
         ExchangeError: the view states it a second time, differently.
     """
-    found = [(entry.tag, (entry.text or "").strip())] if not len(entry) else []
-    found += [(f"{entry.tag}@{name}", value) for name, value in entry.attrib.items()]
-    found += [(f"{entry.tag}/{one.tag}", (one.text or "").strip()) for one in entry]
-    for name, text in found:
-        if values.setdefault(name, text) != text:
+    for name, text in _texts(entry, entry.tag):
+        if not _same(values.setdefault(name, text), text):
             problem = f"{file}: {name} is {values[name][:40]} and {text[:40]}"
             raise ExchangeError.instead(problem, text[:40], "one value", path=name)
+
+
+def _texts(entry: ElementTree.Element, path: str) -> Iterator[tuple[str, str]]:
+    """Yield (path, text) of an element, of its attributes and of all below it.
+
+    Members of one tag are numbered from the second on: `Note/p`, `Note/p[2]`.
+    """
+    if not len(entry):
+        yield path, (entry.text or "").strip()
+    for name, value in entry.attrib.items():
+        yield f"{path}@{name}", value
+    count: Counter[str] = Counter()
+    for member in entry:
+        count[member.tag] += 1
+        number = count[member.tag]
+        which = f"[{number}]" if number > 1 else ""
+        yield from _texts(member, f"{path}/{member.tag}{which}")
+
+
+def _same(first: str, second: str) -> bool:
+    """Check whether two texts are the same, or the same number written twice."""
+    return first == second or as_number(first) == as_number(second)
 
 
 def _number(name: str, values: Mapping[str, str], file: str) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from typing import Annotated, Any, Literal, dataclass_transform
@@ -215,9 +215,12 @@ class Custom(Command):
 
 
 def _all_commands(cls: type[Command] = Command) -> dict[str, type[Command]]:
-    """Map class names to command types: a type and all its subclasses, abstract ones too."""
-    below = {k: v for sub in cls.__subclasses__() for k, v in _all_commands(sub).items()}
-    return {cls.__name__: cls, **below}
+    """Map class names to the command types that a script can hold: those without
+    subclasses."""
+    kinds = cls.__subclasses__()
+    if not kinds:
+        return {cls.__name__: cls}
+    return {name: one for kind in kinds for name, one in _all_commands(kind).items()}
 
 
 def _to_json(command: Command) -> dict[str, Any]:
@@ -234,12 +237,15 @@ def _from_json(value: Any) -> Command:
     ValueError.
 
     Raises:
-        ValueError: no or an unknown `command`.
+        ValueError: no object, or no or an unknown `command`.
     """
     if isinstance(value, Command):
         return value
+    if not isinstance(value, Mapping):
+        raise ValueError("a command must be an object with its name as 'command'")
     fields = dict(value)
-    cls = _all_commands().get(fields.pop("command", ""))
+    name = fields.pop("command", None)
+    cls = _all_commands().get(name) if isinstance(name, str) else None
     if cls is None:
         raise ValueError("unknown command")
     command: Command = adapter_of(cls).validate_json(json.dumps(fields))

@@ -45,18 +45,15 @@ def saturated_part(what: str, share: float) -> str:
     )
 
 
-def first_look(paths: Mapping[str, Path], full_scale: int | None) -> list[str]:
+def first_look(paths: Mapping[str, Path], full_scale: int) -> list[str]:
     """Check images for saturation before anything is computed from them.
 
     `paths`: one image of each kind, which the sentence names. An unreadable image is skipped;
-    reading it later is an error. `full_scale`: largest count of the panel; None where it is not
-    known: nothing is checked.
+    reading it later is an error. `full_scale`: largest count of the panel.
     Returns one sentence, of the first kind of which at least `WARNING_SHARE` of the pixels is
     saturated; else [].
     """
     for kind, path in paths.items():
-        if full_scale is None:
-            break
         try:
             share = float((read_image(path) >= full_scale).mean())
         except (OSError, DatasetError):

@@ -133,3 +133,21 @@ def test_a_foreign_element_is_named():  # LEAP#161
     text = rtk_text(scan(0)).replace("<Projection>", "<Projection><Tube>3</Tube>", 1)
     found = read_rtk(text, (PITCH, PITCH), SHAPE, "mine.xml")
     assert found.notes == ("mine.xml: 1 field not known to flexdt, ignored: Tube = 3",)
+
+
+def test_a_number_twice_and_trees_of_others_are_no_contradiction():
+    """One number in two spellings agrees; members of an unknown element are all told."""
+    text = rtk_text(scan(1))
+    name = NAMES[3]
+    found = re.search(rf"<{name}>([^<]*)</{name}>", text)
+    again = f"{found[0]}<{name}> {float(found[1])!r}e0 </{name}>"
+    note = "<Note><p>a</p><p at='x'>b<q>deep</q></p></Note>"
+    read = read_rtk(text.replace(found[0], again + note, 1), pitch(scan(1)))
+    plain = read_rtk(text, pitch(scan(1)))
+    np.testing.assert_array_equal(read.cone_vec.rows, plain.cone_vec.rows)
+    told = " ".join(read.notes) + repr(read.provenance)
+    for word in ("Note/p", "Note/p[2]@at", "Note/p[2]/q", "deep"):
+        assert word in told
+    other = f"{found[0]}<{name}>{float(found[1]) + 1.0!r}</{name}>"
+    with pytest.raises(ExchangeError, match=name):
+        read_rtk(text.replace(found[0], other, 1), pitch(scan(1)))

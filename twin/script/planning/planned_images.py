@@ -293,7 +293,7 @@ class ImageCollector:
         """
         trigger = self._active(start)
         moving = self.motors.moving(start)
-        inference = self._infer(trigger, start)
+        inference = self._infer(trigger)
         settings = self.camera.settings
         frames = settings.frames
         period = settings.exposure_ms * settings.averages / 1000.0
@@ -399,7 +399,7 @@ class ImageCollector:
             return t
         return None
 
-    def _infer(self, trigger: planned.Trigger | None, start: float) -> Inference | None:
+    def _infer(self, trigger: planned.Trigger | None) -> Inference | None:
         """Infer frames and averages that the script leaves out, set them in the camera,
         and warn of both.
 
@@ -408,7 +408,6 @@ class ImageCollector:
 
         Args:
             trigger: of the sequence, or None.
-            start: not used.
 
         Returns:
             Frames and averages that fit the motion; None where none fit, or without a

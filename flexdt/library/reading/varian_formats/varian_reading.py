@@ -86,14 +86,16 @@ def read_varian(path: Path, geometry: ConeVec | None) -> DataSet:
 
 
 def _projections(said: Ledger, path: Path) -> list[Path]:
-    """List the projections of all acquisitions, by their folders and numbers.
+    """List the projections of all acquisitions, by the numbers in their folders' names, then
+    in their own.
 
     Raises:
         DatasetError: none is there, or two have one number.
     """
-    folders = sorted({one.parent for one in (path.parent / "Acquisitions").glob("*/*")})
+    above = path.parent / "Acquisitions"
+    folders = ordered([one.parent.name for one in above.glob("*/*")]).names
     found: list[Path] = []
-    for folder in folders:
+    for folder in (above / name for name in folders):
         names = [
             one.name
             for one in folder.iterdir()
