@@ -346,23 +346,31 @@ class BiasOnDemand:
         return self.bias.accuracy(grid)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
-        """List what is wrong at first sight: another geometry that fits better, or large
-        errors by the trajectory, the panel's edges and the spectrum. Those are not looked
-        for in a scan that fits, is `CoarseScan.easy` and hardly hardens the beam; of one that
-        has few views, but is easy otherwise, only what few views do to some of its rows.
+        """List what is wrong: another geometry that fits better, or large errors by the
+        trajectory, the panel's edges and the spectrum.
+
+        Whether to warn is seen at first sight (`_warns`); what a warning says is what
+        `accuracy` says.
 
         Args:
             grid: of the volume.
         """
+        return self.bias.warnings(grid) if self._warns(grid) else []
+
+    def _warns(self, grid: Grid | Volume) -> bool:
+        """Return whether a first sight of the scan warns. Large errors are not looked for in a
+        scan that fits, is `CoarseScan.easy` and hardly hardens the beam; of one that has few
+        views, but is easy otherwise, only what few views do to some of its rows.
+        """
         if self._doubtful:
-            return self._told.warnings(grid)
+            return bool(self._told.warnings(grid))
         scan = self._copied(NODES)
         if not scan.easy or (self._bent is not None and self._bent.strong):
-            return self._bounded.warnings(grid)
-        if scan.sparse:
-            thin = scan.thinned(all_views=True, least_rows=STREAK_ROWS)
-            return _bounded(thin, angles_alone=True).warnings(grid)
-        return []
+            return bool(self._bounded.warnings(grid))
+        if not scan.sparse:
+            return False
+        thin = scan.thinned(all_views=True, least_rows=STREAK_ROWS)
+        return bool(_bounded(thin, angles_alone=True).warnings(grid))
 
     def residuals(self, volume: Volume) -> Residuals | None:
         """Compare the finer copy's images with the projections of a volume of the scan;

@@ -174,8 +174,9 @@ def test_few_views_of_one_row_are_warned_of() -> None:
     )
     box = bias_bound.Solid("box", np.zeros(3), np.array([14.0, 10.0, 90.0]), 0.3, 0.02)
     images = bias_bound.Scan("", scan, (1, 48), [box], 0.0, 0.0, 0).images()
-    with pytest.warns(UserWarning, match="missing or few views"):
-        fdk(images, scan, Grid((1, 30, 30), 1.0))
+    with pytest.warns(UserWarning, match="missing or few views") as said:
+        volume = fdk(images, scan, Grid((1, 30, 30), 1.0))
+    assert f"values may be off; {volume.accuracy}" in [str(one.message) for one in said]
 
 
 def test_a_light_body_with_dense_pins_is_what_is_judged() -> None:
@@ -191,8 +192,9 @@ def test_a_light_body_with_dense_pins_is_what_is_judged() -> None:
         for x in (-8.0, 8.0)
     ]
     images = bias_bound.Scan("", scan, SHAPE, [body, *pins], 0.0, 0.0, 0).images()
-    with pytest.warns(UserWarning, match="values may be off"):
-        fdk(images, scan, Grid((3, 40, 40), 1.0))
+    with pytest.warns(UserWarning, match="values may be off") as said:
+        volume = fdk(images, scan, Grid((3, 40, 40), 1.0))
+    assert f"values may be off; {volume.accuracy}" in [str(one.message) for one in said]
 
 
 def turned(*solids: bias_bound.Solid) -> tuple[ConeVec, Float32Array]:
