@@ -36,6 +36,15 @@ NOISE_STEPS: Final = 4
 NO_MINIMUM: Final = "the views agree about as well with the source's plane at another row"
 
 
+class Height(NamedTuple):
+    """The panel's height above the stated one, its standard deviation, and the part of this
+    that the frames' noise has, which more frames would lessen [px]."""
+
+    px: float
+    sigma: float
+    of_noise: float
+
+
 class _Bowl(NamedTuple):
     """Sums of squares about a height, one for each of `LEVELS`: where each would be least,
     sigmas of that, and second derivatives."""
@@ -48,8 +57,8 @@ class _Bowl(NamedTuple):
 
 def find_height(
     fine: PlanePairs, coarse: PlanePairs, reach: float, random: np.random.Generator
-) -> tuple[float, float]:
-    """Estimate the panel's height above the stated one, and its standard deviation [px].
+) -> Height:
+    """Estimate the panel's height above the stated one.
 
     The level of smoothing with the least sigma counts; the sigma contains noise, the
     scatter of other sure levels, and the doubtful parameters.
@@ -92,7 +101,7 @@ def find_height(
     base = slope(0.0 * up)
     for doubt in np.eye(len(up))[1:]:
         variance += ((slope(doubt) - base) / float(bowl.bends[level])) ** 2
-    return at, math.sqrt(variance)
+    return Height(at, math.sqrt(variance), float(blurred[level]))
 
 
 def _settle(

@@ -14,9 +14,10 @@ from flexdt.twin.calibration.without_phantom.circular_scan import about_axis
 from flexdt.twin.calibration.without_phantom.frame_shifts import Shifts, find_shifts
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import REACH, sharpness
 from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs
-from flexdt.twin.calibration.without_phantom.source_row import find_height
+from flexdt.twin.calibration.without_phantom.source_row import Height, find_height
 from flexdt.twin.calibration.without_phantom.turn import Image, Turn
 from flexdt.twin.dataset.normalise import binned_mean
+from flexdt.twin.errors import NotIdentifiableError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.motion import Motion
@@ -25,8 +26,9 @@ from flexdt.twin.geometry.poses import Poses
 
 COLUMNS: Final = 256
 """Number of columns to which frames are binned for planes."""
-MOST_FRAMES: Final = 360
-"""For the row, of more frames than this every second, third and so on is used."""
+FRAMES: Final = 90, 360
+"""For the row: of more frames than this every second, third and so on is used; the second
+number where the first are too few."""
 MOST_SHIFTS: Final = 2000
 """Largest number of frames whose shifts are estimated."""
 FLOOR_OF_ROW: Final = 0.1
@@ -124,10 +126,10 @@ class TurnPlanes:
         )
 
     def row(self, random: np.random.Generator) -> tuple[Offsets, AlignEstimate]:
-        """Estimate the panel's height and the row of the source's plane, from at most
-        `MOST_FRAMES` frames.
+        """Estimate the panel's height and the row of the source's plane.
 
-        The sigma contains sampling, the sharpness of edges and a step of the images.
+        The sigma contains sampling, the sharpness of edges and a step of the images. `FRAMES`
+        rise where the row is refused, or noise has most of its sigma.
 
         Args:
             random: for the images of noise.
@@ -139,24 +141,41 @@ class TurnPlanes:
             NotIdentifiableError: the images do not determine it, or not twice as well as
                 the priors of dD_y and axis_tilt_x.
         """
-        stride = -(-len(self.sorted) // MOST_FRAMES)
-        fine, coarse = (self._pairs(stride, coarser) for coarser in (1, 2))
-        height, sigma = find_height(fine, coarse, REACH * self.turn.mean.shape[0], random)
-        sampled = FLOOR_OF_ROW * self.factor, SHARP_ROWS * sharpness(self.turn.mean) ** 2
-        sigma = math.hypot(sigma, *sampled, STEP_OF_ROW * math.hypot(*self.turn.step_px))
+        of_turn = (
+            FLOOR_OF_ROW * self.factor,
+            SHARP_ROWS * sharpness(self.turn.mean) ** 2,
+            STEP_OF_ROW * math.hypot(*self.turn.step_px),
+        )
         sdd = float(self.poses.sdd[self.sorted[0]])
         lean = sdd * math.tan(math.radians(self.priors["axis_tilt_x"]))
         known = math.hypot(self.priors["dD_y"], lean) / self.pitch
+        few, many = (-(-len(self.sorted) // count) for count in FRAMES)
+        try:
+            height = self._height(few, random)
+            rest = math.sqrt(height.sigma**2 - height.of_noise**2)
+            enough = few == many or height.of_noise < math.hypot(rest, *of_turn)
+        except NotIdentifiableError:
+            if few == many:
+                raise
+            enough = False
+        if not enough:
+            height = self._height(many, random)
+        sigma = math.hypot(height.sigma, *of_turn)
         refuse_if(
             sigma > known / 2,
             f"the images tell it to +- {sigma:.2g} px, the priors of dD_y and "
             f"axis_tilt_x to +- {known:.2g} px",
         )
-        at = np.array([height, *(5 * [0.0])])
+        at = np.array([height.px, *(5 * [0.0])])
         cone_vec = about_axis(self.poses[self.sorted[:1]], self._of(at))
         level = [[0.0, 0.0, float(cone_vec.source[0, 2])]]
         row = cone_vec.project_points(level, self.turn.mean.shape)[0, 0, 1]
         return self._of(at), AlignEstimate(float(row), sigma, "px")
+
+    def _height(self, stride: int, random: np.random.Generator) -> Height:
+        """Find the panel's height in every `stride`-th frame."""
+        fine, coarse = (self._pairs(stride, coarser) for coarser in (1, 2))
+        return find_height(fine, coarse, REACH * self.turn.mean.shape[0], random)
 
     def motion(self, corrected: Offsets, random: np.random.Generator) -> Motion:
         """Estimate shifts of single frames as shifts of the sample, dO_x and dO_y.
