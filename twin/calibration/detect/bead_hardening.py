@@ -57,35 +57,27 @@ class Profiles:
 
     Attributes:
         terms: (m, terms) light that each term leaves, less the open beam's.
-        spread: (m, terms) its change with the variance of the blur [1/px^2].
         light: (m,) light in the images over that beside the beads.
         most: largest line integral to tabulate.
     """
 
     terms: FloatArray
-    spread: FloatArray
     light: FloatArray
     most: float
 
-    def fitted(self, variance: float) -> tuple[Hardening | None, float]:
-        """Estimate the hardening by least squares with weights that are not negative.
-
-        Args:
-            variance: of the blur, besides that in the terms [px^2].
-
-        Returns:
-            The hardening, None where no term explains the light; and the misfit.
+    def fitted(self) -> Hardening | None:
+        """Estimate the hardening by least squares with weights that are not negative; None where
+        no term explains the light.
         """
         weight = 1.0 / np.sqrt(np.maximum(self.light, LEAST_LIGHT))
-        heavy = (self.terms + variance * self.spread) * weight[:, None]
+        heavy = self.terms * weight[:, None]
         taken = weight * (self.light - 1.0)
         shares = non_negative(heavy.T @ heavy, heavy.T @ taken)
-        misfit = float(np.square(heavy @ shares - taken).sum())
         if not shares.any():
-            return None, misfit
+            return None
         given = np.linspace(0.0, self.most, TABLE_STEPS)
         left = np.expm1(-given[:, None] * np.array(ATTENUATIONS)) @ shares
-        return Hardening(given, -np.log(np.maximum(1.0 + left, 1e-6))), misfit
+        return Hardening(given, -np.log(np.maximum(1.0 + left, 1e-6)))
 
 
 def non_negative(normal: FloatArray, right: FloatArray) -> FloatArray:

@@ -87,6 +87,13 @@ from flexdt.twin.projection.analytic_solids import Scene
 
 MISS_PX = 4.0
 """A measurement further than this from its prediction is not that bead."""
+LIKENESS = 0.9
+"""Least likeness of a spot to a ball."""
+SAME_SIZE = 0.2
+"""Logarithm of the ratio of a spot's radius to the expected one, up to which it is as that of
+the others."""
+SAME_CONTRAST = math.log(1.6)
+"""The same of its contrast."""
 MIN_SHARE = 0.35
 """Least share of a spot in view that is still fitted."""
 FIT_NOISE = 0.008
@@ -126,8 +133,8 @@ class Refined:
         covariances: (n, k, 2, 2).
         bias: (n, k) sphere-centre bias factors.
         contrast: (n, k) line integral through the middle.
-        size: apparent over expected radius of complete spots, corrected for blur; nan if
-            unknown.
+        size: of the beads over the stated one; nan if unknown.
+        size_sigma: standard deviation of its logarithm, with blur and hardening open.
         blur_px: blur of the images, estimated from the spots or assumed.
         sampling_px: what remains of the error that depends on a spot's place in the pixel grid.
         common: (n, k, 2, c) shifts of the positions [px] by one standard deviation of each of
@@ -143,6 +150,7 @@ class Refined:
     bias: FloatArray
     contrast: FloatArray
     size: float
+    size_sigma: float
     blur_px: float
     sampling_px: float
     common: FloatArray
@@ -711,9 +719,9 @@ def _accept(
 ) -> Refined:
     """Keep the results that pass the checks; others are nan (bias 0).
 
-    All must be within `MISS_PX` of their prediction. Complete spots need likeness above
-    0.9, a radius within 22 % and a contrast within a factor 1.6 of the expected; cut ones
-    a misfit below `MISFIT`.
+    All must be within `MISS_PX` of their prediction. Complete spots need likeness, and radius
+    and contrast as the others have them (`judge_size` judges the beads' size); cut ones a misfit
+    below `MISFIT`.
 
     Args:
         results: (n, k, RESULTS).
@@ -726,14 +734,14 @@ def _accept(
     off = np.linalg.norm(place - windows.predicted, axis=2)
     peak = results[..., kernels.PEAK]
     good = (results[..., kernels.OK] > 0) & (off < MISS_PX)
+    alike = results[..., kernels.SCORE] > LIKENESS
+    wide = np.log(np.maximum(results[..., kernels.RADIUS], 1e-9) / windows.radii)
+    some = wide[good & whole & alike]
+    usual = float(np.median(some)) if some.size else 0.0
+    faint = np.log(np.maximum(peak, 1e-9) / contrast)
     good &= np.where(
         whole,
-        (results[..., kernels.SCORE] > 0.9)
-        & (
-            np.abs(np.log(np.maximum(results[..., kernels.RADIUS], 1e-9) / windows.radii))
-            < 0.2
-        )
-        & (np.abs(np.log(np.maximum(peak, 1e-9) / contrast)) < math.log(1.6)),
+        alike & (np.abs(wide - usual) < SAME_SIZE) & (np.abs(faint) < SAME_CONTRAST),
         results[..., kernels.NOISE] < MISFIT,
     )
     return Refined(
@@ -741,7 +749,8 @@ def _accept(
         np.where(good[..., None, None], covariances_of(results), np.nan),
         np.where(good, results[..., kernels.BIAS], 0.0),
         np.where(good, peak, np.nan),
-        sharp.size if sharp.seen else math.nan,
+        sharp.size if math.isfinite(sharp.sigma) else math.nan,
+        sharp.sigma,
         sharp.true,
         SHARP_SAMPLING_PX if sharp.blur < BODY_BLUR_PX else SAMPLING_PX,
         np.zeros((*good.shape, 2, 0)),

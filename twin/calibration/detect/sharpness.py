@@ -1,14 +1,12 @@
 """Blur of the images and apparent size of the beads, estimated from the spots themselves.
 
-The profile that is fitted is an approximation, so the estimate is corrected by the same
-estimate from rendered beads. Without complete spots the assumed values are returned, marked as
-not seen.
+The profile that is fitted is an approximation, which finds where to begin; rendered beads give
+blur and size. Without complete spots the assumed values are returned, marked as not seen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +18,7 @@ from flexdt.twin.calibration.detect.bead_hardening import (
     ATTENUATIONS,
     Profiles,
 )
+from flexdt.twin.calibration.detect.bead_sizes import BeadSize, bead_size
 from flexdt.twin.calibration.detect.patches import Patches, centroids, fits, usable
 from flexdt.twin.calibration.detect.windows import (
     Balls,
@@ -37,11 +36,6 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
-# Blur of the images and apparent size of the beads, estimated from the spots themselves.
-#
-# The profile that is fitted is an approximation, so the estimate is corrected by the same estimate
-# from rendered beads. Without whole spots the assumed values are returned, marked as not seen.
-
 SAMPLE = 24
 """Number of spots from which blur and size are estimated."""
 BLURS = (0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6)
@@ -49,35 +43,19 @@ BLURS = (0.12, 0.25, 0.45, 0.7, 1.1, 1.7, 2.5, 3.6)
 VEILS = (0.0, 0.1, 0.2, 0.3, 0.45, 0.6)
 """Trial veils, as a share of the light."""
 RADIUS_RAYS = 18
-"""Rays along a bead's radius where that estimate is checked on rendered beads."""
+"""Rays along a bead's radius where spots are compared with rendered ones."""
 CHECK_FINE = 3
 """Least number of rays along a pixel's side there."""
 MOST_FINE = 6
 """Largest number of rays along a pixel's side."""
 EXPOSED_FINE = 2
 """The same in each moment of an exposure, of which there are many."""
-SMALL_STEP = 0.05
-"""Relative change of blur and contrast below which corrections stop; the remainder is of
-second order."""
-MOST_ROUNDS = 6
 BODY_BLUR_PX = 0.18
 """Blur of the images below which the rendered body is subtracted as it is."""
 ALIKE = 1.1
 """Ratio of the contrasts of two beads below which they harden the beam alike."""
-CHECK_SAMPLE = 8
-"""Number of those spots that are rendered to check the method, where pixels integrate: without
-noise few decide. In single rays a rim is where the nearest ray is, which cancels in the same
-spots only."""
 PROFILES = 12
 """Number of spots from which a hardening is estimated."""
-SLIGHT_BLUR_PX = 0.45
-"""Blur of the images below which what pixels do not explain of it is estimated from profiles."""
-MOST_VARIANCE_PX2 = 0.15
-"""Largest variance of a slight blur, besides the pixel's."""
-SLIGHT_BLURS = 5
-"""Number of trial variances of a slight blur."""
-UNIT_BLUR_PX = 0.1
-"""Blur at which the change of light by blur is taken, which is linear in its variance there."""
 LATTICE_ORDER = 2.0
 """Power of the number of rays along a pixel's side by which the error of a spot's place falls:
 no two of them share a row (measured: 1.7 to 2.0 with the weights of noisy images)."""
@@ -150,6 +128,8 @@ class Sharp:
         seen: whether they were estimated, not assumed.
         true: the blur with which rendered beads look the same.
         size: the same for the factor on the beads' radii.
+        sigma: standard deviation of the logarithm of that; inf where rendered beads did not
+            tell it.
         lift: the same for the factor on the beads' contrast, of which blur takes a part.
     """
 
@@ -159,6 +139,7 @@ class Sharp:
     seen: bool
     true: float
     size: float
+    sigma: float = math.inf
     lift: float = 1.0
 
 
@@ -169,11 +150,11 @@ def seen_sharpness(
     cone: ConeVec,
     model: BeadModel,
 ) -> tuple[Sharp, Balls]:
-    """Correct blur and size by the same estimate from rendered beads, which harden the beam as
-    those of the images.
+    """Estimate blur, size and contrast by rendered beads (`bead_size`), and how the beads harden
+    the beam.
 
     The fit's profile is an approximation, and where a spot is cut by the edge its radius
-    decides its place. Images without blur keep their blur of none.
+    decides its place.
 
     Args:
         sharp: the estimate of the images.
@@ -183,39 +164,34 @@ def seen_sharpness(
         model: the beads.
 
     Returns:
-        The corrected estimate, and the beads as they attenuate; `sharp` itself if nothing was
-        seen, `sharp` with the blur of `hardened_balls` if nothing can be measured in the
-        rendered spots or after `MOST_ROUNDS`.
+        The estimate, and the beads as they attenuate; `sharp` itself if nothing is seen.
     """
-    if not sharp.seen:
-        return sharp, hardened_balls(sharp, patches, cone, model)[0]
-    slight = sharp.blur < SLIGHT_BLUR_PX
-    few = sample
-    if sharp.blur >= BODY_BLUR_PX:
-        few = spread(sample, CHECK_SAMPLE)
-    trial = replace(sharp, true=sharp.blur, size=1.0)
-    for _ in range(MOST_ROUNDS):
-        balls, blur = hardened_balls(trial, patches, cone, model)
-        found, dimmed = _as_rendered(replace(trial, true=blur), balls, patches, few, cone)
-        if not found.seen:
-            break
-        if slight:
-            step = blur - trial.true
-        else:
-            step = max(sharp.blur - found.blur, BLURS[0] - trial.true)
-        still = slight or abs(step) < SMALL_STEP * trial.true
-        change = sharp.scale / found.scale
-        trial = replace(
-            trial,
-            true=trial.true + step,
-            size=trial.size * change,
-            lift=trial.lift / dimmed,
+    found = None
+    if sharp.seen:
+        fine = rays_to_check(sharp, patches.windows)
+        plain = balls_of(model, patches.peaks[: len(model)])
+        first = BeadSize(sharp.scale, math.inf, rest_of_blur(sharp.blur, fine) ** 2)
+        found = bead_size(patches, sample, cone, plain, fine, first)
+    if found is not None:
+        variance = found.variance + (pixel_variance(fine) if fine > 1 else 0.0)
+        lift = found.lift(float(np.median(patches.peaks)))
+        sharp = replace(
+            sharp,
+            true=math.sqrt(variance),
+            size=found.size,
+            sigma=found.sigma,
+            lift=lift,
         )
-        if still and max(abs(dimmed - 1.0), abs(change - 1.0)) < SMALL_STEP:
-            balls, blur = hardened_balls(trial, patches, cone, model)
-            return replace(trial, true=blur), balls
-    balls, blur = hardened_balls(sharp, patches, cone, model)
-    return replace(sharp, true=blur), balls
+    return sharp, hardened_balls(sharp, patches, cone, model)
+
+
+def rays_to_check(sharp: Sharp, windows: Windows) -> int:
+    """Return the rays along a pixel's side with which spots are rendered to be compared: one
+    where the images have one, too.
+    """
+    if sharp.blur < BODY_BLUR_PX:
+        return 1
+    return fine_rays(windows, RADIUS_RAYS, CHECK_FINE)
 
 
 def spread(index: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
@@ -226,7 +202,7 @@ def spread(index: npt.NDArray[np.intp], most: int) -> npt.NDArray[np.intp]:
 
 def hardened_balls(
     sharp: Sharp, patches: Patches, cone: ConeVec, model: BeadModel
-) -> tuple[Balls, float]:
+) -> Balls:
     """Group the beads by contrast, and estimate how each group hardens the beam.
 
     Args:
@@ -236,8 +212,7 @@ def hardened_balls(
         model: the beads.
 
     Returns:
-        Scenes of beads with their hardening, which is None where too few spots show it; and the
-        blur [px], estimated where `sharp` says that there is hardly any.
+        Scenes of beads with their hardening, which is None where too few spots show it.
     """
     k = patches.windows.corner.shape[1]
     contrast = sharp.lift * patches.peaks[:k]
@@ -249,41 +224,9 @@ def hardened_balls(
         spots = patches.entire[np.isin(patches.entire % k, group)]
         spots = spread(spots, PROFILES)
         ball = Scene(tuple(solids[i] for i in group))
-        groups.append((ball, _profiles_of(ball, sharp, patches, spots, cone)))
-    variance = 0.0
-    blur = sharp.true
-    if sharp.blur < SLIGHT_BLUR_PX:
-        variance = _slight_blur(
-            [profiles for _, profiles in groups if profiles is not None]
-        )
-        blur = math.sqrt(variance)
-        if sharp.blur >= BODY_BLUR_PX:
-            fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
-            blur = math.sqrt(variance + pixel_variance(fine))
-    return tuple(
-        (ball, None if profiles is None else profiles.fitted(variance)[0])
-        for ball, profiles in groups
-    ), blur
-
-
-def _slight_blur(groups: Sequence[Profiles]) -> float:
-    """Find the variance of a slight blur with which rendered beads fit best [px^2].
-
-    The best of `SLIGHT_BLURS` variances up to `MOST_VARIANCE_PX2`, and the vertex of a
-    parabola about it where that opens upwards.
-
-    Args:
-        groups: profiles of alike beads; their misfits are added up. Without any it is 0.
-    """
-    if not groups:
-        return 0.0
-    tried = np.linspace(0.0, MOST_VARIANCE_PX2, SLIGHT_BLURS)
-    misfit = np.array([sum(g.fitted(v)[1] for g in groups) for v in tried.tolist()])
-    i = min(max(int(misfit.argmin()), 1), SLIGHT_BLURS - 2)
-    bend, slope, _ = np.polyfit(tried[i - 1 : i + 2], misfit[i - 1 : i + 2], 2)
-    if bend <= 0.0:
-        return float(tried[int(misfit.argmin())])
-    return float(np.clip(-slope / (2.0 * bend), tried[i - 1], tried[i + 1]))
+        profiles = _profiles_of(ball, sharp, patches, spots, cone)
+        groups.append((ball, None if profiles is None else profiles.fitted()))
+    return tuple(groups)
 
 
 def _profiles_of(
@@ -310,9 +253,7 @@ def _profiles_of(
         return None
     frames, beads = np.divmod(spots, patches.windows.corner.shape[1])
     few = patches.windows.pick(frames, beads)
-    slight = sharp.blur < SLIGHT_BLUR_PX
-    sampled = sharp.blur < BODY_BLUR_PX
-    fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
+    rays = rays_to_check(sharp, patches.windows)
     factors = -np.array(ATTENUATIONS, dtype=np.float32)[:, None, None, None, None]
     most = 0.0
 
@@ -323,20 +264,14 @@ def _profiles_of(
         most = max(most, float(rays.max()))
         return np.asarray(np.exp(factors * rays))
 
-    rays = 1 if sampled else fine
     if few.moments:
         light = exposed_light([ball], few, rays, light_of, (len(ATTENUATIONS),))[:, :, 0]
     else:
         light = np.zeros((len(ATTENUATIONS), len(spots), few.side, few.side), np.float32)
         for view, place, weight in rays_of(cone[frames], few, rays):
             light += light_of(view, few, place)[:, :, 0] * weight[:, :, None]
-    if slight:
-        spread = (
-            blurred_light(light, blur_kernel(UNIT_BLUR_PX)) - light
-        ) / UNIT_BLUR_PX**2
-    else:
-        light = blurred_light(light, blur_kernel(rest_of_blur(sharp.true, fine)))
-        spread = np.zeros_like(light)
+    blur = sharp.true if rays == 1 else rest_of_blur(sharp.true, rays)
+    light = blurred_light(light, blur_kernel(blur))
     seen = patches.flat[spots]
     beside = np.where(light[-1] < OPEN_LIGHT, np.nan, seen)
     level = np.nanmedian(beside.reshape(len(spots), -1), axis=1)[:, None, None]
@@ -345,52 +280,9 @@ def _profiles_of(
     use = np.isfinite(seen) & np.isfinite(level) & near
     return Profiles(
         light[:, use].T.astype(np.float64) - 1.0,
-        spread[:, use].T.astype(np.float64),
         np.exp(level - seen)[use].astype(np.float64),
         1.1 * most,
     )
-
-
-def _as_rendered(
-    true: Sharp,
-    balls: Balls,
-    patches: Patches,
-    sample: npt.NDArray[np.intp],
-    cone: ConeVec,
-) -> tuple[Sharp, float]:
-    """Estimate sharpness from beads that are rendered with a known blur, size and
-    contrast, to check the method.
-
-    Args:
-        true: estimate for the images, with which the beads are rendered.
-        balls: the beads.
-        patches: windows of the images.
-        sample: indices of the windows to render.
-        cone: geometry of the frames.
-
-    Returns:
-        The estimate from the rendered windows, and the median rendered contrast over that
-        of the images; if none could be measured, `true` with `seen` False, and 1.
-    """
-    k = patches.windows.corner.shape[1]
-    frames, beads = np.divmod(sample, k)
-    few = patches.windows.pick(frames, beads)
-    if true.blur < BODY_BLUR_PX:
-        rays = render_windows(Scene(()), cone[frames], few, 1, balls)
-        seen = blurred_windows(rays, true.true)
-    else:
-        fine = fine_rays(patches.windows, RADIUS_RAYS, CHECK_FINE)
-        rays = render_windows(Scene(()), cone[frames], few, fine, balls)
-        seen = blurred_windows(rays, rest_of_blur(true.true, fine))
-    every = np.arange(len(sample))
-    rendered = _rendered(patches, sample, seen, few)
-    results = centroids(rendered, every)
-    good = results[:, kernels.OK] > 0
-    if not good.any():
-        return replace(true, seen=False), 1.0
-    dimmed = float(np.median(results[good, kernels.PEAK] / rendered.peaks[good]))
-    rendered = replace(rendered, peaks=dimmed * rendered.peaks)
-    return sharpness(rendered, every, true.true), dimmed
 
 
 def _rendered(

@@ -118,7 +118,7 @@ def followed(
             flat[sample] = seen - level
             peaks = np.tile(contrast, len(flat) // k)
             beside = replace(patches, flat=flat, windows=now, peaks=peaks, entire=sample)
-            balls = hardened_balls(replace(sharp, true=blur), beside, cone, model)[0]
+            balls = hardened_balls(replace(sharp, true=blur), beside, cone, model)
         else:
             balls = ((balls_of(model, contrast, sharp.size), None),)
         few = now.pick(frames, beads)

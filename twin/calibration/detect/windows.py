@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from flexdt.twin.projection.analytic import project_scene
 from flexdt.twin.projection.analytic_solids import Scene, Solid, Sphere
 
 Part = tuple[slice, slice]
+_Light = TypeVar("_Light", Float32Array, FloatArray)
 Balls = tuple[tuple[Scene, Hardening | None], ...]
 """Beads of one contrast each, and how they harden the beam; None: not at all."""
 LEAST_NOISE = 1e-3
@@ -702,7 +703,7 @@ def blurred_windows(line_integrals: Float32Array, blur: float) -> Float32Array:
     return np.asarray(-np.log(out), dtype=np.float32)
 
 
-def blurred_light(light: Float32Array, kernel: FloatArray) -> Float32Array:
+def blurred_light(light: _Light, kernel: FloatArray) -> _Light:
     """Blur intensities (..., side, side) by a kernel along rows and columns; edges are
     repeated outwards.
     """

@@ -14,6 +14,7 @@ from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
 from flexdt.twin.calibration.detect.smear import Smear
 from flexdt.twin.calibration.diagnose import CalibrationCode, listed
+from flexdt.twin.calibration.diagnose.fixed_parameters import HELD_SIGMAS
 from flexdt.twin.calibration.diagnose.usual_factors import OF_RADII, usual_reason
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.frame_source import FrameSpots
@@ -27,10 +28,9 @@ OTHER_BEADS = 1.0 / 6.0
 """Deviation of the first radii from which beads are others."""
 BLURRED_FIRST = 0.4
 """The same before blur is measured: blurred spots are wider."""
-MAX_SIZE_ERROR = 0.04
-"""Deviation of the spots' radii from the expected ones that indicates a wrong scale."""
-BLUR_TOLERANCE = 0.6
-"""Further deviation allowed, in units of the squared blur over radius (measured)."""
+SIZE_TOLERANCE = 0.008
+"""Standard deviation of the beads' radii from the stated ones, as a share (assumed: that of
+moulded balls; balls of bearings have a tenth of it)."""
 MAX_BODY_LOG = 0.5
 """Logarithm of the body's seen over its described attenuation from which it is reported:
 beam hardening alone stays below."""
@@ -75,10 +75,10 @@ def judge_sizes(state: Calibration, fit: FitResult) -> list[Finding]:
     """
     out = []
     for g, scan in enumerate(state.scans):
-        radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
         if np.isfinite(state.measured[g].size):
-            out += listed(judge_size(state.measured[g], float(np.median(radii))))
+            out += listed(judge_size(state.measured[g]))
         elif not state.measured[g].smear.told:
+            radii = spot_radii(state.model, scan.poses.cone_vec(fit.group_parameters[g]))
             first = state.identifications[g], state.looks[g], radii
             out += listed(judge_first_size(*first, OTHER_BEADS))
     return out
@@ -115,32 +115,29 @@ def judge_first_size(
     return _other_size(ratio)
 
 
-def judge_size(measured: Refined, radius_px: float) -> Finding | None:
-    """Judge the spots' size against the one of the phantom's beads at the fitted geometry.
+def judge_size(measured: Refined) -> Finding | None:
+    """Judge the beads' size in the images against the stated one.
 
     A phantom of another scale at another distance gives the same bead positions; only the beads'
     own size reveals it.
 
     Args:
-        measured: size (nan if unknown) and blur.
-        radius_px: expected radius of the spots.
+        measured: size (nan if unknown) with its sigma, and blur.
 
-    Returns beyond `MAX_SIZE_ERROR` a warning if blur may explain it, else an error; None if the
-    size fits or is unknown.
+    Returns an error beyond `HELD_SIGMAS` of both the size's sigma and the beads' tolerance; a
+    warning where only the size's own sigma allows it; None if the size fits or is unknown.
     """
-    off = abs(measured.size - 1.0)
-    blur = measured.blur_px / radius_px
-    if not off >= MAX_SIZE_ERROR:
+    off = abs(math.log(measured.size))
+    known = HELD_SIGMAS * math.hypot(measured.size_sigma, SIZE_TOLERANCE)
+    if not off > HELD_SIGMAS * SIZE_TOLERANCE:
         return None
-    if off < MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2:
-        return warning(
-            CalibrationCode.BLURRED,
-            f"the images are blurred by {measured.blur_px:.1f} px and the shadows are "
-            f"{radius_px:.1f} px wide: the beads' size is known to "
-            f"{100 * (MAX_SIZE_ERROR + BLUR_TOLERANCE * blur**2):.0f} % only, "
-            "and with it the phantom's scale",
-        )
-    return _other_size(measured.size)
+    if off > known:
+        return _other_size(measured.size)
+    return warning(
+        CalibrationCode.BLURRED,
+        f"the images are blurred by {measured.blur_px:.1f} px: the beads' size is known to "
+        f"{100 * known:.0f} % only, and with it the phantom's scale",
+    )
 
 
 def _other_size(ratio: float) -> Finding:
