@@ -109,7 +109,8 @@ def main() -> int:
                 print(f"Python {version}: {kind}: {error}", flush=True)
         if options.story:
             story = ROOT / "tests" / "studies" / "story_from_wheel.py"
-            words = [sys.executable, story, "--python", python]
+            (wheel,) = (file for file in wheels if file.name.startswith("flexdt-"))
+            words = [sys.executable, story, "--wheel", wheel, "--python", python]
             failed += subprocess.run([*map(str, words)], check=False).returncode
     return 1 if failed else 0
 

@@ -19,7 +19,7 @@ from flexdt.twin.attenuation.materials import material
 from flexdt.twin.errors import LimitError, UnknownNameError, shape_words
 from flexdt.twin.geometry.conventions import FloatArray, from_unity
 from flexdt.twin.projection.analytic_solids import Box, Scene, Solid, Sphere, Vector
-from flexdt.twin.signatures import public
+from flexdt.twin.signatures import called, public
 
 CUBOIDS_MM: Final[Mapping[str, Vector]] = {
     "normal": (20.0, 40.0, 60.0),
@@ -133,6 +133,7 @@ def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> Flo
 
 
 @public
+@called("phantoms.beads")
 def bead_phantom(
     name_or_dims: str | npt.ArrayLike = "normal",
     beads: int = DEFAULT_BEADS,
@@ -176,7 +177,9 @@ def bead_phantom(
         numbers = np.asarray(name_or_dims, dtype=np.float64)
         if numbers.shape[-1:] != (3,) or numbers.ndim > 2 or not numbers.size:
             raise LimitError.instead(
-                f"{shape_words(numbers.shape)} in place of a cuboid",
+                f"numbers of shape {shape_words(numbers.shape)} in place of a cuboid"
+                if numbers.ndim
+                else f"{numbers:g} in place of a cuboid",
                 list(numbers.shape),
                 "the name of a cuboid, its three edges [mm], or the places of beads, "
                 "three numbers each [mm]",

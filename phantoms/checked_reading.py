@@ -22,7 +22,7 @@ import numpy.typing as npt
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
 from flexdt.twin.calibration.bead_model import Tolerance
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import TwinError, shape_words
 from flexdt.twin.projection import analytic_solids as analytic
 
 MAX_ARRAY_BYTES: Final = 4 << 30
@@ -252,7 +252,11 @@ def packed(dtype: str) -> PlainValidator:
         except ValueError as error:
             raise PhantomError(f"data is not base64: {error}") from None
         if len(raw) != size:
-            raise wrong(f"{len(raw)} bytes", "data", f"{size} bytes, for shape {shape}")
+            raise wrong(
+                f"{len(raw)} bytes",
+                "data",
+                f"{size} bytes, for shape {shape_words(shape)}",
+            )
         return np.frombuffer(raw, dtype=dtype).reshape(shape)
 
     return PlainValidator(read)

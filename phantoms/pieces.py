@@ -22,6 +22,7 @@ from flexdt.phantoms.checked_reading import (
     Text,
     packed,
 )
+from flexdt.twin.errors import shape_words
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.projection import analytic_solids as analytic
 from flexdt.twin.projection.analytic_solids import as_convex
@@ -88,7 +89,7 @@ class Voxels(ArrayValue):
         """
         data = np.array(self.data, dtype=np.float32)
         if data.ndim != 3 or data.size == 0:
-            message = f"voxels have shape {data.shape}"
+            message = f"voxels have shape {shape_words(data.shape)}"
             shape = list(data.shape)
             raise PhantomError.instead(message, shape, "(z, y, x), none of them 0")
         if not np.isfinite(data).all():
@@ -98,9 +99,9 @@ class Voxels(ArrayValue):
             labels = np.array(self.labels, dtype=np.uint8)
             if labels.shape != data.shape or int(labels.max()) > len(self.materials):
                 raise PhantomError(
-                    f"labels have shape {labels.shape} and end at {labels.max()}; "
+                    f"labels have shape {shape_words(labels.shape)} and end at {labels.max()}; "
                     "allowed: shape "
-                    f"{data.shape}, 0 to {len(self.materials)}"
+                    f"{shape_words(data.shape)}, 0 to {len(self.materials)}"
                 )
             freeze(self, labels=labels)
 

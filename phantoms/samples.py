@@ -416,6 +416,8 @@ def _solids(scene: Scene) -> Phantom:
 
 def _shown(sample: object) -> str:
     """Format a sample for error messages: type, and its text if that has at most 60 characters."""
+    if sample is None:
+        return "None"
     text = repr(sample)
     if len(text) <= 60:
         return f"{type(sample).__name__} {text}"

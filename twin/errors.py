@@ -85,8 +85,9 @@ class TwinError(ValueError):
         Example:
             >>> print(TwinError.of_shape("points", (4, 2), ("...", 3), " [mm]"))
             points of shape 4 x 2; allowed: ... x 3 [mm]"""
+        given = f"of shape {shape_words(got)}" if got else "is a single number"
         return cls(
-            f"{what} of shape {shape_words(got)}; allowed: {shape_words(allowed)}{more}",
+            f"{what} {given}; allowed: {shape_words(allowed)}{more}",
             {"asked": list(got), "allowed": list(allowed)},
         )
 

@@ -85,6 +85,15 @@ class Array:
         return cls
 
 
+if typing.TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    Numbers = ArrayLike
+else:
+    Numbers = Array
+"""ArrayLike in a union that a module names: evaluated, numpy's own has its inner names."""
+
+
 class Kind(NamedTuple):
     """What an annotation allows: in words, and as a test."""
 

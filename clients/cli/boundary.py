@@ -75,15 +75,15 @@ def describe(error: Exception, words: Sequence[str] = ()) -> tuple[tuple[str, ..
             code = error.exit_code
         case twin.LimitError() | twin.CollisionError():
             code = LIMIT
+        case ConnectionError() | TimeoutError():
+            lines = [_first_line(error)]
+            code = REFUSED
         case twin.SafetyError():
             code = REFUSED
         case twin.NotIdentifiableError():
             code = NOT_IDENTIFIABLE
         case twin.TwinError():
             pass
-        case ConnectionError() | TimeoutError():
-            lines = [_first_line(error)]
-            code = REFUSED
         case OSError() if error.errno in UNREACHABLE:
             lines = [reason_of(error)]
             code = REFUSED

@@ -195,6 +195,8 @@ class KeptConnection:
             raise ConnectionLost(self.problem)
         try:
             return await link.request(method, params or {}, None)
+        except ConnectionLost:
+            raise
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
             raise Unsendable(method, error) from None
 

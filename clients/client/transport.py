@@ -31,13 +31,14 @@ from flexdt.protocol import (
 )
 from flexdt.protocol.methods.session_messages import SESSION_PING
 from flexdt.twin import long_work
+from flexdt.twin.errors import LimitError, TwinError
 
 READ_BYTES: Final = 1 << 18
 ASK_AFTER_S: Final = 2.0
 """Time without an answer after which a server is asked what it works at, and again [s]."""
 
 
-class ConnectionLost(ConnectionError):
+class ConnectionLost(TwinError, ConnectionError):
     """The connection could not be made or has ended.
 
     Attributes:
@@ -125,10 +126,12 @@ class TcpTransport:
 
         `host`: name or address. `port`: from 1 to 65535. `codec`: of the messages. `timeout_s`:
         limit of the time to connect. `ssl`: for TLS; the server's certificate must name `host`.
-        Raises ValueError: another port.
+        Raises LimitError: another port.
         """
         if type(port) is not int or not 1 <= port <= 65535:
-            raise ValueError(f"port {port!r} is not a number from 1 to 65535")
+            raise LimitError.instead(
+                f"port is {port!r}", str(port), "a number from 1 to 65535"
+            )
         self.host = host
         self.port = port
         self.codec = codec

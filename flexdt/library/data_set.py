@@ -24,19 +24,19 @@ from flexdt.library.datasets.scan_inputs import (
     with_statements,
 )
 from flexdt.library.datasets.scan_options import ScanOptions
+from flexdt.phantoms import Phantom
 from flexdt.twin import long_work
 from flexdt.twin.algorithms import DEFAULT
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import Offsets
 from flexdt.twin.long_work import Progress
+from flexdt.twin.physics.tube import Tube
 from flexdt.twin.signatures import File, public, with_options_of
 
 if TYPE_CHECKING:
     from flexdt.library.calibration.align_dataset import Aligned
     from flexdt.library.calibration.calibrate import Outcome
     from flexdt.library.notebook.notebook_pages import NotebookPage
-    from flexdt.phantoms import Phantom
-    from flexdt.twin.physics.tube import Tube
     from flexdt.twin.projection import Volume
 
 

@@ -44,7 +44,7 @@ from flexdt.twin.dataset.flexdt_json import (
 )
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
 from flexdt.twin.dataset.provenance import shortened
-from flexdt.twin.errors import LimitError, TwinError
+from flexdt.twin.errors import LimitError, TwinError, shape_words
 from flexdt.twin.findings import Severity
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.offsets import NOMINAL
@@ -872,7 +872,7 @@ def _frame(
     counts = files.read_image(folder.path / _existing_file(folder, frame.file), shape)
     if asked.binning > min(counts.shape):
         raise LimitError(
-            f"binning {asked.binning} leaves nothing of {counts.shape} pixels"
+            f"binning {asked.binning} leaves nothing of {shape_words(counts.shape)} pixels"
         )
     small: npt.NDArray[np.generic]
     match asked.kind:

@@ -142,7 +142,7 @@ def test_cuts_keep_every_pixel_where_it_was(tmp_path: Path, door: str) -> None:
 WRONG = [
     ({"flat": "none*"}, "flat is 'none*': there is no such file"),
     ({"flat": 1.0, "open_beam": 2.0}, "flat images and an open beam are two statements"),
-    ({"dark": np.zeros((3, 4))}, r"dark images of shape (3, 4); allowed: (12, 16)"),
+    ({"dark": np.zeros((3, 4))}, r"dark images of shape 3 x 4; allowed: 12 x 16"),
     ({"dark": [[[["a"]]]]}, "dark"),
     ({"angles": [1.0, 2.0]}, "2 angles and 8 views"),
     ({"angles": "nothing.txt"}, "angles are 'nothing.txt': there is no such file"),

@@ -12,11 +12,13 @@ import inspect
 import json
 import random
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
 import flexdt as fx
@@ -370,3 +372,36 @@ def test_page() -> None:
         return parse_params(Method(method, PAGE[method][0], Nothing, method), given)
 
     verdict(some(of_schemas(schemas, ask, random.Random(86))), refusal)
+
+
+# Values that nobody foresaw, at every argument of every right call
+
+VALUES: tuple[object, ...] = (
+    -1, 0, float("nan"), float("inf"), "", "abc", [], {}, True, 1e30, (1, 2, 3, 4),
+    np.zeros((2, 2)), b"x", [None], {"a": 1},
+)  # fmt: skip
+INNER = re.compile(r"(?<!\w)_\w|bead_phantom|open_data|room_like")
+"""Private names, and functions by which nobody calls."""
+LONG = {"iterations", "turns"}
+"""A number of these may be large, and then takes long."""
+
+
+@pytest.mark.parametrize("where", sorted(test_mistakes.RIGHT))
+@pytest.mark.daily(12)
+def test_no_value_leads_to_the_code(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(warnings, "warn", lambda *_, **__: None)  # of what is accepted
+    call, right = test_mistakes.RIGHT[where]
+    draw = random.Random(where)
+    for name in right:
+        for value in draw.sample(VALUES, 5):
+            if name in LONG and value == 1e30:
+                continue
+            try:
+                call(**{**right, name: value})
+            except fx.TwinError as error:
+                shown = str(error).replace(repr(value), "")
+                assert not FOREIGN.search(shown), (name, value, shown)
+                assert not INNER.search(shown), (name, value, shown)

@@ -1,9 +1,10 @@
 """Run the story's notebooks from the built wheel, in an environment of its own, and look at
 what they show.
 
-    python tests/studies/story_from_wheel.py [--here] [--write] [--python PYTHON ...]
+    python tests/studies/story_from_wheel.py [--here] [--write]
+        [--wheel FILE] [--python PYTHON ...]
 
-Builds the wheel of this tree, installs it with the extra `notebook` into a new
+Builds the wheel of this tree (or takes FILE), installs it with the extra `notebook` into a new
 environment of each PYTHON (this one, unless named), and executes `docs/story/*.ipynb` in a new
 folder, one after the other, since each begins with the files of the one before. `--here` takes
 the environment that this program runs in, as it is. `--write` keeps the outputs in `docs/story`.
@@ -23,7 +24,6 @@ import resource
 import subprocess
 import sys
 import tempfile
-import venv
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -49,19 +49,27 @@ nbformat.write(notebook, target)
 
 def environment(folder: Path, wheel: Path, python: str) -> Path:
     """Make a clean environment with the wheel, and return its Python."""
-    if python == sys.executable:
-        venv.create(folder, with_pip=True)
-    else:
-        subprocess.run([python, "-m", "venv", folder], check=True)
+    uv = [sys.executable, "-m", "uv"]
+    subprocess.run([*uv, "venv", "-q", "--python", python, folder], check=True)
     own = folder / "bin" / "python"
-    words = [own, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt"]
+    words = [*uv, "pip", "install", "-q", "--python", own, "-c", ROOT / "constraints.txt"]
     subprocess.run([*words, f"{wheel}[notebook]", *NEEDED], check=True)
     return own
 
 
 def built(folder: Path) -> Path:
     """Build the wheel of this tree into a folder."""
-    words = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]
+    words = [
+        sys.executable,
+        "-m",
+        "uv",
+        "build",
+        "-q",
+        "--wheel",
+        "--out-dir",
+        folder,
+        ROOT,
+    ]
     subprocess.run(words, check=True)
     (wheel,) = folder.glob("flexdt-*.whl")
     return wheel
@@ -108,7 +116,8 @@ def told(python: str, options: argparse.Namespace) -> list[str]:
         folder = Path(where)
         own = Path(python)
         if not options.here:
-            own = environment(folder / "env", built(folder / "dist"), python)
+            wheel = options.wheel or built(folder / "dist")
+            own = environment(folder / "env", wheel, python)
         work = folder / "work"
         work.mkdir()
         path = f"{own.parent}:/usr/bin:/bin"
@@ -177,6 +186,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="the story from the wheel")
     parser.add_argument("--here", action="store_true", help="in this environment")
     parser.add_argument("--write", action="store_true", help="keep the outputs")
+    parser.add_argument("--wheel", type=Path, help="a wheel that is built already")
     parser.add_argument("--python", nargs="+", default=[sys.executable])
     options = parser.parse_args()
     faults = [fault for python in options.python for fault in told(python, options)]

@@ -288,9 +288,15 @@ def test_rigid_motions_are_a_group_that_acts_on_geometries(
 
 
 def test_what_is_no_rigid_motion_is_an_error() -> None:
-    for turn in (np.diag([1.0, 1.0, -1.0]), np.eye(3) * 1.1, np.zeros((3, 3)), np.eye(2)):
+    for turn in (np.diag([1.0, 1.0, -1.0]), np.eye(3) * 1.1, np.zeros((3, 3))):
         with pytest.raises(GeometryError, match="rotation"):
             Rigid(turn, np.zeros(3))
+    with pytest.raises(GeometryError, match="turn of shape 2 x 2; allowed: 3 x 3"):
+        Rigid(np.eye(2), np.zeros(3))
+    with pytest.raises(GeometryError, match="shift is nan, 0, 0; allowed: finite"):
+        Rigid.translate(np.nan)
+    with pytest.raises(GeometryError, match="axis of shape 2; allowed: 3, or x"):
+        Rigid.rotate([1.0, 2.0], 1.0)
     with pytest.raises(GeometryError, match="axis 'w'"):
         Rigid.rotate("w", 1.0)
     with pytest.raises(GeometryError, match="points of shape"):

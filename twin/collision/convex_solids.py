@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.errors import shape_words
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Vector3
 
@@ -84,7 +85,7 @@ class Polytope(ConvexSolid):
             or not np.isfinite(vertices).all()
         ):
             raise ValueError(
-                f"vertices have shape {vertices.shape}; allowed: (k, 3), finite"
+                f"vertices have shape {shape_words(vertices.shape)}; allowed: k x 3, finite"
             )
         vertices.setflags(write=False)
         object.__setattr__(self, "vertices", vertices)

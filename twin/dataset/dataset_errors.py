@@ -25,6 +25,10 @@ class DatasetMissingError(DatasetError, MissingFileError):
     """A required file is missing; the message names it."""
 
 
+class DatasetIndexError(DatasetError, IndexError):
+    """A number of a projection that the data set does not have."""
+
+
 class DatasetWriteError(DatasetError):
     """A file could not be written."""
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from flexdt.twin.dataset.format_table import Ledger
 from flexdt.twin.dataset.provenance import Provenance
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import TwinError, shape_words
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, rotation_z
 from flexdt.twin.geometry.poses import Poses
@@ -72,7 +72,7 @@ class ScanGeometry:
                 raise ExchangeError.instead(problem, len(count), len(self))
         if self.shape is not None and min(self.shape) < 1:
             raise ExchangeError(
-                f"detector shape {self.shape}; allowed: at least one pixel"
+                f"detector shape {shape_words(self.shape)}; allowed: at least one pixel"
             )
 
     def accounted(self, said: Ledger) -> ScanGeometry:

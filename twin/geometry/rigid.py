@@ -62,15 +62,13 @@ class Rigid:
         turn, shift = (
             np.array(part, dtype=np.float64) for part in (self.turn, self.shift)
         )
-        if turn.shape != (3, 3) or shift.shape != (3,) or not np.isfinite(shift).all():
-            raise GeometryError(
-                f"a rigid motion of shapes {turn.shape} and {shift.shape}; allowed: a rotation "
-                "(3, 3) and a finite shift (3,) [mm]",
-                {
-                    "asked": [list(turn.shape), list(shift.shape)],
-                    "allowed": [[3, 3], [3]],
-                },
-            )
+        if turn.shape != (3, 3):
+            raise GeometryError.of_shape("turn", turn.shape, (3, 3))
+        if shift.shape != (3,):
+            raise GeometryError.of_shape("shift", shift.shape, (3,), " [mm]")
+        if not np.isfinite(shift).all():
+            problem = f"shift is {', '.join(f'{one:g}' for one in shift)}"
+            raise GeometryError.instead(problem, shift.tolist(), "finite numbers [mm]")
         off = float(np.abs(turn @ turn.T - np.eye(3)).max())
         if not (off < ORTHOGONAL_TOLERANCE and np.linalg.det(turn) > 0):
             raise GeometryError(
@@ -108,7 +106,8 @@ class Rigid:
             about: a point on the axis, (3,) [mm]; it stays where it is.
 
         Raises:
-            GeometryError: an unknown name of an axis, or a direction of length 0.
+            GeometryError: an unknown name of an axis, a direction that is none, or an angle
+                that is not finite.
 
         Example:
             >>> (Rigid.rotate("z", 90, about=(1, 0, 0)) @ [0.0, 0.0, 0.0]).round(9).tolist()
@@ -119,7 +118,17 @@ class Rigid:
                 message = f"axis {axis!r}; allowed: x, y, z or a direction of 3 numbers"
                 raise GeometryError(message, {"asked": axis, "allowed": list(AXES)})
             axis = AXES[axis]
-        turn = rotation_about(axis, math.radians(angle_deg))
+        if not math.isfinite(angle_deg):
+            problem = f"angle_deg is {angle_deg:g}"
+            raise GeometryError.instead(problem, str(angle_deg), "a finite number [deg]")
+        direction = np.asarray(axis, dtype=np.float64)
+        if direction.shape != (3,):
+            raise GeometryError.of_shape("axis", direction.shape, (3,), ", or x, y, z")
+        if not 0.0 < np.linalg.norm(direction) < math.inf:
+            problem = f"axis is {', '.join(f'{one:g}' for one in direction)}"
+            allowed = "a direction of finite numbers that are not all 0"
+            raise GeometryError.instead(problem, direction.tolist(), allowed)
+        turn = rotation_about(direction, math.radians(angle_deg))
         point = np.asarray(about, dtype=np.float64)
         return cls(turn, point - turn @ point)
 

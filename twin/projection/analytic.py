@@ -18,7 +18,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, shape_words
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.geometry.virtual_panel import run_through
@@ -275,11 +275,12 @@ class TriangleMesh:
             or not np.isfinite(vertices).all()
         ):
             raise GeometryError(
-                f"mesh vertices have shape {vertices.shape}; allowed: finite (k, 3) in mm"
+                f"mesh vertices have shape {shape_words(vertices.shape)}; "
+                "allowed: finite k x 3 in mm"
             )
         if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
             raise GeometryError(
-                f"mesh faces have shape {faces.shape}; allowed: (m, 3), m > 0"
+                f"mesh faces have shape {shape_words(faces.shape)}; allowed: m x 3, m > 0"
             )
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise GeometryError(

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.twin.errors import GeometryError, LimitError
+from flexdt.twin.errors import GeometryError, LimitError, shape_words
 from flexdt.twin.geometry.cone_vec import ConeVec, check_spread
 from flexdt.twin.geometry.cone_vec import check_shape as check_shape
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
@@ -721,9 +721,9 @@ def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32A
         or not out.flags.c_contiguous
         or not out.flags.writeable
     ):
-        given = f"{out.dtype} {out.shape}"
+        given = f"{out.dtype} {shape_words(out.shape)}"
         raise GeometryError.instead(
-            f"out is {given}", given, f"writeable C-ordered float32 {shape}"
+            f"out is {given}", given, f"writeable C-ordered float32 {shape_words(shape)}"
         )
     return out
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flexdt.twin.backends import backend
-from flexdt.twin.errors import GeometryError, NotBuiltError
+from flexdt.twin.errors import GeometryError, NotBuiltError, shape_words
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray, as_numbers
 from flexdt.twin.projection.portions import PASS_NS, equal_portions
 from flexdt.twin.signatures import File, public
@@ -378,9 +378,15 @@ def blank_layout(volume: Volume, room: Float32Array | None = None) -> Layout:
         or steps[2] < nz
         or steps[1] < nx * steps[2]
     ):
-        message = f"out is {data.dtype} {data.shape} with strides {data.strides}"
-        wanted = f"writeable float32 {volume.shape} with z contiguous in memory, as room_like makes"
-        raise GeometryError.instead(message, list(data.shape), f"{wanted} it")
+        message = (
+            f"out is {data.dtype} {shape_words(data.shape)} with strides {data.strides}"
+        )
+        wanted = (
+            f"writeable float32 {shape_words(volume.shape)} with z contiguous in memory"
+        )
+        raise GeometryError.instead(
+            message, list(data.shape), f"{wanted}, as room_like makes it"
+        )
     low = [c - size / 2 for c, size in zip(volume.center_mm, volume.size_mm, strict=True)]
     return Layout(
         flat=_flat_alias(data, (ny - 1) * steps[1] + (nx - 1) * steps[2] + nz),
@@ -760,11 +766,12 @@ class Volume:
             >>> float(volume.like(np.ones((6, 4, 4))).data.sum())
             96.0
         """
-        if data.shape != self.data.shape:
+        values = np.asarray(data, dtype=np.float32)
+        if values.shape != self.data.shape:
             raise GeometryError.of_shape(
-                "values", data.shape, self.shape, ", the volume's"
+                "data", values.shape, self.shape, ", the volume's"
             )
-        return replace(self, data=np.asarray(data, dtype=np.float32))
+        return replace(self, data=values)
 
     def in_order(self, order: tuple[int, int, int]) -> Volume:
         """Return the volume with axis order[0] (0 for x) in the place of x, order[1] in
@@ -955,7 +962,7 @@ class Grid:
         if min(self.shape) < 1 or not (
             math.isfinite(self.voxel_mm) and self.voxel_mm > 0
         ):
-            message = f"grid of {self.shape} voxels of {self.voxel_mm} mm"
+            message = f"grid of {shape_words(self.shape)} voxels of {self.voxel_mm} mm"
             wanted = "three whole numbers above 0, and one edge above 0"
             raise GeometryError.instead(
                 message, repr((self.shape, self.voxel_mm)), wanted

@@ -28,7 +28,7 @@ from flexdt.library.datasets.geometry_content import Given, arrays_of, text_of
 from flexdt.library.datasets.image_set import Images, ImageSet
 from flexdt.runtime.files.whole_files import write_whole
 from flexdt.twin.dataset.provenance import Part
-from flexdt.twin.errors import GeometryError
+from flexdt.twin.errors import GeometryError, shape_words
 from flexdt.twin.exchange.geometry import ExchangeError, ScanGeometry
 from flexdt.twin.exchange.number_tables import (
     geometry_text,
@@ -426,8 +426,8 @@ def with_geometry(dataset: Images, geometry: ScanGeometry | ConeVec | File) -> I
         raise ExchangeError(message, {"asked": len(geometry), "allowed": len(dataset)})
     if geometry.shape not in (None, dataset.shape):
         raise ExchangeError(
-            f"{dataset.where} has images of {dataset.shape}, the geometry is of "
-            f"{geometry.shape} "
+            f"{dataset.where} has images of {shape_words(dataset.shape)}, the geometry is of "
+            f"{shape_words(geometry.shape)} "
             "(rows, columns)",
             {"asked": geometry.shape, "allowed": list(dataset.shape)},
         )

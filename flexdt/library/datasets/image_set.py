@@ -24,11 +24,16 @@ from flexdt.library.datasets.notebook_html import (
     values_table,
 )
 from flexdt.runtime.files.dataset_folder import Frame, mean_image, read_image, read_values
-from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
+from flexdt.twin.dataset.dataset_errors import (
+    DatasetFormatError,
+    DatasetIndexError,
+    DatasetMissingError,
+)
 from flexdt.twin.dataset.flexdt_json import DatasetDocument
 from flexdt.twin.dataset.normalise import LineIntegrals, of_intensities
 from flexdt.twin.dataset.provenance import Provenance
 from flexdt.twin.dataset.scan_settings import ScanSettings
+from flexdt.twin.errors import shape_words
 from flexdt.twin.findings import Findings
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
@@ -496,6 +501,7 @@ class ImageSet:
             uint16 (rows, cols), or (n, rows, cols).
 
         Raises:
+            DatasetIndexError: no such projection.
             DatasetMissingError: a file is not there.
             DatasetFormatError: it is not an image of this data set.
 
@@ -509,7 +515,7 @@ class ImageSet:
         """
         if index is None:
             return np.stack([self.counts(i) for i in range(len(self))])
-        frame = self.frames[index]
+        frame = self.frames[self._place(index)]
         if self.arrays is not None and self.arrays.counts is not None:
             counts: Counts = self.arrays.counts[index]
             return counts
@@ -614,7 +620,19 @@ class ImageSet:
         arrays = self.arrays
         if arrays is None or arrays.integrals is None:
             return self.normalisation(self.counts(index))
-        return np.array(arrays.integrals[index])
+        return np.array(arrays.integrals[self._place(index)])
+
+    def _place(self, index: int) -> int:
+        """Return the number of a projection, counted from the first.
+
+        Raises:
+            DatasetIndexError: there is none of this number.
+        """
+        try:
+            return range(len(self))[index]
+        except IndexError:
+            allowed = f"0 to {len(self) - 1}"
+            raise DatasetIndexError.instead(f"index is {index}", index, allowed) from None
 
     def stack(self, indices: Sequence[int] | None = None) -> Float32Array:
         """Return line integrals of several projections, by index (default: all present),
@@ -753,7 +771,8 @@ def _image_stack(
     values = values[None] if values.ndim == 2 else values
     if values.ndim != 3 or values.shape[1:] != shape or len(values) == 0:
         raise DatasetFormatError(
-            f"{what} images of shape {values.shape}; allowed: {shape} or (k, *{shape})",
+            f"{what} images of shape {shape_words(values.shape)}; allowed: "
+            f"{shape_words(shape)} or k x {shape_words(shape)}",
             {"asked": list(values.shape), "allowed": list(shape)},
         )
     if values.dtype.kind == "f" and not np.isfinite(values).all():

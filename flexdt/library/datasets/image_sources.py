@@ -22,7 +22,7 @@ from flexdt.runtime.files.dataset_folder import list_folder, read_values
 from flexdt.runtime.files.image_files import ImageHead, image_head
 from flexdt.runtime.files.image_meaning import MAX_IMAGE_BYTES
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
-from flexdt.twin.errors import TwinError
+from flexdt.twin.errors import TwinError, shape_words
 from flexdt.twin.length_units import UNITS_RAD, angle_rad
 
 HDF5_MARK: Final = b"\x89HDF"
@@ -66,9 +66,9 @@ class Reference:
             return np.broadcast_to(self.images, (1, *shape))
         if self.images.shape[1:] != shape:
             raise DatasetFormatError.instead(
-                f"{what} images of shape {self.images.shape[1:]}",
+                f"{what} images of shape {shape_words(self.images.shape[1:])}",
                 list(self.images.shape[1:]),
-                f"{tuple(shape)}, as the projections",
+                f"{shape_words(shape)}, as the projections",
             )
         return self.images
 
@@ -114,9 +114,9 @@ def _stacked(what: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return a number or images as (k, rows, cols)."""
     if values.ndim > 3 or values.ndim == 1 or 0 in values.shape:
         raise DatasetFormatError.instead(
-            f"{what} of shape {values.shape}",
+            f"{what} of shape {shape_words(values.shape)}",
             list(values.shape),
-            "a number, (rows, cols) or (k, rows, cols)",
+            "a number, rows x cols or k x rows x cols",
         )
     if not np.isfinite(values).all():
         many = int((~np.isfinite(values)).sum())
@@ -336,7 +336,9 @@ def angles_deg(said: Any, folder: Path | None = None) -> npt.NDArray[np.float64]
         values, scale, where = np.asarray(said), 1.0, "angles"
     if values.dtype.kind not in "uif" or values.squeeze().ndim > 1 or not values.size:
         raise DatasetFormatError.instead(
-            f"{where} of shape {values.shape}", list(values.shape), "numbers (n,) [deg]"
+            f"{where} of shape {shape_words(values.shape)}",
+            list(values.shape),
+            "numbers (n,) [deg]",
         )
     angles = scale * np.atleast_1d(values.squeeze()).astype(np.float64)
     if not np.isfinite(angles).all():

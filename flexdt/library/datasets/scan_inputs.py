@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from flexdt.library.datasets.cutting import cut
 from flexdt.library.datasets.exchange import load_stated
@@ -24,11 +23,12 @@ from flexdt.twin.geometry.poses import Poses
 from flexdt.twin.plausibility import settled
 from flexdt.twin.plausibility.scan_geometry import azimuths
 from flexdt.twin.plausibility.stated_figures import angle_findings
+from flexdt.twin.signatures import Numbers
 
 NO_DARK: Final = "no dark image"
 NO_FLAT: Final = "no flat image"
 """Beginnings of what a data set without such images is told, which later ones settle."""
-Geometry = ScanGeometry | ConeVec | npt.ArrayLike | str | PathLike[str]
+Geometry = ScanGeometry | ConeVec | Numbers | str | PathLike[str]
 
 
 def geometry_said(

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from os import PathLike
 from typing import TypedDict
 
-import numpy.typing as npt
+from flexdt.twin.signatures import Numbers
 
-Said = float | npt.ArrayLike | str | PathLike[str] | Sequence[str | PathLike[str]]
+Said = float | Numbers | str | PathLike[str] | Sequence[str | PathLike[str]]
 """A number, an array, a path, a pattern of names, FILE.h5:/PATH, or several paths."""
 
 
@@ -37,7 +37,7 @@ class ScanOptions(TypedDict, total=False):
     dark: Said | None
     flat: Said | None
     open_beam: Said | None
-    angles: npt.ArrayLike | str | PathLike[str] | None
+    angles: Numbers | str | PathLike[str] | None
     crop: str | tuple[slice, slice] | None
     binning: int | None
     views: str | slice | Sequence[int] | None

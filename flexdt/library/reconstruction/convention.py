@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.twin import long_work
-from flexdt.twin.errors import GeometryError, TwinError
+from flexdt.twin.errors import GeometryError, TwinError, shape_words
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.long_work import Progress
 from flexdt.twin.reconstruction.consistency.peer_conventions import (
@@ -204,7 +204,7 @@ def _stacks(
     if not found:
         rest = "" if wanted is None else f" of {wanted[0]} x {wanted[1]} pixels"
         raise TwinError.instead(
-            f"images of shape {values.shape}, a geometry of {len(cone)} views{rest}",
+            f"images of shape {shape_words(values.shape)}, a geometry of {len(cone)} views{rest}",
             list(values.shape),
             "axes of these sizes, in any order",
         )

@@ -24,7 +24,7 @@ from flexdt.server.twin.handlers.handler import Client, answers
 from flexdt.server.twin.handlers.motion_methods import camera_change
 from flexdt.server.twin.hub import ImageRequest
 from flexdt.server.twin.live import Shot, image_of
-from flexdt.twin.errors import LimitError
+from flexdt.twin.errors import LimitError, shape_words
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.machine.camera import Roi
 from flexdt.twin.machine.travel import arrival
@@ -63,7 +63,7 @@ async def get_projection(
         shot, warnings = _predicted_shot(twin, shot, params)
     if params.binning > min(shot.camera.shape):
         raise invalid_params(
-            f"binning {params.binning} leaves nothing of {shot.camera.shape} pixels",
+            f"binning {params.binning} leaves nothing of {shape_words(shot.camera.shape)} pixels",
             [problem("binning", "too large", params.binning)],
             min(shot.camera.shape),
         )

@@ -31,6 +31,7 @@ from flexdt.library.reading.hdf5_formats.one_exposure import on_one_exposure
 from flexdt.library.reading.text_formats.text_scans import compared
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError
 from flexdt.twin.dataset.format_table import Ledger
+from flexdt.twin.errors import shape_words
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility import settled
@@ -95,9 +96,9 @@ def _read(
     """
     data = members.get("exchange/data")
     if data is None or data.ndim != 3:
-        shape = None if data is None else data.shape
-        problem = f"{path}: exchange/data of shape {shape}"
-        raise DatasetFormatError.instead(problem, str(shape), "(angles, rows, columns)")
+        given = "is missing" if data is None else f"of shape {shape_words(data.shape)}"
+        allowed = "angles x rows x columns"
+        raise DatasetFormatError.instead(f"{path}: exchange/data {given}", given, allowed)
     require_memory(path, "images", data.size * data.dtype.itemsize)
     said.use("exchange/data")
     kinds: dict[int, npt.NDArray[Any]] = {PROJECTION: data[()]}

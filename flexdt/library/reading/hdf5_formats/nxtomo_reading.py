@@ -23,6 +23,7 @@ from flexdt.library.reading.hdf5_formats.nxtomo_scan import NxScan, scan_of
 from flexdt.library.reading.hdf5_formats.nxtomo_table import DETECTOR
 from flexdt.library.reading.hdf5_formats.one_exposure import on_one_exposure
 from flexdt.twin.dataset.dataset_errors import DatasetFormatError, DatasetMissingError
+from flexdt.twin.errors import shape_words
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.plausibility import settled
@@ -244,10 +245,9 @@ def _images_of(group: Any, path: Path) -> tuple[Any, npt.NDArray[Any]]:
     data = group["data"]
     keys = np.asarray(group["image_key"])
     if data.ndim != 3 or keys.ndim != 1:
-        said = f"{path}: data of shape {data.shape}, image_key {keys.shape}"
-        raise DatasetFormatError.instead(
-            said, list(data.shape), "(n, rows, cols) and (n,)"
-        )
+        sizes = shape_words(data.shape), shape_words(keys.shape)
+        said = f"{path}: data of shape {sizes[0]}, image_key of {sizes[1]}"
+        raise DatasetFormatError.instead(said, list(data.shape), "n x rows x cols and n")
     if len(keys) != len(data):
         if len(keys) in data.shape:
             turned = " (sinograms? give them as images)"
