@@ -177,8 +177,8 @@ def reconstruct(
             done.
         errors: compare the volume with its images (default: True), and warn of
             contradictions and large errors; `volume.accuracy`, `bias_bound` and
-            `residuals` tell more, of FDK also `volume.sigma`, the noise (of a circle, of
-            five rows or more).
+            `residuals` tell more, `volume.sigma` the noise (by FDK of a circle of five rows
+            or more; of iterations it reads the images and iterates twice more).
 
     Returns:
         Volume of attenuation [1/mm].

@@ -646,8 +646,8 @@ class Volume:
     @property
     def sigma(self) -> Float32Array | None:
         """Standard deviation of the noise in each voxel, (nz, ny, nx) [1/mm], by the
-        images (`reconstruct("fdk")`); None if it was not estimated. Computed at each
-        access.
+        images (`reconstruct`); None if it was not estimated. Computed at each access; of
+        iterations, which take as long as two volumes, at the first.
         """
         noise: Any = getattr(self, "_noise", None)  # of `volume_errors.with_errors`
         values: Float32Array | None
@@ -660,7 +660,7 @@ class Volume:
     @property
     def bias_bound(self) -> Float32Array | None:
         """Bound of each voxel's deviation without noise, (nz, ny, nx) [1/mm]
-        (`reconstruct("fdk")`).
+        (`reconstruct`).
 
         NaN where no data cover a voxel; None if it was not estimated. Computed at each
         access. Where `accuracy.cut_off` it is an estimate.
@@ -675,8 +675,7 @@ class Volume:
 
     @property
     def accuracy(self) -> Accuracy | None:
-        """Summary of how far the object's uniform regions may deviate
-        (`reconstruct("fdk")`).
+        """Summary of how far the object's uniform regions may deviate (`reconstruct`).
 
         None if it was not estimated, or if the images do not fit the geometry.
 

@@ -316,7 +316,7 @@ class BiasOnDemand:
         """The errors, cause by cause.
 
         If the images fit another geometry better, nothing is bounded. The coarse volume's
-        change by each flaw, extrapolated (`_extrapolated`), is the standard deviation of its
+        change by each flaw, extrapolated (`extrapolated`), is the standard deviation of its
         error: missing angles, the rungs of `ladder`, and pixels that stand for what is
         between them ("sampling"). Another continuation of truncated rows ("beyond"), or for
         complete rows their level beside the object ("drift"), errors that the images tell and
@@ -478,7 +478,7 @@ class BiasOnDemand:
         along = min(1.0, 0.25 * (off.shape[1] - 1)) * REGION_SIGMA * radius
         smooth = gaussian_filter(drawn, (0.0, along, REGION_SIGMA * radius))
         change = np.nan_to_num(scan.fdk(smooth.astype(np.float32), fine.cone_vec))
-        return _scatter_about(change, bounded.even)
+        return scatter_about(change, bounded.even)
 
     def _changed(self, one: Finding, size: float) -> Float32Array:
         """Compute the change of the coarse volume by an error of a size, (nz, ny, nx).
@@ -550,56 +550,6 @@ class BiasOnDemand:
         return replace(bounded, causes=causes, taken=tuple(dict.fromkeys(taken)))
 
 
-class BiasOfIterations(BiasOnDemand):
-    """Possible errors of an iterative volume: of what iterations that end early, or a
-    penalty, leave out of the smooth coarse volume's projections.
-
-    Args:
-        copied, sides_known, known: as of `BiasOnDemand`.
-        run: reconstructs images (n, rows, cols) of n views on a grid, by the algorithm
-            and with the options of the volume.
-        cause: stopping or penalty.
-    """
-
-    def __init__(
-        self,
-        copied: Callable[[int], CoarseScan],
-        run: Callable[[Float32Array, ConeVec, Volume], Volume],
-        cause: str,
-        *,
-        sides_known: bool = False,
-        known: KnownBeam = UNKNOWN_BEAM,
-    ) -> None:
-        """Look at the scan once; see the class."""
-        self._run = run
-        self._cause = cause
-        super().__init__(copied, sides_known=sides_known, known=known)
-
-    def warnings(self, grid: Grid | Volume) -> list[str]:
-        """List what is wrong at first sight: a contradiction."""
-        if not self._doubtful or self._told.contradiction is None:
-            return []
-        return [str(self._told.contradiction)]
-
-    @cached_property
-    def _bounded(self) -> Bias:
-        """The errors, but for what the comparison adds."""
-        scan = self._copied(NODES)
-        nodes = UniformNodes.of(scan.volume, scan.rim)
-        causes = _extrapolated(scan, nodes, self._left_out)
-        found = scan.grid.like(nodes.found)
-        return self._of_beam(Bias(found, nodes.even, nodes.inside, causes))
-
-    def _left_out(self, scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
-        """Compute what the iterations leave out of the smooth volume of a copy."""
-        shape = (scan.images.shape[1], scan.images.shape[2])
-        images = scan.projected(nodes.found, scan.cone_vec, shape)
-        again = self._run(images, scan.cone_vec, scan.grid).data
-        return {
-            self._cause: Flaw(self._cause, np.nan_to_num(again) - nodes.found, nodes.even)
-        }
-
-
 def bias_of(
     image: Callable[[int], npt.NDArray[np.generic]],
     cone_vec: ConeVec,
@@ -648,9 +598,9 @@ def _bounded(scan: CoarseScan, *, angles_alone: bool = False) -> Bias:
     `scan`: the coarse copy; `angles_alone`: look for what few views do, and nothing else.
     """
     nodes = UniformNodes.of(scan.volume, scan.rim)
-    causes = _extrapolated(scan, nodes, _angles if angles_alone else _flaws)
+    causes = extrapolated(scan, nodes, _angles if angles_alone else _flaws)
     if not angles_alone:
-        causes |= _beside(scan, nodes)
+        causes |= beside(scan, nodes)
     return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
 
 
@@ -675,7 +625,7 @@ Flaws = Callable[[CoarseScan, UniformNodes], dict[str, Flaw]]
 """Finds the flaws of a coarse copy and its nodes, by a name that copies of one scan share."""
 
 
-def _extrapolated(
+def extrapolated(
     scan: CoarseScan, nodes: UniformNodes, flaws: Flaws
 ) -> dict[str, FloatArray]:
     """Compute how far flaws scatter values, from a coarse copy and one of half its nodes.
@@ -712,7 +662,7 @@ def _extrapolated(
             whole = one.change + more
         square = squares.get(one.cause, np.zeros(scan.grid.shape))
         for part in (whole, more):
-            square = square + np.square(_scatter_about(part, one.weights))
+            square = square + np.square(scatter_about(part, one.weights))
         squares[one.cause] = square
     return {cause: np.sqrt(square) for cause, square in squares.items()}
 
@@ -757,7 +707,7 @@ def _flaws(scan: CoarseScan, nodes: UniformNodes) -> dict[str, Flaw]:
     return found
 
 
-def _beside(scan: CoarseScan, nodes: UniformNodes) -> dict[str, FloatArray]:
+def beside(scan: CoarseScan, nodes: UniformNodes) -> dict[str, FloatArray]:
     """Compute by how much the drift of the flat shifts values, or what is beyond the panel's
     edges.
 
@@ -811,18 +761,21 @@ def _about(values: Float32Array, weights: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(_smooth_about(squares, weights), 0.0))
 
 
-def _scatter_about(values: Float32Array, weights: FloatArray) -> FloatArray:
+def scatter_about(
+    values: Float32Array, weights: FloatArray, nodes: float = 1.0
+) -> FloatArray:
     """Compute the weighted root mean square about each node (Gaussian, 1 node) of the values
     of regions (`REGION_SIGMA`), which may scatter from node to node.
 
     Args:
         values: (nz, ny, nx).
         weights: (nz, ny, nx), above 0.
+        nodes: radius of a region.
 
     Returns:
         (nz, ny, nx).
     """
-    squares = np.square(_smooth_about(values, weights, REGION_SIGMA))
+    squares = np.square(_smooth_about(values, weights, REGION_SIGMA * nodes))
     return np.sqrt(np.maximum(_smooth_about(squares, weights), 0.0))
 
 

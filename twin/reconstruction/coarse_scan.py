@@ -493,15 +493,16 @@ class CoarseScan:
         shape: tuple[int, int],
         *,
         fine: bool = True,
+        beyond: bool = True,
     ) -> Float32Array:
-        """Project values on the grid as some views see them; the outermost layers are repeated
-        above and below (`more`).
+        """Project values on the grid as some views see them.
 
         `thing`: the values, (nz, ny, nx); `views`: n of them; `shape`: (rows, cols); `fine`:
-        average two rays a column: the steps of voxels would show as a flaw of their own.
+        average two rays a column: the steps of voxels would show as a flaw of their own;
+        `beyond`: the outermost layers are repeated above and below (`more`).
         Returns (n, rows, cols) line integrals.
         """
-        if self.more:
+        if self.more and beyond:
             thing = np.pad(thing, ((self.more, self.more), (0, 0), (0, 0)), "edge")
         volume = Volume(thing, self.grid.voxel_mm, self.grid.center_mm)
         if not fine:

@@ -10,7 +10,8 @@ and CGLS solve a fine region in coarse surroundings.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +57,7 @@ def sirt(
     model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
+    errors: bool = False,
 ) -> Volume:
     """Reconstruct by SIRT: x += C A' R (b - A x), R and C inverse row and column sums.
 
@@ -92,6 +94,9 @@ def sirt(
         watch: called in every iteration.
         progress: a bar after two seconds; False for none, or what takes the fraction
             done.
+        errors: find `sigma`, `bias_bound` and `accuracy` of the volume, and warn of images
+            that contradict their geometry. The images are kept; `sigma` makes the volume two
+            times more when it is first asked for.
 
     Returns:
         Volume [1/mm] on the grid of `like`.
@@ -123,12 +128,27 @@ def sirt(
         model=model,
     )
     with long_work.during("solving by SIRT", progress) as advance:
-        return solved(
+        made = solved(
             problem,
             lambda p: _subset_steps(
                 p, [ALL], 1.0, iterations, start, nonnegative, watch, advance
             ),
         )
+    if not errors:
+        return made
+    return _checked(
+        made,
+        projections,
+        cone_vec,
+        sirt,
+        iterations=iterations,
+        nonnegative=nonnegative,
+        variances=variances,
+        hardening=hardening,
+        start=start,
+        surroundings=surroundings,
+        model=model,
+    )
 
 
 def sart(
@@ -147,13 +167,14 @@ def sart(
     model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
+    errors: bool = False,
 ) -> Volume:
     """Reconstruct by SIRT's step on subsets of views in turn: faster at first, noisier in
     the end.
 
     Args:
         projections, cone_vec, like, start, nonnegative, variances: as for `sirt`.
-        hardening, surroundings, watch, progress: as for `sirt`.
+        hardening, surroundings, watch, progress, errors: as for `sirt`.
         iterations: passes through all views.
         subsets: number of subsets, at most one a view; each takes every k-th view, so it
             sees all directions.
@@ -192,12 +213,29 @@ def sart(
         )
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
     with long_work.during("solving by SART", progress) as advance:
-        return solved(
+        made = solved(
             problem,
             lambda p: _subset_steps(
                 p, parts, relaxation, iterations, start, nonnegative, watch, advance
             ),
         )
+    if not errors:
+        return made
+    return _checked(
+        made,
+        projections,
+        cone_vec,
+        sart,
+        iterations=iterations,
+        subsets=subsets,
+        relaxation=relaxation,
+        nonnegative=nonnegative,
+        variances=variances,
+        hardening=hardening,
+        start=start,
+        surroundings=surroundings,
+        model=model,
+    )
 
 
 def _subset_steps(
@@ -259,6 +297,7 @@ def cgls(
     model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
+    errors: bool = False,
 ) -> Volume:
     """Reconstruct by conjugate gradients for least squares: the residual falls every
     iteration.
@@ -290,7 +329,19 @@ def cgls(
         projections, cone_vec, like, iterations, surroundings=surroundings, model=model
     )
     with long_work.during("solving by CGLS", progress) as advance:
-        return solved(problem, lambda p: _cgls(p, iterations, start, watch, advance))
+        made = solved(problem, lambda p: _cgls(p, iterations, start, watch, advance))
+    if not errors:
+        return made
+    return _checked(
+        made,
+        projections,
+        cone_vec,
+        cgls,
+        iterations=iterations,
+        start=start,
+        surroundings=surroundings,
+        model=model,
+    )
 
 
 def _cgls(
@@ -341,6 +392,7 @@ def em(
     model: Model = "exact",
     watch: Watch | None = None,
     progress: Progress = None,
+    errors: bool = False,
 ) -> Volume:
     """Reconstruct by expectation maximisation: x *= A'(b / A x) / A' 1, always positive.
 
@@ -365,7 +417,31 @@ def em(
     """
     problem = LinearSystem.of(projections, cone_vec, like, iterations, model=model)
     with long_work.during("solving by EM", progress) as advance:
-        return solved(problem, lambda p: _em(p, iterations, start, watch, advance))
+        made = solved(problem, lambda p: _em(p, iterations, start, watch, advance))
+    if not errors:
+        return made
+    return _checked(
+        made,
+        projections,
+        cone_vec,
+        em,
+        iterations=iterations,
+        start=start,
+        model=model,
+    )
+
+
+def _checked(
+    made: Volume,
+    projections: npt.ArrayLike,
+    cone_vec: ConeVec | npt.ArrayLike,
+    algorithm: Callable[..., Volume],
+    **given: Any,
+) -> Volume:
+    """Return a volume with its errors, by the algorithm and the options that made it."""
+    from flexdt.twin.reconstruction.iterative_errors import checked
+
+    return checked(made, projections, cone_vec, algorithm, given, "stopping")
 
 
 def _em(

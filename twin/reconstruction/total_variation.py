@@ -14,7 +14,7 @@ halved, so that the end is the minimum whatever the subsets were.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -102,6 +102,7 @@ def minimise_tv(
     mask: npt.ArrayLike | None = None,
     watch: Watch | None = None,
     progress: Progress = None,
+    errors: bool = False,
 ) -> Minimised:
     """Minimise the squared residual plus total variation.
 
@@ -123,6 +124,7 @@ def minimise_tv(
         watch: called in every iteration.
         progress: a bar after two seconds; False for none, or what takes the fraction
             done.
+        errors: as for `sirt`; of the volume.
 
     Returns:
         Volume, costs and whether it converged.
@@ -174,7 +176,15 @@ def minimise_tv(
                 advance,
             )
 
-        return solved(problem, minimise)
+        found = solved(problem, minimise)
+    if not errors:
+        return found
+    from flexdt.twin.reconstruction.iterative_errors import checked
+
+    given = {"weight": weight, "tolerance": tolerance, "subsets": subsets, "mask": mask}
+    given |= {"iterations": iterations, "start": start, "nonnegative": nonnegative}
+    volume = checked(found.volume, projections, cone_vec, tv, given, "penalty")
+    return replace(found, volume=volume)
 
 
 @public

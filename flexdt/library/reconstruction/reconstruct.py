@@ -12,10 +12,9 @@ from __future__ import annotations
 import math
 import os
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from importlib.metadata import version
@@ -65,7 +64,7 @@ from flexdt.twin.errors import (
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array
 from flexdt.twin.geometry.offsets import Offsets
-from flexdt.twin.plausibility import Operation, PlausibilityWarning, examine, settled
+from flexdt.twin.plausibility import Operation, examine, settled
 from flexdt.twin.plausibility.volume_grid import voxel_findings
 from flexdt.twin.projection import Volume, gpu
 from flexdt.twin.reconstruction import (
@@ -83,8 +82,14 @@ from flexdt.twin.reconstruction import (
 from flexdt.twin.reconstruction.acquisition.coverage import ends_not_seen_mm
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of, distinct_angles
 from flexdt.twin.reconstruction.acquisition.truncation import SAMPLES as TRUNCATION_VIEWS
-from flexdt.twin.reconstruction.bias import BiasOfIterations, BiasOnDemand, copies_of
+from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of
 from flexdt.twin.reconstruction.coarse_scan import ScanCopies
+from flexdt.twin.reconstruction.iterative_errors import (
+    BiasOfIterations,
+    noise_of_probes,
+    on_copies,
+    quietly,
+)
 from flexdt.twin.reconstruction.known_beam import (
     CORRECTED_BEAM,
     STRAIGHT_BEAM,
@@ -93,6 +98,7 @@ from flexdt.twin.reconstruction.known_beam import (
     KnownBeam,
 )
 from flexdt.twin.reconstruction.scatter_correction import scatterer_of, subtracted
+from flexdt.twin.reconstruction.total_variation import WEIGHT
 
 if TYPE_CHECKING:
     from flexdt.twin.physics.detector import Detector
@@ -706,7 +712,7 @@ def reconstruct_volume(
     Args:
         dataset, request, parameters, progress: as for `reconstruct_dataset`.
         errors: compare the volume with its images: `bias_bound`, `accuracy`, `residuals`,
-            and of FDK `sigma`.
+            and `sigma`, of iterations by reading the images and iterating twice more.
 
     Returns:
         The volume, attenuation [1/mm]; its files say what those of `reconstruct_dataset` do.
@@ -1143,37 +1149,41 @@ def _iterative(
     _require(f"of memory for {request.algorithm}", need, int(0.8 * memory_bytes()), grid)
     options = {"iterations": request.iterations, "weight": request.weight}
     given = {name: value for name, value in options.items() if value is not None}
+    if "weight" in algorithm.options:
+        given.setdefault("weight", WEIGHT)
     mixture = {} if views.mixture is None else {"hardening": views.mixture}
-
-    def run(images: Float32Array, cone_vec: ConeVec, like: Volume, **more: Any) -> Volume:
-        """Reconstruct; what is implausible is among the views' doubts."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PlausibilityWarning)
-            made: Volume = algorithm.load()(images, cone_vec, like, **given, **more)
-        return made
-
+    run = algorithm.load()
     stack = _stack_integrals(views)
 
     def watch(step: Any) -> None:
         """Report the iterations done."""
         tell(step.iteration, step.of)
 
-    made = run(stack, views.cone_vec, grid.blank(), watch=watch, **mixture)
+    more = {**given, **mixture}
+    made = quietly(run, stack, views.cone_vec, grid.blank(), watch=watch, **more)
     copies = views.copies
-    if copies is None or views.mixture is not None:
+    if copies is None:
         return made
-    cause = "penalty" if "weight" in algorithm.options else "stopping"
-    try:
+    read = partial(_stack_integrals, replace(views, kept=None, copies=None))
+    noise = noise_of_probes(
+        read, views.cone_vec, lambda b: quietly(run, b, views.cone_vec, made, **more)
+    )
+    bias = None
+    if views.mixture is None:
+        cause = "penalty" if "weight" in algorithm.options else "stopping"
         copies.truncation = truncation_of(stack.__getitem__, views.cone_vec, views.shape)
-        quiet = partial(run, progress=False)
-        bias = BiasOfIterations(
-            copies, quiet, cause, sides_known=views.sides_known, known=views.known
-        )
-    except GeometryError:  # a trajectory that is not looked at
-        return made
-    for doubt in bias.warnings(made):
+        with suppress(GeometryError):  # a trajectory that is not looked at
+            bias = BiasOfIterations(
+                copies,
+                on_copies(run, given, made),
+                cause,
+                made,
+                sides_known=views.sides_known,
+                known=views.known,
+            )
+    for doubt in () if bias is None else bias.warnings(made):
         warn_caller(doubt)
-    return with_errors(made, bias=bias)
+    return with_errors(made, noise, bias)
 
 
 def _stack_integrals(views: ScanFrames) -> Float32Array:

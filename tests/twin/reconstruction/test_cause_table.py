@@ -18,9 +18,9 @@ from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
 from flexdt.twin.reconstruction.bias import (
     BiasOnDemand,
     Flaw,
-    _extrapolated,
     _within,
     copies_of,
+    extrapolated,
 )
 from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan, ScanCopies
 from flexdt.twin.reconstruction.consistency.agreement import Agreement, agreement_of
@@ -231,7 +231,7 @@ def test_what_nodes_do_not_show_is_extrapolated() -> None:
             "pixels": Flaw("aside", 0.0 * even + falls, even, finite=True),
         }
 
-    spread = _extrapolated(seen, nodes, flaws)
+    spread = extrapolated(seen, nodes, flaws)
     # 0.3 + 8 / n without end is 0.3; it was 0.4 and 0.5, so that it may be 0.1 off.
     np.testing.assert_allclose(spread["cone"], np.hypot(0.3, 0.1), rtol=1e-4)
     np.testing.assert_allclose(spread["rows"], 0.2, rtol=1e-4)

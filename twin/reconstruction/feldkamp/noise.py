@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.cpu import threads
@@ -319,16 +320,32 @@ class NoiseMeter:
             (row + first + 1).ravel(), (counts * part).ravel(), row[-1] + length
         )
         power = np.abs(np.fft.rfft(hits.reshape(-1, length))) ** 2 * self._response**2
-        mean, alternating = (
-            _spectrum(image / self._done, length) for image in self._means
-        )
-        # The object is in the mean, blurred as it turned: its finest details are not.
-        fine = slice(len(mean) // 2, None)
-        share = max(mean[fine].sum() / max(alternating[fine].sum(), TINY) - 1.0, 0.0)
+        mean, alternating = self._means / self._done
+        share = excess_of_mean(mean, alternating, length)
+        alternating = _spectrum(alternating, length)
         twice = np.full(len(self._response), 2.0)
         twice[[0, -1]] = 1.0  # frequencies without a negative one
         found: FloatArray = power @ (twice * share * alternating) / length
         return found
+
+
+def excess_of_mean(
+    mean: npt.NDArray[np.floating],
+    alternating: npt.NDArray[np.floating],
+    length: int | None = None,
+) -> float:
+    """Compute the variance of the noise that all views share, over that of the mean of their own.
+
+    Args:
+        mean, alternating: of the views, without and with alternating signs, (rows, cols), more
+            than `MIN_ROW_DISTANCE` + 1 rows.
+        length: of a padded row; None for no padding.
+    """
+    length = mean.shape[1] if length is None else length
+    power, own = _spectrum(mean, length), _spectrum(alternating, length)
+    # The object is in the mean, blurred as it turned: its finest details are not.
+    fine = slice(len(power) // 2, None)
+    return float(max(power[fine].sum() / max(own[fine].sum(), TINY) - 1.0, 0.0))
 
 
 def _local_variance(values: Float32Array) -> Float32Array:
@@ -354,7 +371,7 @@ def _local_variance(values: Float32Array) -> Float32Array:
     return out
 
 
-def _spectrum(image: Float32Array, length: int) -> FloatArray:
+def _spectrum(image: npt.NDArray[np.floating], length: int) -> FloatArray:
     """Compute the power of an image's noise along its rows.
 
     The volume's voxels may be anywhere between two rows, so that rows and their means are
