@@ -112,7 +112,8 @@ class Jobs:
     def get(self, job: str | None) -> Job:
         """Return the job with id `job`, or for None the current or else the last one.
 
-        An ended job is returned, too, while it is kept.
+        An ended job is returned, too, while it is kept. The last one is no job that was taken
+        off the queue before its turn, unless there are no others.
 
         Raises:
             UnknownNameError: no such job, or no job at all; lists the last
@@ -121,7 +122,9 @@ class Jobs:
         if job is None and self.current is not None:
             return self.current
         if job is None and self._all:
-            return next(reversed(self._all.values()))
+            newest = next(reversed(self._all.values()))
+            ran = (j for j in reversed(self._all.values()) if not j.never_began)
+            return next(ran, newest)
         if job is None or job not in self._all:
             asked = "" if job is None else f"no job {job!r}; "
             last = list(self._all)[-MAX_NAMED_JOBS:]

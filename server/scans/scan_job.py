@@ -78,6 +78,12 @@ class Job:
         return self.runner.progress
 
     @property
+    def never_began(self) -> bool:
+        """Whether it was aborted before its turn: there is no data set, and nothing stands
+        elsewhere."""
+        return self.phase == "aborted" and self.start is None and not self.frames_done
+
+    @property
     def frames_done(self) -> int:
         """Number of finished frames; 0 before it runs."""
         if self.where is None:

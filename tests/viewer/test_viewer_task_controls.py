@@ -307,7 +307,7 @@ def test_a_scan_that_is_not_as_it_should_be_says_why(
     note.wait_for()
     assert "outside [70, 996] mm" in note.inner_text()
     if not all:
-        page.locator(".note", has_text="has begun").wait_for()
+        page.locator(".note", has_text="begins").wait_for()
         twin.control("force")
         twin.abort_job()
         twin.control("release")

@@ -2,9 +2,7 @@
 // restarts: each page says so while it does, with the way back.
 import { $, clicks, fixed, setText } from "./dom.js";
 import { command, on } from "./link.js";
-
-/** The comment of the story's correction. */
-export const BY_HAND = "misaligned by hand";
+import { BY_HAND } from "./story_steps.js";
 
 on("state", ({ correction }) => {
   const wrong = correction?.comment === BY_HAND ? correction : null;

@@ -15,11 +15,36 @@ const NAMED_MOTORS = 3;
 export const isOver = (job) => FINAL.includes(job.state);
 
 /**
+ * Whether it was taken off the queue before its turn: it has no images, no place where it began
+ * and no end, and no scan has ended with it.
+ * @param {Pick<JobStatus, "state" | "start" | "frames_done">} job
+ * @returns {boolean}
+ */
+export const neverBegan = ({ state, start, frames_done: done }) =>
+  state === "aborted" && !start && !done;
+
+/**
  * Whether images of it are missing that `job.resume` makes.
  * @param {JobStatus} job
  * @returns {boolean}
  */
-export const isUnfinished = (job) => isOver(job) && job.state !== "done";
+export const isUnfinished = (job) => isOver(job) && job.state !== "done" && !neverBegan(job);
+
+/**
+ * What a scan that was just submitted does, by its own status among all that the twin knows.
+ * @param {string} job
+ * @param {JobStatus[]} all
+ * @returns {string}
+ */
+export function submittedWords(job, all) {
+  const mine = all.find((each) => each.job === job);
+  const name = mine?.name || job;
+  if (!mine) return `${name} is in the queue`;
+  if (isOver(mine)) return `${name} is ${neverBegan(mine) ? "off the queue" : mine.state}`;
+  const before = all.filter((each) => each !== mine && !isOver(each)).length;
+  if (mine.state === "queued" && before) return `${name} waits: ${before} before it`;
+  return `${name} begins`;
+}
 
 /**
  * @param {JobStatus} job
@@ -35,6 +60,7 @@ export const problem = (job) =>
  */
 export function stateWords(job, isMe) {
   const by = job.ended_by;
+  if (neverBegan(job)) return "taken off the queue";
   if (job.state === "aborted" && by) return `aborted by ${isMe(by) ? "you" : by}`;
   if (isOver(job)) return job.state;
   const pace =
@@ -59,6 +85,7 @@ export function progress(job) {
  * @returns {string}
  */
 export function timeLeft(job, left_s) {
+  if (neverBegan(job)) return "";
   if (isOver(job)) return seconds(job.elapsed_s);
   return left_s === null ? "" : `${seconds(left_s)} left`;
 }
@@ -114,6 +141,7 @@ function xrays({ tube }) {
  * @returns {string}
  */
 function places(job, { axes }) {
+  if (!job.start) return ""; // it has not begun anywhere
   const all = moved(job, axes);
   if (!all.length) return "everything stands where it began";
   const words = all.slice(0, NAMED_MOTORS).map(({ motor, now, start }) => {

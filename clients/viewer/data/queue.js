@@ -1,7 +1,8 @@
 // Scans that wait, above those that have been made: what comes next stands on top of the list of
 // what there is.
 import { $, el } from "./dom.js";
-import { allJobs, command, on, store } from "./link.js";
+import { neverBegan } from "./job_words.js";
+import { allJobs, command, emit, on, store } from "./link.js";
 /** @import { JobStatus } from "../web/viewer.d.ts" */
 
 const SOON_MS = 200;
@@ -15,7 +16,10 @@ let soon;
  */
 function row(job, k) {
   const name = job.name || job.job;
-  const take = () => void command("job.abort", { job: job.job }, `${name} stays`);
+  const take = async () => {
+    const answer = await command("job.abort", { job: job.job }, `${name} stays`);
+    if (answer && neverBegan(answer)) emit("note", "good", "Scan", `${name} is off the queue`);
+  };
   return el(
     "div",
     { class: "data-set queued" },
@@ -29,7 +33,7 @@ function row(job, k) {
     ),
     el(
       "button",
-      { class: "small", title: `Take ${name} off the queue`, onclick: take },
+      { class: "small", title: `Take ${name} off the queue`, onclick: () => void take() },
       "Take off",
     ),
   );

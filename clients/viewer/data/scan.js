@@ -24,6 +24,7 @@ import { differences, listed, only } from "./fingerprint.js";
 import { draw as drawTimeline } from "./timeline.js";
 import * as designer from "./designer.js";
 import { isOver } from "./job_words.js";
+import { tellSubmitted } from "./scan_job.js";
 import { NOW } from "./moment.js";
 import { effect } from "./signals.js";
 import { exposure_ms, frames, kind, sameWish, wished, wishWords } from "./scan_wish.js";
@@ -657,7 +658,7 @@ async function submit() {
   });
   if (!answer) return;
   ran = { job: answer.job, script: text.value };
-  emit("note", "good", "Scan", `${answer.job} has begun`);
+  await tellSubmitted("Scan", answer.job);
   for (const warning of answer.warnings.slice(0, 3))
     emit("note", "warning-note", "Scan", warning);
   if (at() !== null) void scrub(null);

@@ -4,8 +4,9 @@
 import { $, $button, $select, clicks, el, setText, words } from "./dom.js";
 import { command, call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
-import { isUnfinished } from "./job_words.js";
+import { isOver } from "./job_words.js";
 import { across } from "./sample_outline.js";
+import { tellSubmitted } from "./scan_job.js";
 import { nearSample } from "./views.js";
 import { isDown } from "./warnings.js";
 import { reconstruct, watch } from "./volume.js";
@@ -177,7 +178,7 @@ export async function scanIt(named = sample.value) {
     busy = true;
     far = true;
     watch();
-    emit("note", "good", "Scan it", `${named || "the sample"}: ${mine} has begun`);
+    void tellSubmitted("Scan it", mine, named || "the sample");
     return mine;
   } finally {
     pressed = false;
@@ -251,7 +252,7 @@ on("job", (job) => {
     nearSample();
   }
   setText(note, `${job.frames_done} of ${job.frames_total} images`);
-  if (isUnfinished(job)) {
+  if (isOver(job)) {
     mine = null;
     busy = false;
   }

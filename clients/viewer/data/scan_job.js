@@ -1,7 +1,7 @@
 // The scan that runs, waits or has ended last: followed by the twin's events, by its states, and
 // by asking where an end was not heard of.
-import { call, command, emit, Failure, isMe, on, store } from "./link.js";
-import { isOver, isUnfinished, problem } from "./job_words.js";
+import { allJobs, call, command, emit, Failure, isMe, on, store } from "./link.js";
+import { isOver, isUnfinished, neverBegan, problem, submittedWords } from "./job_words.js";
 /** @import { JobStatus } from "../web/viewer.d.ts" */
 
 const ASK_AGAIN_MS = 1000;
@@ -21,6 +21,10 @@ function show(job) {
   if (fresh && job.state === "queued" && last && !isOver(last)) return; // its turn comes
   const older = job.time < toldAt_s || (job.time === toldAt_s && last !== null && isOver(last));
   if (!fresh && older) return;
+  if (neverBegan(job)) {
+    if (!fresh) forget();
+    return; // no scan has ended with it
+  }
   toldAt_s = job.time;
   store.job = job;
   emit("scan", fresh);
@@ -74,6 +78,17 @@ on("session", async () => {
   const status = await call("job.status").catch(() => null);
   if (status && !store.job && isUnfinished(status)) show(status);
 });
+
+/**
+ * Says what a scan does that this page has just submitted: it may have to wait.
+ * @param {string} title
+ * @param {string} job
+ * @param {string} [of] whose it is
+ */
+export async function tellSubmitted(title, job, of = "") {
+  const all = await allJobs().catch(() => []);
+  emit("note", "good", title, `${of && `${of}: `}${submittedWords(job, all)}`);
+}
 
 export async function forgetJob() {
   const job = store.job?.job;

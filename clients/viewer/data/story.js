@@ -5,11 +5,11 @@
 import { $, clicks, el, fixed, setText, words } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { beliefWords } from "./belief.js";
-import { BY_HAND } from "./by_hand.js";
 import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
-import { isUnfinished } from "./job_words.js";
+import { isOver } from "./job_words.js";
 import { scanIt, takeUp, turnOf } from "./scan_it.js";
+import { BY_HAND, sameCorrection, STEP, stepOf } from "./story_steps.js";
 import { reconstruct } from "./volume.js";
 import { isDown } from "./warnings.js";
 /**
@@ -63,10 +63,11 @@ const STEPS = [
   ],
 ];
 /**
- * Where the story is: kept in this tab, so that it goes on after a reload. While it waits, one of
- * `job`, `dataset`, `phantomJob` and `looking` says for what.
+ * What the story has found out: kept in this tab, so that it goes on after a reload. While it
+ * waits, one of `job`, `dataset`, `phantomJob` and `looking` says for what, and `from` in which
+ * step.
  * @typedef {object} Told
- * @property {number} step
+ * @property {number} from
  * @property {string | null} job
  * @property {string | null} dataset
  * @property {string | null} phantomJob
@@ -82,7 +83,7 @@ const STEPS = [
 const KEY = "flexdt-story";
 /** @returns {Told} */
 const fresh = () => ({
-  step: 0,
+  from: STEP.misalign,
   job: null,
   dataset: null,
   phantomJob: null,
@@ -144,26 +145,62 @@ function says() {
     setText($(`#story-${name}-is`), fixed(value, 2));
   }
 }
-function show(says = STEPS[told.step]?.[2] ?? "") {
+/**
+ * The step that comes next: by the correction in force, whoever has put it there or undone it.
+ * Before the first state it is not known.
+ */
+const step = () => stepOf(told, store.state?.correction ?? null);
+function show(says = stepWords()) {
   told.says = says;
   setText($("#story-says"), says);
   allow();
-  if (told.step || told.waiting) sessionStorage.setItem(KEY, JSON.stringify(told));
+  if (told.waiting || Object.keys(told.believed).length)
+    sessionStorage.setItem(KEY, JSON.stringify(told));
+}
+function stepWords() {
+  const at = step();
+  if (at === STEP.end) return `Sharp again. ${compared()}`;
+  const [, , words] = STEPS[at];
+  return at === STEP.calibrate ? `${compared()} ${words}` : words;
 }
 function allow() {
   const down = store.state !== null && isDown(store.state);
+  const at = step();
   STEPS.forEach(([id], k) => {
     /** @type {HTMLButtonElement} */
     const button = $(`#${id}`);
-    button.disabled = down || told.waiting || (k !== told.step && k !== 0);
-    button.classList.toggle("primary", k === told.step);
+    button.disabled = down || told.waiting || (k !== at && k !== STEP.misalign);
+    button.classList.toggle("primary", k === at);
   });
 }
-on("state", allow);
-function next() {
+let shown = -1;
+on("state", ({ correction }) => {
+  // A wrong geometry of another tab, or of before a restart: the sliders say what it is.
+  if (correction?.comment === BY_HAND && !sameCorrection(told.believed, correction.parameters))
+    adopt(correction.parameters);
+  const at = step();
+  if (told.waiting && at !== told.from) failed("The correction has changed meanwhile.");
+  else if (at !== shown && !told.waiting) show();
+  else allow();
+  shown = at;
+});
+
+/** @param {Record<string, number>} believed */
+function adopt(believed) {
+  told = { ...fresh(), believed };
+  setText($("#story-found"), "");
+  for (const name of Object.keys(BELIEFS)) slider(name).value = String(believed[name] ?? 0);
+  says();
+}
+
+/** @param {string} words */
+function wait(words) {
+  Object.assign(told, { waiting: true, from: step() });
+  show(words);
+}
+function goOn() {
   told.waiting = false;
-  told.step += 1;
-  show(told.step < STEPS.length ? undefined : `Sharp again. ${compared()}`);
+  show();
 }
 
 /** @returns {string} */
@@ -189,13 +226,11 @@ async function bend() {
   setText($("#story-found"), "");
   const wrong = { parameters: told.believed, source: null, comment: BY_HAND };
   if (!(await command("sample.set", { name: OBJECT }, "The sample stays"))) return;
-  if (!(await command("calibration.apply", wrong, "Not applied"))) return;
-  next();
+  await command("calibration.apply", wrong, "Not applied");
 }
 async function scan() {
-  told.waiting = true;
   told.dataset = null;
-  show("Scanning; the volume grows in the scene.");
+  wait("Scanning; the volume grows in the scene.");
   told.job = await scanIt(OBJECT);
   if (told.job) show(told.says);
   else failed(NOT_BEGUN);
@@ -203,8 +238,7 @@ async function scan() {
 
 /** Scans the phantom; its beads are looked for once its images are there. */
 async function fit() {
-  told.waiting = true;
-  show("The bead phantom is on the stage, and turns once.");
+  wait("The bead phantom is on the stage, and turns once.");
   told.phantomJob = await turnOf(PHANTOM, PHANTOM_VIEWS);
   if (told.phantomJob) show(told.says);
   else failed(NOT_BEGUN);
@@ -236,7 +270,7 @@ async function look(scanned) {
   told.found = { correction, source: scanned };
   told.parameters = report.parameters;
   tell();
-  next();
+  goOn();
 }
 
 /** What the beads say beside what the sliders said when the geometry was bent. */
@@ -250,11 +284,11 @@ function tell() {
 }
 async function use() {
   const { found } = told;
-  if (found && (await apply(found.correction, found.source, "after a story", true))) next();
+  if (found) await apply(found.correction, found.source, "after a story", true);
 }
 on("job", (/** @type {JobStatus} */ status) => {
   if (!told.waiting || ![told.job, told.phantomJob].includes(status.job)) return;
-  if (isUnfinished(status)) failed(`The scan is ${status.state}.`);
+  if (isOver(status) && status.state !== "done") failed(`The scan is ${status.state}.`);
   if (status.state !== "done") return;
   if (status.job === told.phantomJob) {
     told.phantomJob = null;
@@ -275,8 +309,7 @@ on("volume", (volume) => {
   if (!volume.compared) return;
   told.dataset = null;
   told.rms.push(Object.values(volume.compared)[0].rms);
-  next();
-  if (told.step === 2) show(`${compared()} ${STEPS[2][2]}`);
+  goOn();
 });
 
 // A page that was loaded again, or connected again, takes up what it waited for.

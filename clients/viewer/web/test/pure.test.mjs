@@ -12,6 +12,7 @@ import * as moments from "../../data/moment.js";
 import * as names from "../../data/names.js";
 import { across, outline } from "../../data/sample_outline.js";
 import * as signals from "../../data/signals.js";
+import { BY_HAND, STEP, stepOf } from "../../data/story_steps.js";
 
 let seed = 20261127;
 const random = () => {
@@ -222,7 +223,52 @@ test("a scan's end names who asked and what stands elsewhere", () => {
   assert.equal(job.timeLeft(runs, null), "");
   assert.equal(job.whatWords(runs, { ...state, projector: "no projector" }), "waits: no projector");
   assert.equal(job.isUnfinished({ state: "done" }), false);
-  for (const end of ["failed", "aborted", "incomplete"]) assert.ok(job.isUnfinished({ state: end }));
+  for (const end of ["failed", "aborted", "incomplete"]) assert.ok(job.isUnfinished({ ...ended, state: end }));
+});
+
+// A queue that runs, loses and ends jobs, kept here as events; a job begins with its first event
+// of running, and what is said of each must be what has happened to it.
+test("what is said of a job is what has happened to it", () => {
+  const seen = { begins: 0, waits: 0, off: 0 };
+  for (let history = 0; history < 200; history++) {
+    const jobs = [];
+    const happened = new Map();
+    for (let k = 0; k < 12; k++) {
+      const what = pick(["submit", "submit", "next", "take", "end"]);
+      const runs = jobs.find((one) => one.state === "running");
+      const waiting = jobs.filter((one) => one.state === "queued");
+      if (what === "submit") {
+        jobs.push({ job: `job-${jobs.length + 1}`, name: `scan-${jobs.length + 1}`, state: "queued",
+          start: null, frames_done: 0, frames_total: 9, elapsed_s: 0, ended_by: null, error: null });
+        const mine = jobs.at(-1);
+        happened.set(mine, "waits");
+        const ahead = waiting.length + (runs ? 1 : 0);
+        const told = job.submittedWords(mine.job, jobs);
+        assert.equal(told, ahead ? `${mine.name} waits: ${ahead} before it` : `${mine.name} begins`);
+        seen[ahead ? "waits" : "begins"] += 1;
+      } else if (what === "next" && !runs && waiting.length) {
+        Object.assign(waiting[0], { state: "running", start: { rot_obj: 0 } });
+        happened.set(waiting[0], "began");
+      } else if (what === "take" && waiting.length) {
+        const one = pick(waiting);
+        Object.assign(one, { state: "aborted", ended_by: "Anna #1" });
+        happened.set(one, "taken off");
+      } else if (what === "end" && runs) {
+        Object.assign(runs, { state: pick(["done", "aborted"]), ended_by: "Anna #1" });
+      }
+    }
+    const state = { axes: { rot_obj: { position: 405, unit: "deg" } }, tube: { on: false } };
+    for (const one of jobs.filter((each) => ["done", "aborted"].includes(each.state))) {
+      const never = happened.get(one) === "taken off";
+      seen.off += never;
+      assert.equal(job.neverBegan(one), never);
+      assert.equal(job.isUnfinished(one), !never && one.state === "aborted");
+      assert.equal(/taken off/.test(job.stateWords(one, () => true)), never);
+      assert.ok(!/stands where it began/.test(job.whatWords(one, state)));
+      assert.equal(job.whatWords(one, state).includes("began at 0.00"), !never && one.state === "aborted");
+    }
+  }
+  for (const count of Object.values(seen)) assert.ok(count > 50, JSON.stringify(seen));
 });
 
 test("names cannot turn the text about them around", () => {
@@ -327,6 +373,52 @@ test("a belief that the beads contradict is called wrong, and one that they do n
   }
   const none = beliefWords("panel tilted", "°", 1, undefined);
   assert.match(none, /the slider said 1\.00 °; the beads do not tell it/);
+});
+
+// The story beside what others do to the corrections: a stack of those in force, as the twin has
+// it. Each step is offered only while its geometry is in force.
+test("a step of the story is one of the correction in force", () => {
+  const seen = new Set();
+  for (let history = 0; history < 300; history++) {
+    const inForce = [];
+    let known = { believed: {}, found: null, rms: [] };
+    for (let k = 0; k < 25; k++) {
+      const now = inForce.at(-1) ?? null;
+      const at = stepOf(known, now);
+      const what = pick(["go on", "go on", "go on", "undo", "another"]);
+      if (what === "undo") inForce.pop();
+      else if (what === "another") {
+        const parameters = { dO_x: pick([0.5, 0.25]) };
+        inForce.push({ comment: pick([BY_HAND, "of the bench"]), parameters });
+      } else if (at === STEP.misalign || at === STEP.end) {
+        known = { believed: { dO_x: 0.5 + random(), det_roll: 0 }, found: null, rms: [] };
+        inForce.push({ comment: BY_HAND, parameters: { dO_x: known.believed.dO_x } });
+        assert.equal(stepOf(known, inForce.at(-1)), STEP.scan);
+      } else if (at === STEP.scan) {
+        known = { believed: { ...now.parameters }, found: null, rms: [0.01] };
+        assert.equal(stepOf(known, now), STEP.calibrate);
+      } else if (at === STEP.calibrate) {
+        known.found = { correction: { dO_x: 0.001 * random() } };
+        assert.equal(stepOf(known, now), STEP.apply);
+      } else if (at === STEP.apply) {
+        inForce.push({ comment: "after a story", parameters: { ...known.found.correction } });
+        const next = known.rms.length > 1 ? STEP.end : STEP.again;
+        assert.equal(stepOf(known, inForce.at(-1)), next);
+      } else {
+        known.rms.push(0.002);
+        assert.equal(stepOf(known, now), STEP.end);
+      }
+      const stands = inForce.at(-1) ?? null;
+      const told = stepOf(known, stands);
+      seen.add(told);
+      const wrong = [STEP.scan, STEP.calibrate, STEP.apply].includes(told);
+      assert.equal(wrong, stands?.comment === BY_HAND);
+      if (told === STEP.again || told === STEP.end)
+        assert.deepEqual(stands.parameters, known.found.correction);
+      if (!stands) assert.equal(told, STEP.misalign);
+    }
+  }
+  assert.deepEqual([...seen].sort(), [0, 1, 2, 3, 4, 5]);
 });
 
 test("the reader's own session is called you, and nobody else's", () => {
