@@ -19,6 +19,7 @@ import pytest
 import trimesh
 import viser
 from PIL import Image
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.scenes.beam_planes import MOST, fans
@@ -249,6 +250,26 @@ def test_a_material_has_the_colour_of_the_list() -> None:
         looks.add(sample, cube)
         own = materials()[name].color if name in materials() else None
         assert looks.look(sample).skins[0].color == (own or OTHER_COLOR), name
+
+
+def test_a_hole_of_the_sample_is_open_in_the_scene() -> None:
+    """No triangle lies above a place in a hole where no voxel above holds anything."""
+    voxels = load_phantom("gear").volume(0.5)
+    empty = voxels.data < 1e-3 * voxels.data.max()
+    above = np.flip(np.logical_and.accumulate(np.flip(empty, 0)), 0)
+    outlines = np.stack([ndimage.binary_fill_holes(~layer) for layer in empty])
+    inside = ndimage.binary_erosion(above & outlines, np.ones((1, 5, 5)))
+    x, y, z = voxels.centers()
+    places = [(x[i], y[j], z[k]) for k, j, i in np.argwhere(inside)]
+    assert len(places) > 500
+    (skin,) = MeshCache().look(SampleState(name="gear")).skins
+    corners = 1e3 * skin.vertices[skin.faces]
+    for place in places[:: len(places) // 25]:
+        apart = corners[..., :2] - place[:2]
+        after = np.roll(apart, -1, axis=1)
+        turns = apart[..., 0] * after[..., 1] - apart[..., 1] * after[..., 0]
+        meets = (turns > 0).all(axis=1) | (turns < 0).all(axis=1)
+        assert not (corners[meets][..., 2].mean(axis=1) > place[2]).any(), place
 
 
 def test_the_name_of_the_sample_stands_above_it() -> None:

@@ -2,6 +2,7 @@
 import { nextStep } from "./calibrate_next.js";
 import { $, $$, $button, $input, chosen, clicks, el, fixed, words } from "./dom.js";
 import { call, command, emit, on } from "./link.js";
+import { MEANS, unit } from "./belief.js";
 import { know } from "./compare.js";
 import { open } from "./data.js";
 /**
@@ -58,35 +59,8 @@ const ofBeads = (report) => {
   return typeof phantom === "string" && phantom !== "unknown";
 };
 
-/** @param {string} name */
-const unit = (name) =>
-  name === "angle_scale" ? "" : /^(alpha|det_|axis_tilt_)/.test(name) ? "°" : "mm";
 // Outliers that a report names.
 const LISTED = 3;
-// What the thesis's names mean, in the words of the page.
-/** @type {Record<string, string | undefined>} */
-const MEANS = {
-  dO_x: "axis sideways",
-  dO_y: "axis height",
-  dO_z: "source to axis",
-  alpha: "start angle",
-  tau_x: "sample off the axis, sideways",
-  tau_z: "sample off the axis, along the beam",
-  dD_x: "detector sideways",
-  dD_y: "detector height",
-  dD_z: "source to detector",
-  dS_x: "focal spot sideways",
-  dS_y: "focal spot height",
-  axis_column: "image of the axis, column",
-  axis_angle: "image of the axis, angle",
-  det_roll: "detector roll",
-  det_pitch: "detector pitch",
-  det_yaw: "detector yaw",
-  axis_tilt_x: "axis towards the detector",
-  axis_tilt_z: "axis sideways tilt",
-  angle_scale: "scale of angles",
-};
-
 /**
  * Decimals that leave `digits` significant ones.
  * @param {number} v

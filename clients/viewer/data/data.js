@@ -206,7 +206,7 @@ function row(info) {
       {},
       el("b", {}, info.name),
       el("span", { class: "muted" }, dated(info)),
-      el("span", {}, settings(info)),
+      el("span", { class: "settings" }, settings(info)),
       el(
         "span",
         { class: `state ${info.state}` },

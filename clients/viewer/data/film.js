@@ -39,6 +39,8 @@ let windowed = [0, 1];
 let due = false;
 /** @type {number[]} */
 let stamps = [];
+/** Number of the image that was counted last. */
+let counted = -1;
 /** @type {number | undefined} */
 let quiet;
 /** @type {Pair | null} */
@@ -207,7 +209,8 @@ function beamWords(i) {
     if (counts || i.signed || saturated < MANY_SATURATED) return "";
     return `${percent(saturated)} saturated: drawn as though none were`;
   }
-  if (state.tube.on && !state.tube.ready) return "X-rays warming up";
+  if (state.tube.on)
+    return state.tube.ready ? "from before X-rays were on" : "X-rays warming up";
   return counts ? "X-rays off: dark image" : "X-rays off: drawn as though on";
 }
 
@@ -235,7 +238,9 @@ function transmission(i) {
   const dark = through[Math.floor(0.01 * through.length)];
   const mean = through.reduce((a, v) => a + v, 0) / through.length;
   const darkest = `${(100 * dark).toFixed(1)} % or less in 1 % of the pixels`;
-  return `transmission ${darkest} · ${(100 * mean).toFixed(1)} % in the mean`;
+  const cut = !i.recorded && (store.state?.image?.saturated ?? 0) >= MANY_SATURATED;
+  const though = cut ? " · as though no pixel were saturated" : "";
+  return `transmission ${darkest} · ${(100 * mean).toFixed(1)} % in the mean${though}`;
 }
 
 export function draw() {
@@ -281,7 +286,11 @@ export function draw() {
   $("#film-note").dataset.seq = String(i.seq);
   shown.count++;
   shown.at = performance.now();
-  stamps.push(shown.at);
+  // A finger moves the page over an image that is fitted in and has no other use for it.
+  const own = view.zoom > 1 || $select("#tool").value !== "pan";
+  canvas.style.touchAction = own ? "none" : "pan-y";
+  if (i.seq !== counted) stamps.push(shown.at);
+  counted = i.seq;
   stamps = stamps.filter((t) => shown.at - t < 2000);
   setText(
     $("#film-rate"),
@@ -293,6 +302,7 @@ export function draw() {
   const { moment } = store;
   const which = [
     i.recorded || !i.origin?.file ? "" : nameOf(i.origin.file),
+    i.recorded || i.kind === "counts" ? "" : "without noise",
     moment.kind === "plan" ? `live: the ghost is at ${fixed(moment.time_s, 1)} s` : "",
   ].map((words) => words && `${words}  ·  `);
   const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2));
@@ -528,7 +538,7 @@ function place(e, { full: [rows, cols] }) {
 }
 canvas.addEventListener("pointerdown", (e) => {
   canvas.setPointerCapture(e.pointerId);
-  down = [e.clientX, e.clientY];
+  pointer = down = [e.clientX, e.clientY];
   const i = store.image;
   if (
     i &&
@@ -536,6 +546,7 @@ canvas.addEventListener("pointerdown", (e) => {
   )
     ask();
   else drag = [e.clientX, e.clientY, view.x, view.y];
+  tell();
 });
 canvas.addEventListener("pointerup", (e) => {
   if (Math.hypot(e.clientX - down[0], e.clientY - down[1]) < CLICK) marks.click(at(down));
@@ -559,7 +570,8 @@ canvas.addEventListener("pointermove", (e) => {
   }
   tell();
 });
-canvas.addEventListener("pointerleave", () => {
+canvas.addEventListener("pointerleave", (e) => {
+  if (e.pointerType === "touch") return; // what a finger touched last stays read
   pointer = null;
   tell();
   if (measure.follows()) ask();

@@ -35,6 +35,8 @@ const HELP =
   "Enter presses a button. In a scene: drag to turn, right drag to pan, wheel to zoom; " +
   "W A S D Q E and the arrows fly the camera. " +
   "In the radiograph: wheel to zoom, drag to pan, double click to reset.";
+const TWIN =
+  "Motors, X-rays and images here are computed: no machine moves, and nothing is radiated.";
 const byKey = $input("#key-jog");
 const KEY = "flexdt-keys";
 byKey.checked = localStorage.getItem(KEY) === "on";
@@ -142,7 +144,7 @@ export function toggleHelp() {
     return;
   }
   if (!dialog.childElementCount) {
-    const grid = el("div", { class: "keys" });
+    const grid = el("div", { class: "keys of-keys" });
     const jogs = Object.entries(JOGS).map(([code, [, , what]]) => [name(code), what]);
     for (const [key, what] of [
       ...jogs,
@@ -153,22 +155,21 @@ export function toggleHelp() {
       ["F1", "this help"],
     ])
       grid.append(el("kbd", {}, key), el("span", {}, what));
+    const scanner = store.hello?.machine ?? "X-ray CT";
+    const close = el("button", { class: "primary", onclick: () => dialog.close() }, "Close");
+    const viser = { href: "https://viser.studio", target: "_blank", class: "muted" };
     dialog.append(
-      el("h2", {}, "What would you like to do?"),
-      tasks(() => dialog.close()),
-      el("h2", {}, "Keys"),
-      grid,
-      el("p", { class: "muted" }, HELP),
+      el("div", { class: "row between" }, el("h2", {}, "What would you like to do?"), close),
       el(
-        "div",
-        { class: "row between" },
-        el(
-          "a",
-          { href: "https://viser.studio", target: "_blank", class: "muted" },
-          "3-D by viser",
-        ),
-        el("button", { class: "primary", onclick: () => dialog.close() }, "Close"),
+        "p",
+        { id: "what-this-is" },
+        `flexdt is a digital twin of the ${scanner} scanner. ${TWIN}`,
       ),
+      tasks(() => dialog.close()),
+      el("h2", { class: "of-keys" }, "Keys"),
+      grid,
+      el("p", { class: "muted of-keys" }, HELP),
+      el("a", viser, "3-D by viser"),
     );
   }
   dialog.show();

@@ -36,7 +36,7 @@ function theme(dark, tell = true) {
 }
 const dark = () => document.documentElement.dataset.theme === "dark";
 $button("#theme").addEventListener("click", () => theme(!dark()));
-$button("#help").addEventListener("click", toggleHelp);
+for (const id of ["#help", "#about"]) $button(id).addEventListener("click", toggleHelp);
 on("open", () => theme(dark()));
 
 window.addEventListener("popstate", () => {

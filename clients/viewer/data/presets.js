@@ -29,7 +29,7 @@ function own() {
   }
 }
 const all = () => [...SHIPPED, ...own()];
-const chosen = () => all().find(({ name }) => name === list.value) ?? SHIPPED[0];
+const chosen = () => all().find(({ name }) => name === list.value);
 
 /** @param {Preset} preset */
 function wordsOf({ tube, camera }) {
@@ -40,20 +40,25 @@ function wordsOf({ tube, camera }) {
 }
 
 function tell() {
-  setText($("#preset-note"), wordsOf(chosen()));
-  $button("#preset-delete").hidden = SHIPPED.some(({ name }) => name === list.value);
+  const preset = chosen();
+  setText($("#preset-note"), preset ? wordsOf(preset) : "");
+  $button("#preset-use").disabled = !preset;
+  $button("#preset-delete").hidden = !own().some(({ name }) => name === list.value);
 }
 
 /** @param {string} select */
 function draw(select) {
-  list.replaceChildren(...all().map(({ name }) => el("option", {}, name)));
+  const none = el("option", { value: "" }, "choose one");
+  list.replaceChildren(none, ...all().map(({ name }) => el("option", {}, name)));
   list.value = select;
-  if (!list.value) list.value = SHIPPED[0].name;
+  if (!chosen()) list.value = "";
   tell();
 }
 
 async function use() {
-  const { tube, camera } = chosen();
+  const preset = chosen();
+  if (!preset) return;
+  const { tube, camera } = preset;
   if (tube && !(await command("tube.set", tube, "The tube refuses"))) return;
   await command("camera.set", camera, "The camera refuses");
 }

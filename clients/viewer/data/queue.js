@@ -43,14 +43,17 @@ async function list() {
   if ($("#tab-data").hidden || !store.session) return;
   const jobs = await allJobs().catch(() => null);
   if (!jobs) return;
-  const waiting = jobs.filter((job) => job.state === "queued");
+  const begun = store.job?.state === "queued" ? "" : store.job?.job; // since they were asked for
+  const waiting = jobs.filter((job) => job.state === "queued" && job.job !== begun);
   box.replaceChildren(...waiting.map(row));
 }
 
-/** Several jobs change at once where one ends and the next begins. */
+/** Several jobs change at once where one ends and the next begins; a running one tells often. */
 function listSoon() {
-  clearTimeout(soon);
-  soon = window.setTimeout(() => void list(), SOON_MS);
+  soon ??= window.setTimeout(() => {
+    soon = undefined;
+    void list();
+  }, SOON_MS);
 }
 on("job", listSoon);
 on("session", listSoon);

@@ -65,7 +65,7 @@ void main() {
       vec3 n = vec3(between(p, x), between(p, y), between(p, z));
       n = -n / (length(n) + 1e-6);
       float light = max(dot(n, normalize(-ahead + .5 * up - .3 * right)), 0.);
-      vec3 paint = beside() ? vec3(.62, .78, .9) : vec3(.9, .86, .78);
+      vec3 paint = beside() ? vec3(.9, .86, .78) : vec3(.27, .75, 1.); // the scan as in the scene
       color = vec4(paint * (.22 + .78 * light) + .25 * pow(light, 24.), 1.);
       return;
     }

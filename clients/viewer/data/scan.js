@@ -65,12 +65,21 @@ clicks({
   "job-scrub": recall,
 });
 
+const NO_SCRIPT = $("#empty-note").textContent;
+function emptyNote() {
+  const job = store.job;
+  const runs =
+    job && !isOver(job) ? `${job.name || job.job} runs from a script of its own. ` : "";
+  setText($("#empty-note"), `${runs}${NO_SCRIPT}`);
+}
+on("scan", emptyNote);
 function marks() {
   written = text.value.split("\n");
   worst = new Map();
   for (const id of ["#check", "#plan"]) $button(id).disabled = !text.value.trim();
   allow();
   $("#empty-note").hidden = text.value.trim() !== "";
+  emptyNote();
   for (const p of problems) {
     if (p.line)
       worst.set(p.line, worst.get(p.line) === "hit" || p.severity === "error" ? "hit" : "soft");

@@ -237,7 +237,9 @@ function told(state) {
   const voxel_um = filling(state);
   if (!state.sample.name || voxel_um === null) return "The stage is empty: choose a sample.";
   const views = viewsFor(state, voxel_um);
-  return `One turn, ${views} images; its volume grows in the scene.`;
+  if (isDown(state)) return "Nothing is scanned before the stop is reset.";
+  const waits = store.job && !isOver(store.job) ? "After the scan that runs: one" : "One";
+  return `${waits} turn, ${views} images; its volume grows in the scene.`;
 }
 on("job", (job) => {
   if (job.job !== mine) return;

@@ -318,7 +318,8 @@ function show(state) {
   put("power", state.tube.power_W, 2);
   const xrays = $button("#beam");
   const { on, ready } = state.tube;
-  xrays.textContent = on ? (ready ? "X-rays are ON" : "X-rays warm up") : "Switch X-rays on";
+  const is = ready ? "X-rays are ON" : "X-rays warm up";
+  xrays.textContent = on ? `${is}: switch off` : "Switch X-rays on";
   xrays.classList.toggle("beam-on", on);
   xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";
   xrays.disabled = !on && isDown(state);

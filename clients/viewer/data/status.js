@@ -31,13 +31,13 @@ export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6
   setTimeout(() => node.remove(), life);
 }
 on("note", (kind, title, body) => note(kind, title, body));
+/** What the bar of a stop says is not said twice. */
+const ofStop = /^E-stop by /;
+const TOOK = " took control from you";
 on("log", (entry) => {
-  if (["warning", "error"].includes(entry.level))
-    note(
-      entry.level === "error" ? "error" : "warning-note",
-      "Twin",
-      toYou(entry.message, store.session),
-    );
+  if (!["warning", "error"].includes(entry.level) || ofStop.test(entry.message)) return;
+  const kind = entry.level === "error" ? "error" : "warning-note";
+  note(kind, "Twin", toYou(entry.message, store.session));
 });
 
 /**
@@ -63,6 +63,7 @@ function holder() {
   const pill = $("#holder");
   const who = store.state?.controller ?? null;
   const mine = isMe(who);
+  if (mine) for (const n of $$("#notes .note")) if (n.dataset.key?.endsWith(TOOK)) n.remove();
   // Without the twin nobody knows who may; with it the next state says.
   pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
   setText(
@@ -112,6 +113,8 @@ function release(s) {
   reset.hidden = $("#emergency").hidden = stop === null;
   if (stop !== null) setText($("#emergency-what"), stopped(s));
   document.body.dataset.down = String(stop !== null);
+  for (const id of ["#mains", "#axes"]) $(id).inert = stop !== null;
+  $("#move-down").hidden = stop === null;
   $button("#xrays-off").hidden = stop === null || !s.tube.on;
   if (stop === shown) return;
   shown = stop;

@@ -4,7 +4,7 @@
 // is displaced and with a reconstruction that believes it displaced: so nothing is bent.
 import { $, clicks, el, fixed, setText, words } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
-import { beliefWords } from "./belief.js";
+import { beliefWords, MEANS, unit } from "./belief.js";
 import { apply } from "./calibrate.js";
 import { folder } from "./data.js";
 import { isOver } from "./job_words.js";
@@ -28,17 +28,14 @@ const NOT_BEGUN = "The scan did not begin: the note says why.";
 const FREE = ["dO_x", "dO_y", "dO_z", "alpha", "tau_x", "tau_z", "det_roll"];
 
 /**
- * Offset -> what it is, its unit, the largest and the first value of its slider, what it
- * does to a volume.
- * @typedef {[what: string, unit: string, most: number, first: number, does: string]} Offset
+ * Offset -> the largest and the first value of its slider, what it does to a volume.
+ * @type {Record<string, [most: number, first: number, does: string]>}
  */
-
-/** @type {Record<string, Offset>} */
 const BELIEFS = {
-  dO_x: ["axis aside", "mm", 1, 0.5, "edges double, balls become arcs"],
-  det_roll: ["panel rolled", "°", 3, 1, "slices shear, worse away from the middle"],
-  det_pitch: ["panel tilted", "°", 5, 0, "slices blur with their height"],
-  dS_x: ["source aside", "mm", 1, 0, "edges double, as of the axis"],
+  dO_x: [1, 0.5, "edges double, balls become arcs"],
+  det_roll: [3, 1, "slices shear, worse away from the middle"],
+  det_pitch: [5, 0, "slices blur with their height"],
+  dS_x: [1, 0, "edges double, as of the axis"],
 };
 
 /** @type {Array<[id: string, button: string, says: string]>} */
@@ -105,16 +102,16 @@ const card = el(
   "details",
   { class: "card", id: "story" },
   el("summary", {}, "Misalign: what a wrong geometry does, in five steps"),
-  ...Object.entries(BELIEFS).map(([name, [what, unit, most, start, does]]) =>
+  ...Object.entries(BELIEFS).map(([name, [most, start, does]]) =>
     el(
       "div",
       { title: does },
       el(
         "label",
         { for: `story-${name}` },
-        `${what} `,
+        `${MEANS[name]} `,
         el("output", { id: `story-${name}-is`, class: "mono" }),
-        ` ${unit}`,
+        ` ${unit(name)}`,
       ),
       el("input", {
         type: "range",
@@ -276,9 +273,10 @@ async function look(scanned) {
 /** What the beads say beside what the sliders said when the geometry was bent. */
 function tell() {
   if (!told.found) return;
-  const rows = Object.entries(BELIEFS).map(([name, [what, unit]]) => {
+  const rows = Object.keys(BELIEFS).map((name) => {
     const found = /** @type {Found | undefined} */ (told.parameters[name]);
-    return el("div", {}, beliefWords(what, unit, told.believed[name], found));
+    const words = beliefWords(MEANS[name] ?? name, unit(name), told.believed[name], found);
+    return el("div", {}, words);
   });
   $("#story-found").replaceChildren(...rows);
 }

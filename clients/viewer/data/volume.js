@@ -141,6 +141,7 @@ function forget() {
   $("#volume-beside").hidden = true;
   for (const id of [".slices", "#volume-tools", "#volume-large"]) $(id).hidden = true;
   $("#volume-compared").textContent = "";
+  setText($("#volume-verdict"), "");
   offer(["volume"]);
   large(false);
 }
@@ -558,6 +559,24 @@ export function table(rows) {
 function compared(rows) {
   if ($("#volume-compared").childElementCount) return;
   $("#volume-compared").replaceChildren(table(rows));
+  setText($("#volume-verdict"), verdict(Object.values(rows)[0]));
+}
+
+/**
+ * How near a volume is to its truth, in one line.
+ * @param {Figures} of
+ * @returns {string}
+ */
+function verdict({ attenuation: [seen, true_mu], x_mm, y_mm, z_mm, rms }) {
+  const known = seen !== null && true_mu ? 100 * (seen / true_mu - 1) : null;
+  const off =
+    known === null ? "" : `attenuation ${known < 0 ? "−" : "+"}${fixed(Math.abs(known), 1)} %`;
+  const sizes = [x_mm, y_mm, z_mm].flatMap(([a, b]) =>
+    a === null || b === null ? [] : [Math.abs(a - b)],
+  );
+  const size = sizes.length ? `sizes within ${fixed(Math.max(...sizes), 2)} mm` : "";
+  const told = [off, size, `rms ${fixed(rms, 5)} /mm`].filter(Boolean);
+  return `Beside the truth: ${told.join(", ")}.`;
 }
 
 /**

@@ -22,6 +22,8 @@ from flexdt.twin.machine.description import Machine
 SCREEN: Any = {"thickness_units": "screen"}
 """Lines have a width in pixels."""
 GHOST = (60, 130, 255)
+AROUND_MM = 2.0
+"""A ghost is so much larger on each side that none of its faces lies in one of the part now."""
 PATH = (90, 120, 255)
 HOME = "/object/plan"
 """The node that holds the paths in all scenes: one switch for all of them."""
@@ -50,7 +52,7 @@ class PlanDrawing:
 
         Made at the first call, moved later; bodies that no axis moves are left out.
         Positions of axes that are not given are 0. The meshes are the bare collision
-        bodies, blue and translucent.
+        bodies, a little larger, blue and translucent.
 
         Args:
             clients: that get the ghost.
@@ -68,6 +70,9 @@ class PlanDrawing:
                     handle = client.scene.get_handle_by_name(name)
                     if handle is None:
                         vertices, faces = plain(bare(body.solid))
+                        vertices = vertices + np.sign(
+                            vertices - 0.5 * (vertices.min(0) + vertices.max(0))
+                        ) * np.float32(AROUND_MM * MM)
                         client.scene.add_mesh_simple(
                             name,
                             vertices,

@@ -33,6 +33,8 @@ MAX_LOOKS: Final = 8
 MAX_FACES: Final = 200_000
 DEFAULT_MATERIAL: Final = "abs"
 HAND_MM: Final = 50.0
+SAME_VOLUME: Final = 1e-6
+"""Rounding of a volume of a mesh, relative."""
 """Radius of the ball that is looked at on an empty stage."""
 Key = tuple[str | None, str | None, str | None]
 Ask = Callable[[str, Mapping[str, Any]], Awaitable[object]]
@@ -164,7 +166,7 @@ def _skins(phantom: Phantom) -> SampleLook:
     """Make a phantom's look: one skin for each material, smooth up to a number of
     triangles.
 
-    Holes are turned inside out; steel among other materials is marked as dense. Meshes of
+    Holes are open (`_with_holes`); steel among other materials is marked as dense. Meshes of
     more than `MAX_FACES` triangles are not smoothed. Skins are in order of their
     materials' first part; unknown materials have `OTHER_COLOR`. Names have _ in place of
     other characters than letters and digits.
@@ -172,16 +174,12 @@ def _skins(phantom: Phantom) -> SampleLook:
     Args:
         phantom: with parts and beads.
     """
-    groups: dict[str, list[trimesh.Trimesh]] = {}
+    groups: dict[str, tuple[list[trimesh.Trimesh], list[trimesh.Trimesh]]] = {}
     for part in phantom.parts():
-        mesh = part.mesh
-        if part.hole:
-            mesh = mesh.copy()
-            mesh.invert()
-        groups.setdefault(part.material, []).append(mesh)
+        groups.setdefault(part.material, ([], []))[part.hole].append(part.mesh)
     skins = []
-    for material, meshes in groups.items():
-        mesh = cast("trimesh.Trimesh", trimesh.util.concatenate(meshes))
+    for material, (bodies, holes) in groups.items():
+        mesh = _with_holes(bodies, holes)
         if len(mesh.faces) <= MAX_FACES:
             mesh = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_RAD)
         vertices, faces = plain(mesh)
@@ -191,6 +189,28 @@ def _skins(phantom: Phantom) -> SampleLook:
         color = (named and named.color) or OTHER_COLOR
         skins.append(Skin(name, vertices, faces, color, dense))
     return SampleLook(tuple(skins), np.asarray(phantom.beads))
+
+
+def _with_holes(
+    bodies: list[trimesh.Trimesh], holes: list[trimesh.Trimesh]
+) -> trimesh.Trimesh:
+    """Join bodies of one material, without their holes.
+
+    Where bodies overlap, or one stands in another's hole, there is no such body: all surfaces are
+    joined then, holes turned inside out.
+    """
+    turned = [hole.copy() for hole in holes]
+    for hole in turned:
+        hole.invert()
+    joined = cast("trimesh.Trimesh", trimesh.util.concatenate([*bodies, *turned]))
+    if not holes or not bodies:
+        return joined
+    body = trimesh.util.concatenate(bodies)
+    with suppress(ValueError):  # a mesh that is not closed
+        cut = trimesh.boolean.difference([body, *holes], engine="manifold")
+        if abs(cut.volume - joined.volume) < SAME_VOLUME * joined.volume:
+            return cast("trimesh.Trimesh", cut)
+    return joined
 
 
 def _box(sample: SampleState) -> SampleLook:
