@@ -35,6 +35,7 @@ from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
 from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
 from flexdt.runtime.log import log, traced
+from flexdt.twin.geometry.conventions import FloatArray
 
 MAX_NOTES: Final = 1000
 MAX_ASKED: Final = 64
@@ -109,6 +110,8 @@ class Page:
         self.fine = True
         """Whether the page has reported that a graphics processor draws; True before."""
         self.shown = Shown()
+        self.covered: dict[str, FloatArray] = {}
+        """View -> boxes (n, 4) that the page lays over it [px]."""
         self.plan: Any = None
         self.orbit: Any = None
         """The focal spot's path over the plan, for later scenes of this page."""

@@ -126,13 +126,13 @@ class SceneClients:
         clients = self._server.get_clients()
         return [clients[i] for i in ids if i in clients]
 
-    def with_names(self) -> list[tuple[viser.ClientHandle, str]]:
-        """List the clients whose views have names, with their pages: the beam's eye
-        shows pixels."""
+    def with_names(self) -> list[tuple[viser.ClientHandle, str, str]]:
+        """List the clients whose views have names, with their pages and views: the beam's
+        eye shows pixels."""
         with self._lock:
-            whose = {i: w.page for i, w in self._who.items() if w.view != "beam"}
+            whose = [(i, w) for i, w in self._who.items() if w.view != "beam"]
         clients = self._server.get_clients()
-        return [(clients[i], page) for i, page in whose.items() if i in clients]
+        return [(clients[i], w.page, w.view) for i, w in whose if i in clients]
 
     def show(self, page: str, nodes: Nodes, plain: Nodes, built: int) -> None:
         """Set the nodes of a page's frames, from one thread only.

@@ -78,6 +78,8 @@ DISTANCE_DIGITS: Final = 6
 """Decimals of the distances of a composed script [mm]."""
 MIN_DIFFERENCE: Final = 0.01
 """Least difference of two positions that are not the same [mm, deg]."""
+MAX_COVERED: Final = 16
+"""Largest number of boxes over a view."""
 MAX_SHARED: Final = 2
 """Largest number of pictures and exports at a time, for all pages: each may take
 hundreds of megabytes."""
@@ -114,6 +116,16 @@ class Camera(Params):
 
     view: View = "free"
     sample: bool = False
+
+
+Px = Annotated[float, Ge(-1e5), Le(1e5)]
+
+
+class Covered(Params):
+    """Boxes that the page lays over a view: left, top, right, bottom [px, from its upper left]."""
+
+    view: View
+    boxes: Annotated[list[tuple[Px, Px, Px, Px]], Len(0, MAX_COVERED)]
 
 
 class Preset(Params):
@@ -310,6 +322,12 @@ async def camera(viewer: Viewer, page: Page, params: Camera) -> object:
         )
     else:
         viewer.clients.reset(page.id, params.view)
+    return {}
+
+
+async def covered(viewer: Viewer, page: Page, params: Covered) -> object:
+    """Note what lies over a view of this page, where no name is put; returns {}."""
+    page.covered[params.view] = np.array(params.boxes).reshape(-1, 4)
     return {}
 
 
@@ -961,6 +979,7 @@ METHODS: Mapping[str, tuple[type[Params], Answer]] = {
     "viewer.person": (Person, person),
     "viewer.theme": (Theme, theme),
     "viewer.camera": (Camera, camera),
+    "viewer.covered": (Covered, covered),
     "viewer.preset": (Preset, preset),
     "viewer.feed": (Feed, feed),
     "viewer.window": (Window, window),

@@ -34,7 +34,7 @@ from flexdt.clients.viewer.page_words import of_volume
 from flexdt.clients.viewer.scenes import sample_looks, views
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import Shown
-from flexdt.clients.viewer.scenes.name_tags import NameTags
+from flexdt.clients.viewer.scenes.name_tags import NO_BOXES, NameTags
 from flexdt.clients.viewer.scenes.sample_looks import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.stage_volume import (
     MadeOf,
@@ -347,12 +347,14 @@ class Viewer:
                 before = world
                 self.show_volumes()
                 self.show_layers()
-                for client, id in self.clients.with_names():
+                for client, id, view in self.clients.with_names():
                     named = lab.named(world, self._shown_by(id))
+                    page = self.pages.get(id)
+                    over = NO_BOXES if page is None else page.covered.get(view, NO_BOXES)
                     with contextlib.suppress(
                         AssertionError, KeyError
                     ):  # it has just come or gone
-                        await asyncio.to_thread(self.tags.draw, client, named)
+                        await asyncio.to_thread(self.tags.draw, client, named, over)
 
     def show_layers(self) -> None:
         """Set the nodes that each page shows in its frames, as soon as they have

@@ -212,6 +212,7 @@ def open_page(
         size: tuple[int, int] = (1280, 800),
         notes_stay: bool = True,
         fresh: bool = False,
+        script: str = "",
         **query: object,
     ) -> Any:
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
@@ -221,6 +222,8 @@ def open_page(
         if not fresh:
             page.add_init_script(KNOWN_HERE)
             page.add_init_script(TOOLS_OPEN)
+        if script:
+            page.add_init_script(script)
         if notes_stay:
             page.add_init_script(NOTES_STAY)
         given = {"view": view, "theme": "light", "patience": PATIENCE_S, **query}

@@ -374,6 +374,10 @@ def test_a_slim_or_flat_region_keeps_the_film_in_bounds(
     finally:
         page.mouse.move(1, 1)
         page.evaluate("roi => flexdt.call('camera.set', {roi})", list(before))
+        full = [(before[3] - before[1] + 1) // 2, (before[2] - before[0] + 1) // 2]
+        page.wait_for_function(
+            "f => flexdt.store.image.full.join() === f.join()", arg=full
+        )
 
 
 def test_zoom_to_pixels_and_a_window_in_order(page: Any, wait: Wait) -> None:

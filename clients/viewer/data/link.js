@@ -237,13 +237,17 @@ export function rename(name) {
   // Without a connection the next one brings it.
   void call("viewer.person", { name: name.trim() }).catch(() => null);
 }
+/** @param {string | null | undefined} name */
+const numberOf = (name) => /#\d+$/.exec(name ?? "")?.[0];
 /**
  * Whether a name is or was this page's in its session with the twin: what was told under a former
- * name is still of the same person.
+ * name is still of the same person, and so is a state that comes before the news of a new one.
  * @param {string | null | undefined} name
  * @returns {boolean}
  */
-export const isMe = (name) => name != null && names.has(name);
+export const isMe = (name) =>
+  name != null &&
+  (names.has(name) || (!!numberOf(name) && numberOf(name) === numberOf(store.session)));
 /** @type {Set<string>} */
 const names = new Set();
 export function connect() {

@@ -2,7 +2,7 @@
 import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
-/** @import { View } from "../web/viewer.d.ts" */
+/** @import { Four, View } from "../web/viewer.d.ts" */
 
 /** @type {Record<View, string>} */
 const NAMES = {
@@ -102,6 +102,7 @@ function frame(view) {
       title: "Back to this view's preset",
       onclick: () => {
         box.classList.remove("near");
+        tellCovered();
         return call("viewer.camera", { view });
       },
     },
@@ -115,6 +116,7 @@ function frame(view) {
     posed = ""; // a busy viewer has none: it is asked again
   });
   sample.addEventListener("load", () => {
+    if (sample.hidden) tellCovered();
     sample.hidden = false;
   });
   box.append(
@@ -129,8 +131,38 @@ function frame(view) {
  */
 function closer(view) {
   open.get(view)?.box.classList.add("near");
+  tellCovered();
   return call("viewer.camera", { view, sample: true }).catch(() => {});
 }
+
+/** What lies over each view's picture, for its viewer: no name is put there. */
+function tellCovered() {
+  requestAnimationFrame(() => {
+    for (const [view, { box }] of open) {
+      const at = box.getBoundingClientRect();
+      const over = [...box.querySelectorAll(":scope > .tag, :scope > button")]
+        .filter((node) => getComputedStyle(node).visibility === "visible")
+        .map((node) => node.getBoundingClientRect());
+      /** @type {Four[]} */
+      const boxes = over.map((o) => [
+        o.left - at.left,
+        o.top - at.top,
+        o.right - at.left,
+        o.bottom - at.top,
+      ]);
+      const told = JSON.stringify(boxes);
+      if (box.isConnected && box.dataset.covered !== told) {
+        box.dataset.covered = told;
+        call("viewer.covered", { view, boxes }).catch(() => delete box.dataset.covered);
+      }
+    }
+  });
+}
+const resized = new ResizeObserver(tellCovered);
+on("open", () => {
+  for (const { box } of open.values()) delete box.dataset.covered; // a viewer that is new
+  tellCovered();
+});
 export function nearSample() {
   for (const view of open.keys()) if (view !== "beam") void closer(view);
 }
@@ -240,6 +272,7 @@ export function layout(asked, step = false) {
     const parts = open.get(view) ?? frame(view);
     open.set(view, parts);
     if (!parts.box.isConnected) views.append(parts.box);
+    resized.observe(parts.box);
   }
   for (const [view, parts] of open) if (!parts.iframe.src) void start(parts, view);
   for (const button of $$("#view-switch button"))

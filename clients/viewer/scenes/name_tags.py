@@ -33,33 +33,16 @@ PAD_PX = 10.0
 LEAST_PX = 260
 """Least width of a view with names [px]."""
 LEADER: Final = (40, 150, 235)
-NOTHING: Final = np.zeros((0, 4))
+NO_BOXES: Final = np.zeros((0, 4))
 Name = tuple[str, FloatArray]
 """Words, and the point (3,) that they name [m, world]."""
-
-
-def covered_by_page(area: tuple[float, float]) -> FloatArray:
-    """List the boxes (3, 4) of a view that the page lays over its picture: its title, its
-    buttons, and the sample close up; left, top, right, bottom [px].
-
-    As style.css places them (.view .tag, button, .inset).
-
-    >>> covered_by_page((600.0, 400.0))[2].tolist()
-    [458.0, 258.0, 590.0, 390.0]"""
-    width, height = area
-    side = max(84.0, min(0.33 * height, 0.46 * width))
-    return np.array([
-        [0.0, 0.0, 110.0, 38.0],
-        [width - 84.0, 0.0, width, 38.0],
-        [width - 10.0 - side, height - 10.0 - side, width - 10.0, height - 10.0],
-    ])  # fmt: skip
 
 
 def laid_out(
     anchors: FloatArray,
     sizes: FloatArray,
     area: tuple[float, float],
-    taken: FloatArray = NOTHING,
+    taken: FloatArray = NO_BOXES,
 ) -> FloatArray:
     """Place the names' boxes.
 
@@ -172,7 +155,9 @@ class NameTags:
         self._drawn: dict[int, tuple[str, set[str]]] = {}
         """Client -> what its names were placed for, and the words that are drawn."""
 
-    def draw(self, client: viser.ClientHandle, names: Sequence[Name]) -> None:
+    def draw(
+        self, client: viser.ClientHandle, names: Sequence[Name], covered: FloatArray
+    ) -> None:
         """Put the names where they have room now; nothing is sent while nothing has
         moved.
 
@@ -184,6 +169,8 @@ class NameTags:
         Args:
             client: with its camera.
             names: words and points [m, world].
+            covered: boxes (m, 4) that its page lays over the picture: left, top, right,
+                bottom [px].
         """
         camera = client.camera
         area = float(camera.image_width), float(camera.image_height)
@@ -200,6 +187,7 @@ class NameTags:
             eye.round(4),
             axes.round(4),
             [(w, p.round(4)) for w, p in names],
+            covered.round(0),
         ]
         before, drawn = self._drawn.get(client.client_id, ("", set()))
         if before == (seen := str(key)):
@@ -214,7 +202,7 @@ class NameTags:
             [[PAD_PX + LETTER_PX * len(words), LINE_PX] for words, _ in names]
         )
         sizes = sizes.reshape(-1, 2)
-        corners = laid_out(anchors, sizes, area, covered_by_page(area))
+        corners = laid_out(anchors, sizes, area, covered)
         there = np.flatnonzero(~np.isnan(corners[:, 0])).tolist()
 
         def in_space(places: FloatArray, k: int) -> FloatArray:

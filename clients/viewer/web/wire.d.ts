@@ -74,6 +74,9 @@ export type CorrectionPart = {
   sides_known?: boolean
 };
 export type CorrectionResult = { correction: Correction | null; warnings: Array<string> };
+export type Covered = {
+  view: "iso" | "beam" | "side" | "free"; boxes: Array<[number, number, number, number]>
+};
 export type DatasetGet = {
   name: string; points?: number; measure?: boolean; script?: boolean
 };
@@ -326,6 +329,7 @@ export interface Methods {
   "viewer.person": [Person, object];
   "viewer.theme": [Theme, object];
   "viewer.camera": [Camera, object];
+  "viewer.covered": [Covered, object];
   "viewer.preset": [Preset, object];
   "viewer.feed": [Feed, object];
   "viewer.window": [Window, object];
