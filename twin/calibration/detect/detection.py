@@ -31,7 +31,7 @@ FAINTEST = 0.12
 MIN_LIKENESS = 0.90
 """Smallest correlation with a ball's profile."""
 MISFIT = 0.3
-"""Largest misfit of a fitted ball, as a share of its spot's contrast."""
+"""Largest misfit of a fitted ball beyond noise, as a share of its spot's contrast."""
 BLUR_PX = 0.7
 """Assumed blur (focal spot, scintillator) where a ball is fitted to part of a spot."""
 BRIGHT_PERCENT = 99.0
@@ -439,7 +439,7 @@ def _fitted_cut(
     )
     result[kernels.X] += left
     result[kernels.Y] += top
-    if not (result[kernels.OK] > 0 and result[kernels.NOISE] < MISFIT):
+    if not (result[kernels.OK] > 0 and result[kernels.MISFIT] < MISFIT):
         return None
     if not result[kernels.SCORE] > 0.3:
         return None

@@ -128,7 +128,7 @@ def take(
     Returns:
         Indices of the used fits, in the order of `fitted`.
     """
-    good = (fits[fitted, kernels.OK] > 0) & (fits[fitted, kernels.NOISE] < MISFIT)
+    good = (fits[fitted, kernels.OK] > 0) & (fits[fitted, kernels.MISFIT] < MISFIT)
     part = fitted[~whole[fitted]]
     results[part] = fits[part]
     # Radius, peak and likeness stay those of the centroid: they judge the spot.

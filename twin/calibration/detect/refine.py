@@ -742,7 +742,7 @@ def _accept(
     good &= np.where(
         whole,
         alike & (np.abs(wide - usual) < SAME_SIZE) & (np.abs(faint) < SAME_CONTRAST),
-        results[..., kernels.NOISE] < MISFIT,
+        results[..., kernels.MISFIT] < MISFIT,
     )
     return Refined(
         np.where(good[..., None], place, np.nan),

@@ -68,6 +68,8 @@ STILL_PX = 0.02
 template leaves is of second order."""
 RIM_PX = 6.5
 """Pixels about a spot's rim that tell its background."""
+BESIDE = 0.02
+"""Share of a shadow's depth below which a pixel is beside it."""
 LEAST_PIXELS = 40
 """Least number of usable pixels of a spot."""
 
@@ -186,7 +188,7 @@ class Placed(NamedTuple):
         shift: (m, 2) from where they are rendered [px]; NaN where it is not determined.
         covariance: (m, 2, 2), by the scatter of the pixels.
         contrast: (m,) factor on that of the rendered spot.
-        misfit: (m,) what is left, as a share of the spot's shadow.
+        misfit: (m,) what is left beyond noise, as a share of the spot's shadow.
         share: (m,) part of the shadow in usable pixels.
     """
 
@@ -295,7 +297,13 @@ def _place(
     out.shift[number] = place
     out.covariance[number] = np.linalg.inv(gram)[:2, :2] * variance
     out.contrast[number] = contrast
-    out.misfit[number] = math.sqrt(np.square(left / weight).sum() / max(power, 1e-12))
+    # A count's variance is its mean; beside the shadow all that is left is noise.
+    shadow = 1.0 - lit / behind
+    beside = shadow < BESIDE * shadow.max()
+    noise2 = np.square(left[beside]).mean() if beside.any() else 0.0
+    by_noise = noise2 * np.sum(1.0 / np.square(weight))
+    foreign = max(float(np.square(left / weight).sum() - by_noise), 0.0)
+    out.misfit[number] = math.sqrt(foreign / max(power, 1e-12))
 
 
 def own_pixels(
@@ -361,7 +369,7 @@ def results_of(found: Placed, patches: Patches) -> FloatArray:
         kernels.Y: place[:, 1],
         kernels.RADIUS: patches.radii,
         kernels.PEAK: patches.peaks * found.contrast,
-        kernels.NOISE: found.misfit,
+        kernels.MISFIT: found.misfit,
         kernels.SCORE: found.share,
         kernels.VAR_X: found.covariance[:, 0, 0] + floor,
         kernels.COV_XY: found.covariance[:, 0, 1],

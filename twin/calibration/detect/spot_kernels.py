@@ -12,9 +12,9 @@ import numpy as np
 
 from flexdt.twin.projection.kernels.compiling import linked, serial
 
-X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK = range(11)
+X, Y, RADIUS, PEAK, NOISE, SCORE, BIAS, VAR_X, COV_XY, VAR_Y, OK, MISFIT = range(12)
 """Places in the result of `measure` and `fit_ball`."""
-RESULTS = 11
+RESULTS = 12
 
 PARTIAL_ERROR = 0.004
 """Error of a partial spot's place per radius and missing share (measured: 0.007 px where a
@@ -569,8 +569,9 @@ def fit_ball(  # type: ignore[no-untyped-def]
         sloped: take the background's slope from the ring round the spot; else it is
             level.
         free_radius: estimate the radius too, 0.8 to 1.25 times the given one.
-        result: filled as by `measure`; SCORE is the share of the spot used, NOISE the
-            misfit as a share of the spot's contrast.
+        result: filled as by `measure`; SCORE is the share of the spot used, NOISE what is left
+            as a share of the spot's contrast, and MISFIT the same beyond photons' noise, as the
+            ring round the spot shows it.
     """
     rows, cols = image.shape
     result[:] = 0.0
@@ -593,8 +594,8 @@ def fit_ball(  # type: ignore[no-untyped-def]
         if background(image, x0, y0, inner, outer, plane) < 0:
             plane[:] = 0.0
     x, y, scale = x0, y0, 1.0
-    used, count = 0, 0
-    total, misfit, power = 0.0, 0.0, 1.0
+    used, count, clear = 0, 0, 1.0
+    total, misfit, power, passed = 0.0, 0.0, 1.0, 0.0
     before = 1e300
     h = np.zeros((4, 4))
     g = np.zeros(4)
@@ -605,7 +606,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
         top, bottom = max(0, math.ceil(y - reach)), min(rows - 1, math.floor(y + reach))
         h[:] = 0.0
         g[:] = 0.0
-        total, misfit, power = 0.0, 0.0, 1e-12
+        total, misfit, power, passed = 0.0, 0.0, 1e-12, 0.0
         count, used = 0, 0
         clear = math.exp(-base)
         for row in range(top, bottom + 1):
@@ -637,6 +638,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
                 count += 1
                 total += r * r
                 misfit += (seen - expected) ** 2
+                passed += expected
                 power += (seen - clear) ** 2
                 if d < radius:
                     used += 1
@@ -698,6 +700,11 @@ def fit_ball(  # type: ignore[no-untyped-def]
     result[VAR_Y] = inverse[1, 1] * variance + floor
     result[X], result[Y], result[RADIUS] = x, y, radius * scale
     result[PEAK], result[NOISE] = peak, math.sqrt(misfit / power)
+    # A count's variance is its mean, and in the ring the square of the logarithm's noise is that
+    # of a count of the light there.
+    noise = background(image, x, y, 1.12 * radius + 2.5, 1.55 * radius + 4.0, plane)
+    by_noise = max(noise, 0.0) ** 2 * clear * passed
+    result[MISFIT] = math.sqrt(max(misfit - by_noise, 0.0) / power)
     result[BIAS] = 0.93  # the rim decides: between full chords (0.8) and the outline (1)
     result[SCORE] = share
     result[OK] = 1.0
