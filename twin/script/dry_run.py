@@ -7,7 +7,7 @@ beam's view and, through a function passed as an argument, collisions and cleara
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -117,7 +117,7 @@ def check_plan(
         for x in clearance.collisions:
             message = (
                 f"{x.pair[0]} and {x.pair[1]} come within the safety margin at "
-                f"{x.time_s:.3f} s"
+                f"{x.time_s:.3f} s; last free at {_moved(plan, x.last_free)}"
             )
             findings.append(error(ScriptCode.COLLISION, message, place=Place(x.line)))
     return CheckReport(
@@ -129,6 +129,13 @@ def check_plan(
         text,
         start_known,
     )
+
+
+def _moved(plan: ScanPlan, positions: Mapping[str, float]) -> str:
+    """List positions of the motors that are not where they start [mm, deg]."""
+    start = plan.start.positions
+    moved = {k: x for k, x in positions.items() if abs(x - start.get(k, x)) > 5e-4}
+    return ", ".join(f"{name} {x:.3f}" for name, x in (moved or positions).items())
 
 
 def _start_problems(plan: ScanPlan) -> list[Finding]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from difflib import SequenceMatcher
 from typing import Final
 
 from flexdt.twin.backends import backend
@@ -603,7 +604,7 @@ class _Line:
             if self.row.columns:
                 unknown = fields[0].text
             else:
-                unknown = " ".join(f.text for f in fields[:3])
+                unknown = _likest_words([f.text for f in fields], allowed)
             message = f"{name} does not know {shorten(unknown)!r}{_meant(unknown, allowed)}{knows}"
             raise _Refused(ScriptCode.UNKNOWN_COMMAND, fields[0].column, message)
         if not self._custom_form(fields):
@@ -774,6 +775,19 @@ def _find_wait(words: Sequence[Field], start: int) -> tuple[int, int]:
 def _split(field: Field) -> list[Field]:
     """Split a field into words."""
     return [Field(text, field.column) for text in field.text.split()]
+
+
+def _likest_words(words: Sequence[str], allowed: Sequence[str]) -> str:
+    """Return so many first words of a line as are likest to an allowed command."""
+    most = max((len(command.split()) for command in allowed), default=1)
+    heads = [" ".join(words[:n]) for n in range(1, min(most, len(words)) + 1)]
+
+    def likeness(head: str) -> float:
+        """Return the share of letters that a head has in common with the nearest command."""
+        same = (SequenceMatcher(None, head, one, autojunk=False) for one in allowed)
+        return max((one.ratio() for one in same), default=0.0)
+
+    return max(heads, key=likeness)
 
 
 def _meant(asked: str, allowed: Sequence[str]) -> str:

@@ -402,6 +402,9 @@ def read_report(path: Path) -> Report:
     except InputLimitError:
         raise
     except ValueError as error:
+        if path.suffix.lower() in (".html", ".htm"):
+            text = f"{path} is a report for people; give that of --report NAME.json"
+            raise CommandError(text) from None
         raise CommandError(f"{path}: not JSON: {error}") from None
     if isinstance(document, dict):
         content = document.get("correction", document)

@@ -114,10 +114,15 @@ def new(
     made = parse_machine(text, str(out))
     check_home(made, machines.profile(None, made, str(out)), str(out))
     out.write_text(text, encoding="utf-8")
+    scanner = machines.machine(base)
+    zero = machines.profile(None, scanner, base)
+    offsets = ""
+    if scanner.default_profile:
+        offsets = f" but for the zero offsets, which are 0 and not those of {zero.name}"
     least = f", the tube's least voltage ({made.tube.min_kV:g} kV) included"
     yield {"file": str(out), "text": text}
     yield (
-        f"{out}: {len(text.splitlines())} lines; everything else as in {base}"
+        f"{out}: {len(text.splitlines())} lines; everything else as in {base}{offsets}"
         f"{least if answers.min_kV is None else ''}; see: flexdt machine show {out}"
     )
 

@@ -473,11 +473,14 @@ def sample(
                     file, unit=in_unit, place=place, material=material
                 )
             now = client.set_sample(file=sent.name)
+            every = client.samples().samples
+            what = f" ({next(one.description for one in every if one.name == sent.name)})"
         else:
             now = _named_sample(client, name)
+            what = ""
     warn(now.warnings)
     yield now
-    yield f"on the stage: {now.sample.name or 'nothing'}"
+    yield f"on the stage: {now.sample.name or 'nothing'}{what}"
 
 
 def _named_sample(client: TwinClient, name: str) -> SampleResult:

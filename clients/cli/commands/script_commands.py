@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import typer
 
@@ -19,6 +20,10 @@ from flexdt.library.failure import CommandError
 
 Kind = Literal["fly", "step", "tiled", "helical", "calibration"]
 """Kinds of `compose.Kind`, which is not imported to keep the help fast."""
+FRAMES: Final = 361
+USUAL_FRAMES: Final[Mapping[Kind, int]] = {"calibration": 91}
+"""Kind of script -> images of a turn, where that is not `FRAMES`: a phantom limits a calibration,
+not its images."""
 
 
 def new(
@@ -26,7 +31,7 @@ def new(
     file: Path | None = option(None, "--out", metavar="FILE", written=True),
     sod: float | None = option(None, metavar="MM"),
     sdd: float | None = option(None, metavar="MM"),
-    frames: int = option(361),
+    frames: int | None = option(None),
     exposure: float | None = option(None, metavar="MS"),
     averages: int = option(1),
     position: list[str] | None = option(None, metavar="SOD[:LATERAL]"),
@@ -47,7 +52,7 @@ def new(
         file: Write to this file; default: standard output.
         sod: Set this distance; default: 600 and 1059, or the machine's.
         sdd: Set this distance; default: 600 and 1059, or the machine's.
-        frames: Take so many images in a turn, or in all.
+        frames: Take so many images in a turn, or in all; default: 361, or 91 of a phantom.
         exposure: Expose each image so long; default: 100, or as near as the camera gets.
         averages: Average so many read-outs in an image.
         position: Put a calibration scan there; once for each scan.
@@ -78,7 +83,7 @@ def new(
         sod_mm=sod,
         sdd_mm=sdd,
         height_mm=chosen(ScriptNewSettings).height,
-        frames=frames,
+        frames=USUAL_FRAMES.get(kind, FRAMES) if frames is None else frames,
         exposure_ms=exposure,
         averages=averages,
         kV=kv,

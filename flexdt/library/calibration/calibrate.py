@@ -792,7 +792,9 @@ def next_commands(result: Calibration, typed: Typed) -> list[str]:
         if moving.advice.per_frame:
             follow = list(settling_commands(moving, typed, free))
             return [*follow, typed.use()] if sharp else follow
-    if sharp and not limited:
+    distances = np.concatenate([scan.poses.sod for scan in result.scans])
+    placed = distances.min() <= math.sqrt(SECOND_SOD_RATIO) * distances.max()
+    if sharp and (placed or not limited):
         return [typed.use()]
     sod = float(result.scans[0].poses.sod.mean())
     both = typed.command(data=("PLACE-1", "PLACE-2"))

@@ -11,6 +11,7 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import scanner_messages as p
 from flexdt.protocol.rpc_errors import busy
 from flexdt.server.storage.sample_uploads import UploadHead
+from flexdt.server.storage.stored_samples import sample_material
 from flexdt.server.twin.core import TwinServer
 from flexdt.server.twin.handlers import handler as h
 from flexdt.twin.errors import LimitError, UnknownNameError
@@ -307,7 +308,9 @@ def _sample_info(
 
 def _upload_info(head: UploadHead) -> p.SampleInfo:
     """Describe an upload without reading it: name, kind, format and bytes; no size in mm."""
-    what = f"{head.format} {head.kind}, {head.total} bytes"
+    material = sample_material(head, None)
+    of = "" if material is None else f" of {material}"
+    what = f"{head.format} {head.kind}{of}, {head.total} bytes"
     return p.SampleInfo(name=head.name, kind=head.kind, description=what, uploaded=True)
 
 
