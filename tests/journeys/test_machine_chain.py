@@ -138,7 +138,7 @@ def assert_beads_in_volume(outcome: Outcome, root: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHAINED)
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 def test_a_shipped_machine_goes_through_the_chain_at_its_own_defaults(
     name: str, tmp_path: Path
 ) -> None:

@@ -112,7 +112,7 @@ def test_images(kind: str, priors: Given | None) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
+@pytest.mark.campaign
 def test_what_causes_leave_open_is_forecast() -> None:
     """Of eight drawn scans with all causes looked for: the median of stated over forecast
     sigmas. What each leaves open depends on how far its own phantom is strained."""

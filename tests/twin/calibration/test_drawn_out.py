@@ -7,7 +7,7 @@ import pytest
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
+@pytest.mark.campaign
 def test_an_exposure_of_more_than_a_step_is_followed_where_half_the_shadows_are_long() -> (
     None
 ):

@@ -103,7 +103,7 @@ def test_gaps_behind_natural_objects_are_named(kind: str, seed: int) -> None:
         ("foam", 6101),
     ],
 )
-@pytest.mark.campaign(1)
+@pytest.mark.campaign
 def test_gaps_that_the_mean_shows_are_named(kind: str, seed: int) -> None:
     """At the rim of what turns; behind a wall that turns back there, refused as two gaps; in
     the wall of a neck, and five columns from the axis, left open; and where nothing is seen
@@ -155,5 +155,6 @@ def test_both_ends_of_rays_find_the_column_from_two_pixels_away(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_fans_of_wires_that_harden_the_beam_are_within_their_sigma() -> None:
     assert natural_objects.main(["--fans", "--count", "8", "--seed", "1"]) == 0

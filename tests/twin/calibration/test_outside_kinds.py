@@ -14,7 +14,7 @@ from outside_kinds import FAR_SIGMAS, KINDS, MOVING, drawn, scored
 
 
 @pytest.mark.daily(3)
-@pytest.mark.campaign(6)
+@pytest.mark.campaign(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_offered_of_a_strange_cause_holds(kind: str) -> None:
     found = scored(kind, 3)

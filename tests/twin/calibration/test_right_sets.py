@@ -99,7 +99,7 @@ def test_what_widens_the_estimates_widens_every_rival(plain: Certificate) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(4)
+@pytest.mark.campaign
 @pytest.mark.parametrize("kind", ["as_assumed", "with_causes"])
 def test_regions_contain_as_many_truths_as_they_say(kind: str) -> None:
     """A region of 1.3 times its size fails: 37 of 40 truths are in the 50 % region then."""

@@ -153,7 +153,7 @@ def test_the_order_is_left_open_of_a_round_body() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
+@pytest.mark.campaign
 @pytest.mark.parametrize("seed", [31, 32])
 def test_the_study_in_its_short_form(seed: int) -> None:
     """Drawn scans that chose no constant."""
