@@ -216,8 +216,8 @@ def warm_up_forward() -> None:
 
 
 def warm_up_back() -> None:
-    """Run `back` on tiny problems, into new memory, with rays in fans and alone, so that
-    its kernels are compiled; the same for adding a volume of another order."""
+    """Compile the kernels of `back` by tiny problems: rays in fans, single rays, and adding a
+    volume that is stored in another order of axes."""
     images = np.ones((1, 5, 6), np.float32)
     for volume in _tiny_volumes():
         back(images, END_ON_VIEW, volume)

@@ -204,18 +204,15 @@ def has_room(needed: int) -> bool:
 
 
 def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0) -> bool:
-    """Return whether a device has room for voxels and one portion of images, and is
-    likely faster.
-
-    Voxels that are to be moved pay from `VIEWS_A_THREAD` views a thread on; the views
-    before count for voxels of at least `WORTH_BYTES`.
+    """Return whether a device is there, has room for the voxels and one portion of images and,
+    if voxels must be moved to it, has at least `VIEWS_A_THREAD` views for each thread to do;
+    the views before count, too, for voxels of at least `WORTH_BYTES`.
 
     Args:
         voxel_bytes: size of the voxels to be moved there; 0 for voxels on the device.
         images: (n, rows, cols).
         threads: number of threads of the processor.
-        before: number of views of the same voxels that the processor has projected. More
-            are then likely: the volume is moved once these would have paid for it.
+        before: number of views of the same voxels that the processor has projected.
     """
     views = len(images) + (before if voxel_bytes >= WORTH_BYTES else 0)
     if not availability().present or (voxel_bytes and views < VIEWS_A_THREAD * threads):

@@ -131,21 +131,8 @@ def start(name: str, more: Sequence[str]) -> None:
 
 
 def _check(given: Mapping[str, Any], named: Sequence[str]) -> None:
-    """Check options against each other, and names and folders by themselves.
-
-    TLS needs certificate and key together; a projector's address and port exclude each
-    other.
-
-    Args:
-        given: option -> value.
-        named: options whose values are checked by themselves, where there are such
-            options.
-
-    Raises:
-        typer.BadParameter: options that do not go together.
-        TwinError: an unknown name, or a file that does not hold.
-        OSError: the data folder cannot be written.
-    """
+    """Refuse options that need or exclude each other, then what `require_startable` refuses
+    of those in `named`."""
     if (given.get("tls_cert") is None) != (given.get("tls_key") is None):
         raise typer.BadParameter("--tls-cert and --tls-key go together")
     if given.get("projector") is not None and given["projector_port"] is not None:

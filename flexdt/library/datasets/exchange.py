@@ -355,8 +355,8 @@ def _json(path: Path, given: Given) -> ScanGeometry:
 
 
 def format_of_ending(path: Path, among: Iterable[Format]) -> str:
-    """Return the name of the format with a file's ending, in either case; the first of
-    `OWN_ENDINGS`, flexdt's own, matches none.
+    """Return the name of the format with a file's ending, in either case; .json is flexdt's own
+    document, which callers read first, and matches none.
 
     Args:
         path: file.

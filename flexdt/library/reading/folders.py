@@ -394,8 +394,8 @@ def _by_pattern(content: Folder, names: Sequence[str], pattern: str) -> Referenc
 
 
 def _frame_names(names: Sequence[str], frames: str | None, others: Set[str]) -> list[str]:
-    """List the names that match a pattern, or those of the first image format of which there
-    are some beside the dark and flat images."""
+    """List the names that match `frames`; if it is None, all of the first image format with a
+    name that is not in `others`, whose own names the caller removes."""
     if frames is not None:
         return matching(names, frames)
     for form in IMAGE_FORMATS:

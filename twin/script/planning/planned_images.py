@@ -148,9 +148,9 @@ def _averages(
 ) -> tuple[int, str] | None:
     """Infer the number of averages, and how.
 
-    From the period of an image: the length over the steps, if there are two frames or more and a
-    positive length, else from the run-up less the way to full speed, which covers
-    `MARGIN_IMAGES` images.
+    It is the period of an image over its exposure. The period is the length over the steps and
+    the speed or, with fewer than two frames or no length, the run-up less the way to full speed,
+    over `MARGIN_IMAGES` and the speed.
 
     Args:
         trigger: of the sequence, with its motion.
