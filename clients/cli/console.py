@@ -47,6 +47,13 @@ def speak(quiet: bool, verbose: bool) -> None:
             logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s")
 
 
+def speaks() -> bool:
+    """Return whether `--verbose` was asked for."""
+    import logging
+
+    return logging.getLogger("flexdt.progress").level == logging.INFO
+
+
 def printable() -> None:
     """Set the terminal's streams to write unknown characters as escapes, without an error.
 

@@ -39,6 +39,8 @@ def test_the_text_says_what_is_assumed(
     shot = "tube\txrayon\t\t\tACK\t\t\r\ncamera\ttake image\t\t\tACK\t\t\r\n"
     path.write_text(GOOD + shot + "camera\tsave image\tscan_0.tif\t\tACK\t\t\r\n")
     assert run(["check", str(path)]) == 0
+    assert len(capsys.readouterr().out.splitlines()) <= 25
+    assert run(["check", "-v", str(path)]) == 0
     captured = capsys.readouterr()
     assert "nothing moves ver_tube, ver_det, tra_tube, tra_det, mag_det" in captured.err
     rows = captured.out.splitlines()

@@ -4,7 +4,7 @@ its log."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import typer
 
@@ -16,7 +16,7 @@ from flexdt.clients.cli.commands.script_files import (
     read_log_file,
     tell,
 )
-from flexdt.clients.cli.console import table
+from flexdt.clients.cli.console import speaks, table
 from flexdt.clients.cli.options import Answer, option
 from flexdt.library import machines
 from flexdt.library.failure import CommandError
@@ -24,6 +24,9 @@ from flexdt.runtime.files.limited_files import limited_bytes
 
 if TYPE_CHECKING:
     from flexdt.twin.script import CheckReport
+
+MAX_STEPS: Final = 8
+"""Steps of a plan that are listed unasked: with the summary, a screen of 25 lines."""
 
 
 def check(
@@ -129,8 +132,9 @@ def compare(script: Path, log: Path, machine: str | None, html: Path | None) -> 
 def show(report: CheckReport, file: str) -> Answer:
     """Yield the plan and the figures of a check.
 
-    Yields the table of steps, if any, the summary, and "ok" or "not ok". Times are in
-    [s]; a cell without an assumed time is empty.
+    Yields the table of steps, or their number where they are more than `MAX_STEPS` and
+    `--verbose` is not given, the summary, and "ok" or "not ok". Times are in [s]; a cell
+    without an assumed time is empty.
 
     Args:
         report: of the check.
@@ -151,7 +155,9 @@ def show(report: CheckReport, file: str) -> Answer:
         )
         for s in report.plan.steps
     ]
-    if steps:
+    if len(steps) > MAX_STEPS and not speaks():
+        yield f"{len(steps)} steps, of lines {steps[0][0]} to {steps[-1][0]}: -v lists them\n"
+    elif steps:
         head = (
             "line",
             "start [s]",
