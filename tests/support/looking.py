@@ -29,16 +29,16 @@ USUAL = {"mode": "HW2SW1High", "roi": (32, 8, 1943, 1527)}
 
 
 def until(condition: Callable[[], Any], what: str = "", seconds: float = 120.0) -> Any:
-    """The first true value of `condition`."""
-    deadline = time.monotonic() + seconds
+    """The first true value of `condition`, asked for less often the longer it takes: a look into
+    a page costs four processes some milliseconds."""
+    begun = time.monotonic()
     while True:
         value = condition()
         if value:
             return value
-        assert time.monotonic() < deadline, (
-            f"not within {seconds:g} s: {what or condition}"
-        )
-        time.sleep(0.03)
+        waited = time.monotonic() - begun
+        assert waited < seconds, f"not within {seconds:g} s: {what or condition}"
+        time.sleep(min(0.3, max(0.03, 0.05 * waited)))
 
 
 def seen(page: Any, twin: TwinClient) -> None:

@@ -60,7 +60,7 @@ def counted(four: Any, distance_mm: float, on: bool) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("distance_mm", DISTANCES_MM)
-@pytest.mark.campaign(1)
+@pytest.mark.campaign
 def test_x_rays_never_hide_the_sample(
     four: Any, twin: TwinClient, wait: Wait, distance_mm: float
 ) -> None:

@@ -61,7 +61,7 @@ def opened(browser: Any, url: str) -> Iterator[Any]:
 
 
 @pytest.mark.timeout(900)
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 @pytest.mark.parametrize(
     ("host_kept", "stripped"),
     [(True, True), (True, False), (False, False), (False, True)],
@@ -92,6 +92,7 @@ def test_the_page_works_below_a_path(
 
 
 @pytest.mark.timeout(900)
+@pytest.mark.campaign
 def test_a_scan_is_reconstructed_below_a_path(
     browser: Any, lab: Any, twin: TwinClient
 ) -> None:

@@ -40,6 +40,7 @@ def put(twin: TwinClient, sample: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_a_volume_of_one_visitor_does_not_stand_in_the_scene_of_the_other(
     open_page: Callable[..., Any], twin: TwinClient
 ) -> None:

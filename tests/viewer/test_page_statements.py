@@ -250,6 +250,7 @@ def test_no_statement_of_the_page_contradicts_the_wire(
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 def test_an_abort_of_somebody_else_and_a_hung_projector(
     page: Any, lab: Lab, small: None, twin: TwinClient
 ) -> None:

@@ -69,6 +69,7 @@ def scanned(page: Any, twin: TwinClient, wait: Wait, frames: int) -> str:
     return job
 
 
+@pytest.mark.campaign
 def test_from_scan_to_correction_and_back(
     page: Any, twin: TwinClient, wait: Wait
 ) -> None:

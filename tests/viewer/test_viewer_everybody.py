@@ -206,6 +206,7 @@ def test_four_views_fetch_the_program_once(
     page.close()
 
 
+@pytest.mark.campaign
 def test_slices_grow_while_a_scan_runs(page: Any, twin: TwinClient, wait: Wait) -> None:
     page.click("#tabs [data-tab=scan]")
     page.fill("#wish-frames", "45")

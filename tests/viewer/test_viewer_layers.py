@@ -121,6 +121,7 @@ def darker(now: Picture, before: Picture) -> int:
 
 
 @pytest.mark.browser
+@pytest.mark.campaign
 def test_where_a_graphics_processor_draws_parts_cast_shadows(
     open_page: Callable[..., Any],
 ) -> None:

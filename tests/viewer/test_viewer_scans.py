@@ -671,7 +671,7 @@ def test_a_bar_of_the_designer_rewrites_the_script(
     """What it says is counted here: bytes by images, time by exposures, kerma by both."""
     page.evaluate("flexdt.call('sample.set', {name: 'lego'})")
     page.evaluate(
-        "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW2SW1High'})"
+        "flexdt.call('camera.set', {roi: [32, 8, 1943, 1527], mode: 'HW4SW1High'})"
     )
     seen(page, twin)
     page.click("#tabs [data-tab=scan]")
@@ -683,7 +683,7 @@ def test_a_bar_of_the_designer_rewrites_the_script(
     for frames in (41, 123):
         page.fill("#wish-frames", str(frames))
         wait(lambda n=frames: f"\t{n}\t" in page.input_value("#script"), "the script")
-        size = f"{(frames + 2) * 956 * 760 * 2 / 1e6:.1f} MB"  # a dark and a flat beside them
+        size = f"{(frames + 2) * 478 * 380 * 2 / 1e6:.1f} MB"  # a dark and a flat beside them
         page.locator("#design-time", has_text=size).wait_for()
         told.append(
             float(re.findall(r"([0-9.]+) mGy", page.inner_text("#design-time"))[0])
@@ -694,10 +694,14 @@ def test_a_bar_of_the_designer_rewrites_the_script(
     wait(lambda: set(written(page, "tube", "set kV")) == {kV}, "the voltage")
     g, first = twin.state().geometry, written(page, "mag_obj", "move absolute")[0]
     voxel = pull(page, "voxel_um", 0.62)
-    there = first - g.SOD_mm + voxel / 1000 / 0.1496 * g.SDD_mm
+    there = first - g.SOD_mm + voxel / 1000 / 0.2992 * g.SDD_mm
     at = lambda: written(page, "mag_obj", "move absolute")[0]  # noqa: E731
     wait(lambda: abs(at() - there) < 2.0, "the magnification")
     # The proposed exposure reaches what was wished for.
+    page.locator("#design-quality .verdict").wait_for()
+    now = float(page.inner_text("#design-quality .verdict"))
+    page.fill("#design-cnr", f"{1.5 * now:.2f}")
+    page.press("#design-cnr", "Tab")
     page.locator("#design-reach").wait_for()
     words = page.inner_text("#design-reach")
     page.click("#design-reach")
@@ -721,7 +725,10 @@ def test_a_bar_of_the_designer_rewrites_the_script(
     page.fill("#design-detail", "void:0.5")
     page.click("#designer summary")
     page.fill("#script", "")
-    page.evaluate("roi => flexdt.call('camera.set', {roi, exposure_ms: 100})", ROI)
+    page.evaluate(
+        "camera => flexdt.call('camera.set', camera)",
+        {"roi": ROI, "exposure_ms": 100, "mode": "HW2SW1High"},
+    )
     seen(page, twin)
 
 

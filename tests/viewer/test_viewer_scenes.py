@@ -352,6 +352,7 @@ def test_a_planned_trajectory_is_its_own_pages_in_every_view(
     settled(box, lambda now: changed(now, before) < PATH_PX)
 
 
+@pytest.mark.campaign
 def test_a_planned_trajectory_is_drawn_and_layers_are_switched(scene: Any) -> None:
     box = show(scene, "free")
     scene.click("#tabs [data-tab=scan]")

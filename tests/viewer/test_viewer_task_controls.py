@@ -149,7 +149,7 @@ def test_a_small_screen_shows_the_button_and_its_sample_beside_each_other(
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (1366, 768), (1440, 900), (1920, 1080)])
-@pytest.mark.campaign(2)
+@pytest.mark.campaign(1)
 def test_the_close_up_is_a_quarter_of_each_pane_and_the_bar_is_whole(
     open_page: Callable[..., Any], size: tuple[int, int]
 ) -> None:
@@ -242,6 +242,7 @@ def test_a_script_of_another_wish_is_called_so(page: Any) -> None:
     page.fill("#script", "")
 
 
+@pytest.mark.campaign
 def test_one_click_ends_with_a_volume_beside_its_truth(
     open_page: Callable[..., Any], twin: TwinClient
 ) -> None:
