@@ -57,6 +57,7 @@ SIGHT = """() => {
       : document.getElementById('volume-stands').textContent,
     volume: document.getElementById('volume-title').textContent,
     by_hand: !document.getElementById('by-hand').hidden,
+    story: document.querySelector('#story button.primary')?.id,
     thumbs: [...document.querySelectorAll('#thumbs figure')].map((figure) => {
       const canvas = figure.querySelector('canvas');
       const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
@@ -288,6 +289,8 @@ class History:
                         self.is_now(sight, np.asarray(bert.projection().image))
                         and self.is_said(sight, state)
                         and sight["by_hand"] == by_hand(state)
+                        and sight["story"]
+                        == ("story-scan" if by_hand(state) else "story-bend")
                     )
 
                 until(agrees, f"the page agrees, after {self.told}", 60)

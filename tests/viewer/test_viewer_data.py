@@ -279,15 +279,13 @@ def test_a_past_scan_is_reconstructed_and_gone_through(
     page.mouse.up()
     x, y, z = page.evaluate(cross)
     assert (abs(x - nx / 4) < 2, y, abs(z - nz / 4) < 2) == (True, ny // 2, True)
-    read = re.compile(
-        r"mm\s+(-?[\d.e-]{9,}) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)"
-    )
+    read = re.compile(r"mm\s+(-?[\d.e-]+) per mm ± ([\d.e-]+), bias at most ([\d.e-]+)")
     page.locator("#volume-at", has_text=read).wait_for(timeout=400_000)  # once compared
     exact = page.evaluate(
         "at => flexdt.call('viewer.voxel', { ...flexdt.volume().of, at })", [x, y, z]
     )
     told = [float(word) for word in read.search(page.inner_text("#volume-at")).groups()]  # type: ignore[union-attr]
-    assert told[0] == pytest.approx(exact["volume"], rel=1e-6)
+    assert told[0] == pytest.approx(exact["volume"], abs=0.01 * exact["sigma"])
     assert told[1:] == pytest.approx([exact["sigma"], exact["bias_bound"]], rel=0.06)
     # Its errors are volumes, too, each with a window of its own.
     block, highs = "flexdt.volume().three.block", set()

@@ -20,6 +20,33 @@ BOXES = [
     tuple(DRAWN.randrange(n) for n in (956, 760, 956, 760)) for _ in range(6)
 ] + [(400, 300, 400, 300)]  # fmt: skip
 
+TAGS_APART = """() => {
+  const tags = [...document.querySelectorAll('#film-tags > div')];
+  const before = tags.map((tag) => tag.hidden);
+  tags.forEach((tag) => { tag.hidden = false; tag.textContent ||= 'of another pose'; });
+  const boxes = tags.map((tag) => tag.getBoundingClientRect());
+  tags.forEach((tag, k) => { tag.hidden = before[k]; });
+  const meet = (a, b) => a.left < b.right && b.left < a.right
+    && a.top < b.bottom && b.top < a.bottom;
+  return boxes.length === 3 && boxes.every((a, k) => a.width > 0
+    && boxes.slice(k + 1).every((b) => !meet(a, b)));
+}"""
+"""All that can be said of an image at once lies beside one another."""
+WAY_BACK = """async () => {
+  const bar = document.getElementById('scan-bar');
+  const button = document.getElementById('volume-large');
+  const hidden = [bar.hidden, button.hidden];
+  bar.hidden = button.hidden = false;
+  document.body.classList.add('whole');
+  await new Promise((done) => setTimeout(done, 300));
+  const { x, y, width, height } = button.getBoundingClientRect();
+  const top = document.elementFromPoint(x + width / 2, y + height / 2);
+  document.body.classList.remove('whole');
+  [bar.hidden, button.hidden] = hidden;
+  return top === button;
+}"""
+"""Nothing covers the button that ends an enlarged volume, a scan's line on top neither."""
+
 
 @pytest.fixture(autouse=True)
 def at_rest(page: Any, twin: TwinClient) -> Iterator[None]:
@@ -167,6 +194,7 @@ def test_an_image_without_beam_says_so(page: Any, twin: TwinClient, wait: Wait) 
     )
     page.evaluate("flexdt.call('tube.set', {on: false})")
     wait(lambda: page.is_visible("#film-beam"))
+    assert page.evaluate(TAGS_APART)
 
 
 def test_the_difference_from_a_frame_that_was_kept(
@@ -216,6 +244,7 @@ def test_the_radiograph_grows_and_the_stop_stays(page: Any, wait: Wait) -> None:
     page.keyboard.press("Escape")
     wait(lambda: abs(width() - first) < 2, "as before")
     page.locator("#splitter").dblclick()
+    assert page.evaluate(WAY_BACK)
 
 
 def test_keys_pan_and_zoom_the_radiograph(page: Any, wait: Wait) -> None:

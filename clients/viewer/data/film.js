@@ -16,6 +16,7 @@ import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
+import { beamWords, MANY_SATURATED, rating } from "./image_words.js";
 import { nameOf } from "./moment.js";
 import { signed } from "./slices.js";
 /** @import { Four, Kind, Pair, Shown } from "../web/viewer.d.ts" */
@@ -37,12 +38,6 @@ let range = [0, 1];
 /** @type {Pair} */
 let windowed = [0, 1];
 let due = false;
-/** @type {number[]} */
-let stamps = [];
-/** Number of the image that was counted last. */
-let counted = -1;
-/** @type {number | undefined} */
-let quiet;
 /** @type {Pair | null} */
 let pointer = null;
 export const shown = { count: 0, at: 0 };
@@ -190,33 +185,16 @@ function develop(i) {
   pixels2d.putImageData(out, 0, 0);
 }
 
-// An image taken with the beam off says so: it is dark, or drawn as though the beam were on. Line
-// integrals are drawn as though no pixel were saturated.
-const MANY_SATURATED = 0.001;
+// An image taken with the beam off says so: it is dark, or drawn as though the beam were on.
 /** @param {Shown | null} i */
 const unlit = (i) => i !== null && !i.recorded && i.origin?.lit === false;
 
-/**
- * @param {Shown | null} i
- * @returns {string}
- */
-function beamWords(i) {
-  const state = store.state;
-  if (i === null || i.recorded || !state) return "";
-  const counts = i.kind === "counts";
-  if (!unlit(i)) {
-    const saturated = state.image?.saturated ?? 0;
-    if (counts || i.signed || saturated < MANY_SATURATED) return "";
-    return `${percent(saturated)} saturated: drawn as though none were`;
-  }
-  if (state.tube.on)
-    return state.tube.ready ? "from before X-rays were on" : "X-rays warming up";
-  return counts ? "X-rays off: dark image" : "X-rays off: drawn as though on";
-}
-
 /** @param {Shown | null} i */
 function beam(i) {
-  const words = beamWords(i);
+  const state = store.state;
+  const about = i && { lit: !unlit(i), counts: i.kind === "counts", signed: i.signed };
+  const live = about && !i?.recorded && state;
+  const words = live ? beamWords(about, state.tube, state.image?.saturated ?? 0) : "";
   $("#film-beam").hidden = !words;
   setText($("#film-beam"), words);
 }
@@ -289,15 +267,7 @@ export function draw() {
   // A finger moves the page over an image that is fitted in and has no other use for it.
   const own = view.zoom > 1 || $select("#tool").value !== "pan";
   canvas.style.touchAction = own ? "none" : "pan-y";
-  if (i.seq !== counted) stamps.push(shown.at);
-  counted = i.seq;
-  stamps = stamps.filter((t) => shown.at - t < 2000);
-  setText(
-    $("#film-rate"),
-    stamps.length > 3 ? `${(stamps.length / 2).toFixed(0)} images/s` : "",
-  );
-  clearTimeout(quiet);
-  quiet = window.setTimeout(() => setText($("#film-rate"), ""), 2000);
+  tellRate();
   tell();
   const { moment } = store;
   const which = [
@@ -316,6 +286,11 @@ export function draw() {
     `${which.join("")}${i.full[1]} × ${i.full[0]}  ·  window ${low} – ${high}${zoom}${alone}`,
   );
 }
+
+const rate = rating();
+const tellRate = () =>
+  setText($("#film-rate"), rate(store.image, performance.now(), store.imageAge));
+on("age", tellRate);
 
 // What the window leaves out is pale.
 const BINS = 128;
@@ -455,11 +430,12 @@ function clampView() {
   view.y = inside(view.y, i.full[0], film.clientHeight / s);
 }
 
+const TOUCH = matchMedia("(hover: none)").matches;
 /** The value under the pointer, also when the image changes under it. */
 function tell() {
   const i = frame();
   if (!i || !pointer) {
-    setText($("#pixel"), "point at the image");
+    setText($("#pixel"), TOUCH ? "tap the image to read a value" : "point at the image");
     return;
   }
   const [c, r] = at(pointer).map(Math.floor);

@@ -1,5 +1,5 @@
 // How much of the page the radiograph has: a splitter between it and the scene, and all of it.
-import { $, $button, $dialog, keep } from "./dom.js";
+import { $, $button, $dialog, keep, setText } from "./dom.js";
 import { on } from "./link.js";
 
 const KEY = "flexdt-right";
@@ -48,10 +48,19 @@ else splitter.setAttribute("aria-valuenow", String($("#right").offsetWidth));
 export function large(on) {
   document.body.classList.toggle("large", on);
   $button("#film-large").setAttribute("aria-pressed", String(on));
+  setText($button("#film-large"), on ? "back" : "enlarge");
 }
 $button("#film-large").addEventListener("click", () =>
   large(!document.body.classList.contains("large")),
 );
+// What is laid over the whole page begins below what always stands on top: the way back is seen.
+const NARROW = matchMedia("(max-width: 740px)");
+const above = () => {
+  const px = NARROW.matches ? $("#top").offsetHeight : $("main").offsetTop;
+  document.body.style.setProperty("--above", `${px}px`);
+};
+const tops = new ResizeObserver(above);
+for (const id of ["#top", "#scan-bar"]) tops.observe($(id));
 // Window and tools of the radiograph are closed until somebody opens them; this browser remembers.
 const TOOLS = "flexdt-tools";
 /** @type {HTMLDetailsElement} */

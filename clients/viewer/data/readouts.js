@@ -72,6 +72,7 @@ function readouts() {
   });
   setText(cells[ROWS.length], live ? beam(s.tube) : recordedBeam(recorded?.tube ?? null));
   setText($("#geometry-title"), heading("Geometry", subject()));
+  $("#nearest").hidden = !live; // all that is told here is of one moment
   const of = live ? "" : "nominal, as scanned";
   const none = () => (live ? (s.missing["geometry"] ?? "") : "not known");
   setText($("#geometry-of"), geometry ? of : none());

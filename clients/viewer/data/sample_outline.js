@@ -3,6 +3,8 @@
 /** @import { CameraState, GeometryState, SampleState } from "../web/viewer.d.ts" */
 
 const HALF_PX = 0.5;
+/** Where a scan that runs has moved the sample: there it takes its flat images. */
+export const OUTSIDE = "Sample is outside the image";
 /** @typedef {readonly [from: number, to: number]} Interval */
 
 /**
@@ -47,7 +49,7 @@ export function outline(sample, g, camera, sampleHeight_mm, shape_mm = null) {
   /** @type {Interval} */
   const along = [middle - (height / 2) * nearest, middle + (height / 2) * nearest];
   const [rows, cols] = camera.shape;
-  if (outside(sideways, cols) || outside(along, rows)) return ["Sample is outside the image"];
+  if (outside(sideways, cols) || outside(along, rows)) return [OUTSIDE];
   /** @type {string[]} */
   const cut = [];
   if (beyond(sideways, cols)) cut.push("truncated sideways over a full turn");

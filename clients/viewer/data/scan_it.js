@@ -1,7 +1,7 @@
 // "Scan it": one turn of what stands on the stage. The sample fills the image, the views
 // follow from its size, the volume grows in the scene meanwhile and then stands beside its
 // truth.
-import { $, $button, $select, clicks, el, setText, words } from "./dom.js";
+import { $, $button, $input, $select, clicks, el, setText, words } from "./dom.js";
 import { command, call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
 import { isOver } from "./job_words.js";
@@ -26,6 +26,7 @@ const SHOWN_AGAIN_MS = 100;
 const SAME = 0.12;
 const sample = $select("#scan-it-sample");
 const go = $button("#scan-it");
+const wanted = $input("#scan-it-views");
 const note = $("#scan-it-note");
 const EMPTY = "empty";
 /** @type {string | null} */
@@ -170,10 +171,11 @@ export async function turnOf(named, views = null) {
  * @returns {Promise<string | null>}
  */
 export async function scanIt(named = sample.value) {
+  if (!wanted.reportValidity()) return null;
   pressed = true;
   allow();
   try {
-    mine = await turnOf(named);
+    mine = await turnOf(named, wanted.value ? wanted.valueAsNumber : null);
     if (!mine) return null;
     busy = true;
     far = true;
@@ -236,10 +238,11 @@ async function exchange() {
 function told(state) {
   const voxel_um = filling(state);
   if (!state.sample.name || voxel_um === null) return "The stage is empty: choose a sample.";
-  const views = viewsFor(state, voxel_um);
+  const own = viewsFor(state, voxel_um);
+  wanted.placeholder = String(own);
   if (isDown(state)) return "Nothing is scanned before the stop is reset.";
   const waits = store.job && !isOver(store.job) ? "After the scan that runs: one" : "One";
-  return `${waits} turn, ${views} images; its volume grows in the scene.`;
+  return `${waits} turn, ${wanted.value || own} images; its volume grows in the scene.`;
 }
 on("job", (job) => {
   if (job.job !== mine) return;

@@ -380,7 +380,9 @@ export function slices(canvases, pointed, moved) {
         moved();
       } else if (!me.profiling) me.go(place(side, at));
     });
-    canvas.addEventListener("pointerleave", () => pointed(null));
+    canvas.addEventListener("pointerleave", (e) => {
+      if (e.pointerType !== "touch") pointed(null); // what a finger read stays
+    });
     new ResizeObserver(() => me.draw()).observe(canvas);
   }
   return me;

@@ -115,13 +115,14 @@ function frame(view) {
     sample.hidden = true;
     posed = ""; // a busy viewer has none: it is asked again
   });
+  const inset = el("button", { class: "inset", "aria-label": "Look at the sample", ...near });
   sample.addEventListener("load", () => {
     if (sample.hidden) tellCovered();
     sample.hidden = false;
+    inset.dataset.sample = sample.dataset.of; // its name, of what the picture shows
   });
-  box.append(
-    el("button", { class: "inset", "aria-label": "Look at the sample", ...near }, sample),
-  );
+  inset.append(sample);
+  box.append(inset);
   return { box, iframe, tag, src, sample };
 }
 
@@ -219,8 +220,11 @@ on("state", (s) => {
 
 /** The sample in each pane, close up: what holds source and detector shows it small. */
 function closeUps() {
-  for (const { sample } of open.values())
-    if (sample?.parentElement) window.still(sample, "sample", sample.parentElement);
+  for (const { sample } of open.values()) {
+    if (!sample?.parentElement) continue;
+    sample.dataset.of = store.state?.sample.name ?? "";
+    window.still(sample, "sample", sample.parentElement);
+  }
 }
 
 /** Without WebGL there are no scenes; all the rest works. */

@@ -32,6 +32,9 @@ import { follow } from "./volume_stage.js";
 const KEY = "flexdt-volume";
 const STARTING = "starting; dark, flat and a first image are needed";
 const BEGINS = "the reconstruction begins";
+const COMPARES = "Beside what the sample is made of, with a correction and without";
+const GROWS =
+  "no accuracy or truth while it grows: after the scan, Data, its data set, Reconstruct";
 const EXACT_MS = 60;
 // Largest first zoom of a volume in three dimensions, and the room about its object.
 const NEAREST = 4;
@@ -160,6 +163,7 @@ function cancel() {
 function large(to) {
   document.body.classList.toggle("whole", to);
   $("#volume-large").ariaPressed = String(to);
+  setText($("#volume-large"), to ? "back" : "enlarge");
   three.draw();
   solid?.draw();
 }
@@ -229,6 +233,7 @@ on("volume", (m) => {
     working ? `comparing: ${fixed(100 * (m.comparing ?? 0), 0)} %` : "",
     m.not_compared,
     ...(m.doubts ?? []),
+    m.past ? "" : GROWS,
   ];
   setText(note, other + facts.filter(Boolean).join(" · "));
   if (m.volumes) offer(m.volumes, Object.keys(m.compared ?? {})[1]);
@@ -236,6 +241,7 @@ on("volume", (m) => {
   if (m.compared) compared(m.compared);
   if (m.compared && m.volumes?.includes("truth")) void beside();
   $button("#volume-compare").disabled = !m.past || m.comparing !== undefined;
+  $button("#volume-compare").title = m.past ? COMPARES : GROWS;
   if (thenCompare && m.past && m.done === 1 && m.comparing === undefined && !comparing)
     compare();
 });
@@ -495,7 +501,8 @@ function point(place) {
     const { sigma, bias_bound: bias } = shown.value === "volume" ? (exact ?? {}) : {};
     const noise = sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`;
     const off = bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`;
-    say(`${v.toPrecision(8)} per mm${noise}${off}`);
+    const digits = sigma ? Math.max(0, 2 - Math.floor(Math.log10(sigma))) : 6;
+    say(`${fixed(v, Math.min(8, digits))} per mm${noise}${off}`);
   }, EXACT_MS);
 }
 
@@ -515,10 +522,12 @@ const ROWS = [
 ];
 
 /**
+ * The truth is that of a volume of the same voxels, not of the mesh: its sizes are as coarse.
  * @param {Record<string, Figures>} rows
+ * @param {number} [voxel_mm]
  * @returns {HTMLElement}
  */
-export function table(rows) {
+export function table(rows, voxel_mm) {
   const made = Object.entries(rows);
 
   /**
@@ -533,7 +542,7 @@ export function table(rows) {
       "tr",
       {},
       cell("th", ""),
-      cell("th", "truth"),
+      cell("th", voxel_mm ? `truth in voxels of ${fixed(1000 * voxel_mm, 0)} µm` : "truth"),
       ...made.map(([name]) => cell("th", name)),
     ),
     ...ROWS.map(([key, text, times, digits, unit]) =>
@@ -558,7 +567,7 @@ export function table(rows) {
 /** @param {Record<string, Figures>} rows */
 function compared(rows) {
   if ($("#volume-compared").childElementCount) return;
-  $("#volume-compared").replaceChildren(table(rows));
+  $("#volume-compared").replaceChildren(table(rows, told?.voxel_mm));
   setText($("#volume-verdict"), verdict(Object.values(rows)[0]));
 }
 

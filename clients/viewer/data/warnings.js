@@ -3,7 +3,7 @@
 import { $, el, fixed } from "./dom.js";
 import { isMe, on, store } from "./link.js";
 import { OLD_S } from "./moment.js";
-import { outline } from "./sample_outline.js";
+import { outline, OUTSIDE } from "./sample_outline.js";
 /** @import { State } from "../web/viewer.d.ts" */
 
 const AT_END = 0.05; // mm or degrees from a limit
@@ -112,7 +112,9 @@ function draw(s) {
   const outside = s.geometry
     ? outline(s.sample, s.geometry, s.camera, height_mm, store.across_mm)
     : [];
-  const cut = outside.map((words) => /** @type {Warning} */ (["", words]));
+  const away = s.job?.state === "running"; // the script has put it there
+  const seen = outside.filter((words) => !away || words !== OUTSIDE);
+  const cut = seen.map((words) => /** @type {Warning} */ (["", words]));
   const list = [...ofMachine(s), ...cut, ...ofImage(s), ...ofScan(s)];
   const key = JSON.stringify(list);
   if (key === last) return;

@@ -4,6 +4,7 @@ import { test } from "node:test";
 import { beliefWords } from "../../data/belief.js";
 import { decades } from "../../data/decades.js";
 import { estimates } from "../../data/estimate.js";
+import { beamWords, rating } from "../../data/image_words.js";
 import * as figures from "../../data/figures.js";
 import * as fp from "../../data/fingerprint.js";
 import * as job from "../../data/job_words.js";
@@ -539,4 +540,75 @@ test("how long a scan takes is said only where it is nearly right", () => {
   assert.ok(even.said > 150 * 60 && share(even) === 0, JSON.stringify(even));
   const told = JSON.stringify([uneven, always]);
   assert.ok(uneven.said > 150 * 20 && uneven.off < 0.6 * always.off, told);
+});
+
+// Scans at a pace of the twin's clock, whose status stands still within each step: a way to the
+// flat image, darks, images; a twin that keeps its pace, and one that falls behind from some step.
+test("how long a scan at a pace takes is said from the first second, while the twin keeps it", () => {
+  const kept = { said: 0, asked: 0, off: 0 };
+  const late = { said: 0, off: 0, plan: 0 };
+  for (let scan = 0; scan < 300; scan++) {
+    const left = estimates();
+    const speed_up = pick([1, 8, 60]);
+    const steps = [10, 3, 12, ...Array.from({ length: 30 + Math.floor(60 * random()) }, () => 0.4)]
+      .map((s) => s * (0.5 + random()) * speed_up);
+    const whole = steps.reduce((all, s) => all + s, 0);
+    const slow = scan % 2 ? 1 : 2 + 3 * random();
+    const from = Math.floor(0.7 * steps.length * random());
+    const took = steps.map((s, k) => (s / speed_up) * (k < from ? 1 : slow));
+    const end_s = took.reduce((all, s) => all + s, 0);
+    let elapsed_s = 0;
+    let now = 0;
+    steps.forEach((step, k) => {
+      const until = now + took[k];
+      for (; now < until; now = Math.min(until, now + 0.5)) {
+        const status = { job: "a", state: "running", frames_done: Math.max(0, k - 3),
+          frames_total: steps.length - 3, elapsed_s, remaining_s: whole - elapsed_s, speed_up };
+        const told = left(status, now);
+        const true_s = end_s - now;
+        const wrong = (words) => Math.abs(words - true_s) > 2 + 0.5 * true_s;
+        if (slow === 1) {
+          kept.asked += 1;
+          kept.said += told !== null;
+          kept.off += told !== null && wrong(told);
+        } else {
+          late.said += told !== null;
+          late.off += told !== null && wrong(told);
+          late.plan += wrong((whole - elapsed_s) / speed_up);
+        }
+      }
+      elapsed_s += step;
+    });
+  }
+  const told = JSON.stringify([kept, late]);
+  assert.ok(kept.said > 0.98 * kept.asked && kept.off === 0, told);
+  assert.ok(late.off < 0.6 * late.plan, told);
+});
+
+test("what is said of the beam is of the image, and of the tube only what the image lacks", () => {
+  const tubes = [{ on: false, ready: false }, { on: true, ready: false }, { on: true, ready: true }];
+  for (const lit of [true, false]) for (const counts of [true, false]) for (const tube of tubes) {
+    const said = beamWords({ lit, counts }, tube, 0);
+    assert.equal(said === "", lit);
+    assert.equal(said.includes("X-rays off"), !lit && !tube.on); // as the bar says
+    assert.equal(said.includes("warming up"), !lit && tube.on && !tube.ready);
+  }
+  assert.match(beamWords({ lit: true, counts: false }, tubes[2], 0.0123), /^1\.2 % saturated/);
+  assert.equal(beamWords({ lit: true, counts: true }, tubes[2], 0.5), "");
+});
+
+test("images are counted when they come, not when they are drawn, and not while they are old", () => {
+  const rate = rating();
+  const image = {};
+  for (let ms = 0; ms < 4000; ms += 50) assert.equal(rate(image, ms, 0), "");
+  let said = "";
+  for (let ms = 4000; ms < 8000; ms += 100) {
+    const fresh = ms % 200 === 0 ? {} : null;
+    said = fresh ? rate(fresh, ms, 0) : said;
+  }
+  assert.equal(said, "5 images/s");
+  const last = {};
+  assert.equal(rate(last, 8000, 3), "");
+  assert.equal(rate(last, 8100, 0), "5 images/s");
+  assert.equal(rate(last, 10200, 0), "");
 });
