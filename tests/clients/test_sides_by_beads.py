@@ -44,11 +44,6 @@ def test_a_right_scan_is_told_of_no_other_direction(data: Any, correction: Any) 
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="beads that claim to know exclude the direction, and what the panel cuts off "
-    "is not compared; compared by opposed rays, the direction stays undecided",
-)
 def test_images_that_clearly_run_the_other_way_are_told_all_the_same() -> None:
     """A wrong claim that beads have told the direction hides no contradiction."""
     cone = fx.ConeVec.circular(sod=150, sdd=400, angles=120, shape=(200, 200), pixel=1.0)

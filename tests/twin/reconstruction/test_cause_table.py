@@ -130,11 +130,40 @@ def test_another_geometry_that_fits_is_named(kind: str) -> None:
 
 
 @pytest.mark.slow
-def test_beads_that_tell_the_direction_exclude_the_other() -> None:
+def test_beads_decide_what_images_leave_open_and_hide_no_contradiction() -> None:
+    """They are of another scan: their claim may be wrong of this one."""
     make, _ = claims.WRONG["direction"]
     wrong = coarse(make(scan(), np.random.default_rng(1)))
     known = agreement_of(wrong, sides_known=True).contradiction
-    assert known is None or not set(known.kinds) & {"direction", "columns"}
+    assert known is not None
+    assert "direction" in known.kinds
+    body = claims.Body(2, (0.0, 0.0, 0.0), (8.0, 8.0, 5.0), 0.0, 0.05)
+    turned = coarse(scan(bodies=(body,)))
+    assert "direction" not in agreement_of(turned, sides_known=True).open
+
+
+def narrow(drawn: claims.Drawn) -> claims.Drawn:
+    """The same by a panel that does not reach the object's sides."""
+    return replace(drawn, shape=(drawn.shape[0], int(0.6 * drawn.shape[1])))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("course", ["whole", "short", "rolled", "few", "cone", "tilted"])
+def test_right_scans_of_objects_that_are_cut_off_are_told_of_nothing(course: str) -> None:
+    agreement = found(narrow(claims.right(502, 3, course, "textured")))
+    assert agreement.compared
+    assert agreement.contradiction is None
+    assert [one.cause.name for one in agreement.findings if one.told] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["direction", "columns", "names"])
+def test_what_contradicts_an_object_that_is_cut_off_is_named(kind: str) -> None:
+    make, _ = claims.WRONG[kind]
+    wrong = make(narrow(claims.right(503, 1, "whole", "boxes")), np.random.default_rng(1))
+    contradiction = found(wrong).contradiction
+    assert contradiction is not None
+    assert kind in contradiction.kinds
 
 
 @pytest.mark.parametrize("number", range(2))

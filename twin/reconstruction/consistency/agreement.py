@@ -98,11 +98,8 @@ class Agreement:
 def looked_at(scan: CoarseScan) -> CauseTable | None:
     """Compare the numbers of a scan that should agree, in its stated geometry alone.
 
-    `scan`: coarse. Returns None where nothing compares: an object that the panel cuts off at its
-    sides, or no two views that see it."""
-    truncation = scan.truncation
-    if truncation is not None and truncation.cut_off.any():
-        return None
+    Of an object that the panel cuts off at its sides opposed rays alone compare. `scan`: coarse.
+    Returns None where nothing compares."""
     return _table(scan, scan.images, Suspect("", scan.images, scan.cone_vec))
 
 
@@ -111,16 +108,18 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
 
     Args:
         scan: coarse.
-        sides_known: beads have told the direction of rotation and mirrored images.
+        sides_known: beads have told the direction of rotation and mirrored images: what
+            these images leave open of it is not open. They are evidence of another scan, and
+            hide no contradiction.
     """
     first = looked_at(scan)
     if first is None:
         return Agreement()
-    some, share = _some(scan)
-    images = _without_level(scan.images[some])
-    found = findings(
-        images, scan.cone_vec[some], circle_of(scan.cone_vec[some]), share[some]
-    )
+    found: tuple[list[Finding], CauseTable] | None = [], first
+    if not scan.cut_off:  # opposed rays alone tell errors less well apart
+        some, share = _some(scan)
+        images, views = _without_level(scan, scan.images[some]), scan.cone_vec[some]
+        found = findings(images, views, circle_of(views), share[some])
     if found is None:
         return Agreement()
     told, table = found
@@ -136,7 +135,7 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
     undecided = []
     for one in suspects(there):
         rival = _table(there, one.images, one)
-        if (sides_known and one.kind in SIDES) or rival is None:
+        if rival is None:
             continue
         # A span of few opposed rays is not confirmed as the stated one is by its own.
         surprise = {
@@ -149,8 +148,9 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
             continue
         gain, evidence = _evidence(stated, surprise)
         alike = abs(gain) < VARIANCE_KNOWN * base.surprises
+        beads_tell = sides_known and one.kind in SIDES
         if confirmed and (alike or evidence > -quantile(2.0 * EXCLUDED)):
-            undecided.append(one.kind)
+            undecided += [one.kind] * (not beads_tell)
         better.append((evidence, gain, one))
     left = table.unexplained()
     bar = quantile(FALSE_ALARMS / max(len(better), 1))
@@ -190,13 +190,15 @@ def _table(scan: CoarseScan, images: Float32Array, one: Suspect) -> CauseTable |
         circle = circle_of(views)
     except GeometryError:
         return None
-    return CauseTable.of(
-        _without_level(images[some]), views, circle, share[some], FINE_BLUR
-    )
+    level = _without_level(scan, images[some])
+    return CauseTable.of(level, views, circle, share[some], FINE_BLUR, not scan.cut_off)
 
 
-def _without_level(images: Float32Array) -> Float32Array:
-    """Subtract what each view has beside the object, of the side that has less."""
+def _without_level(scan: CoarseScan, images: Float32Array) -> Float32Array:
+    """Subtract what each view has beside the object, of the side that has less; nothing of one
+    that the panel cuts off."""
+    if scan.cut_off:
+        return images
     ends = images[:, :, [0, -1]].mean(axis=1)
     beside = np.take_along_axis(ends, np.abs(ends).argmin(axis=1)[:, None], axis=1)
     return np.ascontiguousarray(images - beside[:, :, None])

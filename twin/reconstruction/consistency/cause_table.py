@@ -67,6 +67,8 @@ class CauseTable:
         rows: of `ViewPairs` and `OpposedRays`, with their conditions.
         blur: standard deviation of the images' smoothing [pixels].
         sharp: the images before it.
+        whole: the panel sees the whole object from side to side; else opposed rays alone
+            compare.
     """
 
     images: Float32Array
@@ -76,6 +78,7 @@ class CauseTable:
     rows: list[tuple[ViewPairs | OpposedRays, Condition]]
     blur: float
     sharp: Float32Array
+    whole: bool = True
 
     @classmethod
     def of(
@@ -85,17 +88,18 @@ class CauseTable:
         circle: Circle,
         share: FloatArray,
         blur: float = FINE_BLUR,
+        whole: bool = True,
     ) -> CauseTable | None:
         """Make the table; None where no two views see the object so that they compare.
 
         Args:
-            images: (n, rows, cols) line integrals of an object that the panel does not cut
-                off at its sides.
+            images: (n, rows, cols) line integrals.
             cone_vec: n views.
             circle: of them.
             share: (n,) of the scan before each view, 0 to 1.
             blur: standard deviation of the images' smoothing [pixels]: noise that
                 interpolation reduces would show as an error that moves rays between pixels.
+            whole: see the class.
         """
         from scipy.ndimage import gaussian_filter
 
@@ -105,14 +109,14 @@ class CauseTable:
         # Squares of the kernel's values sum to 1 / (2 sqrt(pi) blur), along a line or each way.
         kept = min(1.0, 0.28 / max(along, 0.28))
         rows: list[tuple[ViewPairs | OpposedRays, Condition]] = []
-        pairs = ViewPairs.of(smooth, cone_vec, circle, along)
+        pairs = ViewPairs.of(smooth, cone_vec, circle, along) if whole else None
         if pairs is not None:
             rows.append((pairs, pairs.condition(smooth, cone_vec, noise * kept)))
         rays = OpposedRays.of(smooth, cone_vec, circle, blur)
         if rays is not None:
             kept *= min(1.0, 0.28 / blur)
             rows.append((rays, rays.condition(smooth, cone_vec, noise * kept)))
-        made = cls(smooth, cone_vec, circle, share, rows, blur, images)
+        made = cls(smooth, cone_vec, circle, share, rows, blur, images, whole)
         return made if rows else None
 
     @cached_property
@@ -132,7 +136,8 @@ class CauseTable:
         )
         images = binned_mean(self.sharp[:, :rows, :cols], self._binned)
         images = np.ascontiguousarray(images, np.float32)
-        return CauseTable.of(images, views, self.circle, self.share, 0.5 * self.blur)
+        blur = 0.5 * self.blur
+        return CauseTable.of(images, views, self.circle, self.share, blur, self.whole)
 
     @cached_property
     def differences(self) -> FloatArray:
