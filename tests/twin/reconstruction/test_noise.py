@@ -179,3 +179,51 @@ def test_few_rows_have_a_sigma_or_none(rows: int) -> None:
         lambda: [images], scan, (rows, 80), Grid((rows, 24, 24), 0.8), errors=True
     )
     assert volume.sigma is None or np.isfinite(volume.sigma).any()
+
+
+def box_chords(rows: FloatArray, half: FloatArray, mu: float) -> Float32Array:
+    """Line integrals (n, 72, 80) of a box about the origin, by its three pairs of planes."""
+    c, r = np.arange(80) - 39.5, np.arange(72) - 35.5
+    out = []
+    for row in rows:
+        source, panel, u, v = row.reshape(4, 3)
+        ray = panel + c[None, :, None] * u + r[:, None, None] * v - source
+        first, second = (-half - source) / ray, (half - source) / ray
+        enters = np.minimum(first, second).max(axis=2)
+        leaves = np.maximum(first, second).min(axis=2)
+        length = np.linalg.norm(ray, axis=2)
+        out.append(mu * length * np.maximum(leaves - enters, 0.0))
+    return np.array(out, np.float32)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.slow
+def test_a_plate_and_the_air_about_it_have_sigmas_of_their_own(seed: int) -> None:
+    """A flat body across the axis: noise jumps from layer to layer, by a factor of ten.
+
+    Of nine rows at least, since a voxel on a row has 1.5 times the variance of the mean.
+    """
+    rng = np.random.default_rng([20261130, seed])
+    half = np.array([*rng.uniform(5.0, 8.0, 2), rng.uniform(1.4, 2.5)])
+    counts, mu = 10.0 ** rng.uniform(3.5, 4.5), rng.uniform(0.15, 0.3)
+    angles = np.linspace(0.0, 360.0, 200, endpoint=False)
+    scan = ConeVec.circular(
+        sod=200.0, sdd=350.0, angles=angles, shape=(72, 80), pixel=0.6
+    )
+    clean, grid = box_chords(scan.rows, half, mu), Grid((40, 48, 48), 0.4)
+    volumes, sigma = [], None
+    for _ in range(SEEDS):
+        light = rng.poisson(counts * np.exp(-clean.astype(float)))
+        images = -np.log(np.maximum(light, 0.5) / counts).astype(np.float32)
+        volume = fdk_parts(
+            lambda images=images: [images], scan, (72, 80), grid, errors=True
+        )
+        volumes.append(volume.data)
+        sigma = volume.sigma
+    assert sigma is not None
+    spread = np.std(volumes, axis=0, ddof=1)
+    height = np.abs((np.arange(40) - 19.5) * 0.4)
+    for layers in (height < half[2] - 0.5, (height > half[2] + 1.0) & (height < 6.0)):
+        ours, theirs = sigma[layers, 18:30, 18:30], spread[layers, 18:30, 18:30]
+        ratio = np.sqrt((ours**2).mean() / (theirs**2).mean())
+        assert 0.75 < ratio < 1.35, (seed, half, counts, mu, ratio)

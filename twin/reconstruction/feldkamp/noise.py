@@ -6,6 +6,10 @@ to neighbouring views cancels, what noise gives does not, and has the variance t
 the volume. What all views share, the noise of the flat and dark images: its spectrum is that of
 the views' mean, less that of their alternating mean. A voxel's variance follows from where the
 views see it. On a grid of every few voxels, both cost little.
+
+How the variance changes from voxel to voxel follows from the rays through it: that of a pixel is
+a function of its value (`NoiseByValue`), and a share of the views, back-projected, gives its
+shape. How large it is, the alternating sum says, in wide windows.
 """
 
 from __future__ import annotations
@@ -24,11 +28,19 @@ from flexdt.twin.reconstruction.acquisition.coverage import first_and_steps
 from flexdt.twin.reconstruction.acquisition.trajectory import Circle
 from flexdt.twin.reconstruction.feldkamp.fdk_views import Views
 from flexdt.twin.reconstruction.feldkamp.half_scans import HalfScanMeter, HalfScans
+from flexdt.twin.reconstruction.feldkamp.noise_by_value import NoiseByValue
 from flexdt.twin.reconstruction.feldkamp.slabs import layers
 from flexdt.twin.reconstruction.volume_errors import interpolated
 
 NODES: Final = 24
-"""Largest number of nodes of the coarse grid along a side: noise changes smoothly."""
+"""Largest number of nodes of the coarse grid along a side."""
+SHAPE_LAYERS: Final = 128
+"""Largest number of layers of the variance's shape: along the axis it is as sharp as the
+object."""
+VALUED_VIEWS: Final = 4
+"""Views, at most, of which the noise by value is measured."""
+SHAPE_VIEWS: Final = 24
+"""Views, at most, from which the variance's shape is computed."""
 MIN_ROW_DISTANCE: Final = 3
 """Least distance of two compared rows of the panel: blur correlates neighbours."""
 BANDS: Final = 16
@@ -65,7 +77,9 @@ class Noise:
         [1/mm]; NaN where the grid's values are.
 
         It is the root of the interpolated variance of the views' own noise plus that
-        common to all views, by the distance from the rotation axis.
+        common to all views, by the distance from the rotation axis. It is a mean over where
+        voxels lie between two rows of the panel: near the axis one on a row has up to 1.2
+        times as much, one between two rows .85 times.
         """
         x, y, _ = grid.centers()
         flat = np.hypot(x - self.centre[0], (y - self.centre[1])[:, None])
@@ -137,6 +151,8 @@ class NoiseMeter:
     Attributes:
         grid: coarse.
         data: the alternating sum of the views on it, (ny, nx, nz).
+        shape_grid: of the variance's shape; coarse across, finer along the axis.
+        shape: the variance but for a factor that changes slowly, (ny, nx, nz).
     """
 
     def __init__(self, like: Volume, circle: Circle, table: FloatArray) -> None:
@@ -164,9 +180,19 @@ class NoiseMeter:
             np.zeros((nz, ny, nx), np.float32), (dx, dy, dz), like.center_mm
         )
         self.data = np.zeros((ny, nx, nz), np.float32)
+        layers_mm = like.shape[0] * size[2]
+        fine = min(like.shape[0], SHAPE_LAYERS)
+        self.shape_grid = Volume(
+            np.zeros((fine, ny, nx), np.float32),
+            (dx, dy, float(layers_mm / fine)),
+            like.center_mm,
+        )
+        self.shape = np.zeros((ny, nx, fine), np.float32)
+        self._by_value: NoiseByValue | None = None
         order = np.argsort(circle.angle % (2.0 * np.pi), kind="stable")
         self._signs = np.zeros(len(order), np.float32)
         self._signs[order] = np.where(np.arange(len(order)) % 2, -1.0, 1.0)
+        self._rank = np.argsort(order)
         if len(order) % 2:  # the last has no neighbour to cancel
             self._signs[order[-1]] = 0.0
         self._hits: list[tuple[FloatArray, FloatArray]] = []
@@ -195,6 +221,7 @@ class NoiseMeter:
         images = np.ascontiguousarray(views.images)
         fdk_kernels.add_views(images, views.top, signs, self._means)
         self._hits.append(self._seen_at(views))
+        self._add_shape(views)
         self._response = views.response.astype(np.float64)
         self._done += n
         return signs
@@ -218,6 +245,36 @@ class NoiseMeter:
         first, size = first_and_steps(self.grid)
         fdk_kernels.backproject(
             columns, rows, views.shares, views.table, *first, *size, self.data, threads()
+        )
+
+    def _add_shape(self, views: Views) -> None:
+        """Add the variances of some of the next views' pixels to the shape of the variance.
+
+        The filter takes three quarters of a pixel's variance from that pixel, so that the
+        variance before it has the shape of that behind it.
+        """
+        from flexdt.twin.reconstruction.kernels import fdk_kernels
+
+        rank = self._rank[self._done : self._done + len(views.images)]
+        turn = np.argsort(rank)
+        chosen = turn[rank[turn] * SHAPE_VIEWS % len(self._rank) < SHAPE_VIEWS]
+        some = views.of(chosen)
+        shown = some.images[:, some.shown]
+        if not len(chosen) or min(shown.shape[1:]) < 2:
+            return
+        if self._by_value is None:
+            self._by_value = NoiseByValue.of(shown[:: -(-len(shown) // VALUED_VIEWS)])
+        n, wide, cols, rows = some.sizes
+        images = np.zeros((n, rows, wide), np.float32)
+        some.widen(images)
+        variance = self._by_value(images[:, :, some.kept])
+        variance *= np.square(some.factors[:, None, some.kept])
+        variance /= some.across[:, None, some.kept] + some.up[:, :, None]
+        columns = fdk_kernels.room(n, cols, rows, some.few)
+        columns[:, :, :rows] = variance.transpose(0, 2, 1)
+        first, size = first_and_steps(self.shape_grid)
+        fdk_kernels.backproject(
+            columns, rows, some.shares, some.table, *first, *size, self.shape, threads()
         )
 
     def _points(self) -> tuple[FloatArray, FloatArray]:
@@ -281,22 +338,33 @@ class NoiseMeter:
     def measured(self) -> Noise:
         """Compute the noise.
 
-        The variance of the views' own noise is local, from differences of neighbouring
-        layers of the alternating sum if there are more than two; that common to all views
-        is given over the radius from the rotation axis.
+        The variance of the views' own noise has the shape that the rays give it, times a
+        factor from differences of neighbouring layers of the alternating sum, if there are
+        more than two; that common to all views is given over the radius from the rotation
+        axis.
         """
-        alternating = self.data
+        shape = self._filled_shape()
+        spread = np.sqrt(interpolated(shape, self.grid)).transpose(1, 2, 0)
+        alternating = (self.data / spread).astype(np.float32)
         if (
             alternating.shape[2] > 2
         ):  # without what few views cause, which layers have in common
             pairs = np.diff(alternating, axis=2, append=alternating[:, :, -2:-1])
             pairs /= np.float32(np.sqrt(2.0))
             alternating = np.where(np.isnan(pairs), alternating, pairs)
-        variance = _local_variance(alternating.transpose(2, 0, 1))
+        factor = self.grid.like(_local_variance(alternating.transpose(2, 0, 1)))
+        variance = shape.data * interpolated(factor, shape)
         radii = self._points()[0].reshape(-1, AVERAGED_POINTS).mean(axis=1)
         shared = self._shared_variance().reshape(-1, AVERAGED_POINTS).mean(axis=1)
         centre = (float(self._circle.centre[0]), float(self._circle.centre[1]))
-        return Noise(self.grid.like(variance), centre, radii, shared)
+        return Noise(shape.like(variance), centre, radii, shared)
+
+    def _filled_shape(self) -> Volume:
+        """Return the variance's shape; the least that is known where no chosen view sees."""
+        values = self.shape.transpose(2, 0, 1)
+        seen = values > 0.0
+        least = float(values[seen].min()) if seen.any() else 1.0
+        return self.shape_grid.like(np.where(seen, values, np.float32(least)))
 
     def _shared_variance(self) -> FloatArray:
         """Compute the variance at each point of the noise that all views share (as of a

@@ -1,0 +1,84 @@
+"""How the noise of line integrals grows with their value, from images themselves."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.white_noise import MEDIAN_OF_SQUARES
+
+BINS: Final = 24
+"""Bins between the least and the largest value."""
+BEYOND: Final = 3.0
+"""Line integrals by which the table goes beyond the known ones."""
+TABLE: Final = 1024
+"""Entries of the table in which variances are looked up: they are constant within one."""
+LEAST_SQUARES: Final = 64
+"""Fewest squares of a bin: their median is then known to a quarter."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseByValue:
+    """The variance of a pixel's noise as a function of its value, whatever the camera.
+
+    Photons, electronics and a correction of beam hardening give a pixel a noise that follows
+    from the light that reaches it, thus from its value.
+
+    Attributes:
+        values: (k,) growing, one at least.
+        log_variances: (k,), natural logarithms.
+    """
+
+    values: FloatArray
+    log_variances: FloatArray
+
+    @classmethod
+    def of(cls, images: Float32Array) -> NoiseByValue:
+        """Measure it by bins of the value: from mixed second differences of neighbouring rows
+        and columns, whose median edges do not change.
+
+        `images`: (n, rows, cols), two rows and columns at least. Of images without noise it is
+        1 for all values.
+        """
+        square = np.square(np.diff(np.diff(images, axis=1), axis=2)).ravel() / 4.0
+        value = 0.25 * (
+            images[:, 1:, 1:]
+            + images[:, :-1, 1:]
+            + images[:, 1:, :-1]
+            + images[:, :-1, :-1]
+        )
+        edges = np.linspace(float(value.min()), float(value.max()), BINS + 1)
+        which = np.digitize(value.ravel(), edges[1:-1]).astype(
+            np.uint8
+        )  # sorted by digits
+        order = np.argsort(which, kind="stable")
+        bounds = np.searchsorted(which[order], np.arange(BINS + 1))
+        found = [
+            (0.5 * (edges[k] + edges[k + 1]), np.median(square[order[first:last]]))
+            for k, (first, last) in enumerate(itertools.pairwise(bounds))
+            if last - first >= LEAST_SQUARES
+        ]
+        known = [(at, typical) for at, typical in found if typical > 0.0]
+        if not known:
+            return cls(np.zeros(1), np.zeros(1))
+        values, typical = np.array(known).T
+        # Less light never has less noise: a bin with more than a darker one holds edges.
+        least = np.minimum.accumulate(typical[::-1])[::-1]
+        return cls(values, np.log(least / MEDIAN_OF_SQUARES))
+
+    def __call__(self, images: Float32Array) -> Float32Array:
+        """Return the variance of each pixel, like `images`. Beyond the known values it grows
+        by exp(1) a unit, as that of photons does."""
+        first, last = self.values[0] - BEYOND, self.values[-1] + BEYOND
+        places = np.linspace(first, last, TABLE)
+        beyond = places - np.clip(places, self.values[0], self.values[-1])
+        logs = np.interp(places, self.values, self.log_variances)
+        table = np.exp(logs + beyond)
+        step = (last - first) / (TABLE - 1)
+        at = np.clip((images - np.float32(first)) / np.float32(step), 0, TABLE - 1)
+        out: Float32Array = table.astype(np.float32)[at.astype(np.int16)]
+        return out
