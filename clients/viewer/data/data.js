@@ -163,8 +163,8 @@ $("#stage").append(panel);
  * @param {ImageValue | null} small
  */
 function thumbnail(small) {
-  const c = el("canvas", { width: 1, height: 1 });
-  return small ? putImage(c, small) : c;
+  const none = { class: "none", width: 1, height: 1 };
+  return small ? putImage(el("canvas"), small) : el("canvas", none);
 }
 
 /** @param {DatasetInfo} info */

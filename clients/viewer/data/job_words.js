@@ -112,6 +112,13 @@ export function moved(job, axes) {
 }
 
 /**
+ * The command's numbers with two decimals at most, as the page has them.
+ * @param {string} what
+ */
+const rounded = (what) =>
+  what.replace(/-?\d+\.\d{3,}/g, (value) => fixed(Number(value), 2).replace("-", "−"));
+
+/**
  * What the scan does, or what it has left behind.
  * @param {JobStatus} job
  * @param {State | null} state
@@ -120,7 +127,7 @@ export function moved(job, axes) {
 export function whatWords(job, state) {
   if (!isOver(job)) {
     if (state?.projector && job.state === "running") return `waits: ${state.projector}`;
-    return problem(job) || `${job.line ? `line ${job.line}: ` : ""}${job.what}`;
+    return problem(job) || `${job.line ? `line ${job.line}: ` : ""}${rounded(job.what)}`;
   }
   const why = job.state === "done" ? "" : problem(job);
   const stands = job.state === "done" || !state ? [] : [xrays(state), places(job, state)];
