@@ -1,7 +1,8 @@
-"""Lists of the page: scans that wait, and presets of tube and camera."""
+"""Lists of the page: scans that wait, presets of tube and camera; and the notice of an end."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -74,4 +75,39 @@ def test_presets_set_tube_and_camera_and_stay_in_this_browser(
     )
     page.click("#preset-delete")
     assert "mine" not in page.locator("#preset option").all_inner_texts()
+    page.close()
+
+
+AWAY = """
+window.told = [];
+window.Notification = class {
+  constructor(words) { window.told.push(words); }
+  static requestPermission() { return Promise.resolve('granted'); }
+};
+document.hasFocus = () => false;
+"""
+"""A browser that may tell, on a page that nobody looks at."""
+
+
+def test_the_end_of_a_scan_is_in_the_title_and_told_where_that_was_asked_for(
+    open_page: Callable[..., Any], twin: TwinClient
+) -> None:
+    page = open_page(script=AWAY)
+    usual = page.title()
+    for name, ends in (("ended", "aborted"), ("made", "done")):
+        twin.control("force")
+        pace = 1.0 if ends == "aborted" else "max"
+        job = twin.submit_script(fly_script(frames=41), name, pace).job
+        twin.control("release")
+        if ends == "aborted":
+            page.click("#job-notify")
+            page.locator("#job-notify[aria-pressed=true]").wait_for()
+            until(lambda: re.fullmatch(rf"\d+ % · {re.escape(usual)}", page.title()), "%")
+            twin.control("force")
+            twin.abort_job(job)
+            twin.control("release")
+        until(lambda ends=ends: page.title() == f"scan {ends} · {usual}", "the title")
+    assert page.evaluate("window.told") == ["ended: scan aborted", "made: scan done"]
+    page.evaluate("window.dispatchEvent(new Event('focus'))")
+    assert page.title() == usual
     page.close()
