@@ -256,6 +256,12 @@ class Search:
             self._squares[groups] = whole[np.ix_(keep, keep)], whole[keep, self.value]
         return self._squares[groups]
 
+    def columns(self, model: Model) -> FloatArray:
+        """Return the columns of a model, (2 n k, p), as those of its weights."""
+        groups = [self.products.group_block(*g) for g in model.widths]
+        base = self.products.columns(self.base)[:, : self.base_count]
+        return np.concatenate([base, *map(self.products.columns, groups)], axis=1)
+
     def _kept(self, count: int) -> list[int]:
         """List the columns of some blocks, the base's first, that are no values."""
         last = self.base_count + self.draws

@@ -39,6 +39,7 @@ from flexdt.twin.calibration.diagnose.table.groups import (
     rows,
     spots,
 )
+from flexdt.twin.calibration.diagnose.table.held_out import held_out
 from flexdt.twin.calibration.diagnose.table.posterior import Posterior
 from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
 from flexdt.twin.calibration.fit.fit import FitResult
@@ -47,6 +48,8 @@ from flexdt.twin.findings import ERROR, WARNING, Finding, error, warning
 MISFIT_CHANCE: Final = 0.01
 """Probability of positions that scatter so much, below which a fit is not to be used unless
 its residuals are explained."""
+UNPREDICTED_CHANCE: Final = 1e-3
+"""Probability of a block of frames so far from its prediction, below which it is told."""
 NOISE_SIGMAS: Final = 1.5
 """Stated sigmas up to which residuals are noise, however large."""
 LEAST_BEADS: Final = 3
@@ -119,7 +122,7 @@ def judged(
     what = explained(fit, known)
     found = found_in(what, known)
     told = [finding for cause in CAUSES for finding in cause.told(found)]
-    told += _open(found, told)
+    told += _open(found, told) or _unpredicted(what, told)
     fit = what.fit
     if known.asked:
         fit = replace(fit, motions=frame_motions(what, known.asked))
@@ -189,6 +192,23 @@ def _open(found: Found, told: list[Finding]) -> list[Finding]:
             "the residuals have a cause that the images do not tell for certain: "
             f"{' or '.join(found.open)} (most likely {doubtful[0].name}); the intervals contain "
             "what they differ by",
+        )
+    ]
+
+
+def _unpredicted(what: Explained, told: list[Finding]) -> list[Finding]:
+    """Tell of a block of frames that the others do not predict, unless what withholds the
+    numbers is told.
+    """
+    held = held_out(what.search, what.posterior.best)
+    if held.chance > UNPREDICTED_CHANCE or any(_withheld(f) for f in told):
+        return []
+    return [
+        warning(
+            CalibrationCode.CAUSES_OPEN,
+            f"frames {held.frames[0]} to {held.frames[1]} show the beads {held.off_px:.2g} px from "
+            f"where all others predict them (chance {held.chance:.0e}): something that no cause "
+            "describes; the intervals may be too narrow",
         )
     ]
 
