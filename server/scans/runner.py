@@ -208,11 +208,13 @@ class ScanRunner:
     def abort(self, reason: str | None = None) -> None:
         """Request the end of the run: it raises `JobAborted` at its next wait.
 
+        What had paused it is not why it ends, and leaves `progress`.
         `reason`: for the error; None keeps an earlier one.
         """
         if reason is not None:
             self._end = JobAborted(reason)
         self._abort = True
+        self._set_progress(error=None)
         self._wake()
 
     @property

@@ -32,6 +32,20 @@ def test_a_good_script_exits_0(script: Path, capsys: pytest.CaptureFixture[str])
     assert captured.out.splitlines()[-1] == f"{script}: ok"
 
 
+def test_the_last_line_counts_the_warnings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A target beyond its travel is set to the limit: ok, but not in silence."""
+    path = tmp_path / "far.txt"
+    path.write_bytes(GOOD.encode() + b"mag_det\tmove absolute\t1200\t\tACK\t\t\r\n")
+    assert run(["check", str(path)]) == 0
+    captured = capsys.readouterr()
+    count = captured.err.count("warning: ")
+    assert count > 0
+    s = "s" if count > 1 else ""
+    assert captured.out.splitlines()[-1] == f"{path}: ok, {count} warning{s}"
+
+
 def test_the_text_says_what_is_assumed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -237,7 +237,8 @@ class ScanRecord(ArrayValue):
         lit = shown if first is None else first
         if sample is None:
             size = plan.sample or SampleSize(0.0)
-            sample = SampleRecord(diameter_mm=size.diameter_mm, height_mm=size.height_mm)
+            lower, upper = size.span_mm
+            sample = SampleRecord(diameter_mm=size.diameter_mm, height_mm=upper - lower)
         return cls(
             name=name,
             machine=plan.machine,

@@ -114,14 +114,14 @@ def is_utf16(data: str | bytes) -> bool:
     """Return whether a text seems saved as UTF-16, which no scanner writes.
 
     It does by a byte order mark, or if all bytes at even, or all at odd, places of the
-    first 40 are zero (of 4 bytes or more).
+    first 40 are zero and some at the others are not (of 4 bytes or more).
     """
     if isinstance(data, bytes):
         head = data[:40]
     else:
         head = data[:40].encode("utf-8", "surrogatepass")
     return head[:2] in (b"\xff\xfe", b"\xfe\xff") or (
-        len(head) >= 4 and not (any(head[0::2]) and any(head[1::2]))
+        len(head) >= 4 and any(head[0::2]) != any(head[1::2])
     )
 
 

@@ -168,4 +168,6 @@ def show(report: CheckReport, file: str) -> Answer:
         )
         yield table(steps, head) + "\n"
     yield table([(f"{label}:", value) for label, value in summary(report)])
-    yield f"{file}: {'ok' if report.ok else 'not ok'}"
+    doubts = sum(not problem.forbids for problem in report.problems)
+    told = f", {doubts} warning{'s' * (doubts > 1)}" if report.ok and doubts else ""
+    yield f"{file}: {'ok' if report.ok else 'not ok'}{told}"

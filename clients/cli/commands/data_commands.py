@@ -588,7 +588,9 @@ def describe(dataset: Path = argument(..., "DATASET")) -> Answer:
         "provenance": data.provenance.to_list(),
     }
     rows, columns = data.shape
-    yield f"{data.name}: {len(data)} projections of {columns} x {rows} pixels"
+    taken = len(data.present)
+    count = f"{taken}" if taken == len(data) else f"{taken} of {len(data)}"
+    yield f"{data.name}: {count} projections of {columns} x {rows} pixels"
     yield from data.provenance.lines
 
 

@@ -495,6 +495,13 @@ def test_start_and_stage_are_told_in_every_form(
         "\n".join(LINES), flexray, profile, sample=SampleSize(20.0, 30.0, "mine")
     )
     assert dict(summary(stage))["sample"] == "20 mm across, 30 mm high (mine)"
+    corners = np.array(
+        [[x, y, z] for x in (-3, 4) for y in (0, 3) for z in (-3, 37)], float
+    )
+    part = check_script("\n".join(LINES), flexray, profile,
+                        sample=SampleSize.of_points(corners, "part"))  # fmt: skip
+    said = "10 mm across, 40 mm high from -3 to 37 mm (part)"
+    assert dict(summary(part))["sample"] == said
 
 
 def test_poses_are_checked_alike(flexray: Machine, profile: Profile) -> None:

@@ -321,7 +321,10 @@ class CheckReport(WithProblems):
             return f"{EMPTY} ({EMPTY_ASSUMED})"
         high = ""
         if size.height_mm:
-            high = f", {size.height_mm:g} mm high"
+            lower, upper = size.span_mm
+            high = f", {upper - lower:g} mm high"
+            if size.rims_mm:
+                high += f" from {lower:g} to {upper:g} mm"
         return f"{size.diameter_mm:g} mm across{high} ({size.source})"
 
     def to_dict(self) -> dict[str, object]:

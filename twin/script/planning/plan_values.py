@@ -230,6 +230,12 @@ class SampleSize:
         return cls(diameter_mm, height_mm, source, _outer_rims(radius, height))
 
     @property
+    def span_mm(self) -> tuple[float, float]:
+        """Lowest and highest point over the stage's origin [mm]; equal ones: unknown."""
+        heights = [height for _, height in self.outline_mm]
+        return min(heights), max(heights)
+
+    @property
     def outline_mm(self) -> tuple[tuple[float, float], ...]:
         """The rims, else those of the cylinder: circles (radius, height) about the axis."""
         if self.rims_mm:
