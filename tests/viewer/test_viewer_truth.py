@@ -364,7 +364,7 @@ def test_flags_are_drawn_by_the_cameras_limits(
 def test_a_move_that_halts_early_is_not_called_standing(
     page: Any, twin: TwinClient, wait: Wait
 ) -> None:
-    """The motion that the note speaks of is the one that takes place."""
+    """The motion that the note speaks of is the one that takes place, in what was typed."""
     home = {"mag_obj": 600.0, "mag_det": 1000.0}
     page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", home)
 
@@ -386,3 +386,15 @@ def test_a_move_that_halts_early_is_not_called_standing(
         assert words == "mag_det does not move"
     else:
         assert words == f"mag_det goes to {reached:.2f} and halts there"
+    wait(lambda: rest() and abs(twin.state().axes["mag_det"].position - 1000.0) < 1e-6)
+    page.locator("#notes").evaluate("e => e.replaceChildren()")
+    page.get_by_label("Source to detector").fill("260")
+    page.keyboard.press("Enter")
+    words = wait(
+        lambda: page.evaluate("document.querySelector('#notes .error b')?.textContent")
+    )
+    wait(rest)
+    geometry = twin.state().geometry
+    page.evaluate("t => flexdt.call('axes.move', {targets: t, plan: true})", home)
+    assert geometry is not None
+    assert words == f"Source to detector halts at {geometry.SDD_mm:.2f} mm"

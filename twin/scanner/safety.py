@@ -279,7 +279,8 @@ def collision_error(
         ahead,
         contact.last_free,
         "are too close already",
-        f"{outcome} (blocked attempt {count} of {allowed})",
+        f"{outcome} (blocked attempt {count} of {allowed} in a row; "
+        f"the last one blocks all motion until a reset)",
         halts_at=dict(halts_at),
         blocked_attempts=count,
         max_blocked_attempts=allowed,

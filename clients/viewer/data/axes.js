@@ -1,6 +1,7 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
 import { $, $input, $select, el, field, fixed, keep, parsed, setText, term } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
+import { reached } from "./reached.js";
 /** @import { AxisState, State } from "../web/viewer.d.ts" */
 
 const LEASE_S = 0.5;
@@ -165,15 +166,23 @@ export function jogStopAll() {
 }
 
 /**
+ * Where the motors halt instead.
+ * @param {unknown} error
+ * @returns {Record<string, number>}
+ */
+function haltsAt(error) {
+  if (!(error instanceof Failure)) return {};
+  const data = /** @type {{ halts_at?: Record<string, number> } | null} */ (error.data);
+  return data?.halts_at ?? {};
+}
+
+/**
  * What came of a refused move, in a few words.
  * @param {string} axis
  * @param {unknown} error
  */
 function title(axis, error) {
-  const halts =
-    (error instanceof Failure
-      ? /** @type {{ halts_at?: Record<string, number> } | null} */ (error.data)?.halts_at
-      : null) ?? {};
+  const halts = haltsAt(error);
   if (axis in halts) return `${axis} goes to ${fixed(halts[axis], 2)} and halts there`;
   return Object.keys(halts).length ? `${axis} halts on its way` : `${axis} does not move`;
 }
@@ -181,13 +190,14 @@ function title(axis, error) {
 /**
  * Whether the axes were sent there; the first one names them.
  * @param {Record<string, number>} targets
+ * @param {(axis: string, error: unknown) => string} [told] what came of a refusal
  */
-async function send(targets) {
+async function send(targets, told = title) {
   const [axis] = Object.keys(targets);
   const answer = await command(
     "axes.move",
     { targets, plan: $input("#around").checked },
-    (error) => title(axis, error),
+    (error) => told(axis, error),
   );
   for (const warning of answer?.warnings ?? []) emit("note", "warning-note", axis, warning);
   return answer !== null;
@@ -217,7 +227,8 @@ function mainRow(main, state) {
       return;
     }
     const by = shift(s, value);
-    void send(Object.fromEntries(axes.map((name) => [name, s.axes[name].position + by])));
+    const targets = axes.map((name) => [name, s.axes[name].position + by]);
+    void send(Object.fromEntries(targets), (axis, error) => refused(main, s, axis, error));
   }
   input.addEventListener("blur", () => {
     if (store.state) drawMains(store.state);
@@ -231,6 +242,24 @@ function mainRow(main, state) {
       el("span", {}, input, el("span", { class: "unit" }, unit)),
     ),
   ];
+}
+
+/**
+ * What came of a value that was refused, in its own unit: the motors are named in the sentence.
+ * @param {Main} main
+ * @param {State} s when it was typed
+ * @param {string} axis
+ * @param {unknown} error
+ */
+function refused({ words, unit, digits, now, shift }, s, axis, error) {
+  const halts = haltsAt(error);
+  const at =
+    axis in halts
+      ? reached(now(s), halts[axis] - s.axes[axis].position, (v) => shift(s, v))
+      : NaN;
+  return Number.isFinite(at)
+    ? `${words} halts at ${fixed(at, digits)} ${unit}`
+    : `${words} does not get there`;
 }
 
 /** @param {State} state */

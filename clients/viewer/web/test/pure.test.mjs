@@ -11,6 +11,7 @@ import * as job from "../../data/job_words.js";
 import * as meshes from "../../data/mesh_extent.js";
 import * as moments from "../../data/moment.js";
 import * as names from "../../data/names.js";
+import { reached } from "../../data/reached.js";
 import { across, outline } from "../../data/sample_outline.js";
 import * as signals from "../../data/signals.js";
 import { BY_HAND, STEP, stepOf } from "../../data/story_steps.js";
@@ -611,4 +612,24 @@ test("images are counted when they come, not when they are drawn, and not while 
   assert.equal(rate(last, 8000, 3), "");
   assert.equal(rate(last, 8100, 0), "5 images/s");
   assert.equal(rate(last, 10200, 0), "");
+});
+
+test("where motors halt is told in the quantity that was typed", () => {
+  for (let k = 0; k < 300; k++) {
+    const sod = 100 + 500 * random();
+    const sdd = sod + 100 + 500 * random();
+    const by = 90 * (random() - 0.5);
+    const pitch = 0.1496;
+    const voxel = (1000 * pitch * sod) / sdd;
+    const cases = [
+      [sod, (v) => v - sod, sod + by],
+      [sdd, (v) => v - sdd, sdd + by],
+      [sdd / sod, (v) => sdd / v - sod, sdd / (sod + by)],
+      [voxel, (v) => sod * (v / voxel - 1), (1000 * pitch * (sod + by)) / sdd],
+      [12, (v) => 12 - v, 12 - by],
+    ];
+    for (const [now, shift, wanted] of cases)
+      assert.ok(Math.abs(reached(now, by, shift) - wanted) < 1e-6 * Math.abs(wanted) + 1e-9);
+  }
+  assert.ok(Number.isNaN(reached(2, 5, () => 1)));
 });
