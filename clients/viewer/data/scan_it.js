@@ -35,6 +35,7 @@ let mine = null;
 let pressed = false;
 // Until the twin has answered to a choice.
 let exchanging = false;
+let exchanged = Promise.resolve();
 // From the press of the button until the volume stands beside its truth.
 let busy = false;
 // Until the first image: then the stage stands where it turns, and the camera goes there.
@@ -155,7 +156,10 @@ async function script(state, views) {
  * @returns {Promise<string | null>}
  */
 export async function turnOf(named, views = null) {
-  const other = named && named !== store.state?.sample.name;
+  await exchanged; // what was just chosen is on its way: a state that is older knows nothing of it
+  const stands = await command("state.get", {}, "No scan");
+  if (!stands) return null;
+  const other = named && named !== stands.sample.name;
   if (other && !(await command("sample.set", { name: named }, "The sample stays"))) return null;
   const state = await current();
   const made = state && (await script(state, views));
@@ -267,4 +271,6 @@ on("volume", (volume) => {
   if (mine === null && ended) busy = false;
 });
 clicks({ "scan-it": () => scanIt() });
-sample.addEventListener("change", () => void exchange());
+sample.addEventListener("change", () => {
+  exchanged = exchange();
+});
