@@ -22,7 +22,7 @@ import socket
 import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
@@ -279,11 +279,12 @@ def _application(
             except Exception as error:
                 page.set_exception(error)
 
-        try:
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(make)
-            return page.result(MAX_HELD_S)
-        except (TimeoutError, RuntimeError):  # the loop is held, or closed
-            return HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE)
+            wait([page], MAX_HELD_S)
+        if page.done():
+            return page.result()
+        return HttpResponse("{}", HTTPStatus.SERVICE_UNAVAILABLE)
 
     def application(asked: dict[str, Any], start: Callable[..., object]) -> list[bytes]:
         """Answer a request, as WSGI has it: call `start` with status and headers, and

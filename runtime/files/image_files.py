@@ -189,8 +189,8 @@ def read_rows(
     Raises DatasetError: as `read_pixels`, or another shape.
     """
     with opened(path) as file:
-        some = tiff_images.read_tiff_rows(file, rows)
-    if some is not None and some.shape[1] == shape[1]:
+        some = tiff_images.read_tiff_rows(file, shape, rows)
+    if some is not None:
         return some
     values, _ = read_pixels(path)
     if values.shape != shape:

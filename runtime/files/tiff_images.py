@@ -155,14 +155,17 @@ def read_tiff(file: BinaryIO, image: int) -> tuple[npt.NDArray[Any], ImageHead]:
         return values, head
 
 
-def read_tiff_rows(file: BinaryIO, rows: npt.NDArray[np.intp]) -> npt.NDArray[Any] | None:
-    """Read rows of a plain TIFF with the tags of one that was read before, (rows, cols).
+def read_tiff_rows(
+    file: BinaryIO, shape: tuple[int, int], rows: npt.NDArray[np.intp]
+) -> npt.NDArray[Any] | None:
+    """Read rows of a plain TIFF of a shape with the tags of one that was read before,
+    (rows, cols).
 
     Returns:
         None for any other file; nothing of it is decoded.
     """
     known = _plain.get(os.fstat(file.fileno()).st_size)
-    if known is None:
+    if known is None or known.head.shape != shape:
         return None
     for at, part in known.parts:
         file.seek(at)

@@ -720,7 +720,7 @@ def digest_of(body: Body) -> str:
         )
     elif isinstance(body, TriangleMesh):
         sha = hashlib.sha256(body.vertices.astype("<f8").tobytes())
-        sha.update(body.faces.astype("<i8").data)
+        sha.update(np.ascontiguousarray(body.faces, "<i8").data)
     else:
         grid = [body.shape, body.voxel_xyz, [float(c) for c in body.center_mm]]
         sha = hashlib.sha256(json.dumps(grid).encode())

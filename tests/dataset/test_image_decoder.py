@@ -27,7 +27,7 @@ from image_bytes_of import (
 from tiff_bytes_of import COMPRESSIONS, stored_of, tiff_file
 
 from flexdt.runtime.files.dataset_folder import read_image, read_values
-from flexdt.runtime.files.image_files import image_head
+from flexdt.runtime.files.image_files import image_head, read_rows
 from flexdt.twin.dataset.dataset_errors import DatasetError
 
 RNG = np.random.default_rng(77)
@@ -327,3 +327,18 @@ def test_a_base_installation_names_the_extra(
             match=rf"is {what}, which needs imagecodecs: pip install 'flexdt\[io\]'",
         ):
             read(path, content)
+
+
+@pytest.mark.parametrize("shape", [(8, 6), (3, 6), (4, 5)])
+def test_rows_of_another_shape_are_refused_however_often_they_are_asked_for(
+    tmp_path: Path, shape: tuple[int, int]
+) -> None:
+    """The second time the tags are known, and only the rows are read."""
+    path = tmp_path / "dark.tif"
+    grey = np.arange(24, dtype=np.uint16).reshape(4, 6)
+    tifffile.imwrite(path, grey)
+    rows = np.array([0, 2])
+    for _ in range(2):
+        with pytest.raises(DatasetError, match="another shape"):
+            read_rows(path, shape, rows)
+        np.testing.assert_array_equal(read_rows(path, (4, 6), rows), grey[rows])

@@ -95,3 +95,23 @@ def test_peers_that_hold_connections_keep_nobody_out(
         assert len(threads) <= 8 + 2 + 4  # those of displaced ones end at once
 
     with_pages(work, http_host="0.0.0.0", token_file=token)
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError, NotImplementedError, TimeoutError, KeyError]
+)
+def test_what_a_page_raises_is_no_held_loop(error: type[Exception]) -> None:
+    def broken() -> HttpResponse:
+        raise error("mine")
+
+    async def body() -> None:
+        application = http_pages._application({"/metrics": broken}, None, loopback=False)
+        asked = {
+            "PATH_INFO": "/metrics",
+            "REQUEST_METHOD": "GET",
+            http_pages.ADMIT: lambda: None,
+        }
+        with pytest.raises(error, match="mine"):
+            await asyncio.to_thread(application, asked, lambda line, head: None)
+
+    asyncio.run(body())

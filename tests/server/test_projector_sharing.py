@@ -17,6 +17,7 @@ from flexdt.server.imaging.projector_pool import ProjectorPool
 from flexdt.server.projector.service import ProjectorServer, serve_projector
 from flexdt.server.storage.stored_samples import SampleStore
 from flexdt.twin.projection import Volume
+from flexdt.twin.projection.analytic import TriangleMesh
 from flexdt.twin.scanner.state import Sample
 from tests.support.projector_user import ProjectorUser
 from tests.support.shelf import CAMERA, POSES, M, Shelf, block, brightest, imaging_of
@@ -155,3 +156,9 @@ def test_digests_are_of_contents() -> None:
     digests = {digest_of(body) for body in [one, *others, *scenes]}
     assert len(digests) == 8
     assert digest_of(load_phantom("lego").scene) in digests
+    corners = np.eye(4, 3)  # a tetrahedron
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    mesh = [
+        TriangleMesh(corners, order(faces)) for order in (np.array, np.asfortranarray)
+    ]
+    assert digest_of(mesh[0]) == digest_of(mesh[1])

@@ -94,16 +94,17 @@ def judge_frames(
 
     Returns:
         At most one finding for each of the three states, then one on beads: warnings, and
-        errors where it holds for all frames (of beads: all usable ones). Empty if all
-        show beads.
+        errors where no frame is usable (of beads: where no usable one shows any). Empty if
+        all show beads.
     """
     out = []
     name = scan.name
     n = len(looks)
+    usable = [look for look in looks if look.state is FrameState.USABLE]
     for state, (code, words) in _STATES.items():
         some = [look for look in looks if look.state is state]
         files = sorted({look.unusable for look in some if look.unusable})
-        rest = "; the others are used" if len(some) < n else ""
+        rest = "; the others are used" if usable else ""
         text = f"{name}: {len(some)} of {n} frames are {words}{rest}"
         if files:
             if len(files) > MAX_SHOWN:
@@ -112,14 +113,13 @@ def judge_frames(
                 more = ""
             text += f"; unusable: {'; '.join(files[:MAX_SHOWN])}{more}"
         if some:
-            out.append((error if len(some) == n else warning)(code, text))
-    usable = [look for look in looks if look.state is FrameState.USABLE]
+            out.append((warning if usable else error)(code, text))
     empty = sum(len(look.detections) == 0 for look in usable)
     if usable and empty == len(usable):
         out.append(
             error(
                 CalibrationCode.NO_BEADS,
-                f"{name}: no bead was found in any of {n} frames"
+                f"{name}: no bead was found in any of {len(usable)} frames"
                 f"{_of_intensities(scan, sought) or _looked_for(sought)}",
             )
         )

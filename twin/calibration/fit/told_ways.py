@@ -19,7 +19,7 @@ from flexdt.twin.geometry.told_lengths import (
 
 def told_motions(fit: FitResult) -> tuple[Motion, ...]:
     """Return how the told ways and places that a user doubts move sample and panel, in each
-    frame of each scan; empty where none is doubted.
+    frame of each scan (zeros in a scan of which none is); empty where none is doubted.
 
     A told length that is freed, or has a wider prior than is assumed, is corrected in the
     geometry of the views; others stay as told, and are in the sigmas alone.
@@ -60,8 +60,8 @@ def told_motions(fit: FitResult) -> tuple[Motion, ...]:
                     doubted[name][0] * slope,
                     doubted[name][1] * np.abs(slope),
                 )
-        if not columns:
-            return ()
+        if not columns:  # nothing of this scan is doubted, or it goes no way
+            columns["dO_x"] = np.zeros(int(mine.sum())), np.zeros(int(mine.sum()))
         out.append(
             Motion(
                 tuple(columns),
