@@ -664,6 +664,41 @@ def test_parts_about_to_touch_are_highlighted(
     layers(scene, sample=True)
 
 
+def test_a_scene_of_another_size_shows_the_old_picture_until_the_new_one(
+    scene: Any,
+) -> None:
+    """A canvas is emptied by a new size: it has none that no picture has begun with."""
+    show(scene, "iso")
+    frame = next(f for f in scene.frames if "/iso?" in f.url)
+    inside = scene.locator(".view[data-view=iso] iframe").element_handle()
+    frame.evaluate("""() => {
+        const canvas = document.querySelector("canvas[data-engine]");
+        const glass = canvas.getContext("webgl2");
+        const clear = glass.clear;
+        window.begun = new Set([glass.drawingBufferWidth]);
+        window.empty = [];
+        glass.clear = function (mask) {
+            clear.call(glass, mask);
+            begun.add(glass.drawingBufferWidth);
+        };
+        window.looks = setInterval(() => {
+            const width = glass.drawingBufferWidth;
+            if (!begun.has(width)) empty.push(width);
+        }, 1);
+    }""")
+    try:
+        for count, width in enumerate((400, 460, 430), 2):
+            inside.evaluate(f"e => e.style.width = '{width}px'")
+            frame.wait_for_function(
+                f"begun.size >= {count} || empty.length > 0", polling=100
+            )
+        assert frame.evaluate("empty") == []
+    finally:
+        frame.evaluate("clearInterval(looks)")
+        inside.evaluate("e => e.style.width = ''")
+    settled(scene.locator(".view[data-view=iso]"), drawn)
+
+
 def test_nothing_is_drawn_while_nothing_changes(scene: Any, wait: Wait) -> None:
     """By viser's own count of its pictures; left to itself it draws one every second."""
     frame = show(scene, "side").locator("iframe").element_handle().content_frame()

@@ -44,17 +44,40 @@
     function (/** @type {string} */ kind, /** @type {object | undefined} */ options) {
       if (!/^webgl/.test(kind)) return context.call(this, kind, options);
       const made = context.call(this, kind, { ...options, antialias: false });
-      if (made instanceof WebGL2RenderingContext) glass = made;
+      if (made instanceof WebGL2RenderingContext && made !== glass) {
+        glass = made;
+        deferSize(this);
+      }
       return made;
     }
   );
   /** @type {WebGL2RenderingContext | null} */
   let glass = null;
   let drawn = false;
+  // A canvas that is given a size is empty until it is drawn: it gets the size when a picture
+  // begins, and shows the old one until then.
+  /** @type {Map<string, () => void>} */
+  const sizes = new Map();
+  /** @param {HTMLCanvasElement} canvas */
+  const deferSize = (canvas) => {
+    for (const side of /** @type {const} */ (["width", "height"])) {
+      const own = Object.getOwnPropertyDescriptor(HTMLCanvasElement.prototype, side);
+      let value = canvas[side];
+      Object.defineProperty(canvas, side, {
+        get: () => value,
+        set: (/** @type {number} */ given) => {
+          value = given;
+          sizes.set(side, () => own?.set?.call(canvas, given));
+        },
+      });
+    }
+  };
   // eslint-disable-next-line @typescript-eslint/unbound-method -- called with its context
   const clear = gl.clear;
   gl.clear = function (mask) {
     drawn = true;
+    for (const take of sizes.values()) take();
+    sizes.clear();
     clear.call(this, mask);
   };
   let touched = -Infinity;
