@@ -733,7 +733,7 @@ def test_a_turn_of_one_corner_a_look_is_no_way_past_the_corners() -> None:
     "corners", [np.zeros(3), np.zeros((4, 2)), np.full((4, 3), np.nan)]
 )
 def test_corners_that_are_none_are_refused(corners: FloatArray) -> None:
-    with pytest.raises(ValueError, match=r"allowed: \(k, 3\), finite"):
+    with pytest.raises(ValueError, match=r"allowed: k x 3, finite"):
         Polytope(corners, np.zeros((1, 3), dtype=np.intp))
 
 

@@ -227,8 +227,10 @@ function mainRow(main, state) {
       return;
     }
     const by = shift(s, value);
-    const targets = axes.map((name) => [name, s.axes[name].position + by]);
-    void send(Object.fromEntries(targets), (axis, error) => refused(main, s, axis, error));
+    /** @type {Record<string, number>} */
+    const targets = {};
+    for (const name of axes) targets[name] = s.axes[name].position + by;
+    void send(targets, (axis, error) => refused(main, s, axis, error));
   }
   input.addEventListener("blur", () => {
     if (store.state) drawMains(store.state);

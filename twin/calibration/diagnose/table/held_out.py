@@ -57,6 +57,8 @@ def held_out(search: Search, model: Model) -> HeldOut:
     table = search.table
     block = _blocks(table.scans, table.n)
     count = int(block.max(initial=-1)) + 1
+    if count == 0:
+        return NOT_HELD_OUT
     weight = np.repeat(table.weight, 2, axis=1)
     sums = np.zeros((count, table.n))
     sums[block[block >= 0], np.flatnonzero(block >= 0)] = 1.0
