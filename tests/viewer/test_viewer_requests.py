@@ -95,6 +95,7 @@ WRONG = [
     ("viewer.window", {"low": float("nan"), "high": 1.0}),
     ("viewer.window", {"low": 0.0, "high": float("inf")}),
     ("viewer.layers", {"no such layer": True}),
+    ("viewer.covered", {"view": "iso", "boxes": [[0.0, 1.0, 2.0]]}),
     ("viewer.layers", {"beam": "yes"}),
     ("viewer.layers", {"opacity": []}),
     ("viewer.theme", {"dark": 3}),
