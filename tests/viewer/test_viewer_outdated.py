@@ -91,6 +91,7 @@ def test_a_scan_that_waits_takes_no_other_ones_place(page: Any) -> None:
         "frames_total": 9,
         "elapsed_s": 1.0,
         "speed_up": 1,
+        "what": "",
     }
     first = {**job, "job": "job-a", "state": "running", "dataset": "/data/a"}
     later = {**job, "job": "job-b", "state": "queued", "dataset": "/data/b"}
@@ -101,7 +102,7 @@ def test_a_scan_that_waits_takes_no_other_ones_place(page: Any) -> None:
 
 
 def test_slices_of_another_page_and_answers_that_come_late(page: Any) -> None:
-    job = {"job": "x", "state": "running", "dataset": "/data/none", "time": 1e9, "speed_up": 1,
+    job = {"job": "x", "state": "running", "dataset": "/data/none", "time": 1e9, "speed_up": 1, "what": "",
            "frames_done": 3, "frames_total": 9, "elapsed_s": 1.0}  # fmt: skip
     choose = """
     const size = document.querySelector('#volume-side');
