@@ -122,26 +122,6 @@ def test_a_swing_has_a_period_of_its_own(kind: str, seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
-@pytest.mark.parametrize(
-    ("kind", "seed"),
-    [
-        ("breathing", 93003),
-        ("swinging+jump", 93005),
-        ("relaxing", 92004),
-        ("growing", 95000),
-    ],
-)
-def test_what_moves_goes_in_a_direction_of_its_own(kind: str, seed: int) -> None:
-    """With one width of all directions, what came and went along the beam was an object that moves
-    aside and never up: tau was up to 11 sigmas off.
-    """
-    found = scored(kind, seed)
-    assert found.offered, found.said
-    assert found.worst < FAR_SIGMAS, found.where
-
-
-@pytest.mark.slow
 def test_eigenvalues_that_lapack_does_not_find_are_found() -> None:
     """Its divide and conquer does not converge for the slow errors of these spots."""
     assert scored("breathing", 900).offered

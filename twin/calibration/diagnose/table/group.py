@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,6 @@ __all__ = [
     "Acts",
     "Family",
     "Found",
-    "Kin",
     "Known",
     "Seen",
 ]
@@ -93,20 +92,6 @@ class Known:
     pitch: Pitch | None = None
 
 
-class Kin(NamedTuple):
-    """A part of what may be there in parts, each as large as it is: the directions of a motion.
-
-    Attributes:
-        of: what has the part.
-        way: in which it has it: another may have the same parts in the same way.
-        part: of it.
-    """
-
-    of: str
-    way: Hashable
-    part: str
-
-
 @dataclass(frozen=True, eq=False)
 class Family:
     """Groups of one cause that have the same number of columns.
@@ -129,9 +114,6 @@ class Family:
         always: width that always holds, so that the group is no question; 0: it is one.
         root: (q, c) what each weight does to the q places of `Acts.COLUMNS`, where these do not
             change by themselves; None: each is one.
-        kin: of each group, which part of what it is; empty: each is whole by itself.
-        beside: logarithm of the odds of each group beside one that is a part of the same, (g,) or
-            of all.
     """
 
     cause: str
@@ -145,8 +127,6 @@ class Family:
     widest: float | FloatArray = math.inf
     always: float = 0.0
     root: FloatArray | None = None
-    kin: tuple[Kin, ...] = ()
-    beside: float | FloatArray = 0.0
 
     @property
     def chances(self) -> FloatArray:

@@ -10,14 +10,14 @@ mixture of the best model and of it with one group more, one less, or one exchan
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh, lapack
 
-from flexdt.twin.calibration.diagnose.table.group import OPEN_LOG_ODDS, Family, Kin
+from flexdt.twin.calibration.diagnose.table.group import OPEN_LOG_ODDS, Family
 from flexdt.twin.calibration.diagnose.table.linearised import Linearised
 from flexdt.twin.calibration.diagnose.table.products import Products
 from flexdt.twin.calibration.fit.certificate import SPREAD_FREEDOM
@@ -167,12 +167,6 @@ class Search:
         every = table.values[:, None] if values is None else values
         self.products = Products(table, families)
         self.free = [i for i, f in enumerate(families) if not f.always]
-        self._at = {
-            kin: (i, g) for i, f in enumerate(families) for g, kin in enumerate(f.kin)
-        }
-        self._beside = [
-            np.broadcast_to(np.asarray(f.beside), len(f.names)) for f in families
-        ]
         self.spread = spread
         self.freedom = SPREAD_FREEDOM if spread > 0 else 0.0
         columns = [table.geometry]
@@ -213,30 +207,9 @@ class Search:
         self.least = 1e-12 * self.total + 1e-300
         self._squares: dict[tuple[Group, ...], tuple[FloatArray, FloatArray]] = {}
 
-    def chance(self, groups: Iterable[Group]) -> float:
-        """Return the log odds of some groups before the scan, with their widths' shares of the
-        grid: those that are parts of one thing are as likely as it is, and each beside it.
-        """
-        total = 0.0
-        there: set[tuple[object, ...]] = set()
-        for f, g in groups:
-            chance, beside, kin = self._odds(f, g)
-            total += OCCAM + (beside if kin in there else chance)
-            there |= {kin} - {()}
-        return total
-
-    def _odds(self, f: int, g: int) -> tuple[float, float, tuple[object, ...]]:
-        """Return the log odds of a group alone and beside its kin, and what it is a part of."""
-        kin = self._kin_of((f, g))
-        chance = float(self.products.families[f].chances[g])
-        return chance, float(self._beside[f][g]), () if kin is None else kin[:2]
-
-    def chances_beside(self, f: int, groups: Iterable[Group]) -> FloatArray:
-        """Return the log odds of a family's groups, (g,), beside some groups."""
-        family = self.products.families[f]
-        there = {self._odds(*group)[2] for group in groups if group not in self.held}
-        near = [kin[:2] in there for kin in family.kin] or [False]
-        return np.where(near, self._beside[f], family.chances)
+    def chance(self, group: Group) -> float:
+        """Return the log odds of a group before the scan, with its width's share of the grid."""
+        return float(self.products.families[group[0]].chances[group[1]]) + OCCAM
 
     def _between(self, one: int, other: int) -> FloatArray:
         """Return the products of two blocks, made once."""
@@ -363,7 +336,7 @@ class Search:
     ) -> Model:
         """Make a model, with its evidence; that groups are held open is no question."""
         evidence = self._evidence(solved, noise2) + FACTORS[factor][1]
-        evidence += self.chance(group for group in widths if group not in self.held)
+        evidence += sum(self.chance(group) for group in widths if group not in self.held)
         return Model(widths, noise2, factor, solved, evidence)
 
     def further(self, model: Model, *, pinned: bool = False) -> dict[int, Further]:
@@ -449,7 +422,7 @@ class Search:
         """
         best = ((-1, -1), -math.inf, 0.0)
         for f, one in further.items():
-            total = one.total + self.chances_beside(f, model.widths)
+            total = one.total + self.products.families[f].chances
             g = int(np.argmax(total))
             if total[g] > best[1]:
                 width2 = model.noise2 * GRID[int(np.argmax(one.gain[g]))] ** 2
@@ -464,37 +437,9 @@ class Search:
         solved = self.solve(widths, model.noise2, model.factor)
         return Model(widths, model.noise2, model.factor, solved, -math.inf)
 
-    def _elsewhere(self, widths: Mapping[Group, float]) -> Iterator[dict[Group, float]]:
-        """Yield a model's groups with all parts of one thing exchanged for the same of another."""
-        for kin, own in self._things(widths).items():
-            for other in dict.fromkeys(k.of for k in self._at if k.way == kin.way):
-                there = {g: self._at.get(k._replace(of=other)) for g, k in own.items()}
-                if len(own) > 1 and other != kin.of and None not in there.values():
-                    yield {there.get(g) or g: width for g, width in widths.items()}
-
-    def _whole(self, model: Model) -> Iterator[dict[Group, float]]:
-        """Yield a model's groups with all parts of one thing of which some are there."""
-        for kin in self._things(model.widths):
-            parts = [g for k, g in self._at.items() if k[:2] == kin[:2]]
-            if not set(parts) <= set(model.widths):
-                yield {**dict.fromkeys(parts, model.noise2), **model.widths}
-
-    def _things(self, widths: Iterable[Group]) -> dict[Kin, dict[Group, Kin]]:
-        """Collect the groups of which each thing is there, by what their kin share."""
-        out: dict[Kin, dict[Group, Kin]] = {}
-        for group in widths:
-            kin = self._kin_of(group)
-            if kin is not None:
-                out.setdefault(kin._replace(part=""), {})[group] = kin
-        return out
-
-    def _kin_of(self, group: Group) -> Kin | None:
-        family = self.products.families[group[0]]
-        return family.kin[group[1]] if family.kin else None
-
     def climbed(self, model: Model) -> tuple[Model, dict[int, Further]]:
-        """Climb from a model: add, drop or exchange groups, by themselves or all parts of one
-        thing, and widen the priors, as long as that is more probable.
+        """Climb from a model: add, drop or exchange groups, and widen the priors, as long as
+        that is more probable.
 
         Returns:
             The model, and what further groups would add to it.
@@ -517,11 +462,6 @@ class Search:
                     )
                     if exchanged.evidence > model.evidence + 0.5:
                         model, changed = exchanged, True
-            for widths in (*self._elsewhere(model.widths), *self._whole(model)):
-                other_ = self.model(widths, model.noise2, model.factor)
-                if other_.evidence > model.evidence + 0.5:
-                    model, changed = other_, True
-                    break
             for factor in range(len(FACTORS)):
                 if factor != model.factor:
                     wider = self.model(model.widths, model.noise2, factor)
@@ -592,8 +532,8 @@ class Search:
             mean = one.solved.mean[:count]
             covariance = one.solved.covariance[:count, :count]
             for f, more in some.items():
-                chance = self.chances_beside(f, one.widths) - math.log(len(GRID))
-                weight = log_weight + more.gain + chance[:, None]
+                chance = self.products.families[f].chances[:, None] - math.log(len(GRID))
+                weight = log_weight + more.gain + chance
                 for g, w in np.argwhere(weight > LEAST_LOG_WEIGHT).tolist():
                     width = more.values[g] + GRID[w] ** -2.0
                     taken = more.taken[g].T @ more.vectors[g] / one.noise2
@@ -618,12 +558,9 @@ class Search:
             beside = self._pinned(model, group)
             some = self.further(beside, pinned=True)
             f, g = group
-            own = float(some[f].total[g] + self.chances_beside(f, beside.widths)[g])
+            own = float(some[f].total[g] + self.products.families[f].chances[g])
             some[f].gain[g] = -np.inf
             take_further(beside, some, -own)
-        for widths in self._elsewhere(model.widths):
-            moved = self.model(widths, model.noise2, model.factor)
-            take(moved, moved.evidence - model.evidence)
         for factor in range(len(FACTORS)):
             if factor < model.factor:
                 narrow = self.model(model.widths, model.noise2, factor)

@@ -3,9 +3,9 @@
 A motion is a ramp, a jump, a wander (half waves that fade with their number, as those of a random
 walk do or as those of what slows down), a swing (of a period of its own, which need not be the
 turn's, and with an amplitude that may change), or a jitter (each frame by itself), of object,
-source or panel along an axis, or of the angle. What moves goes in a direction of its own: its
-parts along the axes are kin, each as large as the images say. All have a mean of zero over the
-scan: the geometry is that of the mean.
+source or panel along an axis, or of the angle. What moves along the beam moves aside, too, and
+what turns back aside goes along the beam: a mount goes in a direction of its own. All have a mean
+of zero over the scan: the geometry is that of the mean.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Final, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial.legendre import legvander
-from scipy.special import spherical_jn
 
 from flexdt.twin.calibration.diagnose import CalibrationCode
 from flexdt.twin.calibration.diagnose.frame_numbers import named_turn
@@ -28,7 +27,6 @@ from flexdt.twin.calibration.diagnose.table.group import (
     Acts,
     Family,
     Found,
-    Kin,
     Known,
     Seen,
 )
@@ -89,12 +87,24 @@ SWINGS: Final = (2, 16)
 """Least and most half periods in a scan, of a swing: with fewer it is a drift."""
 LEAST_SWINGING: Final = 12
 """Frames of which a swing is told."""
-SWELL_DEGREES: Final = np.arange(4)
-"""Of Legendre's polynomials, as which an amplitude changes."""
-SWELLS: Final = (2 * SWELL_DEGREES + 1) * spherical_jn(SWELL_DEGREES, math.pi / 4.0)
-"""Their parts in a swing whose period lies in the middle between two that are tried: at the ends
-of the scan it is a quarter of a half period early, and late (Rayleigh's plane wave)."""
+SWELLS: Final = (1.0, 0.7, 0.2, 0.03)
+"""Of an amplitude that changes as Legendre's polynomials do: the parts of a swing whose period lies
+in the middle between two that are tried."""
+ASIDE: Final[Mapping[str, tuple[str, ...]]] = {
+    f"{body}_z": (f"{body}_x", f"{body}_y") for body in ("dO", "dS", "dD")
+}
+"""What moves along the beam -> what else it does by as much: the images do not tell where the beam
+is."""
+ALONG: Final[Mapping[str, tuple[str, ...]]] = {
+    f"{body}_x": (f"{body}_z",) for body in ("dO", "dS", "dD")
+}
+"""What moves aside -> what else it does by as much, where it turns back: once a turn, both are what
+a phantom does that is aside on its mount."""
 DIFFERS: Final = "differs between scans"
+JUMPING: Final = ("jumps", "jitters", DIFFERS)
+"""Ways of motion of which that is no part."""
+FIRST_COLUMNS: Final = 8
+"""Columns of a course, with which it does: the slow ones."""
 LEAVING: Final = ("jumps", "wanders", "slows down", "ramps")
 """Ways of motion after which a thing is elsewhere than before."""
 KINDS: Final = 5
@@ -132,10 +142,10 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
             each = np.stack([_in(table.n, frames, course) for course in courses])
             chance = LOG_CHANCE - math.log(KINDS * len(courses))
             at = [int(frames[i]) if how == "jumps" else i for i in places]
-            for names in _alike(some):
+            for names in _alike(some, how, known):
                 yield _family(
                     table, [Moves(m, how, number, i) for i in at for m in names], where,
-                    each, chance, np.tile(_doubt(names, known), len(courses)),
+                    each, chance + np.tile(_doubt(names, known), len(courses)), known,
                 )  # fmt: skip
     if many:
         group = table.problem.group
@@ -147,11 +157,12 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
         # geometry has its place.
         placed = {n[-1] for n in own if n.startswith("place")}
         shared = tuple(what for what, part in MOVERS.items() if own.isdisjoint(part))
-        for names in _alike(shared):
+        for names in _alike(shared, DIFFERS, known):
             still = [what != "alpha" and what[-1] in placed for what in names]
             yield _family(
                 table, [Moves(name, DIFFERS, -1) for name in names], "",
-                differs[None], LOG_CHANCE - math.log(KINDS), np.where(still, NEVER, 0.0),
+                differs[None], np.where(still, NEVER, LOG_CHANCE - math.log(KINDS)),
+                known,
             )  # fmt: skip
 
 
@@ -174,7 +185,7 @@ def _kinds(count: int) -> Iterator[tuple[str, list[int], FloatArray]]:
     if count >= LEAST_SWINGING:
         halves = np.arange(SWINGS[0], min(SWINGS[1], count // 2) + 1)
         phase = math.pi * halves[:, None] * place
-        swells = legvander(2.0 * place - 1.0, SWELL_DEGREES[-1]) * SWELLS
+        swells = legvander(2.0 * place - 1.0, len(SWELLS) - 1) * SWELLS
         waves_of = np.stack([np.cos(phase), np.sin(phase)], axis=2)
         swings = np.einsum("hnw,nq->hnqw", waves_of, swells).reshape(
             len(halves), count, -1
@@ -211,17 +222,27 @@ def mover(place: object) -> str:
     return ""
 
 
-def _parts(name: str) -> Mapping[str, float]:
-    """Return the parameters of a frame that stand for what moves, with their factors."""
-    return MOVERS.get(name, {name: 1.0})
-
-
-def _alike(names: tuple[str, ...]) -> list[list[str]]:
+def _alike(names: tuple[str, ...], how: str, known: Known) -> list[list[str]]:
     """Group movers by the numbers of their parameters, the angle by itself."""
-    alike: dict[tuple[int, bool], list[str]] = {}
+    alike: dict[tuple[tuple[int, ...], bool], list[str]] = {}
     for name in names:
-        alike.setdefault((len(_parts(name)), name == "alpha"), []).append(name)
+        parts = _parts(name, how, known)
+        kind = tuple(len(part) for part in parts), name == "alpha"
+        alike.setdefault(kind, []).append(name)
     return list(alike.values())
+
+
+def _parts(name: str, how: str, known: Known) -> list[dict[str, float]]:
+    """Return the parameters of a frame that stand for what moves in a way, with their factors,
+    and those of what else it does: nothing that is stated to be exactly known, and of what is
+    asked for, only what is asked for as well.
+    """
+    others = ASIDE.get(name, () if how in JUMPING else ALONG.get(name, ()))
+    if name in known.asked:
+        others = tuple(o for o in others if o in known.asked)
+    exact = _exact(known)
+    others = tuple(o for o in others if exact.isdisjoint(MOVERS[o]))
+    return [MOVERS.get(one, {one: 1.0}) for one in (name, *others)]
 
 
 def _exact(known: Known) -> frozenset[str]:
@@ -233,7 +254,8 @@ def _doubt(names: Sequence[str], known: Known) -> FloatArray:
     be exactly known, and of what is not asked for where others are.
     """
     exact = _exact(known)
-    out = np.array([0.0 if exact.isdisjoint(_parts(n)) else EXACT for n in names])
+    own = [MOVERS.get(name, {name: 1.0}) for name in names]
+    out = np.array([0.0 if exact.isdisjoint(part) else EXACT for part in own])
     if known.asked:
         out += [0.0 if name in known.asked else NOT_ASKED for name in names]
     return out
@@ -250,8 +272,8 @@ def _family(
     moves: list[Moves],
     where: str,
     courses: FloatArray,
-    chance: float,
-    doubt: FloatArray,
+    chance: float | FloatArray,
+    known: Known,
 ) -> Family:
     """Make a family of motions of as many parameters each.
 
@@ -261,27 +283,39 @@ def _family(
         where: words on the scan.
         courses: (m, n, c) of the frames, each with all movers.
         chance: of each.
-        doubt: that it is each that moves.
+        known: what is asked for, and what is exact.
     """
-    parts = [_parts(move.what) for move in moves]
+    parts = [_parts(move.what, move.how, known) for move in moves]
     first = parts[: len(parts) // len(courses)]
     names = tuple(
         f"{m.what} {m.how}{f' at {m.at}' if m.at >= 0 else ''}{where}" for m in moves
     )
-    factors = np.array(list(first[0].values()))
+    every = [tuple(name for one in part for name in one) for part in parts]
     return Family(
         NAME,
         names,
         Acts.FRAMES,
-        tuple(zip([tuple(part) for part in parts], moves, strict=True)),
-        chance + doubt,
-        slopes=np.array([[PER_FRAME.index(p) for p in part] for part in first]),
-        courses=factors[:, None, None] * courses[:, None],
-        kin=tuple(
-            Kin(m.what.split("_")[0], (m.how, m.scan, m.at), m.what[-1]) for m in moves
+        tuple(zip(every, moves, strict=True)),
+        chance,
+        slopes=np.array(
+            [[PER_FRAME.index(p) for p in part] for part in every[: len(first)]]
         ),
-        beside=doubt,
+        courses=_side_by_side(courses, first[0]),
     )
+
+
+def _side_by_side(
+    courses: FloatArray, parts: Sequence[Mapping[str, float]]
+) -> FloatArray:
+    """Give each part of a mover columns of its own for its courses: (m, n, c) to (m, s, n, c') of
+    its s parameters.
+    """
+    columns = [courses, *[courses[:, :, :FIRST_COLUMNS]] * (len(parts) - 1)]
+    rows: list[FloatArray] = []
+    for i, part in enumerate(parts):
+        each = [own if i == j else np.zeros_like(own) for j, own in enumerate(columns)]
+        rows += [factor * np.concatenate(each, axis=2) for factor in part.values()]
+    return np.stack(rows, axis=1)
 
 
 def told(found: Found) -> list[Finding]:
@@ -368,13 +402,13 @@ def _moved(seen: Sequence[Seen], found: Found) -> Finding:
         what = _moves(one).what
         effects[what] = math.hypot(effects.get(what, 0.0), one.effect_px)
     ordered = sorted(effects, key=lambda what: -effects[what])
-    ordered = [what for what in ordered if effects[what] > 0.3 * effects[ordered[0]]]
     first = [s for s in seen if _moves(s).what == ordered[0]]
     said = []
     for what in ordered:
         reach, _ = _reach([s for s in seen if _moves(s).what == what])
-        parameter = "dO_z" if what == "dS_z" else what
-        said.append(f"{what} by {to_edge(parameter, reach):.3g} {UNITS[parameter]}")
+        if effects[what] > 0.3 * effects[ordered[0]]:
+            parameter = "dO_z" if what == "dS_z" else what
+            said.append(f"{what} by {to_edge(parameter, reach):.3g} {UNITS[parameter]}")
     # What moved in a scan is elsewhere in the next.
     within = [s for s in first if _moves(s).how != DIFFERS]
     main = max(within or first, key=lambda s: s.effect_px)

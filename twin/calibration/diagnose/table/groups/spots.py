@@ -30,14 +30,14 @@ or distorts, however small they are (assumed)."""
 KINDS: Final = 4
 """Kinds of errors, which share the odds."""
 HARMONICS: Final = 3
-"""Of errors that repeat, with the turn or from pixel to pixel: they fade with their number, as
-those of a rounding do."""
 LEAST_FRAMES: Final = 16
 MOST_WAVES: Final = 16
 """Half waves over the scan, of slow errors."""
 MOST_COLUMNS: Final = 360
 """Columns of slow errors, from which the waves of many beads are fewer."""
 WITHIN: Final = "within their pixels"
+PIXEL_HARMONICS: Final = 2
+"""Of the distance between pixels, of errors that repeat from pixel to pixel."""
 MOST_WITHIN_PX: Final = 0.5
 """Largest of them: a centre lies in its pixel."""
 BEAD_ERROR_SPREADS: Final = 1.0
@@ -106,9 +106,8 @@ def _within_pixels(places: FloatArray) -> FloatArray:
     """Make shifts of spots (n, k, 2, c) that repeat from pixel to pixel along each axis: what
     sampling by pixels does to the centre of a shadow.
     """
-    number = np.arange(1, HARMONICS + 1)
-    phase = 2.0 * math.pi * places[..., None] * number
-    waves = np.concatenate([np.cos(phase) / number, np.sin(phase) / number], axis=3)
+    phase = 2.0 * math.pi * places[..., None] * np.arange(1, PIXEL_HARMONICS + 1)
+    waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=3)
     count = waves.shape[3]
     out = np.zeros((*places.shape, 2 * count))
     for axis in (0, 1):
