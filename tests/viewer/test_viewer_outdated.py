@@ -102,8 +102,8 @@ def test_a_scan_that_waits_takes_no_other_ones_place(page: Any) -> None:
 
 
 def test_slices_of_another_page_and_answers_that_come_late(page: Any) -> None:
-    job = {"job": "x", "state": "running", "dataset": "/data/none", "time": 1e9, "speed_up": 1, "what": "",
-           "frames_done": 3, "frames_total": 9, "elapsed_s": 1.0}  # fmt: skip
+    job = {"job": "x", "state": "running", "dataset": "/data/none", "time": 1e9, "speed_up": 1,
+           "frames_done": 3, "frames_total": 9, "elapsed_s": 1.0, "what": ""}  # fmt: skip
     choose = """
     const size = document.querySelector('#volume-side');
     const note = document.querySelector('#volume-note');
