@@ -61,6 +61,11 @@ const above = () => {
 };
 const tops = new ResizeObserver(above);
 for (const id of ["#top", "#scan-bar"]) tops.observe($(id));
+// What is brought into view in the left column is not under what stands at its foot.
+const foot = $("#nearest");
+new ResizeObserver(() =>
+  document.body.style.setProperty("--foot", `${foot.offsetHeight}px`),
+).observe(foot);
 // Window and tools of the radiograph are closed until somebody opens them; this browser remembers.
 const TOOLS = "flexdt-tools";
 /** @type {HTMLDetailsElement} */
