@@ -209,6 +209,8 @@ on("volume", (m) => {
     progress.hidden = true;
     return;
   }
+  // What is read at a pointer that rests has the errors of the volume as soon as these are known.
+  const more = (m.volumes?.length ?? 0) !== (told?.volumes?.length ?? 0);
   told = m;
   follow(m);
   const other =
@@ -237,6 +239,7 @@ on("volume", (m) => {
   ];
   setText(note, other + facts.filter(Boolean).join(" · "));
   if (m.volumes) offer(m.volumes, Object.keys(m.compared ?? {})[1]);
+  if (more && pointer) point(pointer);
   if (m.views !== undefined && (!m.past || !blocks.size)) void want();
   if (m.compared) compared(m.compared);
   if (m.compared && m.volumes?.includes("truth")) void beside();
