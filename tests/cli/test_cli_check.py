@@ -386,3 +386,18 @@ def test_the_table_shows_what_will_happen_and_not_only_what_was_asked(
     assert "rot_obj speed 1000 (limited to rot_obj " in out
     assert "mag_obj to 3000 (limited to mag_obj 996 mm)\n" in out
     assert "mag_obj to 600\n" in out
+
+
+def test_a_binary_mesh_is_no_text_of_another_coding(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """80 bytes of head may all be zero; a UTF-16 text has zeros in every second place alone."""
+    mesh = tmp_path / "part.stl"
+    mesh.write_bytes(bytes(80) + (60).to_bytes(4, "little") + bytes(range(50)) * 60)
+    assert run(["check", str(mesh)]) != 0
+    said = "".join(capsys.readouterr())
+    assert "UTF-16" not in said
+    assert "binary data" in said
+    mesh.write_bytes(GOOD.encode("utf-16-le"))
+    assert run(["check", str(mesh)]) != 0
+    assert "UTF-16" in "".join(capsys.readouterr())

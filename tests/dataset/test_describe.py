@@ -47,6 +47,22 @@ def test_every_value_is_printed_with_its_use(
     assert len(document["warnings"]) == 2
 
 
+@pytest.mark.parametrize(("gone", "count"), [(0, "4"), (1, "3 of 4"), (3, "1 of 4")])
+def test_projections_that_are_not_there_are_not_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], gone: int, count: str
+) -> None:
+    geometry = fx.ConeVec.circular(sod=50.0, sdd=100.0, angles=4, shape=(6, 9), pixel=0.2)
+    images = np.full((4, 6, 9), 500, np.uint16)
+    flat = np.full((6, 9), 900, np.uint16)
+    fx.DataSet.from_arrays(images, geometry, dark=flat * 0, flat=flat).save(
+        tmp_path / "s"
+    )
+    for path in sorted((tmp_path / "s").glob("scan_*.tif"))[:gone]:
+        path.unlink()
+    assert run(["describe", str(tmp_path / "s")]) == 0
+    assert f": {count} projections of 9 x 6 pixels" in capsys.readouterr().out
+
+
 def test_a_notebook_shows_the_table(scan: Path) -> None:
     html = fx.open(scan)._repr_html_()
     assert "<td>unknown_thing</td><td>7</td><td>ignored</td>" in html

@@ -79,6 +79,9 @@ def test_a_stop_while_the_rest_of_a_scan_is_swept_pauses_it(
         assert not lab.twin.scanner.moving(lab.twin.clock.now())
         await resumed
         await client.call("job.abort", job=job)
+        # What had paused it is not why it ended.
+        status = await client.call("job.status", job=job)
+        assert (status["state"], status["error"]) == ("aborted", None)
 
     run(tmp_path, body, virtual=True, speed_up=20.0)
 

@@ -168,6 +168,6 @@ def show(report: CheckReport, file: str) -> Answer:
         )
         yield table(steps, head) + "\n"
     yield table([(f"{label}:", value) for label, value in summary(report)])
-    doubts = sum(not problem.forbids for problem in report.problems)
+    doubts = len(report.problems.warnings)
     told = f", {doubts} warning{'s' * (doubts > 1)}" if report.ok and doubts else ""
     yield f"{file}: {'ok' if report.ok else 'not ok'}{told}"

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 from robustness import SURVIVABLE, run_case
 from spoilt_scans import Outcome, corrupt, judge
 
 from flexdt.phantoms import load_phantom
 from flexdt.twin.calibration.bead_model import bead_model
+from flexdt.twin.calibration.diagnose.data import judge_frames
+from flexdt.twin.calibration.frame_source import FrameState
 
 LEGO = load_phantom("lego")
 OTHER = load_phantom("compact-4").scene
@@ -91,3 +96,18 @@ DRAWN = ("frames_repeated", "vibration", "angle_slip", "angle_jitter", "angle_sc
 @pytest.mark.campaign(1)
 def test_never_confidently_wrong(kind: str) -> None:
     assert not outcome(kind, 1001).wrong
+
+
+def test_frames_that_nobody_uses_are_an_error_whatever_is_wrong_with_each() -> None:
+    scan: Any = SimpleNamespace(name="scan")
+    looks: Any = [
+        SimpleNamespace(state=state, unusable=None, detections=())
+        for state in [FrameState.MISSING] * 5 + [FrameState.DARK] * 5
+    ]
+    found = judge_frames(scan, looks, None)  # type: ignore[arg-type]
+    assert [f.forbids for f in found] == [True, True]
+    assert not any("the others are used" in f.text for f in found)
+    looks[0].state, looks[0].detections = FrameState.USABLE, (1,)
+    found = judge_frames(scan, looks, None)  # type: ignore[arg-type]
+    assert [f.forbids for f in found] == [False, False]
+    assert all("the others are used" in f.text for f in found)

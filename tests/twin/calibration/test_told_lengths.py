@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from told_lengths_drawn import drawn_told
 from flexdt.twin.calibration.bead_model import BeadModel, Tolerance
 from flexdt.twin.calibration.diagnose.table.group import Acts, Family, Known
 from flexdt.twin.calibration.diagnose.table.groups import _limited, moving, tiles
+from flexdt.twin.calibration.fit import told_ways
 from flexdt.twin.calibration.fit.fit import estimate_geometry, image_quantities
 from flexdt.twin.calibration.fit.priors import known_scale, known_strain
 from flexdt.twin.calibration.fit.told_ways import told_motions
@@ -22,7 +24,13 @@ from flexdt.twin.calibration.without_phantom.gaps.gap_evidence import GapFound
 from flexdt.twin.calibration.without_phantom.symmetry_plane import _gap
 from flexdt.twin.errors import TwinError, UnknownNameError
 from flexdt.twin.geometry.poses import Poses
-from flexdt.twin.geometry.told_lengths import TOLD, TOLD_MEANINGS, TOLD_SOURCES, told_by
+from flexdt.twin.geometry.told_lengths import (
+    PLACES,
+    TOLD,
+    TOLD_MEANINGS,
+    TOLD_SOURCES,
+    told_by,
+)
 from flexdt.twin.machine.stated_causes import (
     CAUSE_MEANINGS,
     CAUSES,
@@ -214,3 +222,26 @@ def test_courses_are_as_wide_as_an_encoder_or_a_stage_is_stated_to_be(
     assert np.sqrt(np.nanmean(drawn_**2, axis=(1, 2))) == pytest.approx(
         0.25 * unit, rel=0.05
     )
+
+
+@pytest.mark.parametrize("other", [0, 1])
+def test_a_scan_of_which_nothing_is_doubted_leaves_the_others_theirs(
+    monkeypatch: pytest.MonkeyPatch, other: int
+) -> None:
+    name = f"{PLACES[0]}@{1 - other}"
+    problem = SimpleNamespace(
+        layout=SimpleNamespace(names=(name,), parameter_count=1),
+        prior_sigma=np.array([50.0]),
+        poses=None,
+        base=(None, None),
+        group=np.array([0, 0, 0, 1, 1]),
+    )
+    fit: Any = SimpleNamespace(
+        problem=problem, solution=SimpleNamespace(x=np.array([0.25])), sigmas={name: 0.1}
+    )
+    still = np.zeros((5, 3))
+    monkeypatch.setattr(told_ways, "ways", lambda poses: (still, still))
+    motions = told_motions(fit)
+    assert [len(motion.values) for motion in motions] == [3, 2]
+    assert (motions[1 - other].values == 0.25).all()
+    assert (motions[other].values == 0.0).all()

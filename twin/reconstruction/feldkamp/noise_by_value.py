@@ -52,9 +52,8 @@ class NoiseByValue:
             + images[:, :-1, :-1]
         )
         edges = np.linspace(float(value.min()), float(value.max()), BINS + 1)
-        which = np.digitize(value.ravel(), edges[1:-1]).astype(
-            np.uint8
-        )  # sorted by digits
+        # Of few bits, as such are sorted by their digits.
+        which = np.digitize(value.ravel(), edges[1:-1]).astype(np.uint8)
         order = np.argsort(which, kind="stable")
         bounds = np.searchsorted(which[order], np.arange(BINS + 1))
         found = [
