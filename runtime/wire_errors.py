@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from flexdt.protocol.rpc_errors import Code, RpcError, internal
+from flexdt.protocol.rpc_errors import Code, RpcError, internal, link_down
 from flexdt.twin import errors as e
 from flexdt.twin.dataset.dataset_errors import DatasetExistsError, DatasetWriteError
 from flexdt.twin.script import ScriptError
@@ -36,8 +36,8 @@ CODES: Sequence[tuple[type[e.TwinError], Code]] = (
 def explain(error: Exception, root: Path | None = None) -> RpcError:
     """Convert `error` to the wire's error.
 
-    An RpcError is returned as it is. A script's error has its problems as data. Other
-    TwinErrors get the code of their class in `CODES`.
+    An RpcError is returned as it is. A script's error has its problems as data. A lost
+    connection is LINK_DOWN. Other TwinErrors get the code of their class in `CODES`.
 
     Args:
         error: any exception.
@@ -57,6 +57,8 @@ def explain(error: Exception, root: Path | None = None) -> RpcError:
         case ScriptError():
             problems = [p.to_dict() for p in error.problems]
             return RpcError(Code.SCRIPT_INVALID, error.message, problems)
+        case e.TwinError() if isinstance(error, ConnectionError):  # a client's is both
+            return link_down(str(error))
         case e.TwinError():
             code = next(code for kind, code in CODES if isinstance(error, kind))
             return RpcError(code, error.message, error.data)

@@ -150,7 +150,7 @@ ALGORITHMS: Final[dict[str, Algorithm]] = {
             "flexdt.twin.reconstruction.checked_fdk",
             "fdk",
             "direct",
-            frozenset({"window", "errors", "scheduler", "slurm"}),
+            frozenset({"window", "scheduler", "slurm"}),
         ),
         Algorithm("sirt", _ITERATIVE, "sirt", options=_SEVERAL),
         Algorithm("sart", _ITERATIVE, "sart", options=_SEVERAL),

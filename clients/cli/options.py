@@ -55,8 +55,8 @@ ProfileName = Annotated[
     str | None,
     typer.Option(
         "--profile",
-        metavar="NAME",
-        help="Use the zero offsets of this calibration profile.",
+        metavar="FILE or NAME",
+        help="Use the zero offsets of this profile: a shipped name or a TOML file.",
         autocompletion=profile_names,
     ),
 ]

@@ -27,7 +27,6 @@ from pydantic import Field, create_model, model_validator
 
 from flexdt.clients.client.client import AsyncTwinClient
 from flexdt.clients.client.flows import Ask
-from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer import exports
 from flexdt.clients.viewer import scrubbed_plan as plans
 from flexdt.clients.viewer.exports import Form
@@ -1012,15 +1011,13 @@ async def serve(
     `name`: of METHODS; `viewer`: the viewer; `page`: that calls; `given`: parameters.
     Returns the method's result.
     Raises RpcError: -32602 with every problem of the parameters, or the method's refusal; its
-    TwinErrors are converted. ConnectionLost: the twin's connection is lost.
+    TwinErrors are converted.
     """
     model, answer = METHODS[name]
     try:
         return await answer(
             viewer, page, parse_params(Method(name, model, Nothing, name), given)
         )
-    except ConnectionLost:  # of the page to answer
-        raise
     except TwinError as error:
         raise explain(error) from None
 

@@ -229,6 +229,19 @@ def test_run_a_script_to_its_data_set(
     )
 
 
+def test_a_run_takes_a_samples_file(
+    flexdt: Flexdt, document: Document, script: Path, tmp_path: Path
+) -> None:
+    part = tmp_path / "own-part.stl"
+    trimesh.creation.box(extents=(2, 3, 4)).export(part)
+    last = document("run", str(script), "--out", "of-a-file", "--sample", str(part))
+    assert last["state"] == "done"
+    assert document("state")["sample"]["name"] == "own-part"
+    code, _, err = flexdt("run", str(script), "--sample", str(tmp_path / "gone.stl"))
+    assert (code, "gone.stl: no such file" in err) == (1, True)
+    flexdt("sample", "lego")
+
+
 def test_detached_run_can_be_watched_and_aborted(
     flexdt: Flexdt, document: Document, script: Path
 ) -> None:

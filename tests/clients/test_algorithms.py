@@ -15,7 +15,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.settings_file import ReconstructSettings
-from flexdt.twin.algorithms import ALGORITHMS, WINDOWS, Algorithm
+from flexdt.twin.algorithms import ALGORITHMS, OPTIONS, WINDOWS, Algorithm, misfit
 
 PAGE = Path(__file__).parents[2] / "docs" / "reconstruction.md"
 ADDED = Algorithm("half", "tests.clients.test_algorithms", "half_everywhere")
@@ -95,6 +95,23 @@ def in_the_table() -> set[str]:
         for row in table.splitlines()
         for name in re.findall(r"`(\w+)`", row.split("|")[1])
     }
+
+
+def test_the_table_of_options_says_what_is_refused() -> None:
+    table = PAGE.read_text("utf-8").split("| option |", 1)[1].split("\n\n", 1)[0]
+    head, _, *rows = [
+        [*map(str.strip, row.split("|"))][1:-1] for row in table.splitlines()
+    ]
+    columns = [re.findall(r"`(\w+)`", cell) for cell in head]
+    said = {}
+    for row in rows:
+        names = re.findall(r"`(\w+)`", row[0]) or ["materials"]
+        for name in names:
+            for algorithms, word in zip(columns, row[-len(columns) :], strict=True):
+                said |= {(name, one): word == "yes" for one in algorithms}
+    assert {name for name, _ in said} == set(OPTIONS) - {"tube", "kv"}
+    for (name, algorithm), takes in said.items():
+        assert (misfit(algorithm, {name}) is None) == takes, (name, algorithm)
 
 
 def test_the_page_has_all_and_would_lack_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,9 +36,11 @@ from flexdt.protocol import (
 from flexdt.protocol.fields import Empty, Params
 from flexdt.protocol.methods.scanner_messages import SampleUpload
 from flexdt.protocol.methods.session_messages import Hello
-from flexdt.protocol.rpc_errors import parse_error
+from flexdt.protocol.rpc_errors import Code, parse_error
+from flexdt.runtime.wire_errors import explain
 from flexdt.server.network.shell_parts import Peer
 from flexdt.server.network.tcp import serve
+from flexdt.twin.errors import TwinError
 
 AXIS = {
     "position": 1.0,
@@ -409,6 +411,13 @@ def test_wait_job_reports_progress_until_the_end() -> None:
 def test_nobody_there_is_said_in_one_line() -> None:
     with pytest.raises(ConnectionLost, match=r"no server at 127\.0\.0\.1:1 "):
         TwinClient(port=1)
+
+
+def test_a_lost_connection_is_no_wrong_parameter() -> None:
+    said = explain(ConnectionLost("the server ended the connection"))
+    assert said.code == Code.LINK_DOWN
+    assert said.message.endswith("the server ended the connection")
+    assert explain(TwinError("no")).code == Code.INVALID_PARAMS
 
 
 def test_a_closed_client_says_so() -> None:

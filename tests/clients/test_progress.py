@@ -354,3 +354,26 @@ def test_functions_are_told_fractions_that_grow_to_one() -> None:
         assert name == "project" or len(told) >= 2, name
     with pytest.raises(fx.TwinError, match="progress"):
         fx.sirt(images, scan, grid, progress="yes")  # type: ignore[arg-type]
+
+
+def test_a_calibration_names_its_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    entered: list[str] = []
+    shown = long_work.during
+
+    def during(what: str, progress: long_work.Progress = None) -> Any:
+        entered.append(what)
+        return shown(what, progress)
+
+    monkeypatch.setattr(long_work, "during", during)
+    scan = fx.ConeVec.circular(
+        sod=600, sdd=1059, angles=16, shape=(304, 382), pixel=0.374
+    )
+    fx.calibrate(fx.simulate("lego", scan, noise=1), "lego")
+    stages = [what for what in dict.fromkeys(entered) if "compiling" not in what]
+    assert stages[stages.index("calibrating") :] == [
+        "calibrating",
+        "finding the beads",
+        "fitting",
+        "measuring the beads again",
+        "looking for causes of the residuals",
+    ]

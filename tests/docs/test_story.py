@@ -6,7 +6,12 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import re
+import shlex
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +20,8 @@ import pytest
 from doc_pages import DOCS
 from loaded_script import load
 from PIL import Image
+
+import flexdt as fx
 
 PROGRAM = load(DOCS.parent / "tests" / "studies" / "story_from_wheel.py")
 BOOKS = sorted((DOCS / "story").glob("*.ipynb"))
@@ -76,3 +83,44 @@ def test_what_no_reader_should_see_is_found(
 ) -> None:
     faults = [*PROGRAM.faults_of({"cells": [{"outputs": outputs}]})]
     assert (fault in " ".join(faults)) if fault else (faults == [])
+
+
+def commands() -> list[list[str]]:
+    """The words of each command of the page's block, without `flexdt`."""
+    (block,) = re.findall(
+        r"```sh\n(.*?)```", (DOCS / "story.md").read_text("utf-8"), re.DOTALL
+    )
+    words = [shlex.split(line, comments=True) for line in block.splitlines()]
+    assert all(line[0] == "flexdt" for line in words)
+    return [line[1:] for line in words]
+
+
+@pytest.mark.slow
+@pytest.mark.campaign(0)
+@pytest.mark.timeout(1800)
+def test_the_commands_run_as_they_stand(tmp_path: Path) -> None:
+    """Only the ports are others, so that a twin of the machine is left alone."""
+    up, *others = commands()
+    flexdt = [sys.executable, "-m", "flexdt.clients.cli"]
+    ports = ["--port", "0", "--projector-port", "0", "--viewer-port", "0"]
+    with (
+        open(tmp_path / "log", "wb") as log,
+        subprocess.Popen(
+            [*flexdt, *up, *ports], cwd=tmp_path, stdout=subprocess.PIPE, stderr=log
+        ) as twin,
+    ):
+        try:
+            assert twin.stdout is not None
+            ready = json.loads(twin.stdout.readline())
+            server = {"FLEXDT_SERVER": f"{ready['host']}:{ready['port']}"}
+            for words in others:
+                done = subprocess.run(
+                    [*flexdt, *words], cwd=tmp_path, env=os.environ | server,
+                    capture_output=True, text=True, timeout=900, check=False,
+                )  # fmt: skip
+                assert done.returncode == 0, (words, done.stderr)
+        finally:
+            twin.send_signal(signal.SIGINT)
+    assert "accuracy: within" in done.stdout.splitlines()[-1]
+    volume = fx.Volume.load(tmp_path / "gear.nrrd")
+    assert np.nanmax(volume.data) > 0.0

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from flexdt.twin import long_work
 from flexdt.twin.calibration.bead_model import (
     BeadModel,
     BeadPhantom,
@@ -140,20 +141,23 @@ def calibrate(
         require_frames_that_move(scans)
     model = with_contrast(bead_model(phantom), solids)
     asked = with_stated(asked, model)
-    state = _detected(scans, model, detector)
-    if state.errors:
-        return state
-    state = identify_scans(state, asked)
-    if state.errors:
-        return state
+    with long_work.during("finding the beads"):
+        state = _detected(scans, model, detector)
+        if state.errors:
+            return state
+        state = identify_scans(state, asked)
+        if state.errors:
+            return state
     if state.findings.of(CalibrationCode.PHANTOM_LEANS):
         solids = None  # They stand as the file has them.
     asked = asked_of(state, asked)
-    fitted = _first_fit(state, asked)
+    with long_work.during("fitting"):
+        fitted = _first_fit(state, asked)
     if fitted.state.errors or fitted.fit.certificate.spectrum.singular:
         return fitted.outcome  # Nothing that such a geometry predicts has a meaning.
     if asked.second_look:
-        fitted = _second_fit(fitted, solids)
+        with long_work.during("measuring the beads again"):
+            fitted = _second_fit(fitted, solids)
         if not fitted.state.measured or any(
             light.seen and light.dark > 0.0 for light in fitted.state.missing_light
         ):
@@ -161,7 +165,8 @@ def calibrate(
     implausible = judge_offsets(fitted.fit)
     if implausible is not None:  # Nothing else that such a fit shows has a meaning.
         return fitted.with_findings(implausible).outcome
-    return _diagnosed(fitted, asked)
+    with long_work.during("looking for causes of the residuals"):
+        return _diagnosed(fitted, asked)
 
 
 def _detected(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
+from flexdt.clients.cli import value_completion
 from flexdt.clients.cli.boundary import (
     INTERRUPTED,
     INVALID,
@@ -15,7 +16,7 @@ from flexdt.clients.cli.boundary import (
     positions,
     wire_code,
 )
-from flexdt.clients.cli.commands.scanner_commands import warn_of_exposure
+from flexdt.clients.cli.commands.scanner_commands import put_on_stage, warn_of_exposure
 from flexdt.clients.cli.commands.script_files import ScriptFile
 from flexdt.clients.cli.console import duration, note, table, warn
 from flexdt.clients.cli.options import Answer, Twin, option
@@ -40,7 +41,9 @@ def run(
     twin: Twin,
     script: ScriptFile,
     out: str | None = option(None, metavar="NAME"),
-    sample: str | None = option(None, metavar="NAME"),
+    sample: str | None = option(
+        None, metavar="NAME or FILE", proposes=value_completion.sample_names
+    ),
     speed_up: Any = option(None, metavar="X or max", parser=process_settings.speed_up),
     detach: bool = option(False, "--detach"),
 ) -> Answer:
@@ -50,7 +53,7 @@ def run(
 
     Args:
         out: Give the data set this name.
-        sample: Put this sample on the stage first.
+        sample: Put this sample on the stage first; a file is sent (mesh: ABS, in mm).
         speed_up: Let the twin's time run X times as fast as yours.
         detach: Return once the script is submitted.
 
@@ -64,7 +67,7 @@ def run(
     data = limited_bytes(script, "script")
     with twin() as client:
         if sample is not None:
-            client.set_sample(sample)
+            warn(put_on_stage(client, sample).warnings)
         began = client.state().time
         try:
             made = client.submit_script(data, name=out, speed_up=speed_up)

@@ -444,16 +444,10 @@ def sample(
         a name. --unit and --material without a mesh file are a usage error; warnings go
         to standard error.
     """
-    from flexdt.clients.client.twin_methods import MESH_FORMATS, SCENE_FORMATS
+    from flexdt.clients.client.twin_methods import MESH_FORMATS
 
-    file = None if name is None else Path(name)
-    if file is None:
-        kind = ""
-    else:
-        kind = file.suffix.lower().lstrip(".")
-    if file is None or kind not in (*MESH_FORMATS, *SCENE_FORMATS) or not file.is_file():
-        file = None
-    if (file is None or kind not in MESH_FORMATS) and (
+    file = _sample_file(name)
+    if (file is None or _ending(file) not in MESH_FORMATS) and (
         unit is not None or material is not None
     ):
         raise typer.BadParameter("--unit and --material are for a mesh file")
@@ -463,24 +457,62 @@ def sample(
             yield found
             yield from (f"{one.name:20} {one.description}" for one in found.samples)
             return
+        now = put_on_stage(
+            client, name, unit=cast("LengthUnit | None", unit), material=material
+        )
+        what = ""
         if file is not None:
-            if kind in SCENE_FORMATS:
-                sent = client.upload_scene(file)
-            else:
-                in_unit = cast("LengthUnit | None", unit)
-                place = chosen(SampleSettings).place
-                sent = client.upload_mesh(
-                    file, unit=in_unit, place=place, material=material
-                )
-            now = client.set_sample(file=sent.name)
             every = client.samples().samples
-            what = f" ({next(one.description for one in every if one.name == sent.name)})"
-        else:
-            now = _named_sample(client, name)
-            what = ""
+            mine = (one for one in every if one.name == now.sample.name)
+            what = f" ({next(mine).description})"
     warn(now.warnings)
     yield now
     yield f"on the stage: {now.sample.name or 'nothing'}{what}"
+
+
+def _ending(file: Path) -> str:
+    return file.suffix.lower().lstrip(".")
+
+
+def _sample_file(word: str | None) -> Path | None:
+    """Return the mesh, phantom or scene file that a sample's word means; None of a name."""
+    from flexdt.clients.client.twin_methods import MESH_FORMATS, SCENE_FORMATS
+
+    file = Path(word or "")
+    known = _ending(file) in (*MESH_FORMATS, *SCENE_FORMATS) and file.is_file()
+    return file if known else None
+
+
+def put_on_stage(
+    client: TwinClient,
+    word: str,
+    *,
+    unit: LengthUnit | None = None,
+    material: str | None = None,
+) -> SampleResult:
+    """Put a sample on the stage, by its name or by its file, which is sent first.
+
+    Args:
+        client: connected to the twin.
+        word: name or file.
+        unit: of a mesh; None for mm, of GLB m.
+        material: of a mesh; None for ABS.
+
+    Raises:
+        CommandError: a file that is not there or holds no sample.
+        RpcError: the twin refuses it.
+    """
+    from flexdt.clients.client.twin_methods import SCENE_FORMATS
+
+    file = _sample_file(word)
+    if file is None:
+        return _named_sample(client, word)
+    if _ending(file) in SCENE_FORMATS:
+        sent = client.upload_scene(file)
+    else:
+        place = chosen(SampleSettings).place
+        sent = client.upload_mesh(file, unit=unit, place=place, material=material)
+    return client.set_sample(file=sent.name)
 
 
 def _named_sample(client: TwinClient, name: str) -> SampleResult:
@@ -508,7 +540,7 @@ def _named_sample(client: TwinClient, name: str) -> SampleResult:
     except RpcError:
         file = Path(name)
         known = (*MESH_FORMATS, *SCENE_FORMATS)
-        ends = file.suffix.lower().lstrip(".") in known
+        ends = _ending(file) in known
         if file.is_file() and not ends:
             endings = ", ".join(f".{ending}" for ending in known)
             raise CommandError(

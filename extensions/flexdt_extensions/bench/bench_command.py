@@ -21,7 +21,7 @@ def bench(
         False, "Measure a CUDA device against its targets and ASTRA.", "--device"
     ),
 ) -> Answer:
-    """Measure speed and accuracy, beside the peers that are installed.
+    """Measure speed and accuracy of the projector, beside the peers that are installed.
 
     A CUDA device is not used, unless --device measures it alone: then --only and --no-peers
     have no effect, and DIR gets device.json and device.md.

@@ -505,6 +505,7 @@ def run_bench(
     document: Document = {"machine": machine(missing), "cases": [], "growth": {}}
     began = document["machine"]["measured"]
 
+    tell(heading(document["machine"]))
     for case in all_cases():
         if only and case.name not in only:
             continue
@@ -606,6 +607,18 @@ def load() -> float | None:
     if hasattr(os, "getloadavg"):
         return os.getloadavg()[0]
     return None
+
+
+def heading(machine: Document) -> str:
+    """Say what `line_of` lists, in which units, and that other processes disturb it."""
+    busy = "unknown"
+    if machine["load_at_start"] is not None:
+        busy = f"{machine['load_at_start']:.1f}"
+    return (
+        "forward projection: shortest of several calls, ms of wall time a view; mean and "
+        "worst error as shares of the longest path integral; n x peer: it takes n times as "
+        f"long\nload {busy} on {machine['cores']} cores; other processes lengthen all times"
+    )
 
 
 def line_of(entry: Document) -> str:

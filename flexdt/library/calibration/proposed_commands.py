@@ -80,14 +80,26 @@ class Typed:
         return f"flexdt calibrate {shlex.join(words)}{notes and f'  # {notes}'}"
 
     def use(self) -> str:
-        """Return the command that reconstructs a sample with the report."""
-        words = ["SAMPLE"]
-        if self.geometry:
-            words += ["--geometry", "GEOMETRY"]
-        words += ["--correction", self.report or "REPORT.json", "--out", "volume.tif"]
+        """Return the command that reconstructs with the report: the scan itself if its
+        markers were unknown, as they are the sample's own, else a place for the sample's.
+        """
+        scans = self.data or tuple(
+            v for n, v in (self.options or {}).items() if n == "frames"
+        )
+        geometry = list(self.geometry)
         notes = []
-        if self.geometry:
-            notes.append("GEOMETRY: nominal, of the sample's scan")
+        if self.phantom == UNKNOWN and len(scans) == 1 and scans[0] != IN_MEMORY:
+            scan = scans[0]
+        else:
+            scan = "SAMPLE"
+            notes.append("SAMPLE: the folder of your sample's scan")
+            if geometry:
+                geometry = ["GEOMETRY"]
+                notes.append("GEOMETRY: nominal, of that scan")
+        words = [scan]
+        if geometry:
+            words += ["--geometry", geometry[0]]
+        words += ["--correction", self.report or "REPORT.json", "--out", "volume.tif"]
         if self.report is None:
             notes.append("REPORT.json: of this command with --report")
         note = f"  # {'; '.join(notes)}" if notes else ""
