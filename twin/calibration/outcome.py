@@ -10,6 +10,7 @@ from flexdt.twin.calibration.bead_model import BeadModel
 from flexdt.twin.calibration.camera_lag import Lag
 from flexdt.twin.calibration.detect.missing_light import MissingLight
 from flexdt.twin.calibration.detect.refine import Refined
+from flexdt.twin.calibration.fit.certificate import Hidden
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.calibration.frame_source import (
     FrameSpots,
@@ -64,6 +65,15 @@ class Calibration:
         return replace(
             panel or Panel.flat(self.scans[0].frames.shape), lag=float(np.mean(seen))
         )
+
+    @property
+    def reliability(self) -> tuple[Hidden, ...]:
+        """What each cause could do to the geometry without being told, of the axis the most
+        first; empty where the numbers must not be used.
+        """
+        if self.fit is None or not self.identifiable:
+            return ()
+        return self.fit.certificate.hidden
 
     @property
     def errors(self) -> Findings:

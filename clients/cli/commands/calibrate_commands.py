@@ -482,6 +482,10 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
     ]
     if rows:
         yield table(rows, ("in the images", "value", "sigma", "unit"))
+    from flexdt.library.calibration.calibrate import ranges, unseen
+
+    if text := unseen(document.get("reliability", ())):
+        yield text
     beads = f"{document['detections']} of {document['expected']} beads"
     seen = f"{document['frames']} frames, {beads} seen"
     if document["rms_px"] is None:
@@ -500,8 +504,6 @@ def show(document: Mapping[str, Any]) -> Iterator[str]:
     yield f"{seen}, {len(document['outliers'])} of these left out, rms {rms} px, {seconds} s"
     if picture := frames_picture(document["rms_per_frame_px"]):
         yield picture
-    from flexdt.library.calibration.calibrate import ranges
-
     frames: dict[int, list[int]] = {}
     for one in document["outliers"]:
         frames.setdefault(one["marker"], []).append(one["frame"])

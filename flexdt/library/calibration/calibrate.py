@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from itertools import groupby
 from os import PathLike
 from pathlib import Path
-from typing import Final, Generic
+from typing import Any, Final, Generic
 
 import numpy as np
 
@@ -627,7 +627,29 @@ def _use_members(
             }
             for some in seen
         ],
+        "reliability": [asdict(one) for one in result.reliability],
     }
+
+
+def unseen(causes: Sequence[Mapping[str, Any]]) -> str:
+    """Write which cause could shift the axis most without being seen, and which could change
+    lengths most; "" without causes.
+
+    Args:
+        causes: the document's "reliability".
+    """
+    if not causes:
+        return ""
+    axis = max(causes, key=lambda c: c["axis_px"])
+    lengths = max(causes, key=lambda c: c["lengths"])
+    parts = (
+        (axis, f"shift the axis by {axis['axis_px']:.2g} px"),
+        (lengths, f"change lengths by {100 * lengths['lengths']:.2g} %"),
+    )
+    return "Too small to be seen: " + "; ".join(
+        f"{cause['cause']} (spots move by {cause['size_px']:.2g} px) could {effect}"
+        for cause, effect in parts
+    )
 
 
 def inside_95(outcome: Outcome[ImageSet], truth: Mapping[str, float]) -> bool:

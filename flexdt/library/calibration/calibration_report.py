@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.library.calibration.calibrate import Outcome, digits
+from flexdt.library.calibration.calibrate import Outcome, digits, unseen
 from flexdt.library.datasets.image_set import ImageSet
 from flexdt.library.figures import Series, arrows, ellipse_plot, image_under, plot
 from flexdt.library.report_page import (
@@ -130,6 +130,9 @@ def _fit_parts(fit: FitResult, document: Mapping[str, Any]) -> list[str]:
         *(paragraph(f"{n} {t}.") for n, t in document.get("limited", {}).items()),
         heading("In the images", level=3) if seen else "",
         table(["quantity", "value", "sigma", "unit"], seen) if seen else "",
+        paragraph(f"{text}.")
+        if (text := unseen(document.get("reliability", ())))
+        else "",
         paragraph(
             f"Reading of eq. 5.4: {fit.reading.value}. Values are true minus nominal."
         ),

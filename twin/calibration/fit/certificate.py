@@ -295,6 +295,35 @@ class Rival:
     covariance: FloatArray
 
 
+@dataclass(frozen=True, repr=False)
+class Hidden:
+    """What a cause could do to the geometry without being told.
+
+    Attributes:
+        cause: in words.
+        group: of the cause, by its name: which part, or how.
+        size_px: root mean square shift of the spots that it moves, of the smallest that is as
+            likely as none; of a cause that no size makes so, of the largest that there is [px].
+        detected: it is told from that size on.
+        axis_px: shift of the axis column by one of that size that is not told [px].
+        lengths: change of the magnification by it, as a part of it.
+    """
+
+    cause: str
+    group: str
+    size_px: float
+    detected: bool
+    axis_px: float
+    lengths: float
+
+    def __repr__(self) -> str:
+        """Format on one line."""
+        return (
+            f"<{self.cause} ({self.group}), below {self.size_px:.2g} px: the axis by "
+            f"{self.axis_px:.2g} px, lengths by {100 * self.lengths:.2g} %>"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Certificate:
     """The quality of one fit.
@@ -318,6 +347,7 @@ class Certificate:
             `estimates` state what causes leave open, too.
         rivals: explanations that the images leave open, of which `covariance` is the mean
             square about the estimates; empty for one alone.
+        hidden: what each cause could hide that is not told, of the axis the most first.
     """
 
     estimates: dict[str, Estimate]
@@ -335,6 +365,7 @@ class Certificate:
     held: tuple[tuple[str, str], ...]
     rivals: tuple[Rival, ...] = ()
     own: Mapping[str, float] = field(default_factory=dict)
+    hidden: tuple[Hidden, ...] = ()
 
     @property
     def determined(self) -> bool:

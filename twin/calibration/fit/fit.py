@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -415,6 +416,12 @@ class FitResult:
         """(p, p) in the order of `values`, edge units."""
         return self.certificate.covariance
 
+    @cached_property
+    def image_slopes(self) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """`image_slopes` of each group."""
+        groups = range(len(self.group_parameters))
+        return tuple(image_slopes(self.problem, self.solution.x, g) for g in groups)
+
     @property
     def determined(self) -> bool:
         """Whether white noise alone leaves every free parameter determined."""
@@ -771,10 +778,8 @@ def image_quantities(fit: FitResult) -> tuple[dict[str, Estimate], ...]:
         interval and unit.
     """
     t = float(stdtrit(fit.certificate.dof, 0.975))
-    problem = fit.problem
     out = []
-    for group in range(len(fit.group_parameters)):
-        here, rows = image_slopes(problem, fit.solution.x, group)
+    for here, rows in fit.image_slopes:
         variance = np.einsum("qi,ij,qj->q", rows, fit.covariance, rows)
         sigma = np.sqrt(np.maximum(variance, 0.0))
         out.append(

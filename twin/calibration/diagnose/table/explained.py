@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -28,6 +28,7 @@ from flexdt.twin.calibration.diagnose.table.linearised import (
     with_every_column,
 )
 from flexdt.twin.calibration.diagnose.table.posterior import (
+    Further,
     Group,
     Model,
     Posterior,
@@ -70,6 +71,7 @@ class Explained:
             would take up of it [px].
         held: groups of the best model that are assumed.
         search: of the last table.
+        further: what groups would add to the best model.
         state: what the best model makes of it.
     """
 
@@ -81,6 +83,7 @@ class Explained:
     moves_px: dict[Group, float]
     held: frozenset[Group]
     search: Search
+    further: Mapping[int, Further]
     state: State
 
     def of(self, cause: str) -> list[Group]:
@@ -158,7 +161,7 @@ def explained(fit: FitResult, known: Known) -> Explained:
     if held:
         state = _stepped(search, model, table.state)
     posterior = search.mixture(model, further)
-    return _made(fit, search, posterior, state, frozenset(held), known)
+    return _made(fit, search, posterior, further, state, frozenset(held), known)
 
 
 def _never_exact(table: Linearised, known: Known) -> tuple[str, ...]:
@@ -251,6 +254,7 @@ def _made(
     fit: FitResult,
     search: Search,
     posterior: Posterior,
+    further: Mapping[int, Further],
     state: State,
     held: frozenset[Group],
     known: Known,
@@ -316,7 +320,8 @@ def _made(
     )
     return Explained(
         made, posterior, table, weights, _strain(search, posterior),
-        {g: _effect(search, best, g, weights[g]) for g in groups}, held, search, state,
+        {g: _effect(search, best, g, weights[g]) for g in groups}, held, search,
+        further, state,
     )  # fmt: skip
 
 

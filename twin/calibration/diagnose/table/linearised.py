@@ -278,18 +278,20 @@ class Linearised:
         return self._whitened(shift).reshape(len(share), -1) * share[:, None]
 
     def shift_of(self, rows: FloatArray) -> FloatArray:
-        """Return the shift of the positions, (n, k, 2) [px], that unweighted whitened rows (2
-        n k,) stand for; 0 where a position does not count.
+        """Return the shift of the positions, (n, k, 2, ...) [px], that unweighted whitened rows
+        (2 n k, ...) stand for; 0 where a position does not count.
         """
         n, k = self.n, self.k
-        w = self.problem.whiten
-        share = np.where(self.weight > 0, self.weight, 1.0)[..., None]
-        own = rows.reshape(n, k, 2) / share
+        own = rows.reshape(n, k, 2, *rows.shape[1:])
+        further = (1,) * (rows.ndim - 1)
+        w = self.problem.whiten.reshape(n, k, 3, *further)
+        share = np.where(self.weight > 0, self.weight, 1.0).reshape(n, k, *further)
         with np.errstate(divide="ignore", invalid="ignore"):
-            down = own[..., 1] / w[..., 2]
-            across = (own[..., 0] - w[..., 1] * down) / w[..., 0]
-        out = np.stack([across, down], axis=-1)
-        return np.where(self.problem.seen[..., None] & np.isfinite(out), out, 0.0)
+            down = own[:, :, 1] / share / w[:, :, 2]
+            across = (own[:, :, 0] / share - w[:, :, 1] * down) / w[:, :, 0]
+        out = np.stack([across, down], axis=2)
+        seen = self.problem.seen.reshape(n, k, 1, *further)
+        return np.where(seen & np.isfinite(out), out, 0.0)
 
 
 def _order(name: str) -> int:

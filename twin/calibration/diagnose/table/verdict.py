@@ -41,6 +41,7 @@ from flexdt.twin.calibration.diagnose.table.groups import (
 )
 from flexdt.twin.calibration.diagnose.table.held_out import held_out
 from flexdt.twin.calibration.diagnose.table.posterior import Posterior
+from flexdt.twin.calibration.diagnose.table.reliability import hidden_causes
 from flexdt.twin.calibration.fit.certificate import POSITION_SPREAD_PX, SPREAD_FREEDOM
 from flexdt.twin.calibration.fit.fit import FitResult
 from flexdt.twin.findings import ERROR, WARNING, Finding, error, warning
@@ -123,7 +124,8 @@ def judged(
     found = found_in(what, known)
     told = [finding for cause in CAUSES for finding in cause.told(found)]
     told += _open(found, told) or _unpredicted(what, told)
-    fit = what.fit
+    hidden = hidden_causes(what.search, what.posterior.best, what.further, what.fit)
+    fit = replace(what.fit, certificate=replace(what.fit.certificate, hidden=hidden))
     if known.asked:
         fit = replace(fit, motions=frame_motions(what, known.asked))
     lost = _lost_beads(fit, told)
