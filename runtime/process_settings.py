@@ -211,7 +211,7 @@ class ServerSettings(ProcessSettings):
         token_file: Require the token in this file of every client.
         tls_cert: Speak TLS with this certificate.
         tls_key: Use the private key of the certificate in this file.
-        limit: Set a limit of docs/twin-server.md; may be repeated.
+        limit: Set a limit of docs/reliability.md; may be repeated.
         http_port: Serve the pages /healthz and /metrics on this port.
         http_host: Serve these pages on this address; beyond the loopback they need the token.
         log_level: Log from this level on; debug logs every request.

@@ -104,9 +104,9 @@ def scan(
     return fx.ConeVec.circular(**settings)
 
 
-def as_seen(images: Image, believed: fx.ConeVec) -> fx.DataSet:
-    """Return line integrals as a data set with the geometry that is believed."""
-    return fx.DataSet.from_arrays(images.astype(np.float32), believed)
+def as_seen(images: Image, nominal: fx.ConeVec) -> fx.DataSet:
+    """Return line integrals as a data set with the nominal geometry."""
+    return fx.DataSet.from_arrays(images.astype(np.float32), nominal)
 
 
 def pieces() -> fx.phantoms.Phantom:
@@ -142,13 +142,13 @@ def pieces() -> fx.phantoms.Phantom:
 @cache
 def misaligned() -> tuple[fx.DataSet, fx.ConeVec]:
     """Simulate a noisy scan of the LEGO phantom with a shifted, rolled panel; return it
-    with the geometry as believed, and the true geometry. Cached.
+    with the nominal geometry, and the true geometry. Cached.
     """
     fine = {"angles": 72, "shape": (190, 239), "pixel": 0.5984}
     true = scan(**fine, offset=(2.0, 1.0), tilts=(1.5, 0.0, 0.0))
     seen = fx.simulate("lego", true, noise=SEED)
-    believed = scan(**fine)
-    data = fx.DataSet.from_arrays(seen.counts(), believed, dark=seen.dark, flat=seen.flat)
+    nominal = scan(**fine)
+    data = fx.DataSet.from_arrays(seen.counts(), nominal, dark=seen.dark, flat=seen.flat)
     return data, true
 
 
@@ -168,7 +168,7 @@ def calibrated() -> tuple[Figure, Numbers]:
     ]
     grid = {"voxel": 0.5, "shape": (110, 70, 70), "errors": False}
     images = {
-        "as believed": data.reconstruct("fdk", **grid).data[:, 35],
+        "nominal": data.reconstruct("fdk", **grid).data[:, 35],
         "calibrated": right.reconstruct("fdk", **grid).data[:, 35],
     }
     return slices(images, 0.0, 0.06), {
@@ -192,7 +192,7 @@ def aligned() -> tuple[Figure, Numbers]:
     truth = fx.fdk(images, true, grid, errors=False).data
     shown = {
         name: fx.fdk(images, one.geometry, grid, errors=False).data[6]
-        for name, one in (("as believed", data), ("aligned", right))
+        for name, one in (("nominal", data), ("aligned", right))
     }
     return slices(shown, 0.0, 0.06), before_and_after(shown, truth[6])
 

@@ -85,7 +85,7 @@ def difference(found: Iterable[object], expected: Iterable[object]) -> object:
 
 
 def geometry_page() -> object:
-    table = page("exchange.md", "| format | file | carries | does not |\n")
+    table = page("exchange.md", "| format | file | carries | does not carry |\n")
     rows = re.findall(r"^\| `(\w+)` \| ([^|]*) \|", table, re.MULTILINE)
     stated = {(name, ending) for name, cell in rows for ending in endings(cell)}
     listed = {(form.name, e) for form in geometry.FORMATS.values() for e in form.endings}
@@ -136,7 +136,7 @@ def reconstruction_docstring() -> object:
 
 
 def scan_page() -> object:
-    table = page("other-scanners.md", "| scan | needs | not said by the file |\n")
+    table = page("other-scanners.md", "| scan | needs | missing from the file |\n")
     rows = re.findall(r"^\| ([\w ]+?) (`[^|]*) \|", table, re.MULTILINE)
     stated = {(name, ending) for name, cell in rows for ending in endings(cell)}
     return difference(

@@ -31,10 +31,10 @@ INDEXES = {"use.md", "index.md"}
 QUOTED = {
     "calibration.md": [
         ("calibrated", "miss_before_px", "up to {:.1f} pixels"),
-        ("tile-gap", "correlation_before", "geometry {:.3f} and"),
-        ("tile-gap", "correlation_after", "and {:.3f}.*"),
-        ("motion", "correlation_before", "correlation {:.3f} and"),
-        ("motion", "correlation_after", "and {:.3f}.*"),
+        ("tile-gap", "correlation_before", "geometry: {:.3f} without"),
+        ("tile-gap", "correlation_after", "and {:.3f} with the gap"),
+        ("motion", "correlation_before", "above: {:.3f} if the motion"),
+        ("motion", "correlation_after", "and {:.3f} if it is followed"),
     ],
     "align.md": [
         ("aligned", "correlation_before", "{:.3f} before"),

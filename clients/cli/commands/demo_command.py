@@ -337,8 +337,8 @@ def _calibrate(dataset: DataSet, tell: Tell) -> Outcome[DataSet]:
 
 
 def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Path:
-    """Draw the layer of one bead as the scanner believes its geometry, as calibrated, and
-    as it is, at one scale and in one window.
+    """Draw the layer of one bead with the nominal and the calibrated geometry beside the
+    phantom, at one scale and in one window.
 
     Both volumes are FDK of the same images, binned, with Hann's window. Each is `PICTURE_ROWS`
     rows high, by nearest pixels, with white gaps of `PICTURE_GAP` columns.
@@ -384,7 +384,7 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
             ]
         )
         sides = (first, last), (0, dataset.shape[1])
-        believed, calibrated = (
+        nominal, calibrated = (
             fdk(
                 images,
                 window(geometry, dataset.shape, *sides).binned(
@@ -402,9 +402,9 @@ def _draw_picture(dataset: DataSet, outcome: Outcome[DataSet], out: Path) -> Pat
     gap = np.full((1, PICTURE_GAP), 255, np.uint8)
     drawn: list[npt.NDArray[np.uint8]] = []
     for image, title in (
-        (believed, "as believed"),
-        (calibrated, "as calibrated from its own images"),
-        (known, "the truth"),
+        (nominal, "nominal geometry"),
+        (calibrated, "calibrated from its own images"),
+        (known, "the phantom"),
     ):
         picture = windowed(_scaled_to(image[::-1]), like=ends)
         named = labelled(picture, title, PICTURE_VOXEL_MM * rows / PICTURE_ROWS)
@@ -442,7 +442,7 @@ def _print_summary(document: dict[str, Any], out: Path, tell: Tell) -> None:
     folder = shlex.quote(str(out))
     tell(f"verdict: {document['calibration']['verdict']}")
     tell(
-        f"picture: {document['picture']} (a bead's layer as believed, as calibrated, in truth)"
+        f"picture: {document['picture']} (a layer: nominal geometry, calibrated, the phantom)"
     )
     tell(f"summary: {out / 'demo.json'}")
     tell("next:")

@@ -259,7 +259,7 @@ def verdict(document: dict[str, Any]) -> str:
 
 
 def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Make the rows of the comparison: optimised effects in the images, then the
+    """Make the rows of the comparison: optimized effects in the images, then the
     parameters.
 
     Args:
@@ -275,7 +275,7 @@ def table_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
     theirs = document["spiral"]
     return [
         (
-            f"{name} (optimised)" if kind == "image_sigmas" else name,
+            f"{name} (optimized)" if kind == "image_sigmas" else name,
             IN_IMAGES[name] if kind == "image_sigmas" else unit_of(name),
             f"{sigma:.3g}",
             _of(ours["measured"], name),

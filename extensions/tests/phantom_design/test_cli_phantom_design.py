@@ -124,7 +124,7 @@ def test_a_spiral_that_does_not_determine_anything_is_not_a_factor() -> None:
         "criterion_text": "A",
     }
     assert verdict(document).startswith("spiral-50 does not determine the geometry")
-    assert [row[0] for row in table_rows(document)] == ["axis_column (optimised)", "dO_x"]
+    assert [row[0] for row in table_rows(document)] == ["axis_column (optimized)", "dO_x"]
     assert table_rows(document)[0][-1] == "-"
     open_ = {"dO_x": 0.2, "axis_column": 0.02}
     ranges = {"dO_x": [0.1, 0.35], "axis_column": [0.02, 0.02]}
