@@ -112,6 +112,8 @@ class Page:
         self.shown = Shown()
         self.covered: dict[str, FloatArray] = {}
         """View -> boxes (n, 4) that the page lays over it [px]."""
+        self._subjects: dict[str, list[list[int]]] = {}
+        """View -> boxes of what its picture is about, as the page was told [px]."""
         self.plan: Any = None
         self.orbit: Any = None
         """The focal spot's path over the plan, for later scenes of this page."""
@@ -207,6 +209,15 @@ class Page:
         """Send the newest content of `slot`; older content that has not gone out is dropped."""
         self._newest[slot] = content
         self._due.set()
+
+    def tell_subject(self, view: str, boxes: FloatArray) -> None:
+        """Tell the page the boxes (n, 4) of what a view's picture is about [px], if it does not
+        know them."""
+        told = boxes.round().astype(int).tolist()
+        if self._subjects.get(view) != told:
+            self._subjects[view] = told
+            content = {"type": "subject", "view": view, "boxes": told}
+            self.show(f"subject {view}", json.dumps(content))
 
     def drag(self, targets: dict[str, float]) -> None:
         """Move a stage that is dragged in one of this page's frames; the newest

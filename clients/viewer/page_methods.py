@@ -121,11 +121,14 @@ class Camera(Params):
 Px = Annotated[float, Ge(-1e5), Le(1e5)]
 
 
+Box = Annotated[tuple[Px, Px, Px, Px], Field(strict=False)]
+
+
 class Covered(Params):
     """Boxes that the page lays over a view: left, top, right, bottom [px, from its upper left]."""
 
     view: View
-    boxes: Annotated[list[tuple[Px, Px, Px, Px]], Len(0, MAX_COVERED)]
+    boxes: Annotated[list[Box], Len(0, MAX_COVERED)]
 
 
 class Preset(Params):

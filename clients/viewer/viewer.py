@@ -34,7 +34,7 @@ from flexdt.clients.viewer.page_words import of_volume
 from flexdt.clients.viewer.scenes import sample_looks, views
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import Shown
-from flexdt.clients.viewer.scenes.name_tags import NO_BOXES, NameTags
+from flexdt.clients.viewer.scenes.name_tags import NO_BOXES, STILL_M, NameTags, Sight
 from flexdt.clients.viewer.scenes.sample_looks import NOTHING, MeshCache, SampleLook
 from flexdt.clients.viewer.scenes.stage_volume import (
     MadeOf,
@@ -55,6 +55,7 @@ from flexdt.runtime.access import PublicAddress, ViewerLimits
 from flexdt.runtime.log import log
 from flexdt.runtime.workers import Workers
 from flexdt.twin.errors import TwinError
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.machine.description import Machine, Profile, builtin_machine, profile_of
 
 DRAW_HZ: Final = 30.0
@@ -171,6 +172,8 @@ class Viewer:
         self._heard_at = time.monotonic()
         self._built = 0
         self.near: Sequence[str] = ()
+        self._subject: FloatArray | None = None
+        """Middles of source, sample and image at the last state, (3, 3) [m]."""
         self.link = KeptConnection(
             address,
             "flexdt viewer (scene)",
@@ -334,7 +337,8 @@ class Viewer:
 
         Once the machine is at rest it is in each picture, too, unless a person has chosen
         another one. It looks every `NAMES_S` seconds, for ever; at rest means the same
-        geometry as before. Layers are set again, too.
+        geometry as before. Layers are set again, and pages are told what each picture is
+        about, too.
         """
         before: World | None = None
         while True:
@@ -347,6 +351,7 @@ class Viewer:
                 before = world
                 self.show_volumes()
                 self.show_layers()
+                subject = lab.subject(world)
                 for client, id, view in self.clients.with_names():
                     named = lab.named(world, self._shown_by(id))
                     page = self.pages.get(id)
@@ -354,7 +359,28 @@ class Viewer:
                     with contextlib.suppress(
                         AssertionError, KeyError
                     ):  # it has just come or gone
-                        await asyncio.to_thread(self.tags.draw, client, named, over)
+                        shown = Sight.of(client).boxes(subject)
+                        if page is not None:
+                            page.tell_subject(view, shown)
+                        await asyncio.to_thread(
+                            self.tags.draw, client, named, over, shown
+                        )
+
+    async def _drop_names(self, subject: Sequence[FloatArray]) -> None:
+        """Take away the names of what has begun to move, in the pictures that show it move."""
+        at = np.stack([points.mean(axis=0) for points in subject])
+        moved = (
+            self._subject is not None
+            and float(np.abs(at - self._subject).max()) > STILL_M
+        )
+        self._subject = at
+        if not moved:
+            return
+        for client, _, _ in self.clients.with_names():
+            with contextlib.suppress(
+                AssertionError, KeyError
+            ):  # it has just come or gone
+                await asyncio.to_thread(self.tags.leave, client)
 
     def show_layers(self) -> None:
         """Set the nodes that each page shows in its frames, as soon as they have
@@ -479,6 +505,7 @@ class Viewer:
                 feed.again()
         near = nearest(state.safety)
         lab.update(state, world)
+        await self._drop_names(lab.subject(world))
         if near["close"]:
             self.near = near["pair"]
         else:

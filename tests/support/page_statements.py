@@ -151,6 +151,11 @@ def of_connection(texts: dict[str, str], projector: bool) -> list[str]:
     return found
 
 
+def _read(part: str) -> str:
+    """A part's name as the page has it."""
+    return part.replace("_", " ").replace("xray", "X-ray")
+
+
 def of_machine(said: dict[str, Any], state: State) -> list[str]:
     """Of the sample, the beam, control, distances and their heading."""
     texts, found = said["texts"], []
@@ -198,7 +203,7 @@ def of_machine(said: dict[str, Any], state: State) -> list[str]:
         near = re.search(r"([\d.]+) mm", texts["near"])
         close = near is not None and abs(float(near[1]) - mm) < 0.11
         claim(
-            close and all(part in texts["near"] for part in pair),
+            close and all(_read(part) in texts["near"] for part in pair),
             f"near: {texts['near']}",
         )
     if said["shown"]["welcome-title"] and state.sample.name:

@@ -99,7 +99,7 @@ def test_the_first_picture_shows_what_its_page_shows(empty_lab: Any) -> None:
     at = {name: axis.home for name, axis in MACHINE.axes.items()} | {"mag_det": 1059.0}
     world = placed(MACHINE, PROFILE, camera, at)
     axes = {name: SimpleNamespace(position=value) for name, value in at.items()}
-    state = SimpleNamespace(axes=axes, tube=SimpleNamespace(on=True))
+    state = SimpleNamespace(axes=axes, tube=SimpleNamespace(on=True, ready=True))
     scene.update(cast(State, state), world)
     nothing = layers.Shown(frozenset())
     assert scene.shapes(world, nothing) == []

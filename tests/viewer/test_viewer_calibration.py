@@ -181,8 +181,8 @@ def test_what_cannot_be_fitted_is_told(page: Any, twin: TwinClient, wait: Wait) 
     if not page.evaluate("flexdt.call('viewer.datasets')")["datasets"]:
         scanned(page, twin, wait, 2)
     page.click("#tabs [data-tab=calibrate]")
-    page.fill("#fit-phantom", "no-such-phantom")
     page.locator("#datasets input").first.check()
+    page.fill("#fit-phantom", "no-such-phantom")
     page.click("#fit")
     page.locator(".note.error", has_text="no-such-phantom").first.wait_for(
         timeout=600_000

@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from looking import until
+from looking import drawn, settled, until
 
+from flexdt.clients.client.client import TwinClient
 from flexdt.clients.viewer.scenes.name_tags import laid_out, leader_end
+from tests.viewer.test_page_parts import corners_m
+from tests.viewer.test_viewer_scenes import _on_screen, preset
 
 AREA = (520.0, 700.0)
 GRID_PX = 7
@@ -21,7 +24,7 @@ OVER = """step => {
   for (let y = step / 2; y < at.height; y += step)
     for (let x = step / 2; x < at.width; x += step) {
       const top = document.elementsFromPoint(at.left + x, at.top + y)
-        .find((e) => view.contains(e) && e !== view);
+        .find((e) => (view.contains(e) && e !== view) || e.closest('.warning, .note'));
       found.push([x, y, top !== undefined && top.tagName !== 'IFRAME']);
     }
   return found;
@@ -35,6 +38,14 @@ WebSocket.prototype.send = function (words) {
   return send.call(this, words);
 };
 """
+
+NOTES = """() => [...document.querySelectorAll('#notes .note')]
+  .filter((note) => getComputedStyle(note).visibility === 'visible')
+  .map((note) => [note.textContent, ...Object.values(note.getBoundingClientRect().toJSON())])"""
+SAY = """count => import('/link.js').then(({ emit }) => {
+  for (let k = 0; k < count; k++)
+    emit('note', 'error', `note ${k}`, 'the holder would be too near to the source: '.repeat(2));
+})"""
 
 
 def crossing(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> bool:
@@ -95,7 +106,9 @@ def test_what_a_page_lays_over_a_view_is_where_no_name_is_put(
 ) -> None:
     """As the browser finds it, point by point; also once the camera has gone to the sample."""
     page = open_page("iso", size, script=LISTEN)
-    page.add_style_tag(content=".tag { pointer-events: auto !important }")
+    page.add_style_tag(
+        content=":is(.tag, .warning, .note) { pointer-events: auto !important }"
+    )
 
     def told_all() -> bool:
         boxes = np.array(page.evaluate("window.covered?.boxes ?? []")).reshape(-1, 4)
@@ -107,13 +120,47 @@ def test_what_a_page_lays_over_a_view_is_where_no_name_is_put(
         return len(boxes) > 0
 
     page.wait_for_function("document.querySelector('.inset img').naturalWidth > 0")
+    page.evaluate(SAY, 1)
     until(told_all, "what lies over the view is told")
     count = page.evaluate("window.covered.boxes.length")
+    assert page.evaluate("flexdt.call('viewer.covered', window.covered)") is not None
     page.click(".view[data-view=iso] .look")
     until(
         lambda: page.evaluate("window.covered.boxes.length") == count - 1, "no close-up"
     )
     until(told_all, "what lies over the view then")
+    page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(820, 1180), (1366, 768)])
+def test_no_note_but_the_newest_stands_over_source_or_turntable(
+    open_page: Callable[..., Any], twin: TwinClient, size: tuple[int, int]
+) -> None:
+    """Where these are is computed from the machine's boxes and the view's preset."""
+    page = open_page("iso", size)
+    box = page.locator(".view[data-view=iso]")
+    settled(box, drawn)
+    page.wait_for_function("document.querySelector('.inset img').naturalWidth > 0")
+    frame = box.bounding_box()
+    camera, corners = preset(page, "iso", frame), corners_m(twin.state())
+    subject = {
+        name: np.array([_on_screen(frame, camera, at) for at in points])
+        for name, points in (
+            ("source", corners["xray_source"].mean(axis=0, keepdims=True)),
+            ("turntable", corners["sample_holder"]),
+        )
+    }
+    page.evaluate(SAY, 5)
+    until(lambda: len(page.evaluate(NOTES)) < 5, "notes yield")
+    seen = page.evaluate(NOTES)
+    assert seen[-1][0].startswith("note 4")
+    for words, *_, top, right, bottom, left in seen[:-1]:
+        for name, at in subject.items():
+            low, high = at.min(axis=0) + 2.0, at.max(axis=0) - 2.0  # the page rounds
+            apart = np.maximum(low - [right, bottom], [left, top] - high).max()
+            assert apart >= 0.0, (words, name)
     page.close()
 
 

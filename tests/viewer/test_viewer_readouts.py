@@ -93,11 +93,11 @@ def test_truncation_is_told_and_goes(page: Any, wait: Wait) -> None:
     told = lambda: " ".join(t for t in warnings(page) if t.startswith("Sample"))  # noqa: E731
     wait(lambda: told() == "", "nothing is cut off")
     page.evaluate(cut, {"x": 45})
-    wait(lambda: "truncated sideways" in told(), "sideways")
-    assert "top or bottom" not in told()
+    wait(lambda: "cut off at the sides" in told(), "sideways")
+    assert "at the top" not in told()
     page.evaluate(cut, {"z": 45})
-    wait(lambda: "truncated at top or bottom" in told(), "at the top")
-    assert "sideways" not in told()
+    wait(lambda: "cut off at the top" in told(), "at the top")
+    assert "at the sides" not in told()
     page.evaluate(cut, {})
     wait(lambda: told() == "", "and gone again")
 

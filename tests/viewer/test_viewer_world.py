@@ -627,24 +627,32 @@ def test_what_is_drawn_of_axis_and_beam_follows_stage_and_tube() -> None:
         server = viser.ViserServer(host="127.0.0.1", port=0)
     try:
         scene = LabScene(server, MACHINE, PROFILE)
-        for sod, on in ((640.0, False), (500.0, False), (500.0, True), (400.0, True)):
+        for sod, on, ready in (
+            (640.0, False, True), (500.0, False, True), (500.0, True, False),
+            (500.0, True, True), (400.0, True, True),
+        ):  # fmt: skip
             world = placed(MACHINE, PROFILE, CAMERA, {**AT, "mag_obj": sod})
             lines = np.full(world.shape, 0.5)
             scene.show_image(np.zeros((8, 8, 3), np.uint8), lines, world)
-            scene._show_beam(
-                cast(State, SimpleNamespace(tube=SimpleNamespace(on=on))), world
-            )
+            tube = SimpleNamespace(on=on, ready=ready)
+            scene._show_beam(cast(State, SimpleNamespace(tube=tube)), world)
             np.testing.assert_allclose(
                 scene._axis.position, world.axis / 1000.0, atol=1e-9
             )
             shade = server.scene.get_handle_by_name("/beam/shade1")
             assert shade is not None
-            assert shade.visible == on
-            if on:  # the light begins behind the sample
+            assert shade.visible == (on and ready)
+            if shade.visible:  # the light begins behind the sample
                 begins = shade.position[1] - shade.render_width / 2
                 assert begins == pytest.approx(
                     (world.sample.shift[1] + 1.0) / 1000.0, abs=0.002
                 )
+        # Without an image of there its shadow would begin in the air.
+        gone = placed(MACHINE, PROFILE, CAMERA, {**AT, "mag_obj": 300.0})
+        scene._show_beam(cast(State, SimpleNamespace(tube=tube)), gone)
+        assert not shade.visible
+        scene.show_image(np.zeros((8, 8, 3), np.uint8), np.full(gone.shape, 0.5), gone)
+        assert shade.visible
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()

@@ -1,4 +1,5 @@
 // The Move tab: a slider, a number and two hold-to-jog buttons for every axis, and the keys.
+import { partWords } from "./figures.js";
 import { $, $input, $select, el, field, fixed, keep, parsed, setText, term } from "./dom.js";
 import { call, command, emit, Failure, on, store } from "./link.js";
 import { reached } from "./reached.js";
@@ -14,9 +15,13 @@ const GROUPS = [
   [
     "Sample",
     "#3aa0ff",
-    { mag_obj: "to the detector", tra_obj: "sideways", ver_obj: "beam height" },
+    { mag_obj: "along the beam", tra_obj: "sideways", ver_obj: "to the beam" },
   ],
-  ["Detector", "#7a5cff", { mag_det: "distance", ver_det: "height", tra_det: "to the left" }],
+  [
+    "Detector",
+    "#7a5cff",
+    { mag_det: "along the beam", ver_det: "height", tra_det: "sideways, left is +" },
+  ],
 ];
 const TURN = { rot_obj: "Turn of sample" }; // with what is set most, in plain words first
 const JOG_FALLBACK = { mm: 50, deg: 45 };
@@ -28,6 +33,7 @@ const JOG_FALLBACK = { mm: 50, deg: 45 };
  * @property {HTMLInputElement} slider
  * @property {HTMLInputElement} number
  * @property {HTMLElement} now
+ * @property {HTMLElement} goal where it goes to, while it does
  * @property {number} low
  * @property {number} high
  * @property {number} from
@@ -362,7 +368,8 @@ function axisRow(name, axis, what) {
     "aria-label": `${name} slider`,
   });
   const number = field({ "aria-label": `${name} value` }, enter, () => number.blur());
-  const now = el("span", { class: "now" });
+  const now = el("span", { class: "now", title: "where it stands" });
+  const goal = el("span", { class: "goal muted mono" });
   const box = el("div", { class: "axis", "data-axis": name });
   /** @type {Row} */
   const row = {
@@ -371,6 +378,7 @@ function axisRow(name, axis, what) {
     slider,
     number,
     now,
+    goal,
     low,
     high,
     from: low,
@@ -425,6 +433,7 @@ function axisRow(name, axis, what) {
         { title: what },
         el("span", { class: "name" }, said[0]),
         el("span", { class: "what" }, said[1]),
+        goal,
       ),
       el("span", {}, number, el("span", { class: "unit" }, axis.unit === "deg" ? "°" : "mm")),
     ),
@@ -504,10 +513,11 @@ function draw(row) {
   const at = (axis.position - row.from) / (row.to - row.from);
   row.now.style.left = `calc(8px + (100% - 16px) * ${Math.min(1, Math.max(0, at)).toFixed(4)})`;
   row.box.classList.toggle("moving", axis.moving);
-  row.box.classList.toggle(
-    "limit",
-    !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5),
-  );
+  setText(row.goal, axis.moving ? `to ${fixed(axis.target, 2)}` : "");
+  const ended =
+    !axis.moving && (axis.position - row.low < 0.5 || row.high - axis.position < 0.5);
+  row.box.classList.toggle("limit", ended);
+  row.box.title = ended ? "at the end of its travel" : "";
 }
 
 /**
@@ -517,7 +527,7 @@ function draw(row) {
 on("part", (part, motor) => {
   const row = motor === null ? undefined : rows.get(motor);
   if (!row) {
-    emit("note", "", part, "no motor moves it");
+    emit("note", "", partWords(part), "no motor moves it");
     return;
   }
   emit("show-tab", "move");

@@ -59,6 +59,8 @@ const ofBeads = (report) => {
   return typeof phantom === "string" && phantom !== "unknown";
 };
 
+// Decimals of mm and degrees without a sigma: a tenth of a micrometre.
+const FINEST = 4;
 // Outliers that a report names.
 const LISTED = 3;
 /**
@@ -84,7 +86,11 @@ function table(parameters, sigmas = {}, units = {}) {
     ...shown.map(([k, v]) => {
       const sigma = sigmas[k] ?? 0;
       const d =
-        sigma > 0 ? decimals(sigma, 2) : decimals((v ?? 0) - (k === "angle_scale" ? 1 : 0), 3);
+        sigma > 0
+          ? decimals(sigma, 2)
+          : k === "angle_scale"
+            ? decimals((v ?? 0) - 1, 3)
+            : Math.min(FINEST, decimals(v ?? 0, 3));
       return el(
         "tr",
         {},
@@ -189,13 +195,18 @@ async function datasets() {
   $button("#fit").disabled = none;
   if (none) box.append(el("div", { class: "muted" }, "no data sets yet: run a scan"));
   for (const d of answer.datasets.filter((each) => each.present)) {
-    const tick = el("input", { type: "checkbox", value: d.name, checked: chosen.has(d.name) });
+    const own = () => {
+      if (tick.checked && d.sample) $input("#fit-phantom").value = d.sample;
+      named();
+    };
+    const told = { type: "checkbox", value: d.name, checked: chosen.has(d.name) };
+    const tick = el("input", { ...told, onchange: own });
     box.append(
       el(
         "div",
         {},
         el("label", {}, tick, d.name),
-        el("span", { class: "muted small-text" }, `${d.present} frames`),
+        el("span", { class: "muted small-text" }, `${d.sample ?? "?"} · ${d.present} frames`),
       ),
     );
   }

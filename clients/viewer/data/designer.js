@@ -1,5 +1,7 @@
 // The scan designer: bars for voxel and tube; what the wished scan will look like. A change of
 // the wish rewrites the script, unless somebody else's stands there.
+import { spectralWords } from "./setup.js";
+import { detailWords } from "./figures.js";
 import { $input, bytes, el, fixed, seconds, setText, words } from "./dom.js";
 import { decades } from "./decades.js";
 import { differences, listed, only, sampleOf } from "./fingerprint.js";
@@ -86,8 +88,8 @@ const form = el(
   "div",
   { class: "form" },
   ...BARS.flatMap(bar),
-  ...word("design-filter", "filter", "", FILTER),
-  ...word("design-detail", "detail", "void:0.5", DETAIL),
+  ...word("design-filter", "more filter", "", FILTER),
+  ...word("design-detail", "detail [mm]", "void:0.5", DETAIL),
   ...word("design-cnr", "CNR wanted", "5", WANTED),
 );
 const opened = () => {
@@ -248,8 +250,9 @@ function show(p, asked) {
   facts.replaceChildren(
     line("time", `${seconds(p.seconds)} · ${bytes(p.bytes)} · ${dose}`),
     line("least", `${dark} · ${ends}`),
-    line("quality", `contrast to noise of ${p.detail}: `, ...quality(p, asked)),
+    line("quality", `contrast to noise of ${detailWords(p.detail)}: `, ...quality(p, asked)),
     line("best", best(p, asked), ...p.assumed.map((a) => ` · ${a}`)),
+    line("spectral", spectralWords()),
   );
   draw(p.transmission);
 }
@@ -270,7 +273,11 @@ function quality({ asked: { cnr } }, asked) {
   const ms = Math.ceil(asked.exposure_ms * (goal / cnr) ** 2);
   if (ms > longest_ms) return [verdict, ` no exposure reaches ${fixed(goal, 1)}`];
   const reach = { class: "small", id: "design-reach", onclick: () => setExposure(ms) };
-  return [verdict, " ", el("button", reach, `${fixed(goal, 1)} takes ${ms} ms at most`)];
+  return [
+    verdict,
+    " ",
+    el("button", reach, `${fixed(goal, 1)} with ${ms} ms an image, or less`),
+  ];
 }
 
 /**

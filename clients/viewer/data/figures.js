@@ -17,6 +17,20 @@ export function fixed(value, digits = 2) {
 }
 
 /**
+ * What is to be seen, MATERIAL:MM, as people read it.
+ * @param {string} detail
+ * @returns {string}
+ */
+export const detailWords = (detail) => detail.replace(/^(.+):(.+)$/, "$2 mm of $1");
+
+/**
+ * A part of the machine, as people read its name.
+ * @param {string} name
+ * @returns {string}
+ */
+export const partWords = (name) => name.replaceAll("_", " ").replace(/^xray/, "X-ray");
+
+/**
  * @param {number | null | undefined} s
  * @returns {string}
  */

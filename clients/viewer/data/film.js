@@ -215,10 +215,10 @@ function transmission(i) {
   through.sort((a, b) => a - b);
   const dark = through[Math.floor(0.01 * through.length)];
   const mean = through.reduce((a, v) => a + v, 0) / through.length;
-  const darkest = `${(100 * dark).toFixed(1)} % or less in 1 % of the pixels`;
+  const darkest = `${(100 * dark).toFixed(1)} % or less in the darkest 1 % of the pixels`;
   const cut = !i.recorded && (store.state?.image?.saturated ?? 0) >= MANY_SATURATED;
   const though = cut ? " · as though no pixel were saturated" : "";
-  return `transmission ${darkest} · ${(100 * mean).toFixed(1)} % in the mean${though}`;
+  return `transmission ${darkest} · mean ${(100 * mean).toFixed(1)} %${though}`;
 }
 
 export function draw() {
@@ -272,8 +272,8 @@ export function draw() {
   const { moment } = store;
   const which = [
     i.recorded || !i.origin?.file ? "" : nameOf(i.origin.file),
-    i.recorded || i.kind === "counts" ? "" : "without noise",
-    moment.kind === "plan" ? `live: the ghost is at ${fixed(moment.time_s, 1)} s` : "",
+    i.recorded || i.kind === "counts" ? "" : "without the noise of a scan",
+    moment.kind === "plan" ? `live: the plan’s ghost is at ${fixed(moment.time_s, 1)} s` : "",
   ].map((words) => words && `${words}  ·  `);
   const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2));
   const zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";

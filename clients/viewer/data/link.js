@@ -378,6 +378,9 @@ const handlers = {
   drag(m) {
     emit("drag", m);
   },
+  subject(m) {
+    emit("subject", m.view, m.boxes);
+  },
   part(m) {
     emit("part", m.part, m.motor);
   },

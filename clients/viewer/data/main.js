@@ -20,6 +20,7 @@ import "./queue.js";
 import "./calibrate.js";
 import "./share.js";
 import "./layout.js";
+import "./said.js";
 import { look as volume } from "./volume.js";
 import "./scan_it.js";
 import "./by_hand.js";

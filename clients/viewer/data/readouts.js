@@ -2,6 +2,7 @@
 // of it that is shown. Headings say which.
 import { $, el, fixed, isNumber, setText, term } from "./dom.js";
 import { about, heading, ofData } from "./fingerprint.js";
+import { partWords } from "./figures.js";
 import { imageMade, on, store } from "./link.js";
 /**
  * @import { About } from "./fingerprint.js"
@@ -39,7 +40,7 @@ const TIPS = {
   magnification: "SDD / SOD",
   voxel: "A pixel of the image, as large as it is at the sample",
   "field of view": "What of the sample the image holds, width × height",
-  "cone angle": "Opening of the beam that meets the image",
+  "cone angle": "Opening, in height, of the beam that meets the image",
   "piercing point":
     "Pixel (column, row) in which the perpendicular from the focal spot meets the panel",
   "axis column": "Column in which the rotation axis appears",
@@ -100,9 +101,9 @@ function near() {
     const pair = el("span", { class: "pair" });
     const distance = el("b", { class: "mm mono" });
     box.append(el("div", { class: "row between" }, pair, distance));
-    box.append(el("div", { class: "meter" }, el("i")));
+    box.append(el("div", { class: "meter", title: `full from ${METER_MM} mm on` }, el("i")));
   }
-  setText($(".pair", box), parts?.pair.length ? parts.pair.join(" – ") : "–");
+  setText($(".pair", box), parts?.pair.length ? parts.pair.map(partWords).join(" – ") : "–");
   setText($(".mm", box), isNumber(mm) ? `${fixed(mm, 1)} mm` : "");
   const meter = $(".meter", box);
   meter.className = `meter ${parts?.close ? ((mm ?? 0) < TOUCH_MM ? "touch" : "close") : ""}`;

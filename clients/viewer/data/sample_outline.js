@@ -52,9 +52,11 @@ export function outline(sample, g, camera, sampleHeight_mm, shape_mm = null) {
   if (outside(sideways, cols) || outside(along, rows)) return [OUTSIDE];
   /** @type {string[]} */
   const cut = [];
-  if (beyond(sideways, cols)) cut.push("truncated sideways over a full turn");
-  if (beyond(along, rows)) cut.push("truncated at top or bottom");
-  return cut.length ? [`Sample ${cut.join(", ")}`] : [];
+  if (beyond(sideways, cols)) cut.push("at the sides during a full turn");
+  const [above, below] = [along[0] < -HALF_PX, along[1] > rows - HALF_PX];
+  if (above || below)
+    cut.push(`at the ${above && below ? "top and bottom" : above ? "top" : "bottom"}`);
+  return cut.length ? [`Sample cut off ${cut.join(", and ")}`] : [];
 }
 
 /**

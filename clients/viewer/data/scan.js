@@ -1,4 +1,5 @@
 // The Scan tab: a script to write, check, scrub and run.
+import { partWords } from "./figures.js";
 import {
   $,
   $button,
@@ -163,6 +164,7 @@ function outdated() {
   problems = [];
   marks();
   $("#report").textContent = "";
+  $button("#run").classList.add("primary");
   tellWish();
   forget();
   rememberScript(text.value);
@@ -380,8 +382,8 @@ const MOVING_PARTS =
  * @returns {string}
  */
 function clearance({ min_clearance_mm: mm, min_clearance_pair: pair }) {
-  if (!isNumber(mm)) return "";
-  const parts = pair ? pair.join(" and ") : "moving parts";
+  if (!isNumber(mm) || problems.some(({ code }) => code === "collision")) return "";
+  const parts = pair ? pair.map(partWords).join(" and ") : "moving parts";
   return `${parts} come closest, ${fixed(mm, 1)} mm apart`;
 }
 
@@ -397,6 +399,8 @@ export function show(r, made = now()) {
   marks();
   const box = $("#report");
   box.textContent = "";
+  const warnings = problems.filter(({ severity }) => severity !== "error").length;
+  const warned = warnings ? `, ${warnings} warning${warnings === 1 ? "" : "s"}` : "";
   const facts = [seconds(r.duration_s), `${r.frames} frames`, bytes(r.bytes), clearance(r)];
   box.append(
     el(
@@ -405,7 +409,7 @@ export function show(r, made = now()) {
       el(
         "span",
         { class: `verdict ${r.ok ? "ok" : "bad"}` },
-        r.ok ? "Ready to run" : "Not ready",
+        r.ok ? `Ready to run${warned}` : "Not ready",
       ),
       el(
         "span",
@@ -432,13 +436,14 @@ export function show(r, made = now()) {
         "div",
         { class: "problem" },
         link(p.line),
-        el("span", { class: p.severity === "error" ? "error" : "" }, p.message),
+        el("span", { class: p.severity === "error" ? "error" : "caution" }, p.message),
       ),
     );
   }
   if (r.steps.length)
     box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
   checked = made;
+  $button("#run").classList.toggle("primary", r.ok);
 }
 // A report holds for what a script begins with. While a scan runs, the machine is on its way:
 // what it then differs in is known when it has ended, and after a run of this script it is

@@ -80,7 +80,7 @@ function offer(job) {
     pause: !over,
     step: !over,
     abort: !over,
-    resume: job.state !== "done",
+    resume: over ? isUnfinished(job) && job.frames_done < job.frames_total : true,
     scrub: over,
     data: over,
     forget: over,

@@ -245,8 +245,8 @@ function told(state) {
   const own = viewsFor(state, voxel_um);
   wanted.placeholder = String(own);
   if (isDown(state)) return "Nothing is scanned before the stop is reset.";
-  const waits = store.job && !isOver(store.job) ? "After the scan that runs: one" : "One";
-  return `${waits} turn, ${wanted.value || own} images; its volume grows in the scene.`;
+  const waits = store.job && !isOver(store.job) ? "After the current scan: one" : "One";
+  return `${waits} turn of ${wanted.value || own} images; the volume grows in the scene.`;
 }
 on("job", (job) => {
   if (job.job !== mine) return;

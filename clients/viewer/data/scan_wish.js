@@ -1,6 +1,6 @@
 // What the next scan is wished to be: each quantity stands once, and has one field. The designer
 // and the script both read it here.
-import { $input, $select } from "./dom.js";
+import { $, $input, $select, setText } from "./dom.js";
 import { batch, computed, effect, signal } from "./signals.js";
 import { on } from "./link.js";
 /** @import { Compose } from "../web/viewer.d.ts" */
@@ -38,6 +38,9 @@ for (const field of [kindField, framesField, exposureField])
   field.addEventListener("input", read);
 exposureField.addEventListener("keydown", (e) => {
   if (e.key === "Escape") typedExposure_ms.set(null);
+});
+effect(() => {
+  setText($("#wish-what"), kind.get() === "tiled" ? "frames a tile" : "frames");
 });
 effect(() => {
   const ms = exposure_ms.get();

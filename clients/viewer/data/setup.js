@@ -1,4 +1,5 @@
 // The Setup tab: tube, camera, sample on the stage (with upload), layers of the scene.
+import { detailWords } from "./figures.js";
 import {
   $,
   $$,
@@ -214,8 +215,8 @@ export async function list() {
 /** @type {Record<string, string>} */
 const PHYSICS = {
   ideal:
-    "Voltage does nothing to the line integrals here: one attenuation for each material. " +
-    "It makes counts brighter, as power and exposure do. " +
+    "Voltage does not change line integrals here: each material has one attenuation. " +
+    "It raises the counts, as power and exposure do. " +
     "Start the twin with --physics poly for spectra.",
   mono:
     "Photons of one energy, as many as the spectrum below would make visible: " +
@@ -245,14 +246,24 @@ async function predict() {
 }
 
 /**
+ * What a prediction has and the images of a twin with one attenuation for each material do not.
+ * @returns {string}
+ */
+export const spectralWords = () =>
+  store.hello?.physics === "ideal"
+    ? "By the tube’s spectrum, which the images of this twin do not have"
+    : "";
+
+/**
  * @param {ExposurePrediction} p
  * @returns {string}
  */
 function predictionWords(p) {
-  const told = [`contrast to noise of ${p.detail}: ${setting(p.asked)}`];
-  if (p.best.length) told.push(`best ${setting(p.best[0])}`);
-  told.push(`1 % of the pixels see ${fixed(100 * p.transmission.p1, 1)} % or less`);
-  return told.join(" · ");
+  const told = [`contrast to noise of ${detailWords(p.detail)}: ${setting(p.asked)}`];
+  if (p.best.length) told.push(`best: ${setting(p.best[0])}`);
+  const dark = `${fixed(100 * p.transmission.p1, 1)} % or less`;
+  told.push(`the darkest 1 % of the pixels transmit ${dark}`);
+  return [told.join(" · "), spectralWords()].filter(Boolean).join(". ");
 }
 
 /**
@@ -261,7 +272,7 @@ function predictionWords(p) {
  */
 function setting({ kV, filter, cnr }) {
   const quality = cnr === null ? "saturated" : fixed(cnr, 1);
-  return `${fixed(kV, 0)} kV${filter ? ` ${filter}` : ""}: ${quality}`;
+  return `${quality} at ${fixed(kV, 0)} kV${filter ? `, ${filter}` : ""}`;
 }
 function outdatePrediction() {
   const differ = predicted ? differences(predicted, predictable()) : [];
@@ -318,7 +329,7 @@ function show(state) {
   put("power", state.tube.power_W, 2);
   const xrays = $button("#beam");
   const { on, ready } = state.tube;
-  const is = ready ? "X-rays are ON" : "X-rays warm up";
+  const is = ready ? "X-rays are ON" : "X-rays warming up";
   xrays.textContent = on ? `${is}: switch off` : "Switch X-rays on";
   xrays.classList.toggle("beam-on", on);
   xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";

@@ -46,12 +46,8 @@ const STEPS = [
     "The machine stays as it is. The sliders are what the reconstruction wrongly believes of it; " +
       "a printed gear goes onto the stage.",
   ],
-  ["story-scan", "2  Scan it", "One turn, reconstructed with what the sliders say."],
-  [
-    "story-fit",
-    "3  Calibrate",
-    "A bead phantom turns once: its beads measure what the machine truly is.",
-  ],
+  ["story-scan", "2  Scan it", "One turn, reconstructed with the geometry of the sliders."],
+  ["story-fit", "3  Calibrate", "A bead phantom turns once: its beads tell the true geometry."],
   ["story-apply", "4  Apply", "What the beads say takes the place of what the sliders said."],
   [
     "story-again",

@@ -107,10 +107,11 @@ export function draw(canvas, plan, at, running, room = Infinity) {
     const unit = plan.units[name] ?? "";
     const top = i * lane + LABEL + 3;
     const bottom = (i + 1) * lane - 3;
+    const digits = known.some((v) => Math.abs(v) >= 1000) ? 0 : 2;
     const low = known.reduce((a, v) => Math.min(a, v), Infinity);
     const high = known.reduce((a, v) => Math.max(a, v), -Infinity);
     const now = at === null ? null : valueAt(plan.times, values, at);
-    const digits = Math.max(Math.abs(low), Math.abs(high)) >= 1000 ? 0 : 2;
+    const flat = fixed(low, digits) === fixed(high, digits); // what is not told is not drawn
     x.strokeStyle = x.fillStyle = colors[i % colors.length];
     x.lineWidth = 1.5;
     x.beginPath();
@@ -120,18 +121,20 @@ export function draw(canvas, plan, at, running, room = Infinity) {
         pen = false;
         return;
       }
-      const y =
-        high > low ? bottom - ((v - low) / (high - low)) * (bottom - top) : (top + bottom) / 2;
+      const y = flat
+        ? (top + bottom) / 2
+        : bottom - ((v - low) / (high - low)) * (bottom - top);
       if (pen) x.lineTo(px(plan.times[k]), y);
       else x.moveTo(px(plan.times[k]), y);
       pen = true;
     });
     x.stroke();
-    const range = known.length
-      ? `${fixed(low, digits)} – ${fixed(high, digits)} ${unit}`
-      : "not known";
+    const range = flat
+      ? `${fixed(low, digits)} ${unit}`
+      : `${fixed(low, digits)} to ${fixed(high, digits)} ${unit}`;
+    const stands = now === null || now === undefined || flat ? "" : `${fixed(now, digits)} of `;
     x.fillText(
-      `${name}  ${now === null || now === undefined ? range : `${fixed(now, digits)} ${unit}`}`,
+      `${name}  ${known.length ? `${stands}${range}` : "not known"}`,
       4,
       i * lane + LABEL - 2,
     );

@@ -2,6 +2,7 @@
 import { $, $$, el } from "./dom.js";
 import { call, emit, on, pageId, store } from "./link.js";
 import { remember } from "./address.js";
+import { meet } from "./said.js";
 /** @import { Four, View } from "../web/viewer.d.ts" */
 
 /** @type {Record<View, string>} */
@@ -141,9 +142,11 @@ function tellCovered() {
   requestAnimationFrame(() => {
     for (const [view, { box }] of open) {
       const at = box.getBoundingClientRect();
-      const over = [...box.querySelectorAll(":scope > .tag, :scope > button")]
+      const own = box.querySelectorAll(":scope > .tag, :scope > button");
+      const over = [...own, ...$$("#said :is(.warning, .note)")]
         .filter((node) => getComputedStyle(node).visibility === "visible")
-        .map((node) => node.getBoundingClientRect());
+        .map((node) => node.getBoundingClientRect())
+        .filter((o) => meet([o.left, o.top, o.right, o.bottom], at));
       /** @type {Four[]} */
       const boxes = over.map((o) => [
         o.left - at.left,
@@ -159,6 +162,7 @@ function tellCovered() {
     }
   });
 }
+on("said", tellCovered);
 const resized = new ResizeObserver(tellCovered);
 on("open", () => {
   for (const { box } of open.values()) delete box.dataset.covered; // a viewer that is new

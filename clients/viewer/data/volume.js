@@ -34,7 +34,7 @@ const STARTING = "starting; dark, flat and a first image are needed";
 const BEGINS = "the reconstruction begins";
 const COMPARES = "Beside what the sample is made of, with a correction and without";
 const GROWS =
-  "no accuracy or truth while it grows: after the scan, Data, its data set, Reconstruct";
+  "accuracy and truth come after the scan: open its data set in Data and press Reconstruct";
 const EXACT_MS = 60;
 // Largest first zoom of a volume in three dimensions, and the room about its object.
 const NEAREST = 4;
@@ -118,10 +118,22 @@ function ask() {
   progress.value = 0;
   $button("#volume-cancel").hidden = past === null;
   setText($button("#volume-cancel"), "Cancel");
-  setText($("#volume-title"), past ? `Volume of ${past}` : wish ? "Volume so far" : "Volume");
+  entitle();
   setText(note, !wish ? "" : past ? BEGINS : STARTING);
   wait(past ? BEGINS : "");
 }
+function entitle() {
+  const ended = store.job !== null && isOver(store.job);
+  const live = ended
+    ? `Volume of ${store.job?.name ?? "the scan"}, as it grew`
+    : "Volume so far";
+  setText($("#volume-title"), past ? `Volume of ${past}` : asked ? live : "Volume");
+}
+/** Views are added up: before the last one values are that part of what they will be. */
+const unit = () =>
+  told && !told.past && (told.views ?? 0) < (told.of ?? 0)
+    ? `per mm, × ${told.views} / ${told.of}`
+    : "per mm";
 // What has no share yet moves at least with the clock.
 /** @type {number | undefined} */
 let waits;
@@ -190,6 +202,7 @@ export function watch() {
 on("reconstruct", (name) => reconstruct(name));
 on("job", (job) => {
   ask();
+  entitle();
   if (note.textContent === STARTING && isOver(job)) {
     setText(note, `the scan has ended (${job.state}) before its first slices`);
   }
@@ -257,7 +270,9 @@ function behind({ past: over, views, of: all }) {
   const job = store.job;
   if (over || !job?.frames_total || isOver(job) || !views || !all) return "";
   const taken = Math.floor((all * job.frames_done) / job.frames_total);
-  return taken - views > all / 20 ? ` (behind: ${taken} are taken)` : "";
+  const late = taken - views > all / 20 ? ` (behind: ${taken} are taken)` : "";
+  const step = Math.round(job.frames_total / all);
+  return `${step > 1 ? `, one of every ${step} images` : ""}${late}`;
 }
 // The truth beside the scan, under one slider.
 const splitter = $input("#volume-split");
@@ -458,7 +473,7 @@ function drawHistogram() {
   chart.draw({
     counts: three.histogram(range()),
     range: range(),
-    unit: "per mm",
+    unit: unit(),
     window: three.window,
     marks: [{ at: value(level.valueAsNumber), colour, handle: false }],
   });
@@ -469,9 +484,9 @@ function drawProfile() {
   if (three.profiling && !line) setText($("#volume-at"), "drag a line in a slice");
   if (!line) return;
   const { values, mm } = line;
-  plot.draw({ places: along(mm, values.length), values, unit: "mm", of: "per mm" });
+  plot.draw({ places: along(mm, values.length), values, unit: "mm", of: unit() });
   const known = values.filter(Number.isFinite);
-  const ends = `${fixed(Math.min(...known), 5)} to ${fixed(Math.max(...known), 5)} per mm`;
+  const ends = `${fixed(Math.min(...known), 5)} to ${fixed(Math.max(...known), 5)} ${unit()}`;
   const said = known.length ? `${fixed(mm, 2)} mm · ${ends}` : "no data along this line";
   setText($("#volume-at"), said);
 }
@@ -505,7 +520,7 @@ function point(place) {
     const noise = sigma == null ? "" : ` ± ${sigma.toPrecision(2)}`;
     const off = bias == null ? "" : `, bias at most ${bias.toPrecision(2)}`;
     const digits = sigma ? Math.max(0, 2 - Math.floor(Math.log10(sigma))) : 6;
-    say(`${fixed(v, Math.min(8, digits))} per mm${noise}${off}`);
+    say(`${fixed(v, Math.min(8, digits))} ${unit()}${noise}${off}`);
   }, EXACT_MS);
 }
 

@@ -1,6 +1,7 @@
 // What is wrong with the machine, the sample's place and the image, over the scene. A stop has a
 // row of its own above it.
 import { $, el, fixed } from "./dom.js";
+import { partWords } from "./figures.js";
 import { isMe, on, store } from "./link.js";
 import { OLD_S } from "./moment.js";
 import { outline, OUTSIDE } from "./sample_outline.js";
@@ -63,7 +64,10 @@ function ofMachine(s) {
   const near = store.near;
   if (near?.close) {
     const kind = (near.mm ?? 0) < TOUCH_MM ? "bad" : "";
-    list.push([kind, `${near.pair.join(" and ")} are ${fixed(near.mm, 1)} mm apart`]);
+    list.push([
+      kind,
+      `${near.pair.map(partWords).join(" and ")} are ${fixed(near.mm, 1)} mm apart`,
+    ]);
   }
   const ends = atEnds(s);
   if (ends.length) list.push(["", `${ends.join(", ")} at the end of travel`]);

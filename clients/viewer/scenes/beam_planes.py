@@ -138,35 +138,52 @@ class BeamShade:
             for name in range(4)
         ]
         self._newest: tuple[World, npt.NDArray[np.generic], float] | None = None
-        self._lit = False
+        self._lit = self._fits = self._shown = False
 
     def show(
         self, world: World, lines: npt.NDArray[np.generic], radius_mm: float
     ) -> None:
-        """Take the newest image (see `fans`)."""
+        """Take the newest image (see `fans`), made at `world`."""
         self._newest = world, lines, max(radius_mm, 1.0)
-        self._draw()
+        self._fits = True
+        self._change(anew=True)
 
     def light(self, on: bool) -> None:
-        """Show the shaded beam, drawn with the newest image, or hide it; nothing if that
-        is so already.
+        """Show the shaded beam, drawn with the newest image, or hide it.
 
-        `on` is whether X-rays are on.
+        `on` is whether X-rays come out.
         """
-        if on != self._lit:
-            self._lit = on
-            for handle in self._planes:
-                handle.visible = on
+        self._lit = on
+        self._change()
+
+    def follow(self, world: World) -> None:
+        """Hide the shaded beam while source, sample or panel stands farther from where it was
+        for the newest image than the sample is large: its shadow would begin in the air."""
+        if self._newest is not None:
+            then, _, radius = self._newest
+            self._fits = all(
+                float(np.linalg.norm(now - before)) <= radius
+                for now, before in (
+                    (world.source, then.source),
+                    (world.sample.shift, then.sample.shift),
+                    (world.detector, then.detector),
+                )
+            )
+            self._change()
+
+    def _change(self, anew: bool = False) -> None:
+        """Show the planes where they are lit and fit; draw them as they come, or `anew`."""
+        shown = self._lit and self._fits
+        if shown and (anew or not self._shown):
             self._draw()
+        if shown != self._shown:
+            self._shown = shown
+            for handle in self._planes:
+                handle.visible = shown
 
     def _draw(self) -> None:
-        """Draw the newest image as planes along the beam; nothing while X-rays are off or
-        no image is there.
-
-        Also nothing is sent for hidden planes; sizes are converted to [m].
-        """
-        if not self._lit or self._newest is None:
-            return
+        """Draw the newest image as planes along the beam; sizes are converted to [m]."""
+        assert self._newest is not None
         for handle, plane in zip(self._planes, fans(*self._newest), strict=True):
             handle.image = plane.rgba
             handle.render_width, handle.render_height = (side * MM for side in plane.size)

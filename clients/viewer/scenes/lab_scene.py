@@ -6,11 +6,13 @@ viser sends only what changes. Setters may be called from any one thread at a ti
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import viser
+from scipy.spatial.transform import Rotation
 
 from flexdt.clients.viewer.scenes import contact_shadows
 from flexdt.clients.viewer.scenes.beam_planes import LIGHT, BeamShade
@@ -52,6 +54,8 @@ CONE_OPACITY: Final = 0.2
 BEAM_OFF: Final = (120, 140, 165)
 FADED_OPACITY: Final = 0.12
 """Largest opacity of a sample whose volume is drawn within it."""
+PIERCING: Final = (90, 176, 255)
+"""Colour of the piercing point's cross, as in the page's radiograph."""
 FLOOR: Final = (140, 150, 165)
 RANGE: Final = (240, 150, 40)
 RED: Final = (230, 50, 40)
@@ -226,7 +230,7 @@ class LabScene:
             "/axis", _axis_points(), (40, 160, 235), thickness=2.0, **SCREEN
         )
         self._cross = scene.add_line_segments(
-            "/piercing", _cross_points(), (60, 220, 120), thickness=2.5, **SCREEN
+            "/piercing", _cross_points(), PIERCING, thickness=2.5, **SCREEN
         )
         self._ranges = scene.add_line_segments(
             "/ranges",
@@ -295,6 +299,23 @@ class LabScene:
             end = first - [0.0, 2 * AXES_MM, 0.0] + 1.1 * AXES_MM * np.eye(3)[k]
             out.append((words, end * MM))
         return out + names_of_parts(self.machine, dict(self._sent))
+
+    def subject(self, world: World) -> list[FloatArray]:
+        """List what a scene is about, each as points (n, 3) around it [m]: focal spot, sample
+        with the parts that turn with it, and image."""
+        turning = [world.sample.shift[None] * MM]
+        for part in self.machine.components:
+            if part.role in NEAR and (pose := self._sent.get(part.name)) is not None:
+                middle, half = np.array(part.center_mm), 0.5 * np.array(part.size_mm)
+                corners = middle + half * np.array(list(product((-1.0, 1.0), repeat=3)))
+                turn = Rotation.from_quat(pose[:4], scalar_first=True)
+                turning.append(turn.apply(corners * MM) + pose[4:])
+        if (
+            self._look is not None
+            and (around := rim(world, self._look.hulls_m)) is not None
+        ):
+            turning.append(around * MM)
+        return [world.source[None] * MM, np.concatenate(turning), world.corners * MM]
 
     def _top_mm(self, world: World) -> float | None:
         """Compute the height of the sample's highest point; None without a sample."""
@@ -366,20 +387,21 @@ class LabScene:
 
     def _show_beam(self, state: State, world: World) -> None:
         """Move edges, spot, lamp, cross and axis to a state, and colour them by X-rays on
-        or off.
+        or off; the lamp is lit while the tube warms up, too.
 
-        Positions become [m]; the spot is hidden while X-rays are off. Edges are the eight
+        Positions become [m]; the spot is hidden while no X-rays come out. Edges are the eight
         lines of the pyramid of focal spot and image corners.
 
         Args:
             state: of the twin.
             world: geometry of the state.
         """
-        on = state.tube.on
+        on = state.tube.on and state.tube.ready
         points = np.concatenate([world.source[None], world.corners]) * MM
         self._lit = on
-        self._lamp.color = LAMP[on]
+        self._lamp.color = LAMP[state.tube.on]
         self._shade.light(on)
+        self._shade.follow(world)
         a, b, c, d, e = points
         lines = [(a, b), (a, c), (a, d), (a, e), (b, c), (c, d), (d, e), (e, b)]
         self._edges.points = np.array(lines, dtype=np.float32)

@@ -184,6 +184,8 @@ export interface Messages {
   beat: { at: number; silent_s: number };
   // Where a handle is dragged to: why that cannot be reached, or how long it takes (twin's clock).
   drag: { targets: Record<string, number>; why: string | null; duration_s: number | null };
+  // Boxes of what a view's picture is about: source, sample and image.
+  subject: { view: View; boxes: Four[] };
   // What was clicked in a scene, and the motor nearest to it.
   part: { part: string; motor: string | null };
 }
@@ -279,7 +281,9 @@ export interface Events {
   log: [entry: { level: string; message: string }];
   tab: [name: string];
   drag: [told: Messages["drag"]];
+  said: [];
   part: [part: string, motor: string | null];
+  subject: [view: View, boxes: Four[]];
   "show-tab": [name: string];
   moment: [moment: Moment];
   recorded: [name: string | null];

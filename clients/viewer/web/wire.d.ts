@@ -126,8 +126,7 @@ export type HelloResult = {
   physics: string | null; rays: number | "auto" | null; instance: string | null
 };
 export type ImageFlags = {
-  time: number | null; saturated: number; starved: number;
-  truncated: Array<"left" | "right" | "top" | "bottom">; good_counts: [number, number] | null;
+  time: number | null; saturated: number; starved: number; good_counts: [number, number] | null;
   good_lines: [number, number] | null
 };
 export type ImageOrigin = {

@@ -176,7 +176,7 @@ test("a sample is inside, cut or outside as the rays to its corners say", () => 
     if (apart) { assert.equal(said, "Sample is outside the image"); seen.outside++; }
     else if (inside) { assert.equal(said, ""); seen.inside++; }
     else if (crosses && columns[1] > margin && columns[0] < 956 - margin && rows[1] > margin && rows[0] < 760 - margin) {
-      assert.match(said, /^Sample truncated/); seen.cut++;
+      assert.match(said, /^Sample cut off/); seen.cut++;
     }
   }
   for (const count of Object.values(seen)) assert.ok(count > 4, JSON.stringify(seen));
@@ -201,7 +201,7 @@ test("a sample's shape, where it is known, decides how wide it turns, and never 
     piercing_point_px: [477.5, 379.5],
   };
   const camera = { pixel_mm: 0.1496, shape: [760, 956] };
-  assert.match(outline({ size_mm, offset }, g, camera, 0).join(), /sideways/);
+  assert.match(outline({ size_mm, offset }, g, camera, 0).join(), /at the sides/);
   assert.deepEqual(outline({ size_mm, offset }, g, camera, 0, 40), []);
 });
 
