@@ -82,7 +82,7 @@ class ScriptNewSettings(Settings):
     """`flexdt script new`.
 
     Attributes:
-        height: Set the height of source and detector centre [mm].
+        height: Set the height of source and detector center [mm].
     """
 
     command = "script new"

@@ -74,7 +74,7 @@ def reconstruct(
         iterations: Iterate so often; default: the algorithm's.
         weight: Weigh the total variation of tv by this.
         correction: Apply a report's correction, or the twin's; default: the scan's.
-        center: Put the volume's centre there [mm].
+        center: Put the volume's center there [mm].
         rings: Correct the images for rings.
         material: Correct beam hardening of this material; sirt, sart: of several.
         scatter_correction: Subtract the scatter of an object of these, e.g. pmma,aluminium.

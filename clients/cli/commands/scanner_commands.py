@@ -592,13 +592,13 @@ def snap(
 
     A TIFF holds the values as they come: uint16 counts by default. A PNG is windowed to 8 bit,
     dense parts dark, and shows line integrals by default, so X-rays may be off. It marks in
-    colour pixels of a wrong exposure: saturated red, starved blue, cut-off edges
+    color pixels of a wrong exposure: saturated red, starved blue, cut-off edges
     yellow.
 
     Args:
         kind: Write this kind; default: counts in a TIFF, integrals in a PNG.
         binning: Average so many pixels a side.
-        marks: Colour saturated, starved and cut-off pixels of a PNG.
+        marks: Color saturated, starved and cut-off pixels of a PNG.
 
     Yields:
         The document of --json (file, dtype, shape, cone_vec, kind, flags), then a line,

@@ -90,7 +90,7 @@ async function start() {
   try {
     const answer = await send(chosen, mine);
     if (answer?.complete) await arrived(answer);
-    else if (mine.cancelled) setText(note, "cancelled: nothing is kept");
+    else if (mine.cancelled) setText(note, "canceled: nothing is kept");
   } finally {
     sending = null;
     busy(false);
