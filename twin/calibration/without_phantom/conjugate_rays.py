@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d, map_coordinates, spline_filter
+from scipy.ndimage import gaussian_filter1d, spline_filter
 from scipy.special import ndtr, stdtrit
 
 from flexdt.twin.calibration.without_phantom.circular_scan import CircularScan
@@ -369,8 +369,8 @@ class ConjugateRays:
         )
         soft = gaussian_filter1d(band, self.smoothing, axis=2, mode="nearest")
         self.splines = [
-            spline_filter(np.pad(one, ((EDGE_VIEWS, EDGE_VIEWS), (0, 0)), mode="wrap"))
-            for one in soft.transpose(1, 0, 2)
+            spline_filter(np.pad(one, ((0, 0), (EDGE_VIEWS, EDGE_VIEWS)), mode="wrap"))
+            for one in soft.transpose(1, 2, 0)
         ]
         self.sector = np.arange(self.views) * SECTORS // self.views
 
@@ -542,26 +542,43 @@ class ConjugateRays:
         inwards = -source[:2]
         angle = np.arctan2(inwards[0] * ray[1] - inwards[1] * ray[0], inwards @ ray)
         turned = (math.pi + 2.0 * angle) / self.step
-        first = np.arange(self.views)[:, None]
-        return self._read(group, 0.0 * turned + first, columns), self._read(
-            group, turned + first, opposite
-        )
+        here = self._read(group, np.zeros(len(columns)), columns)
+        return here, self._read(group, turned, opposite)
 
-    def _read(self, group: int, view: FloatArray, columns: FloatArray) -> FloatArray:
+    def _read(self, group: int, ahead: FloatArray, columns: FloatArray) -> FloatArray:
         """Interpolate one group of rows between views (cyclic) and columns by cubic splines.
 
-        `group`: number of the group. `view`: (n, k) view numbers, also between two and beyond a
-        turn. `columns`: (k,) or (n, k) columns of the panel [px]; those off it take its edge.
+        In all views the same columns are read, so the splines are summed over columns once.
+
+        `group`: number of the group. `ahead`: (k,) views by which each column is read later than
+        in the view itself. `columns`: (k,) of the panel [px]; those off it take its edge.
         Returns (n, k) line integrals.
         """
-        at = np.stack(
-            [view % self.views + EDGE_VIEWS, np.broadcast_to(columns, view.shape)]
+        splines = self.splines[group]
+        last = len(splines) - 1
+        low, weights = _taps(columns)
+        read = sum(
+            weight[:, None] * splines[np.clip(low + i - 1, 0, last)]
+            for i, weight in enumerate(weights)
         )
+        low, weights = _taps(ahead % self.views)
+        at = (low[:, None] + np.arange(self.views)) % self.views + EDGE_VIEWS - 1
+        at += np.arange(len(columns))[:, None] * splines.shape[1]
+        flat = np.ravel(read)
         return np.asarray(
-            map_coordinates(
-                self.splines[group], at, order=3, prefilter=False, mode="nearest"
-            )
-        )
+            sum(weight[:, None] * flat[at + i] for i, weight in enumerate(weights))
+        ).T
+
+
+def _taps(places: FloatArray) -> tuple[npt.NDArray[np.intp], tuple[FloatArray, ...]]:
+    """Return the second of the four coefficients of a cubic spline at places (k,), and the weights
+    of all.
+    """
+    low = np.floor(places).astype(np.intp)
+    t = places - low
+    u = 1.0 - t
+    inner = (4.0 - 6.0 * t**2 + 3.0 * t**3) / 6.0, (4.0 - 6.0 * u**2 + 3.0 * u**3) / 6.0
+    return low, (u**3 / 6.0, *inner, t**3 / 6.0)
 
 
 def _left_out(moved: FloatArray, told: FloatArray) -> tuple[float, float]:

@@ -133,6 +133,13 @@ class PlanePairs:
                 "of views have planes through both sources that they see whole (at "
                 f"least {100 * FEWEST_PAIRS:.0f} %)"
             )
+        # First pair of each group of a level, and its bins that are valid in all of its pairs.
+        self.groups = []
+        for bins, degrees in LEVELS:
+            near = max(1, round(degrees / 360 * n))
+            first = np.flatnonzero(self.place % near == 0)
+            unseen = np.add.reduceat(_widened(~self.valid, bins), first, axis=0)
+            self.groups.append((first, unseen == 0))
         ends = [self.rows(start + s * np.eye(len(start))[0])[0] for s in (1, -1)]
         magnified = np.hypot(*(here[0, 3:5] - flat)) / np.hypot(*flat)
         # What a row sees at the axis rises so far with the panel's height [mm/px].
@@ -190,17 +197,13 @@ class PlanePairs:
         rest = found[:, 0] - found[:, 1]
         pairs = np.zeros((len(LEVELS), len(rest)))
         blocks = np.zeros((len(LEVELS), len(self.starts), BLOCKS))
-        for i, (bins, degrees) in enumerate(LEVELS):
-            near = max(1, round(degrees / 360 * len(self.sums)))
-            first = np.flatnonzero(self.place % near == 0)
+        wide = {bins: (_widened(rest, bins), _widened(ones, bins)) for bins, _ in LEVELS}
+        for i, (bins, _) in enumerate(LEVELS):
+            first, seen = self.groups[i]
             size = np.diff(first, append=len(rest))
-            k = rest.shape[1] // bins
-            wide = (
-                a[:, : k * bins].reshape(len(a), k, bins).sum(axis=2)
-                for a in (rest, ones, ~self.valid)
-            )
-            r, c, unseen = (np.add.reduceat(a, first, axis=0) for a in wide)
-            square = np.square(without(c, r * (unseen == 0), unseen == 0))
+            k = seen.shape[1]
+            r, c = (np.add.reduceat(a, first, axis=0) for a in wide[bins])
+            square = np.square(without(c, r * seen, seen))
             pairs[i] = np.repeat(square.sum(axis=1) / size, size)
             of_kind = np.add.reduceat(square, np.searchsorted(first, self.starts), axis=0)
             blocks[i] = np.add.reduceat(of_kind, np.arange(BLOCKS) * k // BLOCKS, axis=1)
@@ -304,6 +307,12 @@ class PlanePairs:
                     inside = (k + by >= 0) & (k + by < valid.shape[1])
                     valid[q[inside], (k + by)[inside]] = False
         return valid
+
+
+def _widened(of_bins: FloatArray | npt.NDArray[np.bool_], bins: int) -> FloatArray:
+    """Sum up values of bins, (q, k), over so many neighbours each."""
+    k = of_bins.shape[1] // bins
+    return np.asarray(of_bins[:, : k * bins].reshape(len(of_bins), k, bins).sum(axis=2))
 
 
 def noise_like(images: Float32Array, random: np.random.Generator) -> Float32Array:
