@@ -5,9 +5,10 @@
 Starts a lab of its own, with what a new twin has on its stage, and a browser without graphics
 hardware. Processor seconds are those of the servers and of the browser apart; wall seconds mean
 something on a quiet machine alone, so the load average stands beside them. `load`: JavaScript of
-page and viser, raw and as sent, and the seconds to the first radiograph and picture of the
-scene, cold and warm. `rest`: servers with one page open and nothing moving. `scan`: from a
-browser that has never been here to a volume beside its truth. `story`: Misalign's five steps.
+page and viser, raw and as sent, all that is sent over HTTP, and the seconds to the first
+radiograph and picture of the scene, cold and warm. `rest`: servers with one page open and nothing
+moving. `scan`: from a browser that has never been here to a volume beside its truth. `story`:
+Misalign's five steps.
 """
 
 from __future__ import annotations
@@ -196,6 +197,11 @@ def load(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
                     e["response"]["url"] if "script" in e["response"]["mimeType"] else "",
                 ),
             )
+            sent: list[float] = []
+            network.on(
+                "Network.loadingFinished",
+                lambda e, kept=sent: kept.append(e["encodedDataLength"]),
+            )
             raw: dict[str, int] = {}
             network.on(
                 "Network.dataReceived",
@@ -218,14 +224,15 @@ def load(play: Any, url: str, meter: Meter, shots: Path | None) -> None:
             print(f"{visit}: first picture {picture.since(begun)}")
             print(f"{visit}: radiograph {image.since(begun)}")
             print(f"{visit}: live scene {live.since(begun)}")
+            print(f"{visit}: {sum(sent) / 1e3:.0f} kB sent in all, without WebSockets")
             js = {name: size for name, size in sizes.items() if name.endswith(".js")}
             for what, chosen in (
                 ("viser's", [v for k, v in js.items() if "/viser-" in k]),
                 ("the page's", [v for k, v in js.items() if "/viser-" not in k]),
             ):
-                sent, whole = (sum(size[k] for size in chosen) / 1e3 for k in (0, 1))
+                by_wire, whole = (sum(size[k] for size in chosen) / 1e3 for k in (0, 1))
                 print(
-                    f"{visit}: {what} JavaScript {sent:.0f} kB sent, {whole:.0f} kB raw"
+                    f"{visit}: {what} JavaScript {by_wire:.0f} kB sent, {whole:.0f} kB raw"
                 )
             if shots:
                 page.screenshot(path=shots / f"load-{visit}.png")

@@ -122,7 +122,7 @@ def stop_and_go_on(v: Visitor) -> None:
     v.button("E-STOP")
     v.sees("nothing moves until it is reset")
     v.button("RESET")
-    v.button("Release this stop")
+    v.button("Reset this stop")
     v.sees_no_more("nothing moves until it is reset")
 
 

@@ -78,7 +78,7 @@ const decimals = (v, digits) =>
  */
 function table(parameters, sigmas = {}, units = {}) {
   const shown = Object.entries(parameters).filter(([k, v]) =>
-    k === "angle_scale" ? v !== 1 : v !== 0,
+    k === "angle_scale" ? v !== 1 : Math.abs(v ?? 0) >= 0.5 * 10 ** -FINEST || k in sigmas,
   );
   return el(
     "table",

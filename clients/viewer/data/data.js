@@ -189,6 +189,12 @@ function settings(info) {
     .join(" · ");
 }
 
+/**
+ * Whether images of an unfinished data set are missing: an abort after the last one leaves none.
+ * @param {DatasetInfo} info
+ */
+const lacks = (info) => info.present < info.projections || info.problem !== "";
+
 /** @param {DatasetInfo} info */
 function row(info) {
   const why = info.problem || info.reason;
@@ -211,7 +217,7 @@ function row(info) {
         "span",
         { class: `state ${info.state}` },
         info.state === "incomplete" && why
-          ? `incomplete: ${why}`
+          ? `${lacks(info) ? "incomplete" : "all images are there"}: ${why}`
           : info.state === "unknown" && why
             ? why
             : WORDS[info.state],
@@ -219,7 +225,7 @@ function row(info) {
     ),
   );
   node.setAttribute("aria-current", String(info.name === told?.info.name));
-  if (info.state !== "incomplete") return [node];
+  if (info.state !== "incomplete" || !lacks(info)) return [node];
   const title = `Make the images of ${info.name} that are missing`;
   const go = { class: "small data-resume", title, onclick: () => resume(info.name) };
   return [node, el("button", go, `Resume ${info.name}`)];

@@ -9,13 +9,13 @@ const tab = (name) => () => emit("show-tab", name);
 const TASKS = [
   [
     "See a volume of the sample",
-    "one turn, its volume, its truth",
+    "one turn, then its volume beside the truth",
     () => $button("#scan-it").click(),
   ],
   ["Put another sample on the stage", "a shipped one, or a mesh of yours", tab("setup")],
-  ["Change voltage, exposure or filters", "and see what they do to the image", tab("setup")],
+  ["Change voltage, power or exposure", "and see what they do to the images", tab("setup")],
   ["Move source, sample or detector", "by magnification, voxel size or motor", tab("move")],
-  ["Plan and check a scan", "from wishes or from a script of yours", tab("scan")],
+  ["Plan and check a scan", "written for you, or a script of yours", tab("scan")],
   ["Look at a past scan", "image by image, beside the virtual one", tab("data")],
   ["Correct the geometry", "from a bead phantom, or from any turn", tab("calibrate")],
   ["See what a wrong geometry does", "a story in five steps", openStory],

@@ -36,7 +36,7 @@ const HELP =
   "W A S D Q E and the arrows fly the camera. " +
   "In the radiograph: wheel to zoom, drag to pan, double click to reset.";
 const TWIN =
-  "Motors, X-rays and images here are computed: no machine moves, and nothing is radiated.";
+  "Motors, X-rays and images here are computed: no machine moves, and no X-rays are emitted.";
 const byKey = $input("#key-jog");
 const KEY = "flexdt-keys";
 byKey.checked = localStorage.getItem(KEY) === "on";
@@ -151,7 +151,7 @@ export function toggleHelp() {
       ["Space", "stop all axes"],
       ["Shift+Space", "emergency stop"],
       ["Alt+1…5", "views"],
-      ["Alt+0", "the sample, near"],
+      ["Alt+0", "the sample close up"],
       ["F1", "this help"],
     ])
       grid.append(el("kbd", {}, key), el("span", {}, what));

@@ -94,7 +94,7 @@ function offer(job) {
   const down = store.state !== null && isDown(store.state);
   $button("#job-step").disabled = down || job.state !== "paused";
   $button("#job-resume").disabled = down || (job.state !== "paused" && !isUnfinished(job));
-  $button("#job-back").disabled = Boolean(store.state?.job);
+  $button("#job-back").disabled = down || Boolean(store.state?.job);
 }
 on("scan", draw);
 on("state", draw);

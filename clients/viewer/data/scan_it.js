@@ -244,7 +244,7 @@ function told(state) {
   if (!state.sample.name || voxel_um === null) return "The stage is empty: choose a sample.";
   const own = viewsFor(state, voxel_um);
   wanted.placeholder = String(own);
-  if (isDown(state)) return "Nothing is scanned before the stop is reset.";
+  if (isDown(state)) return "Reset the stop before scanning.";
   const waits = store.job && !isOver(store.job) ? "After the current scan: one" : "One";
   return `${waits} turn of ${wanted.value || own} images; the volume grows in the scene.`;
 }

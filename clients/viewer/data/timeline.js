@@ -102,6 +102,8 @@ export function draw(canvas, plan, at, running, room = Infinity) {
     x.fillRect(px(t), tall - AXIS + 4, 1, 9);
   }
   x.textAlign = "left";
+  /** @type {Array<[words: string, y: number, colour: string]>} */
+  const names = [];
   lanes.forEach(([name, values], i) => {
     const known = values.filter((v) => v !== null);
     const unit = plan.units[name] ?? "";
@@ -133,11 +135,8 @@ export function draw(canvas, plan, at, running, room = Infinity) {
       ? `${fixed(low, digits)} ${unit}`
       : `${fixed(low, digits)} to ${fixed(high, digits)} ${unit}`;
     const stands = now === null || now === undefined || flat ? "" : `${fixed(now, digits)} of `;
-    x.fillText(
-      `${name}  ${known.length ? `${stands}${range}` : "not known"}`,
-      4,
-      i * lane + LABEL - 2,
-    );
+    const told = `${name}  ${known.length ? `${stands}${range}` : "not known"}`;
+    names.push([told, i * lane + LABEL - 2, colors[i % colors.length]]);
   });
   for (const [t, color] of /** @type {const} */ ([
     [running, colour("--ok")],
@@ -146,5 +145,13 @@ export function draw(canvas, plan, at, running, room = Infinity) {
     if (t === null) continue;
     x.fillStyle = color;
     x.fillRect(Math.min(px(t), w - 2), 0, 2, tall - 14);
+  }
+  // What a lane is stands over the playheads, with a rim of the ground about its letters.
+  x.lineWidth = 3;
+  x.strokeStyle = colour("--soft");
+  for (const [words, y, ink] of names) {
+    x.strokeText(words, 4, y);
+    x.fillStyle = ink;
+    x.fillText(words, 4, y);
   }
 }
