@@ -3,12 +3,14 @@
 Blur widens the shadow of a small ball as a larger ball does, and a beam that hardens changes its
 rim: images tell sizes no better than they tell these apart. The spots are compared with rendered
 ones by Gauss-Newton steps; size, blur and hardening are common to all, and each spot has its own
-place, contrast and background. What these leave of the size is its variance.
+place, contrast and background. What these leave of the size is its variance; where that speaks
+against the stated size, the likelihood of this one is asked: size and blur trade along a curve.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,6 +41,8 @@ LARGEST_STEP = 0.2
 LEAST_DAMPING = 0.1
 """Damping after the first step that leads away."""
 MOST_ROUNDS = 12
+DOUBTED = 2.0
+"""Standard deviations by the slopes from which the likelihood of the stated size is asked."""
 SETTLED = 0.3
 """Change in standard deviations below which a round is the last."""
 LEAST_SPOTS = 3
@@ -56,6 +60,7 @@ class BeadSize:
         variance: of the blur [px^2].
         spread: of the attenuation, its variance over the square of its mean.
         contrast: factor on the line integrals through the middle, of the mean attenuation.
+        wider: sigma over that of independent pixels.
     """
 
     size: float
@@ -63,6 +68,7 @@ class BeadSize:
     variance: float
     spread: float = 0.0
     contrast: float = 1.0
+    wider: float = 1.0
 
     def lift(self, peak: float) -> float:
         """Return the factor on the line integral `peak` that a bead shows in its middle where
@@ -114,21 +120,52 @@ def bead_size(
     spots = _spots(patches, sample, cone)
     if len(spots.light) < LEAST_SPOTS:
         return None
+
+    def compared(now: BeadSize) -> _Compared:
+        return _compared(spots, balls, fine, now)
+
+    found, best = _settled(compared, first)
+    if abs(math.log(found.size)) < DOUBTED * found.sigma:
+        return found
+    stated, there = _settled(compared, replace(found, size=1.0), held=True)
+    noise2 = best.misfit / best.freedom
+    lost = (there.misfit - best.misfit) / noise2
+    lost += (stated.spread**2 - found.spread**2) / HARDENING**2
+    # Where the stated size is likelier, the best one may be as far on its other side.
+    wide = found.wider * abs(math.log(found.size)) / math.sqrt(max(lost, 1.0))
+    likeliest = found if lost > 0.0 else replace(stated, size=1.0)
+    return replace(likeliest, sigma=max(found.sigma, wide))
+
+
+def _settled(
+    compared: Callable[[BeadSize], _Compared], first: BeadSize, *, held: bool = False
+) -> tuple[BeadSize, _Compared]:
+    """Step to the most likely beads.
+
+    Args:
+        compared: compares spots with rendered ones.
+        first: to begin with.
+        held: keep the size.
+
+    Returns:
+        The estimate; what a last step would still change counts as its standard deviation; and
+        the comparison with it, or the one before where it is settled.
+    """
     now = first
-    best, damping = _compared(spots, balls, fine, now), 0.0
+    best, damping = compared(now), 0.0
     for _ in range(MOST_ROUNDS):
-        moved, settled = best.moved(now, damping)
+        moved, settled = best.moved(now, damping, held=held)
         if settled and damping == 0.0:
-            return moved
-        there = _compared(spots, balls, fine, moved)
+            return moved, best
+        there = compared(moved)
         if there.misfit > best.misfit:
             damping = max(10.0 * damping, LEAST_DAMPING)
             continue
         now, best = moved, there
         damping = 0.1 * damping if damping > LEAST_DAMPING else 0.0
-    moved, _ = best.moved(now, 0.0)
+    moved, _ = best.moved(now, 0.0, held=held)
     open_ = math.hypot(moved.sigma, math.log(moved.size / now.size))
-    return replace(now, sigma=open_)
+    return replace(now, sigma=open_), best
 
 
 def hardened(rays: FloatArray, spread: float) -> FloatArray:
@@ -186,13 +223,20 @@ class _Compared:
         """Sum of squares."""
         return float(np.square(self.left).sum())
 
-    def moved(self, now: BeadSize, damping: float) -> tuple[BeadSize, bool]:
-        """Return a better estimate than `now`, and whether it is settled."""
+    def moved(
+        self, now: BeadSize, damping: float, *, held: bool = False
+    ) -> tuple[BeadSize, bool]:
+        """Return a better estimate than `now`, of its size if that is `held`, and whether it is
+        settled.
+        """
         best = np.linalg.lstsq(self.gram, self.right)[0]
         noise2 = max(self.misfit - float(self.right @ best), 0.0) / self.freedom
         gram, right = self.gram.copy(), self.right.copy()
         gram[SPREAD, SPREAD] += noise2 / HARDENING**2
         right[SPREAD] -= now.spread * noise2 / HARDENING**2
+        if held:
+            gram[LOG_SIZE, LOG_SIZE + 1 :] = gram[LOG_SIZE + 1 :, LOG_SIZE] = 0.0
+            right[LOG_SIZE] = 0.0
         inverse = np.linalg.inv(gram)
         gram += damping * np.diag(np.diag(gram))
         change = _bounded(gram, right, np.array([-np.inf, -now.variance, -now.spread]))
@@ -200,7 +244,8 @@ class _Compared:
         rest = self.left - self.columns @ change
         scores = np.einsum("mpi,mp->mi", self.columns, rest) @ inverse
         by_spots = np.square(scores).sum(axis=0)
-        sigmas = np.sqrt(np.maximum(noise2 * np.diag(inverse), by_spots))
+        by_noise = noise2 * np.diag(inverse)
+        sigmas = np.sqrt(np.maximum(by_noise, by_spots))
         contrast = float(np.median(self.contrast[:, -1] - self.contrast[:, :-1] @ change))
         most = max(abs(contrast), *np.abs(change[[LOG_SIZE, SPREAD]]).tolist())
         share = min(1.0, LARGEST_STEP / max(most, LARGEST_STEP))
@@ -211,6 +256,7 @@ class _Compared:
             max(now.variance + float(change[VARIANCE]), 0.0),
             max(now.spread + float(change[SPREAD]), 0.0),
             now.contrast * math.exp(contrast),
+            float(sigmas[LOG_SIZE]) / math.sqrt(float(by_noise[LOG_SIZE]) + 1e-300),
         )
         return found, bool((np.abs(change[:2]) < SETTLED * sigmas[:2]).all())
 
