@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import flexdt as fx
+from flexdt.twin.projection.volume import WARNING_BOUND
 from flexdt.twin.reconstruction import field_of_view
 
 REGIONS = 24
@@ -256,7 +257,8 @@ def judged(scan: Scan) -> Judged:
         if len(rows) == REGIONS:
             break
     errors, bounds, noise = np.array(rows).reshape(-1, 3).T
-    warned = bool(volume.accuracy is not None and volume.accuracy.warnings)
+    accuracy = volume.accuracy
+    warned = accuracy is not None and (accuracy.cut_off or accuracy.most > WARNING_BOUND)
     return Judged(errors, bounds, noise, warned=warned)
 
 

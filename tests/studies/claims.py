@@ -515,6 +515,7 @@ class Judged:
     noise: float = np.nan
     within: float = np.nan
     seconds: float = 0.0
+    words: int = 0
 
     @property
     def true(self) -> bool:
@@ -555,9 +556,11 @@ def judged(scan: Drawn, algorithm: str = "fdk") -> Judged:
                 moved = np.abs(noisy - volume.data) <= 2.0 * sigma
                 noise = float(moved[inside & np.isfinite(noisy)].mean())
     said = [str(one.message) for one in caught]
-    text = "; ".join([str(accuracy), *said])
+    whole = "None" if accuracy is None else accuracy.details
+    text = "; ".join([whole, *said])
+    words = len(str(accuracy).split())
     told = "contradict each other" in text or "fit better if" in text
-    out = Judged(scan.said, text, told=told, seconds=spent, noise=noise)
+    out = Judged(scan.said, text, told=told, seconds=spent, noise=noise, words=words)
     out.named = any(word in CONDITION.sub("", text).lower() for word in scan.causes)
     conditions = " ".join(CONDITION.findall(text)).lower()
     out.taken = any(word in conditions for word in scan.causes)
@@ -663,6 +666,7 @@ def main() -> int:
     noise = [one.noise for one in made if np.isfinite(one.noise)]
     print(f"  voxels within 2 sigma of noise: {np.mean(noise) if noise else np.nan:.1%}")
     print(f"  CPU s a scan: {np.mean([one.seconds for one in made]) if made else 0:.2f}")
+    print(f"  longest sentence: {max((one.words for one in made), default=0)} words")
     kinds = [one for one in chosen.kinds.split(",") if one] or list(WRONG)
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for kind in kinds:

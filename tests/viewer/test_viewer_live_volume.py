@@ -282,8 +282,8 @@ def test_the_volume_of_a_past_scan_is_that_of_the_command(
     ]
     with pytest.raises(SystemExit, match="0"):
         main(words)
-    doubt = next(words for words in last["doubts"] if "accuracy" in words)
-    accuracy = doubt[doubt.index("accuracy") :]
+    accuracy = next(one for one in last["doubts"] if one.startswith("accuracy"))
+    assert last["details"].startswith(accuracy.split(",")[0])
     printed = "".join(capsys.readouterr())  # as a warning, or with the file
     assert re.findall(r"accuracy: within .*", printed) == [accuracy]
     whole = tifffile.imread(out)  # (z, y, x)

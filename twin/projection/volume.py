@@ -26,15 +26,15 @@ from flexdt.twin.projection.portions import PASS_NS, equal_portions
 from flexdt.twin.signatures import File, public
 
 WARNING_BOUND: Final = 0.03
-"""Relative bound from which on `Accuracy.warnings` warns if a tenth of the uniform
-regions exceed it. The bound is two to four times the actual deviation: about 1 %."""
+"""Relative bound from which on a cause is warned of, if a tenth of the uniform regions exceed it.
+The bound is two to four times the actual deviation: about 1 %."""
 CAUSES: Final = {
     "angles": "missing or few views",
     "aside": "an offset panel's narrow overlap",
     "cone": "the cone angle",
     "rows": "truncation above or below",
     "beyond": "truncation at the sides",
-    "drift": "an open beam unlike the flat",
+    "drift": "a drift of the flat",
     "axis": "the axis offset",
     "slip": "a slip along the axis",
     "height": "the panel's height",
@@ -53,10 +53,12 @@ CAUSES: Final = {
     "images": "images that no object explains",
     "geometry": "what images leave open",
     "stopping": "iterations that ended early",
-    "penalty": "the penalty of the total variation",
+    "penalty": "the total variation's penalty",
 }
 ONE_ENERGY: Final = "one energy"
 """What is taken as stated where no spectrum is known."""
+PLURALS: Final = frozenset({"distances", "angles"})
+"""Of what is taken as stated."""
 NOT_BOUNDED: Final = (
     "accuracy: not bounded, because the object extends beyond the panel's sides: "
     "a denser shell out there makes every value too low, and no image shows it"
@@ -86,9 +88,12 @@ class Accuracy:
         cut_off: the object continues beyond the panel's sides: the figures are estimates,
             not bounds.
         figure: size of the cause with its standard error, where the images tell one.
-        taken: what is taken as stated, because the images do not decide it.
+        taken: what is taken as stated, because the images do not decide it, by how much it
+            would change the volume.
         next: the next of the errors that images tell, with its size; "" without one.
         doubled: distance at which those errors double edges [pixels, as seen by a view].
+        edges: distance within which opposite views show an edge, by these errors and by two
+            standard errors of others [pixels]; None where it was not found.
     """
 
     half: float
@@ -99,38 +104,79 @@ class Accuracy:
     taken: tuple[str, ...] = ()
     next: str = ""
     doubled: float = 0.0
+    edges: float | None = None
 
     def __str__(self) -> str:
-        """Return the accuracy sentence: largest errors [%] in nine of ten and in half of
-        the uniform regions, their largest cause, and what they are conditional on; that
-        none is bounded if the object is cut off. See docs/glossary.md.
+        """Return the accuracy sentence, at most 30 words: largest errors [%] of values in nine of
+        ten uniform regions and of edges, the largest cause, and the condition that matters most;
+        that nothing is bounded if the object is cut off. See docs/glossary.md.
         """
         if self.cut_off:
             return NOT_BOUNDED
-        half, most = (
-            f"{min(100.0 * part, 99.0):.2g} %" for part in (self.half, self.most)
-        )
+        first, *more = self._stated or ("",)
+        edges = "" if self.edges is None else f", edges within {self.edges:.2g} pixels"
+        taken = _as_stated(first, "more" if more else "")
+        return f"{self._values}{edges}, mainly {CAUSES[self.cause]}{taken}"
+
+    @property
+    def details(self) -> str:
+        """All that the sentence is made of, as one longer sentence."""
         figure = f" ({self.figure})" if self.figure else ""
         further = f", then {self.next}" if self.next else ""
-        stated = [one for one in self.taken if one != ONE_ENERGY]
-        *first, last = stated or [""]
-        listed = f"{', '.join(first)} and {last}" if first else last
-        taken = f"; if {listed} are as stated" if stated else ""
-        energy = f" at {ONE_ENERGY}" * (len(stated) < len(self.taken))
+        doubled = f", edges doubled by {self.doubled:.2g} pixels" if self.doubled else ""
+        *first, last = self._stated or ("",)
+        values = f"{self._values} ({_percent(self.half)} in half)"
+        bound = f"{NOT_BOUNDED}; estimate: " if self.cut_off else ""
         return (
-            f"accuracy{energy}: within {most} in nine of ten uniform regions ({half} in half), "
-            f"mainly {CAUSES[self.cause]}{figure}{further}{taken}"
+            f"{bound}{values}, mainly {CAUSES[self.cause]}{figure}{further}{doubled}"
+            f"{_as_stated(', '.join(first), last) if first else _as_stated(last)}"
         )
 
     @property
-    def warnings(self) -> list[str]:
-        """A warning if a tenth of the regions may deviate by more than some per cent, or an
-        edge is two, else empty.
-        """
-        doubts = ["values may be off"] * (self.most > WARNING_BOUND)
-        if self.doubled >= MIN_TWO_EDGES_PX and not self.cut_off:
-            doubts.append(f"edges doubled by {self.doubled:.2g} pixels")
-        return [f"{' and '.join(doubts)}; {self}"] * bool(doubts)
+    def _stated(self) -> tuple[str, ...]:
+        """What is taken as stated, but for the energy."""
+        return tuple(one for one in self.taken if one != ONE_ENERGY)
+
+    @property
+    def _values(self) -> str:
+        """The claim about values, in words."""
+        energy = f" at {ONE_ENERGY}" if ONE_ENERGY in self.taken else ""
+        return f"accuracy{energy}: within {_percent(self.most)} in nine of ten uniform regions"
+
+
+def _percent(part: float) -> str:
+    return f"{min(100.0 * part, 99.0):.2g} %"
+
+
+def _as_stated(one: str, other: str = "") -> str:
+    """Name what is taken as stated, or two such things; "" without."""
+    if not one:
+        return ""
+    if other:
+        return f"; if {one} and {other} are as stated"
+    return f"; if {one} {'are' if one in PLURALS else 'is'} as stated"
+
+
+def doubt_words(causes: Sequence[str], doubling: str = "") -> list[str]:
+    """Say by which causes values may be off, and by which edges are doubled, as one warning at
+    most. How large these are, only `accuracy` says.
+
+    Args:
+        causes: of `CAUSES`, of large errors of values.
+        doubling: the cause that doubles edges; "" without one.
+
+    Example:
+        >>> doubt_words(["cone"])
+        ['values may be off: the cone angle; see its accuracy']
+    """
+    if "beyond" in causes:
+        return [f"values may be off; {NOT_BOUNDED}"]
+    doubts = ["values may be off"] * bool(causes) + ["edges doubled"] * bool(doubling)
+    if not doubts:
+        return []
+    named = dict.fromkeys([*causes, doubling] if doubling else causes)
+    listed = ", ".join(CAUSES[cause] for cause in named)
+    return [f"{' and '.join(doubts)}: {listed}; see its accuracy"]
 
 
 @public
@@ -485,13 +531,15 @@ class Volume:
         accuracy and the sharpness.
         """
         size = " x ".join(f"{side:g}" for side in self.size_mm)
-        rows = {"size (x, y, z)": f"{size} mm", "values": self._range_words()}
-        if self.accuracy is not None:
-            rows["accuracy"] = str(self.accuracy).removeprefix("accuracy").lstrip(": ")
+        rows = {"size (x, y, z)": f"{size} mm", "values": escape(self._range_words())}
+        if (accuracy := self.accuracy) is not None:
+            said = escape(str(accuracy).removeprefix("accuracy").lstrip(": "))
+            more = escape(accuracy.details)
+            rows["accuracy"] = f"<details><summary>{said}</summary>{more}</details>"
         if getattr(self, "_bias", None) is not None:
-            rows["sharpness"] = str(self.sharpness).removeprefix("sharpness: ")
+            rows["sharpness"] = escape(str(self.sharpness).removeprefix("sharpness: "))
         body = "".join(
-            f"<tr><th>{escape(name)}</th><td>{escape(said)}</td></tr>"
+            f"<tr><th>{escape(name)}</th><td>{said}</td></tr>"
             for name, said in rows.items()
         )
         return f"<table><caption>{escape(repr(self)[1:-1])}</caption>{body}</table>"

@@ -30,8 +30,11 @@ from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import (
     CAUSES,
     MIN_DOUBLED_VOXELS,
+    MIN_TWO_EDGES_PX,
+    WARNING_BOUND,
     Accuracy,
     Residuals,
+    doubt_words,
 )
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
 from flexdt.twin.reconstruction.coarse_scan import (
@@ -114,6 +117,7 @@ class Bias:
         figures: cause -> its size, in words.
         taken: what is taken as stated, because the images do not decide it.
         doubled: cause -> distance at which it doubles edges [pixels], of errors that images tell.
+        edges: likewise of the others, `SIGMAS` standard errors; None where it was not found.
     """
 
     found: Volume
@@ -125,6 +129,7 @@ class Bias:
     taken: tuple[str, ...] = ()
     shifts: frozenset[str] = SHIFTS
     doubled: Mapping[str, float] = field(default_factory=dict)
+    edges: float | None = None
 
     @cached_property
     def shift(self) -> FloatArray:
@@ -143,6 +148,11 @@ class Bias:
     def total(self) -> Float32Array:
         """Bound at the nodes [1/mm]."""
         return np.asarray(self.shift + SIGMAS * self.spread, np.float32)
+
+    def doubling(self, least_px: float) -> str:
+        """Return the cause that doubles edges most, by at least so many pixels; "" without."""
+        most = max(self.doubled, key=lambda cause: self.doubled[cause], default="")
+        return most if self.doubled.get(most, 0.0) >= least_px else ""
 
     def bound(self, grid: Volume) -> Float32Array | None:
         """Compute the bound of the error at each voxel of a grid, interpolated from the nodes.
@@ -197,9 +207,9 @@ class Bias:
             if cause in off and cause != worst
         }
         following = max(told, key=lambda cause: told[cause], default="")
-        doubling = max(self.doubled, key=lambda cause: self.doubled[cause], default="")
-        doubled = self.doubled.get(doubling, 0.0)
-        if doubled > MIN_DOUBLED_VOXELS and doubling in told:
+        doubling = self.doubling(MIN_DOUBLED_VOXELS)
+        doubled = max(self.doubled.values(), default=0.0)
+        if doubling in told:
             following = doubling  # it may hardly change values
         elif following and told[following] <= FLOOR:
             following = ""
@@ -208,16 +218,18 @@ class Bias:
             further = f"{CAUSES[following]} ({self.figures[following]})"
         figure = self.figures.get(worst, "")
         cut_off = "beyond" in off
+        edges = None if self.edges is None else round(doubled + self.edges, 2)
         return Accuracy(
-            half, most, worst, cut_off, figure, self.taken, further, round(doubled, 2)
+            half,
+            most,
+            worst,
+            cut_off,
+            figure,
+            self.taken,
+            further,
+            round(doubled, 2),
+            edges,
         )
-
-    def warnings(self, grid: Grid | Volume) -> list[str]:
-        """List what is wrong: a contradiction, or large errors."""
-        if self.contradiction is not None:
-            return [str(self.contradiction)]
-        accuracy = self.accuracy(grid)
-        return [] if accuracy is None else accuracy.warnings
 
 
 def _within(share: float, shift: FloatArray, spread: FloatArray) -> float:
@@ -346,31 +358,37 @@ class BiasOnDemand:
         return self.bias.accuracy(grid)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
-        """List what is wrong: another geometry that fits better, or large errors by the
-        trajectory, the panel's edges and the spectrum.
-
-        Whether to warn is seen at first sight (`_warns`); what a warning says is what
-        `accuracy` says.
+        """List what is wrong at first sight: another geometry that fits better, or causes of
+        large errors, by their names. How large they are is found by `accuracy` alone.
 
         Args:
             grid: of the volume.
         """
-        return self.bias.warnings(grid) if self._warns(grid) else []
-
-    def _warns(self, grid: Grid | Volume) -> bool:
-        """Return whether a first sight of the scan warns. Large errors are not looked for in a
-        scan that fits, is `CoarseScan.easy` and hardly hardens the beam; of one that has few
-        views, but is easy otherwise, only what few views do to some of its rows.
-        """
-        if self._doubtful:
-            return bool(self._told.warnings(grid))
+        if self._doubtful and self._contradiction is not None:
+            return [str(self._contradiction)]
         scan = self._copied(NODES)
-        if not scan.easy or (self._bent is not None and self._bent.strong):
-            return bool(self._bounded.warnings(grid))
-        if not scan.sparse:
-            return False
-        thin = scan.thinned(all_views=True, least_rows=STREAK_ROWS)
-        return bool(_bounded(thin, angles_alone=True).warnings(grid))
+        causes = scan.at_sight
+        if self._bent is not None and self._bent.strong:
+            causes.append("hardening")
+        if scan.few and not scan.cut_off and self._streaked(grid):
+            causes.append("angles")
+        doubling = ""
+        if self._doubtful:
+            told = self._with_told(self._blank)
+            accuracy = told.accuracy(grid) if told.causes else None
+            if accuracy is not None and accuracy.most > WARNING_BOUND:
+                causes.append(accuracy.cause)
+            doubling = told.doubling(MIN_TWO_EDGES_PX)
+        return doubt_words(list(dict.fromkeys(causes)), doubling)
+
+    def _streaked(self, grid: Grid | Volume) -> bool:
+        """Return whether few views alone make values off, by some rows of the scan."""
+        thin = self._copied(NODES).thinned(all_views=True, least_rows=STREAK_ROWS)
+        nodes = UniformNodes.of(thin.volume, thin.rim)
+        causes = extrapolated(thin, nodes, _angles)
+        found = Bias(thin.grid.like(nodes.found), nodes.even, nodes.inside, causes)
+        accuracy = found.accuracy(grid)
+        return accuracy is not None and accuracy.most > WARNING_BOUND
 
     def residuals(self, volume: Volume) -> Residuals | None:
         """Compare the finer copy's images with the projections of a volume of the scan;
@@ -382,17 +400,31 @@ class BiasOnDemand:
             return None
 
     @cached_property
+    def _nodes(self) -> UniformNodes:
+        """Uniform regions of the coarse volume."""
+        scan = self._copied(NODES)
+        return UniformNodes.of(scan.volume, scan.rim)
+
+    @cached_property
+    def _blank(self) -> Bias:
+        """The coarse volume without any error."""
+        nodes = self._nodes
+        found = self._copied(NODES).grid.like(nodes.found)
+        return Bias(found, nodes.even, nodes.inside, {})
+
+    @cached_property
     def _bounded(self) -> Bias:
         """The errors, but for what the comparison adds."""
-        return self._of_beam(_bounded(self._copied(NODES)))
+        scan, nodes = self._copied(NODES), self._nodes
+        causes = extrapolated(scan, nodes, _flaws) | beside(scan, nodes)
+        return self._of_beam(replace(self._blank, causes=causes))
 
     def _of_beam(self, found: Bias) -> Bias:
         """Add what is known of the scan's energies."""
         found = replace(found, taken=self._known.taken)
         if self._bent is None:
             return found
-        scan = self._copied(NODES)
-        nodes = UniformNodes.of(scan.volume, scan.rim)
+        nodes = self._nodes
         bent = self._bent.bent_share(nodes) * np.abs(nodes.found)
         return replace(
             found,
@@ -405,34 +437,50 @@ class BiasOnDemand:
         """The images, compared with the stated geometry and others."""
         return agreement_of(self._copied(FINE_NODES), sides_known=self._sides_known)
 
+    @property
+    def _contradiction(self) -> Clipped | Contradiction | None:
+        """What forbids a claim."""
+        return self._clipped or self._agreement.contradiction
+
     @cached_property
     def _told(self) -> Bias:
         """The errors, with those that the images tell."""
-        doubt = self._clipped or self._agreement.contradiction
+        doubt = self._contradiction
         if doubt is not None:
             scan = self._copied(NODES)
             nodes = UniformNodes.of(scan.fdk(scan.images, scan.cone_vec), scan.rim)
             blank = scan.grid.like(nodes.found)
             return Bias(blank, nodes.even, nodes.inside, {}, doubt)
-        bounded, found = self._bounded, self._agreement
+        return self._with_told(self._bounded)
+
+    @cached_property
+    def _changes(self) -> list[tuple[Finding, FloatArray]]:
+        """Errors that the images tell, and by how much each shifts values."""
+        even = self._blank.even
+        return [
+            (one, _about(self._changed(one, one.size), even))
+            for one in self._agreement.findings
+            if one.told
+        ]
+
+    def _with_told(self, bounded: Bias) -> Bias:
+        """Add the errors that the images tell, and their standard errors ("geometry")."""
         causes = dict(bounded.causes)
         figures = dict(bounded.figures)
         shifts = set(bounded.shifts)
         squares = np.zeros(bounded.found.shape)
         doubled: dict[str, float] = {}
-        for one in found.findings:
-            if one.told:
-                name = one.cause.name
-                doubled[name] = max(doubled.get(name, 0.0), self._doubled(one))
-                change = _about(self._changed(one, one.size), bounded.even)
-                squares += np.square(one.sigma / one.size * change)
-                name = one.cause.name
-                causes[name] = causes.get(name, 0.0) + change
-                causes[name] += one.level * np.abs(bounded.found.data)
-                shifts.add(name)
-                figures[name] = one.figure
-        if found.unexplained:
-            causes["images"] = found.unexplained * np.abs(bounded.found.data)
+        for one, change in self._changes:
+            name = one.cause.name
+            doubled[name] = max(doubled.get(name, 0.0), self._doubled(one))
+            squares += np.square(one.sigma / one.size * change)
+            level = one.level * np.abs(bounded.found.data)
+            causes[name] = causes.get(name, 0.0) + change + level
+            shifts.add(name)
+            figures[name] = one.figure
+        unexplained = self._agreement.unexplained
+        if unexplained:
+            causes["images"] = unexplained * np.abs(bounded.found.data)
         if squares.any():
             causes["geometry"] = np.sqrt(squares)
         return replace(
@@ -527,27 +575,44 @@ class BiasOnDemand:
         """
         scan = self._copied(NODES)
         nodes = UniformNodes.of(self._volume, scan.rim)
-        taken = [*self._known.taken, "distances"]
+        taken: dict[str, float] = {}
+
+        def decided(name: str, moved: Float32Array) -> bool:
+            """Note what changes the volume by more than all that is claimed."""
+            size = nodes.change(nodes.found + moved)
+            if size > claimed:
+                taken[name] = max(taken.get(name, 0.0), size)
+            return size <= claimed
+
         squares = np.square(bounded.causes.get("geometry", np.zeros(scan.grid.shape)))
+        edges = 0.0
         for one in self._agreement.findings:
-            if one.told or one.cause.nuisance or one.cause.name == "distance":
+            if one.cause.nuisance or one.cause.name == "distance":
+                continue
+            doubled = self._doubled(replace(one, size=SIGMAS * one.sigma))
+            if one.told:
+                edges = float(np.hypot(edges, doubled))
                 continue
             change = self._changed(one, one.sigma)
             moved = SIGMAS * _smooth_about(change, bounded.even)
-            if nodes.change(nodes.found + moved.astype(np.float32)) > claimed:
-                taken.append(STATED.get(one.cause.name, one.cause.name))
-            else:
+            name = STATED.get(one.cause.name, one.cause.name)
+            if decided(name, moved.astype(np.float32)):
                 squares += np.square(_about(change, bounded.even))
+                if doubled < MIN_TWO_EDGES_PX:
+                    edges = float(np.hypot(edges, doubled))
+                else:  # as the angles of a ball: it is its edges that are taken as stated
+                    taken.setdefault(name, 0.0)
         kinds = [one for one in suspects(scan) if one.kind in self._agreement.open]
         for suspect in kinds:
             try:
                 shifted = self._moved(suspect.images, suspect.cone_vec)
             except GeometryError:
                 continue
-            if nodes.change(nodes.found + smoothed(shifted)) > claimed:
-                taken.append("rotation" if suspect.kind in SIDES else "order")
+            decided("rotation" if suspect.kind in SIDES else "order", smoothed(shifted))
+        largest = sorted(taken, key=lambda name: -taken[name])
+        listed = dict.fromkeys([*largest, *self._known.taken, "distances"])
         causes = {**bounded.causes, "geometry": np.sqrt(squares)}
-        return replace(bounded, causes=causes, taken=tuple(dict.fromkeys(taken)))
+        return replace(bounded, causes=causes, taken=tuple(listed), edges=edges)
 
 
 def bias_of(
@@ -590,18 +655,6 @@ def copies_of(
         return None
     copies.truncation = truncation
     return copies
-
-
-def _bounded(scan: CoarseScan, *, angles_alone: bool = False) -> Bias:
-    """Bound the errors of a coarse volume, by cause (`BiasOnDemand.bias`).
-
-    `scan`: the coarse copy; `angles_alone`: look for what few views do, and nothing else.
-    """
-    nodes = UniformNodes.of(scan.volume, scan.rim)
-    causes = extrapolated(scan, nodes, _angles if angles_alone else _flaws)
-    if not angles_alone:
-        causes |= beside(scan, nodes)
-    return Bias(scan.grid.like(nodes.found), nodes.even, nodes.inside, causes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from flexdt.twin.projection.operators import (
 )
 from flexdt.twin.reconstruction.acquisition.coverage import LostVoxels
 from flexdt.twin.reconstruction.acquisition.truncation import truncation_of
-from flexdt.twin.reconstruction.bias import Bias, BiasOnDemand, copies_of, too_coarse
+from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of, too_coarse
 from flexdt.twin.reconstruction.feldkamp.backprojection import CHUNK, PIXELS
 from flexdt.twin.reconstruction.feldkamp.fdk import fdk_parts
 from flexdt.twin.reconstruction.volume_errors import with_errors
@@ -68,7 +68,7 @@ def fdk(
         UnknownNameError: no such window.
 
     Warns:
-        UserWarning: even places may be off by more than some per cent, and why; layers of the
+        UserWarning: a cause by which values may be off by some per cent; layers of the
             grid lie above or below what the panel sees, or most voxels are not seen from all
             sides.
 
@@ -182,12 +182,11 @@ def checked_fdk(
     return with_errors(volume, bias=bias), [*doubts, *lost]
 
 
-def bias_warnings(bias: BiasOnDemand | Bias | None, grid: Grid | Volume) -> list[str]:
+def bias_warnings(bias: BiasOnDemand | None, grid: Grid | Volume) -> list[str]:
     """List warnings about uniform regions that may deviate, or of which nothing is known.
 
-    The first of: accuracy unknown as there is no bias, a contradiction, voxels too large;
-    else those of the accuracy. Empty if there is nothing to warn of, or no uniform region
-    in the grid.
+    The first of: accuracy unknown as there is no bias, voxels too large, a contradiction;
+    else causes of large errors. Empty if there is nothing to warn of.
 
     Args:
         bias: of the scan; None if it could not be found.

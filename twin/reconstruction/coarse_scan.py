@@ -14,6 +14,7 @@ from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Volume, forward
+from flexdt.twin.projection.volume import WARNING_BOUND
 from flexdt.twin.reconstruction.acquisition.rectify import (
     field_of_view,
     on_its_side,
@@ -47,13 +48,10 @@ COMPARED_VIEWS: Final = 2.0
 """Views per column, about, of a scan whose images are compared with its volume."""
 COMPARED_ROWS: Final = 16
 """Least rows of that scan, if the panel has so many."""
-MAX_EASY_CLIMB: Final = 0.06
-"""Largest tangent of rays with the plane of the circle for which the bound of the cone's error
-is not looked at unasked: of 3, 5 and 9 plates one above the other it is 0.99, 1.5 and 0.9 %
-there, below `WARNING_BOUND`; at 0.065, of 2 to 5 plates, up to 12 %."""
-MAX_EASY_LEVEL: Final = 0.01
-"""Largest level beside the object, over the largest line integral, that is a small error:
-it is about the error in the volume, of which `WARNING_BOUND` tells from 3 % on."""
+MAX_CLIMB: Final = 0.176
+"""Tangent of rays through the object with the plane of the circle from which on the cone angle is
+warned of unasked: 10 degrees, up to which FDK is taken as accurate (Feldkamp, Davis, Kress, J. Opt.
+Soc. Am. A 1 (1984) 612)."""
 PEAK_COLUMNS: Final = 2
 """Largest number of columns in which a view of a right scan has the scan's largest value."""
 MAX_FLAT_VIEWS: Final = 0.05
@@ -381,24 +379,29 @@ class CoarseScan:
         """False if a panel aside sees less than a turn: then it never sees some rays."""
         return bool(self.circle.rise or self.circle.full or not self.aside)
 
-    @cached_property
-    def easy(self) -> bool:
-        """True if nothing of the trajectory and the panel's edges can be a large error:
-        a full circle, a panel in the middle, rays that climb at most
-        `MAX_EASY_CLIMB`, and an object that ends within the panel, with the open beam
-        beside it within `MAX_EASY_LEVEL`.
+    @property
+    def at_sight(self) -> list[str]:
+        """Causes of large errors that geometry and images show without a volume: an object
+        beyond the panel's sides, rays through it that climb by `MAX_CLIMB`, an open beam beside
+        it that is `WARNING_BOUND` of the largest line integral.
         """
-        if self.circle.rise or not self.circle.full or self.aside:
-            return False
-        if self.cut_off or self.more:
-            return False
-        level = self.level
-        away = np.linalg.norm((level.detector - level.source)[:, :2], axis=1)
-        half = 0.5 * self.images.shape[1] * np.linalg.norm(level.v, axis=1)
-        climb = float(((np.abs(level.detector - level.source)[:, 2] + half) / away).max())
-        ends = np.abs(self.images[:, :, [0, -1]].mean(axis=1)).min(axis=1)
-        beside = float(ends.mean()) <= MAX_EASY_LEVEL * float(self.images.max())
-        return climb <= MAX_EASY_CLIMB and beside
+        if self.cut_off:
+            return ["beyond"]
+        found = []
+        sizes = np.abs(self.images).mean(axis=(0, 2))
+        rows = np.flatnonzero(sizes > ACCURACY * sizes.max())
+        if len(rows) and not self.circle.rise:
+            level = self.level
+            ends = rows[[0, -1]] + [-0.5, 0.5] - 0.5 * (len(sizes) - 1)
+            ray = (level.detector - level.source)[:, None] + ends[:, None] * level.v[
+                :, None
+            ]
+            climb = np.abs(ray[..., 2]) / np.linalg.norm(ray[..., :2], axis=-1)
+            found += ["cone"] * bool(climb.max() > MAX_CLIMB)
+        beside = np.abs(self.images[:, :, [0, -1]].mean(axis=1)).min(axis=1)
+        if float(beside.mean()) > WARNING_BOUND * float(self.images.max()):
+            found.append("drift")
+        return found
 
     @cached_property
     def volume(self) -> Float32Array:
@@ -712,12 +715,12 @@ class Plateaus:
     def take(self, image: npt.NDArray[np.generic]) -> None:
         """Look at line integrals (rows, cols); an image of one value has no plateau."""
         peak = image.max()
-        at = image == peak
-        if at.all():
+        at = np.flatnonzero(image == peak)
+        if len(at) == image.size:
             return
-        columns = int(at.any(axis=0).sum())
+        columns = len(np.unique(at % image.shape[1]))
         thick = int((image > 0.5 * peak).sum()) if columns > PEAK_COLUMNS else 0
-        self._peaks.append((float(peak), columns, int(at.sum()), thick))
+        self._peaks.append((float(peak), columns, len(at), thick))
 
     @property
     def clipped(self) -> Clipped | None:

@@ -251,6 +251,7 @@ on("volume", (m) => {
     m.past ? "" : GROWS,
   ];
   setText(note, other + facts.filter(Boolean).join(" · "));
+  note.title = m.details ?? "";
   if (m.volumes) offer(m.volumes, Object.keys(m.compared ?? {})[1]);
   if (more && pointer) point(pointer);
   if (m.views !== undefined && (!m.past || !blocks.size)) void want();

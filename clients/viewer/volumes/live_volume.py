@@ -258,8 +258,8 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
 
     At the end it gets accuracy or doubts, the part of voxels that no view sees, the
     surface, and then the volumes of errors, if any. Warnings of the reconstruction become
-    `doubts`, followed by the accuracy if none of them says it, and the
-    sharpness if there are edges. The surface is printed with
+    `doubts`, followed by the accuracy, whose `details` a tooltip shows, and the sharpness if
+    there are edges. The surface is printed with
     `FINISHED_CELLS` cells and not stored. `sigma` and `bias_bound` are stored if they
     were computed.
 
@@ -282,9 +282,9 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
             data, held.request, progress=_share(held, "done"), errors=True
         )
     said = [str(doubt.message) for doubt in doubts]
-    accuracy = str(volume.accuracy or "")
-    if not any(accuracy in doubt for doubt in said):
-        said.append(accuracy)
+    accuracy = volume.accuracy
+    if accuracy is not None and not any(str(accuracy) in doubt for doubt in said):
+        said.append(str(accuracy))
     if volume.sharpness.across is not None:
         said.append(str(volume.sharpness))
     held.hold(volume.data, volume)
@@ -295,6 +295,7 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
         binning=held.request.binning,
         geometry=_named(data.correction),
         doubts=said,
+        details="" if accuracy is None else accuracy.details,
         uncovered=float(1.0 - np.isfinite(volume.data).mean()),
         **_facts(data),
     )

@@ -142,6 +142,7 @@ export interface VolumeMessage {
   binning?: number;
   geometry?: string;
   doubts?: string[];
+  details?: string;
   volumes?: Name[];
   uncovered?: number;
   sample?: string;

@@ -200,9 +200,11 @@ def test_an_axis_half_a_pixel_off_doubles_edges_and_is_doubted_at_first_sight() 
     accuracy = bias.accuracy(bias.found)
     assert accuracy is not None
     assert accuracy.doubled == pytest.approx(1.2, abs=0.1)
-    assert "the axis offset (-0.59" in str(accuracy)
-    (doubt,) = bias.warnings(bias.found)
-    assert doubt.startswith("edges doubled by 1.2 pixels; ")
+    assert "edges within 1.2 pixels" in str(accuracy)
+    assert "the axis offset (-0.59" in accuracy.details
+    assert bias.warnings(bias.found) == [
+        "edges doubled: the axis offset; see its accuracy"
+    ]
     right = BiasOnDemand(copied(scan()))
     assert right.warnings(right.found) == []
     assert right.accuracy(right.found).doubled < 0.1  # type: ignore[union-attr]

@@ -103,7 +103,7 @@ def test_planes_seen_from_both_sides_tell_their_distance(shift: float) -> None:
     assert apart == pytest.approx(0.2 * abs(shift), abs=max(3.0 * error, 0.004))
 
 
-@pytest.mark.filterwarnings("ignore:edges doubled by")
+@pytest.mark.filterwarnings("ignore:edges doubled")
 @pytest.mark.parametrize("off", [0.0, 0.6])
 @pytest.mark.daily(1)
 def test_an_axis_beside_its_place_doubles_edges(off: float) -> None:
