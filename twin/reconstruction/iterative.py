@@ -10,8 +10,10 @@ and CGLS solve a fine region in coarse surroundings.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import wraps
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +38,31 @@ from flexdt.twin.reconstruction.linear_system import (
 )
 from flexdt.twin.signatures import public
 
+Algorithm = TypeVar("Algorithm", bound=Callable[..., Volume])
+NOT_AGAIN: Final = frozenset({"watch", "progress", "errors"})
+"""Options of a call that do not change its volume."""
+
+
+def finding_errors(algorithm: Algorithm) -> Algorithm:
+    """Let an algorithm's `errors=True` find those of its volume, by the same call once more."""
+    signature = inspect.signature(algorithm)
+
+    @wraps(algorithm)
+    def call(*arrays: Any, **options: Any) -> Any:
+        errors = options.pop("errors", False)
+        made = algorithm(*arrays, **options)
+        if not errors:
+            return made
+        from flexdt.twin.reconstruction.iterative_errors import checked
+
+        stated = signature.bind(*arrays, **options)
+        stated.apply_defaults()
+        images, views, _ = stated.args
+        given = {k: v for k, v in stated.kwargs.items() if k not in NOT_AGAIN}
+        return checked(made, images, views, algorithm, given)
+
+    return call  # type: ignore[return-value]
+
 
 def far_apart(count: int) -> list[int]:
     """Order 0 .. count-1 so that neighbours in time are far apart (golden-section steps)."""
@@ -43,6 +70,7 @@ def far_apart(count: int) -> list[int]:
 
 
 @public
+@finding_errors
 def sirt(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
@@ -128,29 +156,15 @@ def sirt(
         model=model,
     )
     with long_work.during("solving by SIRT", progress) as advance:
-        made = solved(
+        return solved(
             problem,
             lambda p: _subset_steps(
                 p, [ALL], 1.0, iterations, start, nonnegative, watch, advance
             ),
         )
-    if not errors:
-        return made
-    return _checked(
-        made,
-        projections,
-        cone_vec,
-        sirt,
-        iterations=iterations,
-        nonnegative=nonnegative,
-        variances=variances,
-        hardening=hardening,
-        start=start,
-        surroundings=surroundings,
-        model=model,
-    )
 
 
+@finding_errors
 def sart(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
@@ -213,29 +227,12 @@ def sart(
         )
     parts = [np.arange(k, len(problem.geometry), count) for k in far_apart(count)]
     with long_work.during("solving by SART", progress) as advance:
-        made = solved(
+        return solved(
             problem,
             lambda p: _subset_steps(
                 p, parts, relaxation, iterations, start, nonnegative, watch, advance
             ),
         )
-    if not errors:
-        return made
-    return _checked(
-        made,
-        projections,
-        cone_vec,
-        sart,
-        iterations=iterations,
-        subsets=subsets,
-        relaxation=relaxation,
-        nonnegative=nonnegative,
-        variances=variances,
-        hardening=hardening,
-        start=start,
-        surroundings=surroundings,
-        model=model,
-    )
 
 
 def _subset_steps(
@@ -286,6 +283,7 @@ def _subset_steps(
 
 
 @public
+@finding_errors
 def cgls(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
@@ -329,19 +327,7 @@ def cgls(
         projections, cone_vec, like, iterations, surroundings=surroundings, model=model
     )
     with long_work.during("solving by CGLS", progress) as advance:
-        made = solved(problem, lambda p: _cgls(p, iterations, start, watch, advance))
-    if not errors:
-        return made
-    return _checked(
-        made,
-        projections,
-        cone_vec,
-        cgls,
-        iterations=iterations,
-        start=start,
-        surroundings=surroundings,
-        model=model,
-    )
+        return solved(problem, lambda p: _cgls(p, iterations, start, watch, advance))
 
 
 def _cgls(
@@ -382,6 +368,7 @@ def _cgls(
     return problem.volume(x)
 
 
+@finding_errors
 def em(
     projections: npt.ArrayLike,
     cone_vec: ConeVec | npt.ArrayLike,
@@ -417,31 +404,7 @@ def em(
     """
     problem = LinearSystem.of(projections, cone_vec, like, iterations, model=model)
     with long_work.during("solving by EM", progress) as advance:
-        made = solved(problem, lambda p: _em(p, iterations, start, watch, advance))
-    if not errors:
-        return made
-    return _checked(
-        made,
-        projections,
-        cone_vec,
-        em,
-        iterations=iterations,
-        start=start,
-        model=model,
-    )
-
-
-def _checked(
-    made: Volume,
-    projections: npt.ArrayLike,
-    cone_vec: ConeVec | npt.ArrayLike,
-    algorithm: Callable[..., Volume],
-    **given: Any,
-) -> Volume:
-    """Return a volume with its errors, by the algorithm and the options that made it."""
-    from flexdt.twin.reconstruction.iterative_errors import checked
-
-    return checked(made, projections, cone_vec, algorithm, given, "stopping")
+        return solved(problem, lambda p: _em(p, iterations, start, watch, advance))
 
 
 def _em(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -37,23 +37,22 @@ from flexdt.twin.reconstruction.coarse_scan import (
     FINE_NODES,
     NODES,
     CoarseScan,
+    ScanCopies,
     two_rays,
 )
 from flexdt.twin.reconstruction.feldkamp.noise import MIN_ROW_DISTANCE, excess_of_mean
+from flexdt.twin.reconstruction.feldkamp.noise_by_value import NoiseByValue
 from flexdt.twin.reconstruction.known_beam import UNKNOWN_BEAM, KnownBeam
 from flexdt.twin.reconstruction.uniform_nodes import UniformNodes
 from flexdt.twin.reconstruction.volume_errors import interpolated, with_errors
-from flexdt.twin.reconstruction.white_noise import MEDIAN_OF_SQUARES
 
 PROBES: Final = 2
 """Volumes that are made again for the noise: with the neighbours of a voxel they leave it
 known to about a tenth."""
 NEAR_VOXELS: Final = 2.0
 """Standard deviation of the Gaussian over which squares of the changes are averaged [voxels]."""
-LEVELS: Final = 12
-"""Classes of line integrals, each with a variance of its own."""
 LEVEL_VIEWS: Final = 60
-"""Largest number of views, about, in which those variances are measured."""
+"""Largest number of views, about, in which the noise by value is measured."""
 WINDOW: Final = 5
 """Side of the square in which noise and object are told apart [pixels]."""
 MOST_RMS: Final = 1.45
@@ -80,9 +79,8 @@ def checked(
     cone_vec: ConeVec | npt.ArrayLike,
     algorithm: Callable[..., Volume],
     options: Mapping[str, Any],
-    cause: str,
 ) -> Volume:
-    """Give a volume the errors that its images tell; warns of a contradiction.
+    """Give a volume the errors that its images tell; warns as `with_iteration_errors`.
 
     Args:
         made: the volume.
@@ -90,24 +88,69 @@ def checked(
         cone_vec: n views.
         algorithm: that made it, called with images, views and grid.
         options: of that call.
-        cause: stopping or penalty.
 
     Raises:
         GeometryError: images on a device.
     """
-    from flexdt.twin.caller_warnings import warn_caller
-
     if hasattr(images, "__cuda_array_interface__"):
         message = "errors of images on a device"
         raise GeometryError.instead(message, "device", "images of the host")
     measured = np.asarray(images, np.float32)
     views = cone_vec if isinstance(cone_vec, ConeVec) else ConeVec(np.asarray(cone_vec))
+    shape = (measured.shape[1], measured.shape[2])
+    copies = copies_of(views, shape)
+    if copies is not None:
+        for number in copies.wanted:
+            copies.take(number, measured[number])
     given = {name: one for name, one in options.items() if one is not None}
-    noise = noise_of_probes(
-        lambda: measured, views, lambda b: quietly(algorithm, b, views, made, **given)
+    return with_iteration_errors(
+        made, measured, lambda: measured, views, algorithm, given, copies
     )
-    run = on_copies(algorithm, given, made)
-    bias = bias_of_iterations(measured, views, made, run, cause)
+
+
+def with_iteration_errors(
+    made: Volume,
+    images: Float32Array,
+    again: Callable[[], Float32Array],
+    cone_vec: ConeVec,
+    algorithm: Callable[..., Volume],
+    options: Mapping[str, Any],
+    copies: ScanCopies | None,
+    *,
+    sides_known: bool = False,
+    known: KnownBeam = UNKNOWN_BEAM,
+) -> Volume:
+    """Give a volume of iterations its noise, and its bias unless it is of several materials;
+    warns of what `BiasOfIterations.warnings` lists.
+
+    Args:
+        made: the volume.
+        images: (n, rows, cols) line integrals; not kept.
+        again: gives them once more, when the noise is asked for.
+        cone_vec: n views.
+        algorithm, options: that made it, called with images, views and grid.
+        copies: of the scan, with all images that they want; None without.
+        sides_known, known: as of `BiasOnDemand`.
+    """
+    from flexdt.twin.caller_warnings import warn_caller
+
+    noise = noise_of_probes(
+        again, cone_vec, lambda b: quietly(algorithm, b, cone_vec, made, **options)
+    )
+    bias = None
+    if copies is not None and options.get("hardening") is None:
+        shape = (images.shape[1], images.shape[2])
+        cause = "penalty" if "weight" in options else "stopping"
+        with suppress(GeometryError):  # a trajectory that is not looked at
+            copies.truncation = truncation_of(images.__getitem__, cone_vec, shape)
+            bias = BiasOfIterations(
+                copies,
+                on_copies(algorithm, options, made),
+                cause,
+                made,
+                sides_known=sides_known,
+                known=known,
+            )
     for doubt in () if bias is None else bias.warnings(made):
         warn_caller(doubt)
     return with_errors(made, noise, bias)
@@ -142,30 +185,6 @@ def quietly(algorithm: Callable[..., Volume], *arrays: Any, **options: Any) -> V
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PlausibilityWarning)
         return algorithm(*arrays, progress=False, **options)
-
-
-def bias_of_iterations(
-    images: Float32Array,
-    cone_vec: ConeVec,
-    made: Volume,
-    run: OnCopy,
-    cause: str,
-) -> BiasOfIterations | None:
-    """Find the bias of a volume from all images of its scan; None of a trajectory that is not
-    looked at.
-
-    Args: see `checked` and `BiasOfIterations`.
-    """
-    shape = (images.shape[1], images.shape[2])
-    with suppress(GeometryError):
-        copies = copies_of(
-            cone_vec, shape, truncation_of(images.__getitem__, cone_vec, shape)
-        )
-        if copies is not None:
-            for number in copies.wanted:
-                copies.take(number, images[number])
-            return BiasOfIterations(copies, run, cause, made)
-    return None
 
 
 class BiasOfIterations(BiasOnDemand):
@@ -203,8 +222,8 @@ class BiasOfIterations(BiasOnDemand):
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong at first sight: a contradiction, or an object in layers that some
         view does not see."""
-        if self._doubtful and self._told.contradiction is not None:
-            return [str(self._told.contradiction)]
+        if self._doubtful and self._contradiction is not None:
+            return [str(self._contradiction)]
         scan = self._copied(NODES)
         outside = int(self._beyond(as_volume(grid)).sum())
         if not scan.more or not outside:
@@ -224,10 +243,8 @@ class BiasOfIterations(BiasOnDemand):
     def _bounded(self) -> Bias:
         """The errors, but for what the comparison adds."""
         scan = self._copied(NODES)
-        nodes = UniformNodes.of(scan.volume, scan.rim)
-        causes = self._missed(scan.grid) | beside(scan, nodes)
-        found = scan.grid.like(nodes.found)
-        return self._of_beam(Bias(found, nodes.even, nodes.inside, causes))
+        causes = self._missed(scan.grid) | beside(scan, self._nodes)
+        return self._of_beam(replace(self._blank, causes=causes))
 
     def bound(self, grid: Volume) -> Float32Array | None:
         """Compute the bound of the error at each voxel of a grid; see `Bias.bound`. It is NaN
@@ -426,12 +443,12 @@ def noise_in(
     """
     from scipy.ndimage import uniform_filter
 
-    levels, deviations = _by_level(images, order)
+    by_value = _by_value(images, order)
     out = np.empty_like(images)
     signed = np.zeros(images.shape[1:])
     for place in range(len(order)):
         number, bend, level = _bend(images, order, place)
-        expected = np.interp(level, levels, deviations)
+        expected = np.sqrt(by_value(level))
         squares = uniform_filter(np.square(bend), WINDOW, mode="nearest")
         local = np.sqrt(np.maximum(squares, 0.0))
         most = MOST_RMS * expected
@@ -458,14 +475,11 @@ def _bend(
     return int(order[place]), bend, (before + here + after) / 3.0
 
 
-def _by_level(
-    images: Float32Array, order: npt.NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Measure the noise of line integrals of each size: (k,) sizes, growing, and standard
-    deviations.
+def _by_value(images: Float32Array, order: npt.NDArray[np.intp]) -> NoiseByValue:
+    """Measure the noise by value between views.
 
     Rows `MIN_ROW_DISTANCE` apart are compared: what the object gives to both cancels, and blur
-    does not make them alike. Medians: edges are few.
+    does not make them alike.
     """
     squares, sizes = [], []
     step = max(1, len(order) // LEVEL_VIEWS)
@@ -477,12 +491,7 @@ def _by_level(
             level = 0.5 * (level[far:] + level[:-far])
         squares.append(np.square(bend).ravel())
         sizes.append(level.ravel())
-    square, size = np.concatenate(squares), np.concatenate(sizes)
-    parts = np.array_split(np.argsort(size), LEVELS)
-    return (
-        np.array([np.median(size[part]) for part in parts]),
-        np.sqrt([np.median(square[part]) / MEDIAN_OF_SQUARES for part in parts]),
-    )
+    return NoiseByValue.fitted(np.concatenate(squares), np.concatenate(sizes))
 
 
 def _mean(noise: Float32Array, rng: np.random.Generator) -> Float32Array:

@@ -183,7 +183,7 @@ def minimise_tv(
 
     given = {"weight": weight, "tolerance": tolerance, "subsets": subsets, "mask": mask}
     given |= {"iterations": iterations, "start": start, "nonnegative": nonnegative}
-    volume = checked(found.volume, projections, cone_vec, tv, given, "penalty")
+    volume = checked(found.volume, projections, cone_vec, tv, given)
     return replace(found, volume=volume)
 
 

@@ -14,7 +14,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from importlib.metadata import version
@@ -85,10 +85,8 @@ from flexdt.twin.reconstruction.acquisition.truncation import SAMPLES as TRUNCAT
 from flexdt.twin.reconstruction.bias import BiasOnDemand, copies_of
 from flexdt.twin.reconstruction.coarse_scan import ScanCopies
 from flexdt.twin.reconstruction.iterative_errors import (
-    BiasOfIterations,
-    noise_of_probes,
-    on_copies,
     quietly,
+    with_iteration_errors,
 )
 from flexdt.twin.reconstruction.known_beam import (
     CORRECTED_BEAM,
@@ -1164,26 +1162,17 @@ def _iterative(
     copies = views.copies
     if copies is None:
         return made
-    read = partial(_stack_integrals, replace(views, kept=None, copies=None))
-    noise = noise_of_probes(
-        read, views.cone_vec, lambda b: quietly(run, b, views.cone_vec, made, **more)
+    return with_iteration_errors(
+        made,
+        stack,
+        partial(_stack_integrals, replace(views, kept=None, copies=None)),
+        views.cone_vec,
+        run,
+        more,
+        copies,
+        sides_known=views.sides_known,
+        known=views.known,
     )
-    bias = None
-    if views.mixture is None:
-        cause = "penalty" if "weight" in algorithm.options else "stopping"
-        copies.truncation = truncation_of(stack.__getitem__, views.cone_vec, views.shape)
-        with suppress(GeometryError):  # a trajectory that is not looked at
-            bias = BiasOfIterations(
-                copies,
-                on_copies(run, given, made),
-                cause,
-                made,
-                sides_known=views.sides_known,
-                known=views.known,
-            )
-    for doubt in () if bias is None else bias.warnings(made):
-        warn_caller(doubt)
-    return with_errors(made, noise, bias)
 
 
 def _stack_integrals(views: ScanFrames) -> Float32Array:

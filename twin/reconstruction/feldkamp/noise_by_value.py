@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.reconstruction.white_noise import MEDIAN_OF_SQUARES
@@ -17,6 +18,8 @@ BEYOND: Final = 3.0
 """Line integrals by which the table goes beyond the known ones."""
 TABLE: Final = 1024
 """Entries of the table in which variances are looked up: they are constant within one."""
+MOST_SQUARES: Final = 200_000
+"""Squares that are looked at, at most: the median of a bin is then known to some per cent."""
 LEAST_SQUARES: Final = 64
 """Fewest squares of a bin: their median is then known to a quarter."""
 
@@ -38,11 +41,10 @@ class NoiseByValue:
 
     @classmethod
     def of(cls, images: Float32Array) -> NoiseByValue:
-        """Measure it by bins of the value: from mixed second differences of neighbouring rows
-        and columns, whose median edges do not change.
+        """Measure it in single views: from mixed second differences of neighbouring rows and
+        columns. Blur makes these too small, by a factor that all values share.
 
-        `images`: (n, rows, cols), two rows and columns at least. Of images without noise it is
-        1 for all values.
+        `images`: (n, rows, cols), two rows and columns at least.
         """
         square = np.square(np.diff(np.diff(images, axis=1), axis=2)).ravel() / 4.0
         value = 0.25 * (
@@ -51,9 +53,22 @@ class NoiseByValue:
             + images[:, 1:, :-1]
             + images[:, :-1, :-1]
         )
+        return cls.fitted(square, value.ravel())
+
+    @classmethod
+    def fitted(
+        cls, square: npt.NDArray[np.floating], value: npt.NDArray[np.floating]
+    ) -> NoiseByValue:
+        """Fit it to squares of differences that are noise but for few edges, which do not change
+        a median, by bins of the value. Of squares that are 0 it is 1 for all values.
+
+        `square`, `value`: (m,) each, of the variance of one pixel, and its value.
+        """
+        each = -(-len(square) // MOST_SQUARES)
+        square, value = square[::each], value[::each]
         edges = np.linspace(float(value.min()), float(value.max()), BINS + 1)
         # Of few bits, as such are sorted by their digits.
-        which = np.digitize(value.ravel(), edges[1:-1]).astype(np.uint8)
+        which = np.digitize(value, edges[1:-1]).astype(np.uint8)
         order = np.argsort(which, kind="stable")
         bounds = np.searchsorted(which[order], np.arange(BINS + 1))
         found = [
@@ -69,7 +84,7 @@ class NoiseByValue:
         least = np.minimum.accumulate(typical[::-1])[::-1]
         return cls(values, np.log(least / MEDIAN_OF_SQUARES))
 
-    def __call__(self, images: Float32Array) -> Float32Array:
+    def __call__(self, images: npt.NDArray[np.floating]) -> Float32Array:
         """Return the variance of each pixel, like `images`. Beyond the known values it grows
         by exp(1) a unit, as that of photons does."""
         first, last = self.values[0] - BEYOND, self.values[-1] + BEYOND
