@@ -284,6 +284,7 @@ PAGES = {
     "commands.md": commands,
     "findings.md": list_pages.findings,
     "limits.md": list_pages.limits,
+    "thresholds.md": list_pages.thresholds,
     "evidence/bench.md": benchmark,
 }
 

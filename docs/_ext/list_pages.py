@@ -10,6 +10,7 @@ LISTED = {
     "twin/calibration/diagnose/__init__.py": "findings.md",
     "twin/plausibility/contradictions.py": "findings.md",
     "runtime/access.py": "limits.md",
+    "twin/reconstruction/consistency/thresholds.py": "thresholds.md",
     "clients/cli/command_settings.py": "commands.md",
 }
 """File of the repository that declares a list -> its page below `_generated/`."""
@@ -39,6 +40,27 @@ def findings() -> str:
         out += [f"## {title}", "", "| code | gravest | means |", "|---|---|---|"]
         out += [f"| `{code}` | {code.gravest} | {code.meaning} |" for code in room]
         out.append("")
+    return "\n".join(out)
+
+
+def thresholds() -> str:
+    """List the numbers that decide what is claimed of a volume, with their sources."""
+    from flexdt.twin.reconstruction.consistency import thresholds as code
+
+    out = [
+        "# Thresholds of accuracy",
+        "",
+        "Numbers that decide what `volume.accuracy` claims, what is told of a scan, and what is "
+        "warned of.",
+        "",
+        "| module | name | value | meaning | source |",
+        "|---|---|---|---|---|",
+    ]
+    for one in code.thresholds():
+        module = one.module.removeprefix("flexdt.twin.")
+        source = "" if one.source is None else one.source.value
+        cells = (f"`{module}`", f"`{one.name}`", one.value, one.meaning, source)
+        out.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return "\n".join(out)
 
 
