@@ -273,7 +273,7 @@ export function draw() {
   const which = [
     i.recorded || !i.origin?.file ? "" : nameOf(i.origin.file),
     i.recorded || i.kind === "counts" ? "" : "without the noise of a scan",
-    moment.kind === "plan" ? `live: the plan’s ghost is at ${fixed(moment.time_s, 1)} s` : "",
+    moment.kind === "plan" ? `live; ghost: plan at ${fixed(moment.time_s, 1)} s` : "",
   ].map((words) => words && `${words}  ·  `);
   const [low, high] = windowed.map((v) => fixed(v, i.kind === "counts" ? 0 : 2));
   const zoom = view.zoom !== 1 ? `  ·  ${view.zoom.toFixed(1)}×` : "";
