@@ -85,7 +85,7 @@ def test_hardening_of_an_aluminium_tube_is_told_and_gone_after_its_correction(
     assert off < 0.01
     assert corrected.cause != "hardening"
     assert off < corrected.most < 0.01
-    assert "if material" in str(corrected)
+    assert "material" in corrected.taken
     assert said == []
 
 
