@@ -279,3 +279,21 @@ def test_beads_marked_by_clicking_are_what_is_fitted(page: Any, twin: TwinClient
     assert abs(value - aside) < 4 * sigma
     assert sigma < 0.3
     page.keyboard.press("Escape")
+
+
+def test_a_page_comes_back_under_any_correction_by_hand(
+    open_page: Callable[..., Any], twin: TwinClient
+) -> None:
+    """Also one with parameters for which the story has no slider: of a script, say."""
+    page = open_page(tab="calibrate")
+    twin.control("force")
+    twin.apply_calibration({"dO_y": 0.2, "dO_x": 0.3}, comment="misaligned by hand")
+    page.locator("#by-hand").wait_for()
+    page.wait_for_function("sessionStorage.getItem('flexdt-story') !== null")
+    page.reload()
+    page.wait_for_function("window.flexdt?.store.state && flexdt.store.session")
+    page.locator("#by-hand").wait_for()
+    assert float(page.input_value("#story-dO_x")) == pytest.approx(0.3, abs=0.02)
+    page.close()
+    twin.revert_calibration()
+    twin.control("release")

@@ -182,8 +182,16 @@ on("state", ({ correction }) => {
 function adopt(believed) {
   told = { ...fresh(), believed };
   setText($("#story-found"), "");
-  for (const name of Object.keys(BELIEFS)) slider(name).value = String(believed[name] ?? 0);
+  put(believed);
   says();
+}
+
+/**
+ * The sliders as a correction has them, which may have more parameters than there are sliders.
+ * @param {Record<string, number>} believed
+ */
+function put(believed) {
+  for (const name of Object.keys(BELIEFS)) slider(name).value = String(believed[name] ?? 0);
 }
 
 /** @param {string} words */
@@ -331,7 +339,7 @@ clicks({
   "story-apply": use,
   "story-again": scan,
 });
-for (const [name, value] of Object.entries(told.believed)) slider(name).value = String(value);
+if (Object.keys(told.believed).length) put(told.believed);
 says();
 tell();
 show(told.says || undefined);
