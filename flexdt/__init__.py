@@ -163,5 +163,4 @@ if (
 
 
 def __dir__() -> list[str]:
-    """List the public names, also those not imported yet."""
     return list(__all__)

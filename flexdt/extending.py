@@ -77,5 +77,5 @@ class OneLine(argparse.ArgumentParser):
     all options."""
 
     def error(self, message: str) -> NoReturn:
-        """End the program with exit code 2 and one line."""
+        """Exit with code 2 and one line."""
         self.exit(2, f"{self.prog}: {message}\n")

@@ -136,7 +136,7 @@ class Phantom(ArrayValue):
 
     @property
     def bounding_radius_mm(self) -> float:
-        """Radius of a sphere about the origin that contains the phantom [mm]."""
+        """Radius about the origin that contains the phantom [mm]."""
         return float(np.linalg.norm(np.asarray(self.size_mm) / 2.0))
 
     @property

@@ -34,8 +34,7 @@ USELESS_PLACEMENTS: Final = (
 def check_tube(machine: Machine, exposure: ExposureSettings) -> None:
     """Check that the machine's tube has a voltage and power.
 
-    Raises:
-        LimitError: names the value and the allowed ones.
+    Raises LimitError: names value and allowed ones.
     """
     tube = machine.tube
     changed_tube(tube, TubeSettings(tube.kV, tube.power_W), exposure.kV, exposure.power_W)

@@ -102,7 +102,7 @@ class AcquilaEvent:
 
     @property
     def is_command(self) -> bool:
-        """Whether the event is a command to its component."""
+        """Whether it commands its component."""
         return self.reply_type is ReplyType.SEND
 
     @property
@@ -218,7 +218,7 @@ class Exchange:
 
     @property
     def next_feedback(self) -> float:
-        """Real time at which the next FDB is due [s]."""
+        """When the next FDB is due [s]."""
         return self._last + FEEDBACK_S
 
     def received(self, now: float) -> AcquilaEvent:
@@ -241,7 +241,6 @@ class Exchange:
 
 
 def _attribute(name: str) -> str:
-    """Return the attribute of `AcquilaEvent` that holds the field called `name`."""
     return name.lower().replace(" ", "_")
 
 

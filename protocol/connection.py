@@ -178,7 +178,7 @@ class Connection:
 
     @property
     def waiting(self) -> int:
-        """Number of complete messages that wait to be taken out."""
+        """Number of complete messages that wait."""
         return len(self._ready) + len(self._new)
 
     @property
@@ -501,7 +501,7 @@ class Connection:
         return out
 
     def holds(self, name: bytes) -> bool:
-        """Return whether a message completed by the last `feed` may contain the text `name`."""
+        """Return whether a message completed by the last `feed` may contain `name`."""
         return self._may_name(_joined(islice(self._new, self._fed, None)), (name,))
 
     def withdraw(self, message: bytes) -> bool:
@@ -518,7 +518,6 @@ class Connection:
         return False
 
     def _may_name(self, raw: bytes, names: tuple[bytes, ...]) -> bool:
-        """Return whether received bytes may contain one of `names` as a text; see `may_name`."""
         return may_name(self.codec or Codec.JSON, raw, names)
 
     def _end(self) -> None:

@@ -41,10 +41,10 @@ def few(most: int) -> BeforeValidator:
 
 
 def payload(value: object) -> object:
-    """Convert binary data to bytes: base64 text is decoded, bytes, bytearray and memoryview are
-    copied.
+    """Convert to bytes: base64 is decoded; bytes, bytearray, memoryview copied.
 
-    Raises ValueError: anything else."""
+    Raises ValueError: anything else.
+    """
     try:
         return bytes(image.payload(value))
     except RpcError as error:
@@ -70,7 +70,7 @@ def whole(value: object) -> object:
 
 
 def encoded(name: str) -> str:
-    """Percent-encode `name` for use in a file's name; different names give different texts."""
+    """Percent-encode `name` for a file's name; different names differ."""
     return quote(name, safe=" ", errors="surrogatepass").replace(".", "%2E")
 
 

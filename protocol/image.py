@@ -114,7 +114,6 @@ def payload(data: object) -> bytes | memoryview:
 
 
 def _wire_dtype(name: str) -> np.dtype[np.generic]:
-    """Return the little-endian dtype of a name in `DTYPES`."""
     return np.dtype(name).newbyteorder("<")
 
 

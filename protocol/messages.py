@@ -166,7 +166,7 @@ def finite(data: object) -> object:
     """Replace NaN and infinities in the `data` of an error by text; JSON has no such
     numbers.
 
-    An error repeats the value that it is about, and that may have overflowed. Dicts and
+    An error repeats the value that it is about, which may have overflowed. Dicts and
     lists are copied, at all levels, and tuples become lists; names and other values stay.
     """
     match data:

@@ -140,7 +140,7 @@ class VoxelGrid(f.Params):
 
     @property
     def nbytes(self) -> int:
-        """Size of the voxels' values on the wire [bytes]."""
+        """Size on the wire [bytes]."""
         return 4 * math.prod(self.shape)
 
     @model_validator(mode="after")

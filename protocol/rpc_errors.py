@@ -60,7 +60,6 @@ class RpcError(Exception):
         self.code = int(self.code)
 
     def __str__(self) -> str:
-        """Return the message alone, without code and data."""
         return self.message
 
 
@@ -74,7 +73,7 @@ def parse_error(why: str) -> RpcError:
 
 
 def invalid_request(why: str) -> RpcError:
-    """Make the error for a document that is not a JSON-RPC 2.0 message."""
+    """Make the error for a document that is no JSON-RPC 2.0 message."""
     return RpcError(Code.INVALID_REQUEST, f"invalid request: {why}")
 
 
@@ -154,7 +153,7 @@ def superseded(key: str) -> RpcError:
 
 
 def link_down(why: str) -> RpcError:
-    """Make the error for a request without a connection to the twin, or one that was lost."""
+    """Make the error for a missing or lost connection to the twin."""
     return RpcError(Code.LINK_DOWN, f"no connection to the twin: {why}")
 
 
@@ -166,10 +165,8 @@ def cancelled(request: object) -> RpcError:
 def clip(value: object, limit: int = 200) -> str:
     """Convert a value to text, cut after `limit` characters with "..." appended.
 
-    Lone surrogates are escaped before the cut.
-
-    `value`: a text is taken as it is; other plain data are formatted as by `repr`, no more of
-    them than needed. `limit`: number of characters.
+    Lone surrogates are escaped before the cut. `value`: a text is taken as it is; other
+    plain data are formatted as by `repr`, no more of them than needed.
     """
     if isinstance(value, str):
         text = value[: limit + 1]

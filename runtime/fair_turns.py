@@ -79,7 +79,6 @@ class FairTurns:
             raise
 
     async def __aexit__(self, *_: object) -> None:
-        """Give the place to the next who waits."""
         self._give()
 
     def _give(self) -> None:

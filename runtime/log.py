@@ -142,7 +142,7 @@ class _Listener(QueueListener):
 
 
 def dropped() -> int:
-    """Return how many records were dropped while the log's reader was blocked."""
+    """Return how many records were dropped while the reader was blocked."""
     return sum(h.dropped for h in LOGGER.handlers if isinstance(h, Apart))
 
 

@@ -68,7 +68,6 @@ class Holds:
     """Durations of the loop's turns [s]."""
 
     def __init__(self) -> None:
-        """Begin to count."""
         self.begin()
 
     def begin(self) -> None:
@@ -91,7 +90,7 @@ class Holds:
         self._worst = max(self._worst, seconds)
 
     def worst(self) -> float:
-        """Return the longest turn since the last call, and reset it."""
+        """Return the longest turn since the last call."""
         worst = self._worst
         self._worst = 0.0
         return worst
@@ -175,7 +174,7 @@ class ListeningServer:
 
     @property
     def port(self) -> int:
-        """Port it listens on, the system's choice for port 0; `listen` must have been called."""
+        """Port it listens on, the system's choice for 0; `listen` must have been called."""
         assert self.server is not None
         return int(self.server.sockets[0].getsockname()[1])
 

@@ -163,7 +163,7 @@ def scatter_method(text: str) -> str:
 
 
 def public_url() -> Any:
-    """Declare the viewer's address behind a proxy; help pages leave it to the settings file."""
+    """Declare the viewer's address behind a proxy; help leaves it to the settings file."""
     return option(None, public=False, hidden=True, metavar="URL", parser=public_address)
 
 

@@ -96,7 +96,6 @@ class Lines:
     bar = False
 
     def __init__(self, log: logging.Logger) -> None:
-        """Show work as lines of a log."""
         self._log = log
 
     def show(self, what: str, done: float | None, times: str) -> None:
@@ -187,7 +186,7 @@ class _Terminal:
             self._rows.remove_task(row)
 
     def clear(self) -> None:
-        """Take all rows off the screen until the next `draw`."""
+        """Hide all rows until `draw`."""
         with self._lock:
             self._clear()
 
@@ -397,7 +396,6 @@ class _Threads(threading.local):
     """The works that each thread is in, the outermost first."""
 
     def __init__(self) -> None:
-        """Begin without works, once in each thread."""
         self.works: list[_Entered] = []
 
 
@@ -577,6 +575,6 @@ def silence_shown(what: str) -> Iterator[Callable[[], None]]:
 
 
 def make_room() -> None:
-    """Take bars off the terminal, so that a line can be printed; they come back in time."""
+    """Take bars off the terminal for a line; they come back in time."""
     if _Terminal._current is not None:
         _Terminal._current.clear()

@@ -233,7 +233,7 @@ class Workers:
 
     @property
     def ready(self) -> bool:
-        """Whether an idle process is available."""
+        """Whether one is idle."""
         return bool(self._idle)
 
     async def ask(self, work: Work, *arguments: object, raw: Parts = ()) -> list[bytes]:

@@ -175,33 +175,28 @@ def having(option: str) -> list[str]:
 
 
 def _ram_lak(frequency: Any) -> Any:
-    """Compute the Ram-Lak window: 1 at each frequency."""
     return frequency**0
 
 
 def _shepp_logan(frequency: Any) -> Any:
-    """Compute the Shepp-Logan window, sinc(f / 2) with f = 1 at the Nyquist frequency."""
     import numpy as np
 
     return np.sinc(frequency / 2.0)
 
 
 def _cosine(frequency: Any) -> Any:
-    """Compute the cosine window, cos(pi f / 2) with f = 1 at the Nyquist frequency."""
     import numpy as np
 
     return np.cos(np.pi / 2.0 * frequency)
 
 
 def _hamming(frequency: Any) -> Any:
-    """Compute the Hamming window, 0.54 + 0.46 cos(pi f) with f = 1 at the Nyquist frequency."""
     import numpy as np
 
     return 0.54 + 0.46 * np.cos(np.pi * frequency)
 
 
 def _hann(frequency: Any) -> Any:
-    """Compute the Hann window, 0.5 + 0.5 cos(pi f) with f = 1 at the Nyquist frequency."""
     import numpy as np
 
     return 0.5 + 0.5 * np.cos(np.pi * frequency)

@@ -534,7 +534,6 @@ def _of_machine(machine: Machine) -> Iterator[tuple[str, Any]]:
 
 
 def _limits(axis: Axis | MotorReply) -> tuple[float, ...]:
-    """Return lower and upper limit, largest speed and acceleration of an axis or a reply."""
     return axis.lower, axis.upper, axis.max_speed, axis.max_acceleration
 
 

@@ -137,7 +137,7 @@ class Finding:
 
     @property
     def line(self) -> int:
-        """Line of the script, from 1; 0 for all of it."""
+        """Line of the script, from 1; 0 for all."""
         return self.place.line if self.place else 0
 
     @property

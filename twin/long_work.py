@@ -65,7 +65,6 @@ class Told:
     """
 
     def __init__(self, function: Advance) -> None:
-        """Pass fractions to `function`; none has been passed yet."""
         self._function = function
         self._last = 0.0
 
@@ -76,7 +75,7 @@ class Told:
             self._function(done)
 
     def end(self) -> None:
-        """Hand on that all is done."""
+        """Hand on the end."""
         self._function(1.0)
 
 
@@ -187,7 +186,7 @@ class WorkClock:
     lost_s: float = 0.0
 
     def stop(self, now_s: float) -> None:
-        """Stand still from now on, until as many calls of `go_on` as of `stop`."""
+        """Stand still until as many calls of `go_on` as of `stop`."""
         if not self.compiling:
             self.since_s = now_s
         self.compiling += 1
@@ -278,7 +277,7 @@ class Rhythm:
         return cls(begun_s + LINE_INTERVALS_S[0])
 
     def after(self, begun_s: float) -> Rhythm:
-        """Go on with work of one name: a thousand short works write as few lines as a long one."""
+        """Go on: a thousand short works of a name write as few lines as a long one."""
         return Rhythm(max(self.due_s, begun_s + LINE_INTERVALS_S[0]), self.lines)
 
     def write(self, now_s: float) -> bool:

@@ -64,7 +64,7 @@ def printable() -> None:
 
 
 def hush(stream: TextIO) -> None:
-    """Drop further output of a stream: its reader has ended (`flexdt ... | head`)."""
+    """Drop further output of a stream whose reader has ended."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

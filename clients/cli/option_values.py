@@ -135,8 +135,9 @@ def names(word: str) -> tuple[str, ...]:
 def require_ending(file: Path, *allowed: str) -> None:
     """Check a file's ending.
 
-    `allowed` are endings with their dot, lower case; the file's may be of any case.
-    Raises typer.BadParameter: another one."""
+    `allowed` are endings with their dot, lower case; the file's of any case. Raises
+    typer.BadParameter: another one.
+    """
     if file.suffix.lower() not in allowed:
         raise typer.BadParameter(
             f"{file.name}: the ending must be {' or '.join(allowed)}"

@@ -267,12 +267,12 @@ def chosen(kind: type[S]) -> S:
 
 
 def home_of(command: str, flag: str) -> str | None:
-    """Return the place in the file of a former option `flag`; None if the file has no
-    such key.
+    """Return the place in the file of a former option `flag`; None without such a key.
 
     The words are "`key` in [table] of FILE"; the table is that of the command. `command`
     is the whole path, e.g. "flexdt twin"; `flag` may begin with dashes. The file need not
-    exist."""
+    exist.
+    """
     name = "_".join(command.split()[1:])
     table = SHARED_TABLES.get(name, name)
     key = flag.lstrip("-").replace("-", "_")

@@ -60,7 +60,7 @@ def axis_names(typed: str) -> list[str]:
 
 
 def axis_values(typed: str) -> list[str]:
-    """List completions: the machine's axes, each with the sign before its value."""
+    """List the machine's axes, each with the sign before its value."""
     return _beginning(typed, (name + AXIS_VALUE for name in _axes()))
 
 

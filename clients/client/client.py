@@ -211,7 +211,7 @@ class Core:
     async def close(self) -> None:
         """End all subscriptions and disconnect; the connection is never opened again.
 
-        Listeners get `end` and are forgotten; a second call does nothing more.
+        Listeners get `end` and are forgotten; a second call does nothing.
         """
         self.closed = True
         listeners = list(self._listeners)
@@ -558,7 +558,7 @@ class AsyncTwinClient(SharedMethods):
         return self.core.hello
 
     async def run(self, flow: Flow[_R]) -> _R:
-        """Run a flow of `twin_methods`, or your own made of them."""
+        """Run a flow of `twin_methods` or yours."""
         return await adrive(flow, self.core.call)
 
     def subscribe(

@@ -128,7 +128,7 @@ class KeptConnection:
 
     @property
     def hello(self) -> HelloResult | None:
-        """The twin's answer to the greeting; None while there is no connection."""
+        """The twin's answer to the greeting; None without a connection."""
         if self.connected:
             return self._client.core.hello
         return None

@@ -370,7 +370,7 @@ class Link:
                     )
 
     async def ended(self) -> None:
-        """Wait until the connection has ended."""
+        """Wait for the connection's end."""
         await asyncio.wait([self._reader])
 
     async def close(self) -> None:

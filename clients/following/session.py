@@ -110,9 +110,11 @@ class FollowSession:
             self.executed(line)
 
     def link(self, connected: bool, why: str) -> None:
-        """Record that the connection was made or lost, update the mirror and report new alarms.
+        """Record that the connection was made or lost, update the mirror and report new
+        alarms.
 
-        `connected` is whether it was made, `why` the reason of a loss, for people."""
+        `connected`: it was made; `why`: the reason of a loss.
+        """
         now = self.clock()
         self._keep(UP if connected else LINK + why.encode(), now, 0.0)
         self._take(self.follower.linked(self.mirror, connected, now, why))
@@ -122,7 +124,7 @@ class FollowSession:
         self._take(self.follower.tick(self.mirror, now))
 
     def time_of_day(self, at: float) -> str:
-        """Format a time of the clock as hh:mm:ss.mmm."""
+        """Format a clock's time as hh:mm:ss.mmm."""
         return time_of_day(at - self._midnight)
 
     def _keep(self, data: bytes, at: float, late_s: float) -> None:

@@ -171,7 +171,7 @@ class ConnectedTwin:
             raise Refusal(f"the twin cannot be reached: {error}") from None
 
     async def run(self, flow: Flow[_R]) -> _R:
-        """Run a method of the client (`twin_methods`), return its result; raises as `ask`."""
+        """Run a method of `twin_methods` and return its result; raises as `ask`."""
         return await adrive(flow, lambda asked: self.ask(asked.method, asked.params))
 
     async def state(self) -> State:
@@ -216,8 +216,8 @@ class ConnectedTwin:
         """Close the recording and save later images in another folder, `path`.
 
         The new transcript begins with the last command, which leaves the old one; or, if
-        no image was saved yet, with all commands. Nothing is written now; the folder is
-        made with the first image.
+        no image was saved yet, with all commands. The folder is made with the first
+        image.
         """
         old = self.record()
         fresh = old.folder is None

@@ -301,8 +301,7 @@ def camera_of(state: State) -> CameraSettings:
 
 
 def kind_of_file(file: str) -> FrameKind:
-    """Determine the kind of an image from its file name; a preview counts as a
-    projection."""
+    """Determine the kind of an image by its file name; a preview is a projection."""
     kind = kind_of(file)
     if kind == "preview":
         return "projection"

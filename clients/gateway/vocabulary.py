@@ -147,5 +147,5 @@ def _extra(event: AcquilaEvent, name: str) -> c.Command:
 
 
 def shown(text: str) -> str:
-    """Return text in quotes, short enough for a message."""
+    """Quote a text, short enough for a message."""
     return repr(grammar.shorten(text, MAX_SHOWN))

@@ -140,7 +140,7 @@ def services(options: UpSettings) -> tuple[Service, ...]:
 
 
 def port_of(name: str, asked: int, known: Addresses) -> int:
-    """Return the port of a service: the one it had before, else `asked`."""
+    """Return a service's port: the one before, else `asked`."""
     if name in known:
         return known[name].port
     return asked

@@ -89,7 +89,7 @@ class BrowserConnection(ServerConnection):
         """Take received bytes; aborts the connection if all connections together hold
         more than `MAX_HELD` and this one more than `FAIR_BYTES`.
 
-        The data that exceed the limit are dropped.
+        Data beyond are dropped.
         """
         self._hold(self._held + len(data))
         if self._admission.held > MAX_HELD and self._held > FAIR_BYTES:

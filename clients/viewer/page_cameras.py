@@ -277,7 +277,7 @@ class SceneClients:
             _theme(client, dark, fine)
 
     def forget(self, page: str) -> None:
-        """Drop the clients of a page that has closed."""
+        """Drop a page's clients."""
         self._theme.pop(page, None)
 
     def _looking(self, view: str) -> list[viser.ClientHandle]:

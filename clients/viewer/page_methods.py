@@ -346,7 +346,7 @@ async def preset(viewer: Viewer, page: Page, params: Preset) -> object:
 
 
 async def feed(viewer: Viewer, page: Page, params: Feed) -> object:
-    """Set the kind of images that this page wants: line_integral or counts."""
+    """Set the page's kind of images: line_integral or counts."""
     page.kind = params.kind
     viewer.refresh_feeds()
     return {}
@@ -667,10 +667,9 @@ async def _of_volume(viewer: Viewer, params: Live, *words: str) -> tuple[Any, by
 async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
     """Offer a part of a reconstructed volume to a page.
 
-    A part offered before that was not fetched is dropped.
-    `viewer` and `page`: of the request; `params`: name the volume, and the part: `what`.
-    Returns its head, and url, name and size of the codes to download; {} while there is none.
-    Raises RpcError: the viewer has no --data.
+    A part offered before that was not fetched is dropped. `params`: name the volume, and
+    the part: `what`. Returns its head, and url, name and size of the codes to download;
+    {} while there is none. Raises RpcError: the viewer has no --data.
     """
     head, codes = await _of_volume(viewer, params, "block", params.what)
     if not codes:
@@ -682,7 +681,7 @@ async def volume_block(viewer: Viewer, page: Page, params: Block) -> object:
 
 
 async def voxel(viewer: Viewer, page: Page, params: Voxel) -> object:
-    """Read exact values of a voxel by the names of the volumes; None where no data cover."""
+    """Read a voxel's exact values by names of volumes; None where no data cover."""
     return (await _of_volume(viewer, params, "voxel", *map(str, params.at)))[0]
 
 

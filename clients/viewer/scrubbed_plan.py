@@ -122,7 +122,7 @@ async def make(
 
 
 def work(parts: Sequence[bytes]) -> list[bytes]:
-    """Run a plan in a worker process, from the message of `make`."""
+    """Run a plan in a worker, from `make`'s message."""
     return [pickle.dumps(_made(*pickle.loads(parts[0])))]
 
 

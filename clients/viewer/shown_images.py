@@ -80,9 +80,10 @@ def window_of(image: ShownImage) -> tuple[float, float]:
 
 
 def grey(image: ShownImage, window: tuple[float, float]) -> npt.NDArray[np.uint8]:
-    """Convert to 8-bit RGB (rows, cols, 3); line integrals are drawn as a film: matter bright on
-    black. Values beyond the window are cut; NaN is black. `image`: whose pixels are drawn;
-    `window`: values of black and white, not equal."""
+    """Convert to 8-bit RGB (rows, cols, 3); line integrals as a film: matter bright on
+    black. Values beyond the window are cut; NaN is black. `image`: that is drawn;
+    `window`: values of black and white, not equal.
+    """
     low, high = window
     scaled = (np.asarray(image.pixels, dtype=np.float32) - low) * (255.0 / (high - low))
     byte = np.nan_to_num(np.clip(scaled, 0.0, 255.0)).astype(np.uint8)

@@ -396,7 +396,6 @@ class Viewer:
             self.clients.show(page.id, nodes, lab.plain, self._built)
 
     def _shown_by(self, id: str) -> Shown:
-        """Return the layers shown by a page, or the default ones for an unknown page."""
         page = self.pages.get(id)
         return Shown() if page is None else page.shown
 

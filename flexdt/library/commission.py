@@ -354,7 +354,6 @@ def _without_copies(scans: Sequence[PastScan]) -> list[PastScan]:
 
 
 def _commands(scan: PastScan) -> list[Command]:
-    """List the commands that a scan has executed."""
     return [x.command for x in scan.log]
 
 

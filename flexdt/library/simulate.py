@@ -224,7 +224,7 @@ class Truth:
         return read_out(self.chain.panel, expected, self.camera, lit, rng)
 
     def line_integrals(self) -> Float32Array:
-        """Compute -log of the noise-free signal over the open beam's, float32 (n, rows, cols)."""
+        """Compute noise-free line integrals, float32 (n, rows, cols)."""
         return np.stack([image.integrals for image in self.radiographs()])
 
 

@@ -197,7 +197,6 @@ class _Jumps(selectors.DefaultSelector):
     """Waits for no timer: time jumps instead."""
 
     def __init__(self, loop: SimulatedLoop) -> None:
-        """Make a selector for a loop whose clock it lets jump."""
         super().__init__()
         self._loop = loop
 
@@ -260,7 +259,7 @@ class DirectProjector:
     async def paths_within(
         self, name: str, cone_vec: ConeVec, shape: tuple[int, int], within: Within
     ) -> Float32Array:
-        """Compute line integrals along several rays of some pixels, float32 (rays,)."""
+        """Compute integrals along rays of some pixels, float32 (rays,)."""
         return paths_within(self.known[name], cone_vec, shape, within)
 
 
@@ -333,22 +332,22 @@ class InProcessTransport(asyncio.Transport):
         return messages
 
     def write(self, data: bytes | bytearray | memoryview) -> None:
-        """Hand the server's bytes to the client; dropped after the connection's end."""
+        """Hand bytes to the client; dropped after the connection's end."""
         if self._server is not None:
             self._inbox.put_nowait(bytes(data))
 
     def close(self) -> None:
         """End the connection, from either side; a second call does nothing.
 
-        A waiting `receive` returns []; the server learns of the end in the loop's next
-        turn."""
+        A waiting `receive` returns []; the server learns of it in the loop's next turn.
+        """
         server, self._server = self._server, None
         if server is not None:
             self._inbox.put_nowait(b"")
             self._loop.call_soon(server.connection_lost, None)
 
     def is_closing(self) -> bool:
-        """Return whether the connection has ended."""
+        """Return whether it ended."""
         return self._server is None
 
     def get_write_buffer_size(self, *_: Any, **__: Any) -> int:
@@ -363,12 +362,10 @@ class _Client(TwinClient):
     """A blocking client that lets virtual time pass while it waits."""
 
     def __init__(self, twin: InProcessTwin, name: str) -> None:
-        """Make a client of a twin in this process; it waits by running the twin's loop."""
         self._twin = twin
         super().__init__(transport=twin.transport(), name=name)
 
     def _wait(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run work on the twin's loop and return its result."""
         return self._twin.run(work)
 
 
@@ -406,7 +403,7 @@ class InProcessTwin:
         return _Client(self, name)
 
     def transport(self) -> Transport:
-        """Make a connection of its own, for `AsyncTwinClient` and Bluesky's `TwinLab`."""
+        """Make a connection for `AsyncTwinClient` and `TwinLab`."""
         return InProcessTransport(self.loop, self._shell.connection)
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:

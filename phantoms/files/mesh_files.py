@@ -258,7 +258,7 @@ def read_part(path: str | os.PathLike[str]) -> trimesh.Trimesh:
 
 
 def default_unit(file_type: str) -> str:
-    """Return the unit of a format's numbers where none is given."""
+    """Return the default unit of a format."""
     return DEFAULT_UNIT.get(file_type, "mm")
 
 

@@ -160,7 +160,6 @@ class Folder:
         return next((two for _, two in self._numbered.values() if two is not None), None)
 
     def _images(self, prefix: str) -> dict[int, str]:
-        """Return number -> name of the images with this prefix."""
         return self._numbered[prefix][0]
 
     @cached_property
@@ -411,5 +410,5 @@ def free_name(root: Directory, wanted: str) -> str:
 
 
 def dated_name(moment: datetime, number: int = 1) -> str:
-    """Format a name as the scanner does: 201106_001."""
+    """Format a name like 201106_001."""
     return f"{moment:%y%m%d}_{number:03d}"

@@ -354,8 +354,8 @@ class Directory:
     def stat(self, name: str) -> os.stat_result | None:
         """Return the status of an entry, of a link itself.
 
-        Returns the status; None if there is no such entry, or no such folder.
-        Raises OSError: the system refuses for another reason.
+        Returns None if there is no such entry or folder. Raises OSError: the system
+        refuses for another reason.
         """
         try:
             with self._opened() as fd:
@@ -416,8 +416,9 @@ class Directory:
                     self.unlink(name)
 
     def sync(self) -> None:
-        """Make the names safe: before that a power cut may undo the last changes of the
-        directory. Raises DatasetWriteError: the system refuses."""
+        """Make the last changes of names safe from a power cut. Raises DatasetWriteError:
+        the system refuses.
+        """
         with writing(self.path, f"cannot write {self.path}"), self._opened() as fd:
             if fd is not None:
                 os.fsync(fd)
@@ -434,15 +435,12 @@ class Directory:
                 self._fd = None
 
     def __enter__(self) -> Directory:
-        """Return the directory itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the directory at the end of the context."""
         self.close()
 
     def __del__(self) -> None:
-        """Close the directory when nothing refers to it any more."""
         self.close()
 
     @contextmanager
@@ -638,12 +636,11 @@ def _fields(file: Path) -> dict[str, int]:
 
 
 def open_data(root: Path) -> Directory:
-    """Open a twin's data directory, made with its parents if it is missing, and check that files
-    can be written into it.
+    """Open a twin's data directory, made with its parents if missing, and check that
+    files can be written into it.
 
-    The caller closes it. A full disk is no error: state and jobs have room of their own
-    (`spare_files`).
-    Raises DatasetWriteError: it cannot be made, opened or written.
+    The caller closes it. A full disk is no error: state and jobs have own room
+    (`spare_files`). Raises DatasetWriteError: it cannot be made, opened or written.
     """
     refused = f"the data directory {root} cannot be written"
     with writing(root, refused):

@@ -39,8 +39,7 @@ class UnreadImageError(Exception):
 
 
 def quoted(text: str) -> str:
-    """Return a text of a file for a message: its first 40 characters, those that are not to
-    be printed as question marks."""
+    """Return a file's text for a message: 40 characters, unprintable ones as ?."""
     kept = "".join(c if c.isprintable() else "?" for c in text.strip()[:40])
     return kept or "nothing"
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 
 def limited_bytes(path: Path, form: str) -> bytes:
-    """Read a file of a format of `LIMITS`. Raises InputLimitError: it has more bytes than its
-    format may have; OSError: it cannot be read."""
+    """Read a file of a format of `LIMITS`. Raises InputLimitError: it has more bytes than
+    allowed; OSError: it cannot be read.
+    """
     from flexdt.twin.input_limits import read_limited
 
     with path.open("rb") as file:

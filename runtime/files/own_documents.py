@@ -201,7 +201,6 @@ class Changes:
         return f"{BEFORE}{os.getpid()}-{threading.get_native_id()}-{len(self._made)}"
 
     def __enter__(self) -> Changes:
-        """Return the changes themselves."""
         return self
 
     def __exit__(

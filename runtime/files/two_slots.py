@@ -105,7 +105,6 @@ class TwoSlots:
             self._file = None
 
     def __del__(self) -> None:
-        """Close the file when nothing refers to it any more."""
         self.close()
 
     def _is_open(self) -> bool:

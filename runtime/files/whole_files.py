@@ -24,8 +24,8 @@ OF_LIBRARIES: Final = re.compile(r"No space left|errno = (\d+)|requested and \d+
 def require_bytes(path: Path, needed: int) -> None:
     """Check that a disk has room for a file, before anything of it is written.
 
-    `path`: of the file; `needed`: its size [bytes].
-    Raises OSError: ENOSPC, the file is larger than the free space; names `path` and both sizes.
+    `path`: of the file; `needed`: its size [bytes]. Raises OSError: ENOSPC, too little
+    free space; names `path` and both sizes.
     """
     free = free_bytes(path)
     if needed > free:

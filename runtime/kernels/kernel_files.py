@@ -181,7 +181,7 @@ class KernelFiles:
         self._tended = True
 
     def writable(self) -> Place | None:
-        """Return the place that would take an item now."""
+        """Return the place that would take an item."""
         return self._write("probe", b"", keep=False)
 
     def told(self) -> str:
@@ -265,7 +265,7 @@ def opened() -> KernelFiles:
 
 
 def kept_in() -> Path | None:
-    """Return the folder that takes what this process compiles; None where none can be written."""
+    """Return the folder for what is compiled here; None if none is writable."""
     place = opened().writable()
     return None if place is None else place.folder
 

@@ -76,7 +76,6 @@ class TrueGeometry:
     __slots__ = ("__parameters",)
 
     def __init__(self, parameters: Offsets = NOMINAL) -> None:
-        """Hold the hidden misalignment, from which nothing can be read outside this class."""
         self.__parameters = parameters
 
     def __repr__(self) -> str:

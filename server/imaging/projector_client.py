@@ -68,7 +68,7 @@ class ProjectorClient:
         return self._channel is not None and not self._channel.lost
 
     async def close(self) -> None:
-        """End the connection for good; open requests fail, and later ones are refused."""
+        """End the connection for good; open requests fail, later ones are refused."""
         self._closed = True
         if self._channel is not None:
             self._channel.close()

@@ -131,7 +131,6 @@ class ProjectorPool:
         self._lines = Sparing()
 
     def __len__(self) -> int:
-        """Return the number of projectors, reachable or not."""
         return len(self._members)
 
     @property

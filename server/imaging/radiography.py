@@ -163,7 +163,7 @@ class Radiography:
 
     @property
     def photons(self) -> bool:
-        """Whether images are counts of photons."""
+        """Whether images count photons."""
         return counts_photons(self.physics)
 
     @property

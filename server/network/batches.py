@@ -57,9 +57,8 @@ class Batch:
     def next_item(self, *, urgent_alone: bool = False) -> Item | None:
         """Take out the next item, urgent ones first, and remember its place in the batch.
 
-        Returns:
-            The item; None if none is left, or, with `urgent_alone`, if the next is
-                ordinary (it stays then).
+        Returns None if none is left, or, with `urgent_alone`, the next is ordinary (it
+        stays).
         """
         if not self._left:
             return None

@@ -14,7 +14,6 @@ class Deadlines:
     """
 
     def __init__(self, on_timeout: Callable[[str, float], object]) -> None:
-        """Begin without timeouts; `on_timeout` gets name and seconds of one that has passed."""
         self._on_timeout = on_timeout
         self._timers: dict[str, asyncio.TimerHandle] = {}
 
@@ -35,6 +34,6 @@ class Deadlines:
             timer.cancel()
 
     def clear(self) -> None:
-        """Cancel all timeouts; their names stay taken until `stop`."""
+        """Cancel all timeouts; names stay taken until `stop`."""
         for timer in self._timers.values():
             timer.cancel()

@@ -196,7 +196,7 @@ class Outbox:
             await self.ready.wait()
 
     def lost(self) -> None:
-        """Drop everything queued, as the connection has ended, and wake who waits to send."""
+        """Drop the queue, as the connection ended, and wake who waits to send."""
         self.over = True
         self.queue.clear()
         self.slots.clear()

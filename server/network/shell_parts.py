@@ -109,7 +109,7 @@ class Frozen:
     method: str
 
     def thawed(self) -> m.Single | Call:
-        """Unpickle the message: a validated call, or a message that is no call."""
+        """Unpickle the message: a validated call, or no call."""
         message: m.Single | Call = pickle.loads(self.data)
         return message
 

@@ -465,7 +465,7 @@ class _Link(asyncio.BufferedProtocol):
         self.gone.set()
 
     def pause_writing(self) -> None:
-        """Queue messages, as the client reads too slowly; after `send_timeout_s` it is cut off."""
+        """Queue messages of a slow client; after `send_timeout_s` it is cut off."""
         self.out.pause()
         self.deadlines.start("send", self.limits.send_timeout_s)
 
@@ -478,11 +478,11 @@ class _Link(asyncio.BufferedProtocol):
 
     @property
     def codec(self) -> Codec:
-        """Codec of the connection; JSON until its first byte."""
+        """Codec; JSON until the first byte."""
         return self.wire.codec or Codec.JSON
 
     def post(self, message: m.Message | Prepared, slot: str | None = None) -> None:
-        """Send or queue an event; see `Peer.post`."""
+        """See `Peer.post`."""
         self.out.event(message, slot)
 
     def close(self, reason: str) -> None:
@@ -520,7 +520,7 @@ class _Link(asyncio.BufferedProtocol):
         error: bool = False,
         **facts: object,
     ) -> None:
-        """Log a line about this connection, unless there have been too many of its kind.
+        """Log a line about this connection, unless there were too many of its kind.
 
         Lines of connections that are not admitted are counted as a kind of their own.
         """
@@ -749,7 +749,6 @@ class _Link(asyncio.BufferedProtocol):
                     await self._send(self.out.encode(answer))
 
     def _batch(self, items: Sequence[m.Single | parts.Frozen]) -> batches.Batch:
-        """Make a batch with this connection's lanes and the size limit of its codec."""
         return batches.Batch(items, self._lane, MAX_ANSWER[self.codec])
 
     async def _begin(self, split: batches.Split) -> None:
@@ -792,7 +791,6 @@ class _Link(asyncio.BufferedProtocol):
             )
 
     async def _send(self, body: list[bytes]) -> None:
-        """Send a body, and wait while the client has too many unread replies."""
         self.out.send(body)
         await self.out.room()
 

@@ -126,8 +126,7 @@ class ComputeJob:
             return await asyncio.wrap_future(self._step)
 
     def sent(self) -> None:
-        """Release the lane for another request: the answer was sent, or its
-        request was abandoned."""
+        """Release the lane: the answer was sent, or its request abandoned."""
         if self._in_hand:
             self._in_hand = False
             self.lane.in_hand.release()
@@ -156,7 +155,7 @@ class ComputeThread:
         return future
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Stop after the steps that are in the queue and still wanted."""
+        """Stop after the queued steps still wanted."""
         self._steps.put(None)
         self._thread.join(timeout_s)
 

@@ -111,14 +111,15 @@ class Context:
         )
 
     async def run(self, client: JobClient, id: Id, step: Step) -> object:
-        """Compute the one step of a request and return its value."""
+        """Compute a request's one step and return its value."""
         return await client.begin(id).run(self.compute, step)
 
     def supersede(self, client: JobClient, key: str) -> None:
         """End this client's jobs of that key that still wait, with an error, and count
         them in `superseded`.
 
-        Jobs that are being computed go on."""
+        Running ones go on.
+        """
         for job in client.jobs.values():
             if job.key == key and job.waits:
                 job.end(superseded(key))

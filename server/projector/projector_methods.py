@@ -190,10 +190,9 @@ async def project(context: Context, client: JobClient, id: Id, p: wire.Project) 
 async def rays(context: Context, client: JobClient, id: Id, p: wire.RaysNeeded) -> object:
     """Find the rays that pixels need, and send their marks (`pixel_areas.packed`).
 
-    `context`: of the server; `client`: that calls; `id`: of the request; `p`: name of the
-    volume, cone_vec (n, 12), detector, and the permitted error.
-    Returns as of `project`.
-    Raises RpcError, GeometryError: as of `project`.
+    `client`: that calls; `id`: of the request; `p`: name of the volume, cone_vec (n, 12),
+    detector, and the permitted error. Returns as of `project`. Raises RpcError,
+    GeometryError: as of `project`.
     """
     volume, rows, warnings = _looked_at(context, p)
     steps = marking_steps(

@@ -126,13 +126,13 @@ class ProjectorServer(ListeningServer):
 
     @property
     def largest_frame(self) -> int:
-        """Largest frame that is taken from a client [bytes]."""
+        """Largest frame taken from a client [bytes]."""
         return min(MAX_FRAME, self.limits.max_message)
 
     def refuse(self, link: FrameLink, error: RpcError) -> None:
         """Log an error as a warning, send it without an id, and end the connection.
 
-        `link`: connection of the client; `error`: why it is refused.
+        `link`: of the client; `error`: why it is refused.
         """
         self.context.lines.log(
             "refused", logging.WARNING, client=link.peer, reason=error.message

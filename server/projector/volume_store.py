@@ -69,11 +69,9 @@ class VolumeStore:
         self._uploads: dict[tuple[object, str], _Upload] = {}
 
     def __len__(self) -> int:
-        """Return the number of complete bodies; uploads do not count."""
         return len(self._held)
 
     def __contains__(self, name: object) -> bool:
-        """Return whether a complete body of that name is held."""
         return name in self._held
 
     @property

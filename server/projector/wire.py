@@ -315,7 +315,7 @@ class ProjectorLink:
 
     @property
     def lost(self) -> bool:
-        """Whether the connection has ended."""
+        """Whether it ended."""
         return self.link.lost
 
     def close(self) -> None:

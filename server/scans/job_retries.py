@@ -68,8 +68,8 @@ class Retry:
             self._attempts = 0
 
     def cancel(self) -> None:
-        """Cancel the next attempt, if there is one, and reset the pause: a user takes
-        over, or the job has ended.
+        """Cancel the next attempt and reset the pause: a user takes over, or the job has
+        ended.
         """
         if self._task is not None:
             self._task.cancel()

@@ -148,8 +148,9 @@ class Jobs:
         """True while the current job runs and makes frames or opens, or runs at speed
         "max".
 
-        False for a paused or waiting job, and for one that waits between frames at
-        another speed."""
+        False for a paused or waiting job, and one that waits between frames at another
+        speed.
+        """
         job = self.current
         if job is None or job.phase != "running":
             return False
@@ -425,7 +426,7 @@ class Jobs:
 
     @property
     def made(self) -> int:
-        """Number of all jobs so far."""
+        """Number of jobs."""
         return self._count
 
     def changed(self) -> dict[str, JobMemory | None]:
@@ -525,7 +526,6 @@ class Jobs:
         ]
 
     def _tell(self, job: Job) -> None:
-        """Note a job as changed, to be written, and publish it."""
         self._changed.add(job.id)
         self._notify(job)
 
@@ -666,7 +666,6 @@ class Jobs:
             self._preparing = False
 
     def _stopped(self) -> Exception | None:
-        """Return the last stop from outside since the current job's turn, or None."""
         return self._interrupted  # a call: it may change while others run
 
     def _mark_incomplete(self, job: Job, scan: JobInputs, reason: str) -> None:
@@ -797,5 +796,5 @@ def _logged(produce: Produce, job: str) -> Produce:
 
 
 def fresh_seed() -> int:
-    """Draw a seed for a new scan's noise."""
+    """Draw a scan's seed."""
     return secrets.randbits(32)

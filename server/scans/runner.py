@@ -91,7 +91,6 @@ class JobAborted(Exception):
     """A user ended the job, for the reason given."""
 
     def __init__(self, reason: str | None = None) -> None:
-        """Make the exception with the message "aborted", and the reason if there is one."""
         super().__init__(f"aborted: {reason}" if reason else "aborted")
 
 
@@ -169,13 +168,13 @@ class ScanRunner:
     # Control ------------------------------------------------------------------------------------
 
     def pause(self, error: Exception | None = None) -> None:
-        """Request a pause: the run stops motion at its next wait, and waits for `resume`, `step`
-        or `abort`.
+        """Request a pause: the run stops motion at its next wait, and waits for `resume`,
+        `step` or `abort`.
 
-        The settings in force are saved, to be restored then; a second pause keeps those saved
-        first. A single step is given up.
+        The settings in force are saved, to be restored then; a second pause keeps those
+        saved first. A single step is given up.
 
-        `error`: reason, shown in `progress` at once; None if a user requested the pause.
+        `error`: reason, shown in `progress` at once; None if a user requested it.
         """
         if error is not None:
             self._set_progress(error=error)
@@ -224,12 +223,12 @@ class ScanRunner:
 
     @property
     def stepping(self) -> bool:
-        """True while a requested step has not ended."""
+        """Whether a step goes on."""
         return self._single_step
 
     @property
     def idle(self) -> bool:
-        """True if no frame is being made."""
+        """True if no frame is made."""
         return self._pipeline.idle
 
     # Running ------------------------------------------------------------------------------------
@@ -551,7 +550,6 @@ class ScanRunner:
             await self._sleep(rest)
 
     def _has_request(self) -> bool:
-        """Return whether a pause, a stop that is due, or an abort is requested."""
         # A call: all three may change while others run.
         return self._pause or self._stop_due or self._abort
 

@@ -79,8 +79,7 @@ class Job:
 
     @property
     def never_began(self) -> bool:
-        """Whether it was aborted before its turn: there is no data set, and nothing stands
-        elsewhere."""
+        """Whether it was aborted before its turn: there is no data set."""
         return self.phase == "aborted" and self.start is None and not self.frames_done
 
     @property

@@ -256,8 +256,8 @@ class ObstacleMoves:
     _commands: int = 0
 
     def cancel(self) -> None:
-        """Stop planning and start no further leg, because of another command; the present
-        leg ends normally.
+        """Stop planning and start no further leg, for another command; the present leg
+        ends normally.
         """
         self._commands += 1
         if self._task is not None:

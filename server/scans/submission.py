@@ -195,7 +195,7 @@ class Submissions:
         return await forecast_sample(self.radiography, sample, probes)
 
     def close(self) -> None:
-        """End the processes of checks."""
+        """End the processes."""
         self.checks.close()
 
     async def submit(

@@ -181,7 +181,6 @@ class TwinClock:
         return self._speed_up == "max" and self._base < LATE_S
 
     def _rebase(self) -> None:
-        """Make the present twin time and real time the origin, before the rate changes."""
         self._base = self._time()
         self._base_wall = self._wall()
 

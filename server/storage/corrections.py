@@ -230,8 +230,9 @@ class Corrections:
         return history[-1:] if self.filed else history
 
     def store_history(self, changes: documents.Changes, history: History) -> None:
-        """Write the history; on a full disk it stays as it was, which costs steps of `revert`
-        only. Raises DatasetWriteError: the system cannot write."""
+        """Write the history; on a full disk it stays, which costs steps of `revert`.
+        Raises DatasetWriteError: the system cannot write.
+        """
         with suppress(DiskFullError):
             changes.put(self._folder, HISTORY, json.dumps(history).encode())
             self._written = history

@@ -161,7 +161,7 @@ class DatasetWriter:
         self._write_end(True, "", duration_s)
 
     def mark_incomplete(self, reason: str, *, duration_s: float | None = None) -> None:
-        """Write into all texts that and why the scan did not finish."""
+        """Write into all texts why it ended early."""
         self._write_end(False, reason, duration_s)
 
     def close(self) -> None:

@@ -136,7 +136,6 @@ class DiskRoom:
 
     @cached_property
     def _used(self) -> UsedBytes:
-        """Counter of the bytes below the data directory."""
         return UsedBytes(self.root)
 
     def require(self, what: str, size: int, there: int = 0) -> None:

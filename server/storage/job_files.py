@@ -92,7 +92,7 @@ class JobFiles:
         return sorted(found, key=lambda job: number_of(job.id))
 
     def put(self, changes: documents.Changes, job: JobMemory) -> None:
-        """Write a job, among other changes. Raises DatasetWriteError: the system refuses."""
+        """Write a job. Raises DatasetWriteError: the system refuses."""
         self._records.make()
         changes.put(self._folder, _file(job.id), _text(job))
 

@@ -208,7 +208,7 @@ class Journal:
         self._try(self.take(), make)
 
     def changed(self, *, at_once: bool = False) -> None:
-        """Schedule a write after a change; `at_once` skips the pause."""
+        """Schedule a write; `at_once` skips the pause."""
         self._changed.set()
         if at_once:
             self._at_once.set()

@@ -269,7 +269,7 @@ class StateStore:
         self._ended = False
 
     def changed(self) -> None:
-        """Schedule a write after a change."""
+        """Schedule a write."""
         self._changed.set()
 
     async def run(self) -> None:
@@ -524,7 +524,6 @@ class StateStore:
                 changes.put(self._root, FILE, _text(document), self.spares.keep)
 
     def _undo(self, changes: documents.Changes) -> None:
-        """Undo changes on the disk, after a write that is under way; blocks."""
         with self._file:
             changes.undo()
 

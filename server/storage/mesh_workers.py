@@ -25,11 +25,9 @@ MEMORY_BYTES = 3 << 30
 def mesh_apart(
     raw: bytes, *, unit: str, material: str, file_type: str, name: str, place: str
 ) -> Phantom:
-    """Read a mesh from untrusted bytes, as `flexdt.phantoms.mesh_phantom`; blocks.
+    """Read a mesh from untrusted bytes, as `mesh_phantom`; blocks.
 
-    Raises:
-        PhantomError: as there, unknown material, or reading it takes too much time or
-            memory.
+    Raises PhantomError: as there, unknown material, or too much time or memory.
     """
     how = {
         "unit": unit,

@@ -130,7 +130,7 @@ class PastScans:
         return Encoded(tuple(await workers.ask(work, self._root, params, context, codec)))
 
     def close(self) -> None:
-        """End the processes of listing and of fitting."""
+        """End the processes of listing and fitting."""
         self._workers.close()
         self._fitters.close()
 
@@ -343,7 +343,6 @@ def _texts(folder: files.Folder) -> Any:
 
 
 def _opened(root: Directory, name: str) -> _Scan:
-    """Read a data set, or return the cached one."""
     return _kept_scan(*_place(root, name))
 
 

@@ -149,7 +149,7 @@ class SampleStore:
 
     @property
     def uploads(self) -> tuple[str, ...]:
-        """Names of the complete uploads."""
+        """Complete uploads' names."""
         return tuple(self._heads)
 
     def head(self, name: str) -> UploadHead | None:
@@ -303,10 +303,10 @@ class SampleStore:
         return ReceivedSample(head, raw, phantom, _revision(head, raw), worn)
 
     def prepare(self, upload: ReceivedSample) -> None:
-        """Write an upload's bytes, before any lock is taken; `store` makes them visible.
+        """Write an upload's bytes, before any lock; `store` makes them visible.
 
-        The file is named after its content, and nothing refers to it yet: unless `know` is
-        called, `tidy` deletes it.
+        The file is named after its content, and nothing refers to it yet: unless `know`
+        is called, `tidy` deletes it.
 
         Raises DatasetWriteError: the system cannot write.
         """
@@ -354,7 +354,7 @@ class SampleStore:
         changes.remove(self._folder, f"{documents.file_stem(name)}.json")
 
     def forget(self, name: str) -> None:
-        """Remove an upload from memory; `tidy` deletes its bytes."""
+        """Forget an upload; `tidy` deletes its bytes."""
         with self._lock:
             self._replace(name, None)
 

@@ -123,7 +123,7 @@ class ControlLease:
             raise self._control_error(what)
 
     def is_observer(self, who: str) -> bool:
-        """Return whether another client has control."""
+        """Return whether another has control."""
         return self.holder not in (None, who)
 
     def ensure_allowed(self, who: str, what: str) -> None:
@@ -133,12 +133,12 @@ class ControlLease:
             raise self._control_error(what)
 
     def release(self, who: str) -> None:
-        """Give control back; nothing happens if `who` does not hold it."""
+        """Give control back if `who` holds it."""
         if self.holder == who:
             self.holder = None
 
     def rename(self, before: str, now: str) -> None:
-        """Let control go along with a client that has another name now."""
+        """Let control follow a client's new name."""
         if self.holder == before:
             self.holder = now
 
@@ -680,11 +680,9 @@ class TwinServer:
                 end.set_result(None)
 
     def _in_use(self) -> list[Sample]:
-        """List the samples on the stage and in scans that have not ended."""
         return [self.scanner.sample, *self.jobs.samples()]
 
     def _settled(self) -> None:
-        """Request a live image and the saving of positions after motion has ended."""
         self.live.changed()
         self.journal.changed(at_once=True)
 
@@ -694,7 +692,6 @@ class TwinServer:
         return self.scanner.rest_time(now) > now
 
     def _at_rest(self) -> bool:
-        """Return whether no motor is under way and no scan runs."""
         return not self._moving() and not self.jobs.running
 
     def _content(self) -> Content:

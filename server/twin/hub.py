@@ -218,7 +218,7 @@ class Hub:
         return bool(self._listeners.get(topic))
 
     def count(self, topic: TopicName) -> int:
-        """Return the number of events of `topic` so far."""
+        """Count a topic's events."""
         return self._seq.get(topic, 0)
 
     def views(self, topic: TopicName) -> set[ImageRequest]:

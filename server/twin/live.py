@@ -112,7 +112,7 @@ class Shot:
 
     @property
     def lit(self) -> bool:
-        """True if X-rays reach the panel: on, and warmed up."""
+        """True if X-rays are on and warm."""
         return self.tube.ready(self.time)
 
     @property

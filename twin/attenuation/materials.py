@@ -63,12 +63,12 @@ class Material:
 
     @property
     def fractions(self) -> tuple[tuple[str, float], ...]:
-        """Its composition: (symbol, mass fraction)."""
+        """Pairs (symbol, mass fraction)."""
         return self.substance.fractions
 
     @cached_property
     def mu_per_mm(self) -> float:
-        """Linear attenuation coefficient at the effective energy [1/mm]."""
+        """Attenuation at the effective energy [1/mm]."""
         return self.mu_at(self.effective_energy_keV)
 
     def mu_at(self, energy_keV: float) -> float:
@@ -110,7 +110,7 @@ def materials() -> Mapping[str, Material]:
 
 
 def stated_keV() -> float:
-    """Return the energy at which phantoms state their attenuation [keV]."""
+    """Return the energy of phantoms' attenuation [keV]."""
     return next(iter(materials().values())).effective_energy_keV
 
 

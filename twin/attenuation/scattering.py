@@ -58,7 +58,6 @@ class CrossSections:
 
 @cache
 def _scattering() -> dict[str, FloatArray]:
-    """Load the shipped form factors and scattering functions."""
     return stored_arrays("scattering.npz")[0]
 
 

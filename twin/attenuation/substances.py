@@ -207,7 +207,7 @@ class Substance:
         return np.asarray(sum(part * tables().total[row] for row, part in self.parts))
 
     def attenuation(self) -> FloatArray:
-        """Compute linear attenuation at the energies of the tables, (e,) [1/mm]."""
+        """Compute attenuation at the tables' energies, (e,) [1/mm]."""
         return self.mass_attenuation() * (self.density_g_cm3 / 10.0)
 
     def attenuation_at(self, energy_keV: float) -> float:

@@ -224,7 +224,6 @@ class PairStack:
 
     @cached_property
     def _reach(self) -> FloatArray:
-        """Absolute values of the relative slides, of the same shape."""
         return np.abs(self.slides)
 
     def clearances(self, lower: FloatArray, upper: FloatArray) -> FloatArray:

@@ -57,7 +57,7 @@ class SweepResult:
 
 
 def first_contact(scene: CollisionScene, path: Path) -> Contact | None:
-    """Find the first contact along a path, without clearances; None if there is none."""
+    """Find the first contact along a path, without clearances, or None."""
     return PathSearch(scene, path).first_contact(only_contacts=True).contact
 
 

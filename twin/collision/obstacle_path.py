@@ -89,8 +89,7 @@ class _Planner:
         return self.start.get(axis, self.machine.axes[axis].home)
 
     def pace(self, axis: str) -> Pace:
-        """Return the speed and acceleration of a motor: those given for the search, else the
-        machine's."""
+        """Return a motor's speed and acceleration: the search's, else the machine's."""
         a = self.machine.axes[axis]
         return self.paces.get(axis, (a.speed, a.acceleration))
 

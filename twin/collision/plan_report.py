@@ -55,8 +55,7 @@ def collision_check(
     ) -> Clearance:
         """Sweep a plan with the machine's bodies and a sample; see `collision_report`.
 
-        The sample given to `collision_check` counts; `size` is used (as a cylinder) only
-        without one.
+        The sample given to `collision_check` counts, else `size`, as a cylinder.
         """
         if sample is None:
             pieces = _from_size(size)

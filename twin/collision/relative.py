@@ -473,7 +473,6 @@ class RelativeMotion:
         self.lengths -= 2.0 * math.pi * again / np.where(again > 0.0, rate, 1.0)
 
     def __len__(self) -> int:
-        """Return the number of segments that were kept."""
         return len(self.times)
 
     def time(self, at: Moment) -> float:
@@ -604,7 +603,7 @@ class Limits:
     accuracy: tuple[float, float]
 
     def slack(self, clearance: float) -> float:
-        """Return the error allowed in a least clearance of this size [mm]."""
+        """Return the error allowed in such a least clearance [mm]."""
         return max(self.accuracy[0], self.accuracy[1] * clearance)
 
 

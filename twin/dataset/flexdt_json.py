@@ -114,7 +114,6 @@ class FrameBlock(ArrayValue):
     xrays_on: bool = True
 
     def __len__(self) -> int:
-        """Return the number of images."""
         return len(self.files)
 
     def __repr__(self) -> str:
@@ -291,7 +290,7 @@ class ScanRecord(ArrayValue):
         """Compute the nominal geometry of all images, or of `blocks`, in order, without a
         correction and a detector shape.
 
-        Empty blocks are skipped; GeometryError if none is left.
+        Empty blocks are skipped; GeometryError if all are.
         """
         if blocks is None:
             chosen = self.blocks

@@ -132,7 +132,7 @@ def refused(
     neutral: tuple[str, ...] = OFF,
     of: Part = Part.NONE,
 ) -> Field:
-    """Make a field whose value makes a scan unreadable, unless another states the same."""
+    """Make a field that makes a scan unreadable, unless another says the same."""
     return Field(name, meaning, Role.REFUSED, because, neutral=neutral, of=of)
 
 
@@ -337,7 +337,7 @@ class Ledger:
         self.warnings.append(f"{self.file}: {consequence}")
 
     def ignore(self, name: str, because: str) -> None:
-        """Say that a value is ignored, without a warning."""
+        """Ignore a value, without a warning."""
         self._mark(name, Use.IGNORED, because)
 
     def replaced(self, names: Iterable[str], by: str) -> None:

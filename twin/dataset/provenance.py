@@ -58,7 +58,7 @@ class Stated:
     of: Part = Part.NONE
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON form, of `flexdt describe --json` and saved data sets."""
+        """Return the JSON form of `describe --json` and saved data sets."""
         return {**asdict(self), "use": self.use.value, "of": self.of.value}
 
     @classmethod
@@ -139,7 +139,7 @@ class Provenance(tuple[Stated, ...]):
 
     @classmethod
     def from_list(cls, members: Iterable[Mapping[str, object]]) -> Provenance:
-        """Make it of its JSON form; raises as `Stated.from_dict`."""
+        """Make it of its JSON; raises as `Stated.from_dict`."""
         return cls(Stated.from_dict(one) for one in members)
 
     @property

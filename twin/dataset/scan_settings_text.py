@@ -69,12 +69,12 @@ def clean(text: str) -> str:
 
 
 def parse_number(text: str) -> float:
-    """Read a finite number as scanners print it: `1.5`, `1,5`, `1.5;`, `1.5 mm`, `874.6E-9`.
+    """Read a finite number as scanners write: `1.5`, `1,5`, `1.5;`, `1.5 mm`, `874.6E-9`.
 
-    One comma without a point is the decimal sign; all after a space is dropped. Infinity, NaN
-    and underscores are errors.
+    One comma without a point is the decimal sign; all after a space is dropped. Infinity,
+    NaN and underscores are errors.
 
-    Raises ValueError: it is not a number.
+    Raises ValueError: no number.
     """
     word = text.strip().rstrip(";").strip().split(" ")[0]
     if word.count(",") == 1 and "." not in word:
@@ -98,8 +98,8 @@ def _whole(text: str) -> int:
 def parse_roi(text: str) -> Roi:
     """Read four whole numbers, left, top, right, bottom, with any separators.
 
-    Decimals that are zero are allowed; order and sensor are not checked.
-    Raises ValueError: there are not exactly four.
+    Decimals that are zero are allowed; order and sensor are not checked. Raises
+    ValueError: not exactly four.
     """
     words = re.findall(r"-?\d+(?:\.0*)?", text)
     if len(words) != 4:

@@ -59,7 +59,7 @@ class Figures:
 
     @property
     def voxel_um(self) -> float:
-        """pixel * SOD / SDD [um] (the thesis prints the ratio upside down)."""
+        """pixel * SOD / SDD [um] (the thesis inverts the ratio)."""
         return 1000.0 * self.pixel_mm * self.sod_mm / self.sdd_mm
 
 

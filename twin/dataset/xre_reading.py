@@ -33,11 +33,12 @@ class XreSettings:
         )
 
     def number(self, section: str, key: str) -> float | None:
-        """Return an entry's value as a number (`parse_number`); None if it is absent or empty.
+        """Return an entry's value as a number (`parse_number`); None if it is absent or
+        empty.
 
         Case of section and key does not matter.
 
-        Raises DatasetFormatError: it is present and not a number.
+        Raises DatasetFormatError: it is no number.
         """
         text = self.text(section, key)
         if text is None:

@@ -83,7 +83,6 @@ class ScanGeometry:
         return replace(self, notes=notes, provenance=self.provenance.and_also(values))
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self.cone_vec)
 
     @property
@@ -96,8 +95,9 @@ class ScanGeometry:
         """Return the geometry with rows counted from the other side: v is negated, in
         `real` too.
 
-        It belongs to images that are turned upside down. Twice gives the same geometry;
-        files, shape and notes stay."""
+        It belongs to images turned upside down. Twice gives the same geometry; files,
+        shape and notes stay.
+        """
         down = np.repeat([1.0, -1.0], [9, 3])
         real = None
         if self.real is not None:

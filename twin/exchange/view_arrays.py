@@ -20,7 +20,7 @@ SPACE: Final = 3
 
 
 def stated(table: FormatTable, arrays: Arrays, file: str) -> Ledger:
-    """Enter the arrays of a file in a ledger, each as its shape or its value.
+    """Enter the arrays of a file in a ledger, each as its shape or value.
 
     `table`: of the format; `arrays`: name -> array; `file`: for messages.
     """

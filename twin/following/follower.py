@@ -853,7 +853,6 @@ def _with_problems(
 def _alarm(
     mirror: Mirror, now: float, severity: Severity, kind: str, about: str, message: str
 ) -> Mirror:
-    """Add an alarm to a mirror, unless one of its kind and subject is active."""
     return mirror.alarmed(Alarm(now, severity, kind, about, message))
 
 

@@ -243,8 +243,8 @@ class Mirror:
         """
 
         def alike(waiting: Waiting) -> tuple[bool, bool]:
-            """Rank a waiting command for `max`: first by agreement of component and
-            command, then of the tick.
+            """Rank a waiting command for `max`: by agreement of component and command,
+            then of tick.
             """
             return waiting.heard.words[:2] == reply.words[
                 :2

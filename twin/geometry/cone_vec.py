@@ -971,7 +971,6 @@ def _numbers(
 
 
 def _formats() -> Any:
-    """Return the library's module for geometry files and other programs' objects."""
     return backend("geometry files")
 
 

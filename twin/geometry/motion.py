@@ -23,11 +23,11 @@ MOVABLE: Final = ("dO_x", "dO_y", "dO_z", "alpha", "dS_x", "dS_y", "dD_x", "dD_y
 
 
 def require_movable(names: Sequence[str]) -> Sequence[str]:
-    """Return the names unchanged if all are parameters that may differ from frame to frame
-    (`MOVABLE`).
+    """Return the names unchanged if all are parameters that may differ from frame to
+    frame (`MOVABLE`).
 
-    An empty sequence passes.
-    Raises UnknownNameError: names the first other one, and lists those allowed."""
+    An empty sequence passes. Raises UnknownNameError: lists those allowed.
+    """
     for name in names:
         if name not in MOVABLE:
             message = f"{name!r} cannot differ from frame to frame; allowed"
@@ -93,8 +93,9 @@ class Motion:
         )
 
         def shift(part: str) -> FloatArray:
-            """Return the deviation of a part in the world frame, (n, 3) [mm]; 0 along directions
-            without a parameter. `part`: "dS", "dO" or "dD"."""
+            """Return a part's deviation in the world, (n, 3) [mm]; 0 without a parameter.
+            `part`: "dS", "dO" or "dD".
+            """
             z = d.get(f"{part}_z", np.zeros(len(poses)))
             return from_unity(np.stack([d[f"{part}_x"], d[f"{part}_y"], z], axis=1))
 

@@ -130,8 +130,7 @@ class Panel:
 
     @classmethod
     def flat(cls, shape: tuple[int, int]) -> Panel:
-        """Make a panel without distortion, lag and tile borders, for images of `shape`
-        (rows, cols)."""
+        """Make a panel without distortion, lag and tiles, of `shape` (rows, cols)."""
         model = PanelModel(0.0, shape)
         return cls(model, (0.0,) * len(model.names))
 

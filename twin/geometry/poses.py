@@ -68,7 +68,6 @@ class Poses:
             object.__setattr__(self, f.name, value)
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.angle)
 
     def __getitem__(self, index: slice | npt.NDArray[np.intp]) -> Poses:

@@ -64,7 +64,7 @@ class PixelGrid:
 
     @property
     def size_mm(self) -> tuple[float, float]:
-        """Width and height of the active area [mm]: unbinned columns and rows times their pitch."""
+        """Width and height [mm]: unbinned columns and rows times their pitch."""
         across, up = self.edges_mm
         return self.columns * across, self.rows * up
 
@@ -86,7 +86,7 @@ class CameraSettings:
 
     @property
     def binning(self) -> int:
-        """Unbinned pixels per image pixel along each side."""
+        """Unbinned pixels per image pixel and side."""
         return binning_of(self.mode, dict(self.modes))
 
     @property

@@ -530,8 +530,8 @@ class Timing(_Frozen):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of commands that have a time here, assumed or measured, without the "_s",
-        in the order of the fields; those whose time is None are left out.
+        """Kinds of commands that have a time here, assumed or measured, without "_s", in
+        the fields' order.
         """
         return tuple(
             name[:-2]
@@ -898,7 +898,7 @@ class Machine(_Frozen):
         return tuple(motors)
 
     def has(self, axis: str) -> bool:
-        """Return whether there is a motor or virtual axis of that name."""
+        """Return whether a motor or virtual axis has that name."""
         return axis in self.axes or axis in self.virtual_axes
 
     def moves(self, axis: str) -> Mapping[str, float]:
@@ -926,10 +926,9 @@ class Machine(_Frozen):
         return 1.0 / (max(shares, default=0.0) or 1.0)
 
     def axis(self, name: str) -> Axis:
-        """Look up the motor called `name`.
+        """Look up a motor.
 
-        Raises:
-            UnknownNameError: lists the machine's axes.
+        Raises UnknownNameError: lists the machine's axes.
         """
         if name not in self.axes:
             raise unknown_axis(name, self)
@@ -1070,7 +1069,7 @@ def default_profile(machine: Machine, file: str) -> Profile:
 
 
 def builtin_machines() -> tuple[str, ...]:
-    """List the names of the shipped machines."""
+    """List shipped machines."""
     return _names("machines")
 
 

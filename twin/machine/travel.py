@@ -172,8 +172,9 @@ def _bounded(machine: Machine, targets: Mapping[str, float]) -> dict[str, float]
 
 
 def distance_beyond(machine: Machine, motor: str, target: float) -> float:
-    """Compute how far beyond the travel a target brings the motor's part [mm, deg];
-    negative within it."""
+    """Compute how far beyond travel a target brings the motor's part [mm, deg]; negative
+    within it.
+    """
     a = machine.axes[motor]
     return max(a.lower - target, target - a.upper) / machine.counts(motor)
 

@@ -311,7 +311,7 @@ class _State:
 
     @property
     def speed_of_part(self) -> float:
-        """Speed at which the motor moves a part [mm/s, deg/s]."""
+        """Speed of its part [mm/s, deg/s]."""
         return abs(self.velocity) / self.counts
 
     def slowing(self, rate: float, ahead: float) -> float:

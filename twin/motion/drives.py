@@ -81,8 +81,8 @@ class Drive:
         return {}
 
     def next_start(self, now: float) -> float:
-        """Return the start of the trajectory after the one in force at `now`, in the
-        twin's time [s]; inf if there is none.
+        """Return the start of the trajectory after that of `now`, in the twin's time [s];
+        inf without one.
         """
         index = self._index(now) + 1
         if index < len(self._starts):
@@ -91,7 +91,7 @@ class Drive:
 
     @property
     def end(self) -> float:
-        """Moment at which the motor comes to its last rest [s]."""
+        """Moment of the motor's last rest [s]."""
         return self.trajectories[-1].end + self.origin
 
     @property
@@ -121,17 +121,17 @@ Drives = Mapping[str, Drive]
 
 
 def clock_left(now: float) -> float:
-    """Return how long motion may still take at time `now` of the clock [s]."""
+    """Return how long motion may still take at time `now` [s]."""
     return max(now, motion.LATE_S) + motion.LATEST_MOTION_S - now
 
 
 def require_time(what: str, end: float, now: float) -> None:
-    """Check that a motion ends before the clock does: its steps would be too coarse for what was
-    swept.
+    """Check that a motion ends before the clock does: its steps would be too coarse for
+    what was swept.
 
-    `what`: the command, for the message. `end`: of the motion [s]; one without an end passes, as
-    a jog that is renewed. `now`: time of the command [s].
-    Raises LimitError: it ends more than `LATEST_MOTION_S` after `LATE_S` and now.
+    `what`: the command, for the message. `end`: of the motion [s]; one without an end
+    passes, as a renewed jog. `now`: time of the command [s]. Raises LimitError: it ends
+    more than `LATEST_MOTION_S` after `LATE_S` and now.
     """
     last = now + clock_left(now)
     if last < end < math.inf:

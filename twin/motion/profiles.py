@@ -63,7 +63,7 @@ class Trajectory:
 
     @property
     def start(self) -> float:
-        """Time at which the motion begins [s]."""
+        """When motion begins [s]."""
         return self.pieces[0].start
 
     @property
@@ -105,7 +105,7 @@ class Trajectory:
         return piece.velocity + piece.acceleration * (time - piece.start)
 
     def moving(self, time: float) -> bool:
-        """Return whether the motor is under way at `time`."""
+        """Return whether it moves at `time`."""
         return self.start <= time < self.end
 
     def positions(self, times: npt.ArrayLike) -> FloatArray:
@@ -143,10 +143,10 @@ class Trajectory:
         return velocity, a, until
 
     def acceleration(self, time: float) -> float:
-        """Return the largest absolute acceleration from `time` on, the one that braking
-        was planned with [mm/s2, deg/s2].
+        """Return the largest absolute acceleration from `time` on, which braking was
+        planned with [mm/s2, deg/s2].
 
-        Before the start it is that of the whole motion; after the end 0.
+        Before the start that of the whole motion; after the end 0.
         """
         if time >= self.end:
             return 0.0
@@ -174,9 +174,7 @@ class Trajectory:
     def redirected(
         self, target: float, speed: float, acceleration: float, time: float
     ) -> Trajectory:
-        """Plan the motion from the state at `time` to rest at `target`; see `move` for
-        arguments and errors.
-        """
+        """Plan the motion from the state at `time` to rest at `target`; see `move`."""
         return move(
             self.position(time), self.velocity(time), target, speed, acceleration, time
         )

@@ -174,11 +174,11 @@ def expected_signal(
 
 
 def open_noise(chain: Chain, view: npt.ArrayLike, exposure: ExposureSettings) -> float:
-    """Compute the noise of a pixel of the open beam at the panel's centre, relative to its
-    signal (standard deviation); infinite without a signal.
+    """Compute the noise of a pixel of the open beam at the panel's centre, relative to
+    its signal (standard deviation); infinite without a signal.
 
     `chain`: tube and panel; its materials are not used. `view`: cone_vec row (12,) [mm].
-    `exposure`: tube, time and averages; taken as if X-rays were on.
+    `exposure`: as if X-rays were on.
     """
     signal, variance = weights_of(chain, exposure.kV)
     charge = float(flux_of(view, (1, 1))[0, 0]) * mAs(replace(exposure, xrays_on=True))

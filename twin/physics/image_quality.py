@@ -108,7 +108,7 @@ def pixel_reading(
 
 
 def contrast_to_noise(background: PixelValue, detail: PixelValue) -> float:
-    """Compute the difference of two readings over the background's noise, of one pixel."""
+    """Compute a pixel's difference over the background's noise."""
     return abs(background.signal - detail.signal) / background.noise
 
 

@@ -56,7 +56,7 @@ class OpenBeam:
 
     @property
     def fill(self) -> float:
-        """Part of the panel's range; saturated from 1."""
+        """Part of the range; saturated from 1."""
         return self.counts / self.full_counts
 
     @property

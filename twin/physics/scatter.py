@@ -153,7 +153,7 @@ class ScatterImage:
     balance: FloatArray
 
     def full(self, values: FloatArray | None = None) -> Float32Array:
-        """Interpolate `mean`, or other values at the nodes, at every pixel by cubic splines."""
+        """Interpolate `mean`, or other nodes, at pixels by cubic splines."""
         return spread_out(self.mean if values is None else values, self.shape)
 
 
@@ -427,7 +427,7 @@ class ScanScatter:
         return replace(self, way=self.way[chosen])
 
     def signal(self, index: int) -> Float32Array:
-        """Interpolate `Scattered.signal` of a view alone."""
+        """Interpolate a view's signal alone."""
         return self._spread_out(index, "mean")
 
     def error(self, index: int) -> Float32Array:

@@ -53,8 +53,7 @@ _11 = np.uint64(11)
 
 @inline
 def mixed(z: Any) -> Any:
-    """Compute SplitMix64's finaliser: a bijection of 64 bits in which every bit depends
-    on every bit."""
+    """Compute SplitMix64's finaliser: a bijection of 64 bits that mixes all."""
     z = (z ^ (z >> _30)) * _MIX_1
     z = (z ^ (z >> _27)) * _MIX_2
     return z ^ (z >> _31)

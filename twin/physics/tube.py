@@ -133,7 +133,7 @@ class Spectrum:
 
     @property
     def energy_keV(self) -> FloatArray:
-        """(e,) centres of the bins [keV]."""
+        """(e,) bin centres [keV]."""
         return tables().energy_keV
 
     @property

@@ -151,7 +151,7 @@ def _project_alone(
 
 
 def tile_ns(box: Box, rows: int) -> float:
-    """Estimate the time of TILE_COLUMNS detector columns of single rays [ns]."""
+    """Estimate the time of TILE_COLUMNS columns, single rays [ns]."""
     return TILE_COLUMNS * rows * ray_ns((box.nx, box.ny, box.nz))
 
 
@@ -260,7 +260,7 @@ def box_shadows(
 
 
 def threads() -> int:
-    """Return the number of threads that the kernels use."""
+    """Return the number of the kernels' threads."""
     import numba
 
     return int(numba.get_num_threads())

@@ -47,8 +47,8 @@ class DeviceArray(NDArrayOperatorsMixin):
 
     @classmethod
     def of_images(cls, images: Any) -> DeviceArray:
-        """Make an array of images (n, rows, cols): a copy of those on the host, or the shared
-        memory of those on the device.
+        """Make an array of images (n, rows, cols): a copy of those on the host, the
+        shared memory of those on the device.
 
         Raises DeviceError: the device failed.
         """
@@ -146,7 +146,7 @@ class DeviceArray(NDArrayOperatorsMixin):
         return _combine(UFUNCS[ufunc], a, other, None if out is None else out[0])
 
     def over(self, other: DeviceArray, least: float) -> DeviceArray:
-        """Compute self / other, and 0 where other is at most `least`."""
+        """Compute self / other; 0 where other <= `least`."""
         return _combine("RATIO", self, other, least=least)
 
     def copy(self, order: str = "K") -> DeviceArray:

@@ -70,7 +70,7 @@ def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
 
 
 def exchanged(views: FloatArray) -> FloatArray:
-    """Return the same rays with rows and columns exchanged."""
+    """Exchange the rays' rows and columns."""
     return np.ascontiguousarray(views[:, EXCHANGED])
 
 
@@ -93,7 +93,7 @@ class FanPlan:
     alone: IntArray
 
     def fans(self, views: FloatArray, some: slice = slice(None)) -> Fans:
-        """Return the plan of `views` (n, 12), or `some` of its jobs, as the kernels' `Fans`."""
+        """Return the plan of `views` (n, 12), or `some` jobs, as `Fans`."""
         return Fans(views, self.lines, self.jobs[some], self.room, self.widest)
 
 

@@ -198,7 +198,7 @@ def free_bytes() -> int | None:
 
 
 def has_room(needed: int) -> bool:
-    """Return whether the device can take `needed` more bytes; True if that is unknown."""
+    """Return whether the device takes `needed` more bytes; True if unknown."""
     free = free_bytes()
     return free is None or needed + SPARE_BYTES <= free
 
@@ -225,7 +225,7 @@ def usable(voxel_bytes: int, images: Float32Array, threads: int, before: int = 0
 
 
 def on(device: int) -> Any:
-    """Return a context in which this device is the current one."""
+    """Return a context with this device as current."""
     from numba import cuda
 
     return cuda.gpus[device]

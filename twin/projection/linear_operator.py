@@ -214,7 +214,7 @@ class Operator:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of the matrix, for `scipy.sparse.linalg.aslinearoperator`."""
+        """Rows and columns, for `scipy.sparse.linalg.aslinearoperator`."""
         return math.prod(self.image_shape), math.prod(self.voxel_shape)
 
     def matvec(self, x: npt.NDArray[Any]) -> Float32Array:

@@ -692,8 +692,7 @@ def _are_finite(values: npt.NDArray[Any]) -> bool:
 
 
 def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
-    """Check that each pixel of cone_vec, a ConeVec or (n, 12) [mm], has its own ray, and return
-    a ConeVec.
+    """Return a ConeVec of a ConeVec or (n, 12) [mm]; each pixel must have its own ray.
 
     Raises GeometryError: a row does not; it is named.
     """

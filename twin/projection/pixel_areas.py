@@ -503,8 +503,9 @@ def rays_of(marks: Marks) -> IntArray:
 
 
 def ray_offsets(mark: int) -> tuple[FloatArray, FloatArray]:
-    """Compute the places of a pixel's rays, (columns, rows) from its centre, (rays,) each: no two
-    in one row or column, so that edges along them come out in as many steps."""
+    """Place a pixel's rays from its centre, (columns, rows) of (rays,): no two in a row
+    or column, so that edges along them get as many steps.
+    """
     a, b = (mark + 1) // 2, mark // 2 + 1
     j, i = np.divmod(np.arange(a * b), a)
     return (i + (j + 0.5) / b) / a - 0.5, (j + (a - i - 0.5) / a) / b - 0.5

@@ -238,7 +238,7 @@ class CoarseScan:
 
     @property
     def share(self) -> FloatArray:
-        """Share of the scan before each view, (n,), 0 to 1; views are in order of angle."""
+        """Share of the scan before each view, (n,), 0 to 1, by angle."""
         return np.asarray(self.numbers / max(float(self.numbers.max()), 1.0))
 
     @cached_property
@@ -277,12 +277,12 @@ class CoarseScan:
 
     @cached_property
     def noise(self) -> float:
-        """Variance of white noise in the images."""
+        """Variance of white noise."""
         return noise_of(self.images)
 
     @cached_property
     def level(self) -> ConeVec:
-        """The same views with upright panels."""
+        """Views with upright panels."""
         return upright(self.cone_vec)
 
     @cached_property
@@ -376,7 +376,7 @@ class CoarseScan:
 
     @property
     def whole(self) -> bool:
-        """False if a panel aside sees less than a turn: then it never sees some rays."""
+        """False if a panel aside sees less than a turn, and never some rays."""
         return bool(self.circle.rise or self.circle.full or not self.aside)
 
     @property

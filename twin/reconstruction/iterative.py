@@ -65,7 +65,7 @@ def finding_errors(algorithm: Algorithm) -> Algorithm:
 
 
 def far_apart(count: int) -> list[int]:
-    """Order 0 .. count-1 so that neighbours in time are far apart (golden-section steps)."""
+    """Order 0 .. count-1 so that neighbours in time are far apart (golden-section)."""
     return [int(i) for i in np.argsort((np.arange(count) * 0.6180339887498949) % 1.0)]
 
 

@@ -124,7 +124,7 @@ class StraightCopies:
         return float((straight * images).sum()) / max(power, 1e-30)
 
     def straight(self, images: Float32Array) -> Float32Array:
-        """Straighten line integrals of any shape, on the scale of the measured ones."""
+        """Straighten line integrals of any shape, on the measured scale."""
         return np.asarray(self._scale * self.curve(images), np.float32)
 
     def bent_share(self, nodes: UniformNodes) -> float:

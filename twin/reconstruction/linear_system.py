@@ -245,7 +245,7 @@ class LinearSystem:
         return weights, inverse(self.spread(weights * rows, views))
 
     def volume(self, x: Float32Array) -> Volume:
-        """Return the reconstructed voxels on their grid."""
+        """Return the voxels on their grid."""
         return replace(self.like, data=x)
 
     def tell(self, watch: Watch | None, i: int, of: int, rest: Float32Array) -> None:
@@ -459,7 +459,7 @@ def ones(like: Any) -> Any:
 
 
 def inverse(values: Float32Array) -> Float32Array:
-    """Compute one over sums of weights, zero where the sum is (nearly) zero."""
+    """Compute 1 / sums of weights, 0 where they are nearly 0."""
     found: Float32Array = ratio(ones(values), values)
     return found
 

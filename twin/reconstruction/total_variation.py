@@ -296,7 +296,7 @@ def _minimise(
 
 
 def momentum(t: float) -> tuple[float, float]:
-    """Compute the next t of accelerated steps, and the factor of extrapolation."""
+    """Compute the next t of accelerated steps, and the extrapolation."""
     new = (1 + math.sqrt(1 + 4 * t * t)) / 2
     return new, (t - 1) / new
 
@@ -452,10 +452,11 @@ class Regular:
         return x
 
     def primal_step(self, z: Any, dual: Any, theta: np.float32, x: Any) -> None:
-        """Fill x from the dual variables, by portions of layers; see `tv_kernels.primal_step`.
+        """Fill x from the dual variables, by portions of layers; see
+        `tv_kernels.primal_step`.
 
-        `z`: voxels (nz, ny, nx); `dual`: (3, nz, ny, nx); `theta`: weight of total variation;
-        `x`: (nz, ny, nx), changed in place.
+        `z`: voxels (nz, ny, nx); `dual`: (3, nz, ny, nx); `theta`: weight of total
+        variation; `x`: (nz, ny, nx), changed.
         """
         from flexdt.twin.reconstruction.kernels import tv_kernels
 

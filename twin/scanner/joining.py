@@ -377,13 +377,13 @@ class Lookahead:
     # -----------------------------------------------------------------------------------
 
     def stopped(self, most: Most = None) -> StopMotion:
-        """Compute how everything stops: along the path, or quicker where a sweep shows that
-        free.
+        """Compute how everything stops: along the path, or quicker where a sweep shows
+        that free.
 
         An error of the sweep gives the stop along the path. Nothing moves yet.
 
-        `most`: motor -> greatest acceleration; None: those that the motion was planned with.
-        Returns the stop, its path "apart" where it is the quicker one, else "along".
+        `most`: motor -> greatest acceleration; None: the planned ones. Returns the stop,
+        its path "apart" where it is the quicker one, else "along".
         """
         along = braked_along(self.drives, self.now, most)
         try:

@@ -130,7 +130,7 @@ class ScannerTwin:
         return {name: d.at(now).target for name, d in self._drives.items()}
 
     def final_positions(self) -> dict[str, float]:
-        """Return the position of every motor after its programme [mm, deg]."""
+        """Return motors' positions after their programme [mm, deg]."""
         return {name: d.final for name, d in self._drives.items()}
 
     def moving(self, now: float) -> bool:
@@ -138,7 +138,7 @@ class ScannerTwin:
         return any(d.at(now).moving(now) for d in self._drives.values())
 
     def rest_time(self, now: float) -> float:
-        """Return when the last motor comes to rest, at least `now` [s]."""
+        """Return when the last motor rests, at least `now` [s]."""
         return max(now, *(d.end for d in self._drives.values()))
 
     @property
@@ -519,7 +519,7 @@ class ScannerTwin:
         return here and self.holds(certificate)
 
     def holds(self, certificate: CertifiedProgramme) -> bool:
-        """Return whether stage and stops are those that a programme was prepared for."""
+        """Return whether stage and stops are a prepared programme's."""
         return certificate.prepared.version == (self._stage, self._stops)
 
     def follow(self, certificate: CertifiedProgramme, now: float) -> None:

@@ -66,9 +66,7 @@ class Command:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Fields of the command's own type, name -> value; those that all commands have
-        (`Command`) are left out.
-        """
+        """Fields of the command's own type, name -> value, without those of `Command`."""
         return {
             f.name: getattr(self, f.name) for f in fields(self)[len(fields(Command)) :]
         }

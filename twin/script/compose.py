@@ -127,7 +127,7 @@ def _distances_to_try(
     """
 
     def tried(asked: float | None, *usual: float) -> Iterable[float]:
-        """Return the requested value alone, or (None) the usual ones, each once."""
+        """Return the requested value, or (None) the usual ones, each once."""
         if asked is None:
             return dict.fromkeys(usual)
         return (asked,)
@@ -217,8 +217,7 @@ class _Writer(MotorTargets):
         yield from self.image("io000000.tif", w.flats)
 
     def fly(self) -> Iterator[str]:
-        """Yield the sample's move back into the beam, then one smooth turn of 360 degrees
-        with its run-up."""
+        """Yield the sample's move into the beam, then one smooth turn with its run-up."""
         yield from self.go(*self.aside)
         yield from self.turn(360.0, self.request.frames, 0)
 
@@ -436,8 +435,9 @@ class _Writer(MotorTargets):
         return speed
 
     def run_up_deg(self, total: float, frames: int) -> float:
-        """Compute the length of the run-up [deg] for `frames` images over `total`
-        degrees: acceleration and `MARGIN_IMAGES` images."""
+        """Compute the run-up [deg] of `frames` images over `total` degrees: acceleration
+        and `MARGIN_IMAGES`.
+        """
         speed = self.turn_speed(total, frames)
         return run_up(speed, self.rotation[1].acceleration, self.image_s)
 
@@ -534,8 +534,9 @@ class _Writer(MotorTargets):
         }
 
     def out_of_beam(self) -> dict[str, float]:
-        """Compute the target of the stage that takes the sample beside the beam, to the
-        freer side, for the flat image: motor -> [mm]."""
+        """Compute where the sample is beside the beam, to the freer side, for the flat
+        image: motor -> [mm].
+        """
         station = self.station(self.request.sod_mm)
         return beside_beam(self.machine, self.profile, self.camera, station)[0]
 

@@ -222,7 +222,7 @@ def log_line(
 
 
 def reply_bytes(text: str) -> bytes:
-    """Encode a text as Latin-1 (one byte a character), or if it does not fit, as UTF-8.
+    """Encode a text as Latin-1, or if it does not fit, as UTF-8.
 
     In UTF-8 lone surrogates become "?".
     """

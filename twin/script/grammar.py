@@ -131,8 +131,8 @@ def positive(text: str, what: str) -> float:
 def not_negative(text: str, what: str) -> float:
     """Read a number from zero up.
 
-    `text`: of the argument; `what`: name of the argument, for the message.
-    Raises ArgumentError: a negative number, or none."""
+    `what`: name of the argument. Raises ArgumentError: a negative number, or none.
+    """
     value = number(text, what)
     if value < 0:
         raise ArgumentError(f"{what} is {shorten(text)}; it must not be negative")
@@ -156,9 +156,7 @@ def whole(text: str, what: str, low: int, high: int, index: int = 0) -> int:
 
 
 def shorten(text: str, length: int = 60) -> str:
-    """Shorten a text for a message to at most `length` characters, the last three then
-    dots.
-    """
+    """Shorten a text to `length` characters, the last three dots."""
     if len(text) <= length:
         return text
     return text[: length - 3] + "..."
@@ -321,7 +319,7 @@ _BY_KEY = {
 
 
 def vocabulary(component: str) -> tuple[str, ...]:
-    """List the commands that `component` knows, as they are written."""
+    """List a component's commands, as written."""
     return tuple(FIXED.get(component.lower(), _MOTOR))
 
 

@@ -183,7 +183,7 @@ class LogComparison:
 
     @classmethod
     def of(cls, log: Log, machine: Machine) -> LogComparison:
-        """Predict each line of `log` on `machine`; warn of axes that it lacks (`unlike`)."""
+        """Predict each line of `log` on `machine`; warn of lacking axes (`unlike`)."""
         return cls(machine, tuple(against_log(log, machine)), unlike(log, machine))
 
     @property
@@ -327,8 +327,8 @@ def against_log(log: Log, machine: Machine) -> list[LogRow]:
     """Simulate the commands of an executed script, from the machine's home; return each
     line's time beside its prediction, in the log's order.
 
-    A row has real and predicted time [s] of the line itself; its 5 % to 95 % range is
-    None where no time of that kind is measured.
+    A row has real and predicted time [s] of the line; its 5 % to 95 % range is None where
+    none is measured.
     """
     rows = []
     for x, step in zip(log, _plan(log, machine).steps, strict=True):

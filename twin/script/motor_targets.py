@@ -123,9 +123,9 @@ class MotorTargets:
         return self.drivers[quantity]
 
     def need(self, what: str, quantity: str) -> None:
-        """Check that motors move a quantity. `what`: purpose, for the message; `quantity`: one
-        of `QUANTITIES`. Raises LimitError: names the quantity that no motor moves, and the
-        purpose."""
+        """Check that motors move a quantity. `what`: purpose; `quantity`: of
+        `QUANTITIES`. Raises LimitError: names the quantity that no motor moves.
+        """
         if not self.has(quantity):
             none = f"has no motor for {QUANTITIES[quantity]}, which {what} needs"
             raise self.lacking(none, asked=what, missing=quantity)

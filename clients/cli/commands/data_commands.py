@@ -239,7 +239,6 @@ def _check_together(
 
 
 def _option(name: str) -> str:
-    """Write an option of the library as the command line has it."""
     return f"--{name.replace('_', '-')}"
 
 
@@ -369,7 +368,7 @@ class Report:
 
     @property
     def of_geometry(self) -> bool:
-        """True for a report of a scan whose geometry came from a file."""
+        """Whether its geometry is from a file."""
         return bool(self.document.get("geometry"))
 
     @property

@@ -34,11 +34,11 @@ def light_plainly(scene: viser.SceneApi) -> None:
 
 
 def light_finely(scene: viser.SceneApi) -> None:
-    """Set a room that shines in metal and lights from all around, and a lamp that casts shadows.
+    """Set a room that shines in metal and lights all around, and a lamp with shadows.
 
-    The environment map is "studio"; sky and key lamp replace the plain ones, the plain fill
-    light stays.
-    `scene`: of one client; its lamps replace those of all clients."""
+    The environment map is "studio"; sky and key lamp replace the plain ones; the fill
+    light stays. `scene`: of one client; its lamps replace those of all clients.
+    """
     scene.configure_environment_map("studio", environment_intensity=0.1)
     scene.add_light_hemisphere(
         SKY, sky_color=SKY_COLOR, ground_color=GROUND, intensity=1.1

@@ -81,8 +81,8 @@ class StageVolume:
     made: MadeOf
 
     def manner(self, state: State | None, asked: bool) -> Manner | None:
-        """Choose how it is drawn: on the stage where it fits, as a ghost where it was asked
-        for, else not at all.
+        """Choose how it is drawn: on the stage where it fits, as a ghost where asked for,
+        else not at all.
         """
         if state is not None and fits(self.made, state):
             return "stands"

@@ -102,11 +102,11 @@ class Fitted:
     around: FloatArray
 
     def at(self, aspect: float) -> Standpoint:
-        """Choose the camera for a pane: of those that hold all points, the one nearest to the
+        """Choose a pane's camera: of those that hold all points, the one nearest to the
         middle.
 
-        The aspect is limited to `MIN_ASPECT` to `MAX_ASPECT`.
-        `aspect`: the pane's width over its height.
+        The aspect is limited to `MIN_ASPECT` to `MAX_ASPECT`. `aspect`: the pane's width
+        over its height.
         """
         cameras = [
             fitted(self.points, way, self.fov, self.around, aspect) for way in self.ways
@@ -144,7 +144,7 @@ LEAST_REACH: Final = 0.75
 
 
 def bounded(aspect: float) -> float:
-    """Cut an aspect to the range for which cameras are made."""
+    """Cut an aspect to the range of the cameras."""
     return min(MAX_ASPECT, max(MIN_ASPECT, aspect))
 
 

@@ -82,12 +82,12 @@ class World:
 
     @property
     def foot(self) -> FloatArray:
-        """The piercing point: foot of the perpendicular from the focal spot (3,) [mm]."""
+        """Foot of the perpendicular from the focal spot (3,) [mm]."""
         return np.asarray(self.source + self.normal * self.distance)
 
     @property
     def piercing_px(self) -> FloatArray:
-        """The piercing point in pixels (column, row), (2,)."""
+        """The piercing point (column, row), (2,) [px]."""
         return self.view.piercing_points().reshape(2)
 
     def pixel(self, column: float, row: float) -> FloatArray:

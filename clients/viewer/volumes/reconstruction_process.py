@@ -28,7 +28,7 @@ Wish = tuple[str, ...]
 
 
 def wish(folder: Path, side: int, past: bool) -> Wish:
-    """Make the request for a data set's volume of so many voxels; past scans' are complete."""
+    """Request a volume of so many voxels; past scans' are complete."""
     return str(folder.absolute()), str(side), *(["past"] if past else [])
 
 
@@ -53,8 +53,7 @@ class LiveReconstruction:
         self._wanted: deque[asyncio.Future[Answer]] = deque()
 
     def warm(self) -> None:
-        """Start a spare process that loads its libraries ahead of the first request; do
-        nothing if one is spare or running."""
+        """Start a spare process, which loads its libraries ahead; nothing if one is there."""
         if self._spare is None and self._task is None:
             self._spare = asyncio.create_task(_started())
 
@@ -106,7 +105,6 @@ class LiveReconstruction:
             await process.wait()
 
     def _hang_up(self) -> None:
-        """Cancel all requests that wait for an answer, and forget the process's input."""
         self._writer = None
         while self._wanted:
             self._wanted.popleft().cancel()

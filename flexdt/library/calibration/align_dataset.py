@@ -70,8 +70,9 @@ class Aligned(Generic[Images_co]):
 
     @property
     def parameters(self) -> Mapping[str, Mapping[str, object]]:
-        """Name -> {value, sigma, unit}: axis_column_px [px] and, if the images determine
-        them, det_roll and det_yaw [deg] and source_row_px [px]."""
+        """Name -> {value, sigma, unit}: axis_column_px [px] and, if determined, det_roll,
+        det_yaw [deg], source_row_px [px].
+        """
         estimates: Mapping[str, Mapping[str, object]] = self.document["parameters"]  # type: ignore[assignment]
         return estimates
 

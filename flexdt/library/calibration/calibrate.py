@@ -119,7 +119,7 @@ class Outcome(Generic[Images_co]):
 
     @property
     def verdict(self) -> str:
-        """How the calibration may be used, in a sentence or two."""
+        """How it may be used, in words."""
         return str(self.document["verdict"])
 
     @property
@@ -440,7 +440,7 @@ def saturation_named(saturated: Sequence[Finding]) -> Iterator[None]:
 
 
 def explained_by(saturated: Sequence[Finding], findings: Findings) -> Findings:
-    """List findings on saturated images first, without those that saturation falsifies."""
+    """List findings on saturation first, without those that it falsifies."""
     return Findings(saturated).and_also(findings.unexplained_by(saturated))
 
 
@@ -783,7 +783,6 @@ def _column(seen: Sequence[Mapping[str, Estimate]]) -> Estimate:
 
 
 def _is_sharp(fit: FitResult) -> bool:
-    """Return whether the axis column is known well enough for a sharp volume."""
     return _column(image_quantities(fit)).sigma <= SHARP_PX
 
 

@@ -149,9 +149,9 @@ class Scale:
 def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Markers:
     """Read the markers of a CSV or NumPy file, or collect given marks.
 
-    `source`: the file's path (.npy is a NumPy file, anything else a CSV file), or the marks;
-    `views`: how many frames there are.
-    Raises TwinError: the file cannot be read or is invalid; names the line.
+    `source`: the file's path (.npy: NumPy, else CSV), or the marks; `views`: how many
+    frames there are. Raises TwinError: the file cannot be read or is invalid; names the
+    line.
     """
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)

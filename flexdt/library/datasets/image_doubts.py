@@ -35,7 +35,7 @@ DARK: Final = (
 
 
 def saturated_part(what: str, share: float) -> str:
-    """Make the sentence on the saturated part of some images, with its remedy.
+    """Say which part of some images is saturated, with the remedy.
 
     `what`: which images; `share`: of their pixels, 0 to 1.
     """

@@ -467,8 +467,7 @@ class ImageSet:
 
     @property
     def panel(self) -> Panel | None:
-        """The panel's distortion and lag that the correction in force undoes in line
-        integrals."""
+        """Distortion and lag that the correction in force undoes."""
         if self.correction is None:
             return None
         return self.correction.panel

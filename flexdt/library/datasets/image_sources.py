@@ -47,7 +47,7 @@ class Reference:
 
     @classmethod
     def of_files(cls, paths: Sequence[Path]) -> Reference:
-        """Make a reference of image files, each of one image or more."""
+        """Make a reference of files of one image or more."""
         return _together([_of_file(path) for path in paths])
 
     def __bool__(self) -> bool:

@@ -29,7 +29,7 @@ def facts_table(caption: str, facts: Mapping[str, object]) -> str:
 
 
 def emphasised(text: str) -> str:
-    """Write a sentence as a paragraph in bold; it is escaped."""
+    """Write a bold paragraph, escaped."""
     return f"<p><b>{escape(text)}</b></p>"
 
 

@@ -328,7 +328,6 @@ def _small(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _grey(image: npt.NDArray[Any], low: float, high: float) -> npt.NDArray[np.uint8]:
-    """Return a small picture with `low` black and `high` white; NaN is black."""
     return grey_of(_small(image).astype(np.float64), low, high)
 
 

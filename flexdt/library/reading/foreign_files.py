@@ -140,9 +140,10 @@ def format_of(path: Path) -> ScanFormat | None:
 
 
 def refuse_distances(path: Path, name: str, distances: tuple[float, float]) -> NoReturn:
-    """Refuse distances with a scan that states its own. `path`: of the scan; `name`: of its
-    format; `distances`: source to axis and to panel [mm]. Raises DatasetFormatError: names the
-    formats that are allowed."""
+    """Refuse distances with a scan that states its own. `path`: of the scan; `name`: of
+    its format; `distances`: source to axis and to panel [mm]. Raises DatasetFormatError:
+    names those allowed.
+    """
     named = ", ".join(one.name for one in SCAN_FORMATS if one.distant)
     said = f"{path}: distances with a scan of {name}"
     raise DatasetFormatError.instead(said, list(distances), f"with {named}")

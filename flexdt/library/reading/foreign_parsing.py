@@ -114,7 +114,6 @@ def xml_values(path: Path, group: str) -> Iterator[tuple[str, str]]:
 
 
 def _plain(tag: str) -> str:
-    """Return a name without its namespace."""
     return tag.rpartition("}")[2]
 
 

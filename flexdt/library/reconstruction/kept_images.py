@@ -220,8 +220,7 @@ class KeptImages:
     ) -> Float32Array:
         """Return rows of a prepared image, preparing and keeping it the first time.
 
-        `number`: of the image; `prepare`: gives the prepared image by its number, the first
-        time; `rows`: of it.
+        `number`: of the image; `prepare`: gives it by its number; `rows`: of it.
         """
         if number in self._prepared:
             return self._store.get(number, rows)

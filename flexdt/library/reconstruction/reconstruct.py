@@ -163,7 +163,7 @@ class VolumeRequest:
 
     @property
     def ramp_window(self) -> str:
-        """The window of FDK's ramp filter, `PLAIN` where none is asked for."""
+        """Window of FDK's ramp filter; `PLAIN` by default."""
         return PLAIN if self.window is None else self.window
 
 
@@ -348,12 +348,12 @@ class ReconstructionTask:
 
     @property
     def direct(self) -> bool:
-        """Whether the algorithm goes through the images once, as FDK does."""
+        """Whether it uses each image once, as FDK does."""
         return ALGORITHMS[self.request.algorithm].direct
 
     @cached_property
     def standing(self) -> StandingImages:
-        """The images as upright panels record them, for FDK, without truncation."""
+        """Images as upright panels record them, for FDK, without truncation."""
         return StandingImages.of(self.views.cone_vec, self.views.shape, None)
 
     @cached_property

@@ -258,12 +258,12 @@ class Work:
         return cls(count, READ_PIXEL_WORK * count * rows * cols, work, tell)
 
     def read(self) -> None:
-        """Count one more image as read."""
+        """Count an image as read."""
         self._read += 1
         self._say()
 
     def slab(self, number: int, part: float) -> None:
-        """Set the part of a slab that is done, from 0 to 1."""
+        """Set a slab's share done, 0 to 1."""
         self._done[number] = part
         self._say()
 

@@ -79,7 +79,7 @@ def volume_writer(
 
 
 def endings() -> list[str]:
-    """List the endings of all formats, in the order in which they are listed."""
+    """List the endings of all formats, in their order."""
     return [ending for form in VOLUME_FORMATS for ending in form.endings]
 
 
@@ -230,8 +230,9 @@ class MiddleSlices:
 
     @property
     def images(self) -> dict[str, npt.NDArray[np.float32]]:
-        """Middle slices by name, first row at the top: xy (seen from above, +y up), xz
-        and yz (+z up); layers not taken yet are zero."""
+        """Middle slices by name, top row first: xy (from above, +y up), xz, yz (+z up);
+        layers not taken are zero.
+        """
         return {
             "xy": self._across_z[::-1],
             "xz": self._across_y[::-1],

@@ -122,7 +122,7 @@ class VoxelPlaces:
 
     @property
     def cubes(self) -> bool:
-        """Whether the three edges of a voxel are equal."""
+        """Whether voxels are cubes."""
         return len(set(self.edges_mm)) == 1
 
     @property

@@ -140,8 +140,9 @@ async def delete(
             )
 
         def files(changes: Changes) -> None:
-            """Add the new history and the removal of the correction's file to the set of
-            changes on the disk."""
+            """Add the new history and the removal of the correction's file to the changes
+            on the disk.
+            """
             twin.corrections.store_history(changes, history)
             twin.corrections.remove(changes, params.name)
 

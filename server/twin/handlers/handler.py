@@ -90,7 +90,7 @@ def answers(*methods: Method[_P, _R]) -> Callable[[_Handler[_P, _R]], _Handler[_
 
 
 def ensure_allowed(twin: TwinServer, client: Client, what: str) -> Callable[[], None]:
-    """Return a check that control has not changed hands since the request."""
+    """Return a check that control is as at the request."""
     return lambda: twin.control.ensure_allowed(client.name, what)
 
 
@@ -105,8 +105,7 @@ def ensure_idle(
     Returns the check; it raises RpcError -32003."""
 
     def check() -> None:
-        """Raise RpcError -32003 if another client has control, or else if a job would be
-        disturbed."""
+        """Raise RpcError -32003 if another has control, or a job would be disturbed."""
         twin.control.ensure_allowed(client.name, method)
         twin.jobs.require_idle(what)
 
@@ -126,7 +125,7 @@ async def in_turns(items: Sequence[Item], view: Callable[[Item], View]) -> list[
 
 
 def page(items: Sequence[Item], start: int, count: int | None) -> Sequence[Item]:
-    """Return the part of a list that a request wants; None: all from `start` on."""
+    """Return the part of a list that is wanted; None: all from `start` on."""
     return items[start:] if count is None else items[start : start + count]
 
 
@@ -161,8 +160,8 @@ async def change_settings(
         return with_scanner_state(memory, trial)
 
     def take() -> None:
-        """Change the scanner itself and notify watchers; `ready` raises first if the
-        client has lost control.
+        """Change the scanner and notify watchers; `ready` raises first if the client has
+        lost control.
         """
         ready()
         change(twin.scanner)

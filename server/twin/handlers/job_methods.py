@@ -98,8 +98,7 @@ async def step(twin: TwinServer, client: h.Client, params: p.JobRef) -> w.JobSta
     """Run one frame or command of a paused job, wait for its end at most `PATIENCE_S`,
     and return the job's status.
 
-    Raises:
-        CollisionError: an obstacle stopped it; the job stays paused.
+    Raises CollisionError: an obstacle stopped it; the job stays paused.
     """
     job = twin.jobs.get(params.job)
     twin.jobs.step(job)

@@ -231,7 +231,7 @@ async def delete(
         _ensure_unused(twin, name)
 
         def take() -> None:
-            """Forget the upload; raise first if the client has lost control or it is in use."""
+            """Forget the upload; raise if control is lost or it is in use."""
             ready()
             _ensure_unused(twin, name)
             twin.samples.forget(name)

@@ -104,7 +104,7 @@ def ping(twin: TwinServer, client: Client, params: Empty) -> p.Pong:
 
 @answers(p.STATE_GET)
 def get_state(twin: TwinServer, client: Client, params: Empty) -> w.State:
-    """Return the complete state."""
+    """Return the state."""
     return twin.state()
 
 
@@ -131,7 +131,7 @@ def subscribe(twin: TwinServer, client: Client, params: p.Subscribe) -> Nothing:
 
 @answers(p.STATE_UNSUBSCRIBE)
 def unsubscribe(twin: TwinServer, client: Client, params: p.Unsubscribe) -> Nothing:
-    """End the client's subscriptions to these topics; others are ignored."""
+    """End subscriptions to these topics; others are ignored."""
     twin.hub.unsubscribe(client.peer, params.topics)
     return Nothing()
 

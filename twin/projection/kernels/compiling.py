@@ -252,7 +252,7 @@ class KeptCode(FunctionCache):  # type: ignore[misc]
 
     @property
     def cache_path(self) -> str:
-        """Name of the place, for numba's statistics."""
+        """Name for numba's statistics."""
         return repr(kernel_store.store())
 
     @cached_property

@@ -69,8 +69,8 @@ def mix(out, right, left, right_before, left_before):
 
 @inline
 def part_of(rays, first, last):
-    """Select the arrays that the correction at a vertex changes (acc, weight, tilt,
-    level, picked), as views, of rays first to last - 1 of a sorted fan.
+    """Select arrays that the correction at a vertex changes (acc, weight, tilt, level,
+    picked), as views, of rays first to last - 1 of a sorted fan.
     """
     some = slice(first, last)
     return (
@@ -110,13 +110,13 @@ def correct_back(part, jump, offset, reach):
 
 @inline
 def column_at(grid, j, i):
-    """Compute the position in memory of voxel column (l = i, t = j)."""
+    """Compute the place in memory of (l = i, t = j)."""
     return grid.base + j * grid.hop_t + i * grid.hop_l
 
 
 @inline
 def mark_of(grid, j, i):
-    """Compute the index of voxel column (l = i, t = j) in the spans or marks."""
+    """Compute the index of (l = i, t = j) in spans or marks."""
     return 2 * (grid.span_base + j * grid.span_t + i * grid.span_l)
 
 

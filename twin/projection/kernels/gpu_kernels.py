@@ -758,7 +758,7 @@ project_rays, spread_rays = ray_kernel(False), ray_kernel(True)
 
 @cuda.jit
 def clear(values):
-    """Set values to 0 on the device, which saves sending zeros from the host."""
+    """Set values to 0 on the device, without sending zeros."""
     i = cuda.grid(1)
     if i < values.size:
         values[i] = 0
@@ -766,9 +766,7 @@ def clear(values):
 
 @cuda.jit
 def unscale(sums, factor, flat):
-    """Compute flat += sums / factor from sums of integers, whose bytes are equal at every
-    run.
-    """
+    """Compute flat += sums / factor, from sums of integers, the same in every run."""
     i = cuda.grid(1)
     if i < flat.size:
         flat[i] += np.float32(sums[i] / factor)

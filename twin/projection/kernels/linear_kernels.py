@@ -83,8 +83,8 @@ def prepare_column(box, g, c, rows, along, across, factor):
 
 @parallel
 def prepare(box, g, main, along, across, factor):
-    """Fill `main` (cols,), `along` and `across` (cols, rows + 1) and `factor` (cols, rows) for
-    all columns of a view, see `prepare_column`.
+    """Fill `main` (cols,), `along` and `across` (cols, rows + 1) and `factor` (cols,
+    rows) for a view, see `prepare_column`.
     """
     cols, rows = factor.shape
     for c in prange(cols):

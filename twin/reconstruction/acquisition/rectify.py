@@ -43,7 +43,7 @@ def leans(cone_vec: ConeVec) -> bool:
 
 
 def is_upright(cone_vec: ConeVec) -> bool:
-    """Return whether all rows are horizontal and all columns point down."""
+    """Return whether rows are level, columns point down."""
     return columns_fall(cone_vec) and not leans(cone_vec)
 
 

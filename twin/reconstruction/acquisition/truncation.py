@@ -619,7 +619,6 @@ def _fit(
 
 
 def _edge(cols: int) -> int:
-    """Compute the number of columns whose mean is the value at an edge."""
     return max(1, cols // SAMPLES)
 
 

@@ -242,7 +242,7 @@ class CauseTable:
 
     @cached_property
     def bar(self) -> float:
-        """Size of an estimate from which on it is told [standard errors]."""
+        """Size from which an estimate is told [standard errors]."""
         return quantile(FALSE_ALARMS / max(len(self.columns), 1))
 
     def fit(

@@ -617,7 +617,6 @@ def _deviates(distances: Float32Array | FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _bad_columns(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Find columns that are bad over more than half of their rows, (cols,)."""
     return np.asarray(mask.mean(axis=0) > 0.5)
 
 

@@ -156,7 +156,7 @@ class Reprojection:
 
     @cached_property
     def noise_again(self) -> float:
-        """Variance that differences between neighbours in the projections show as noise."""
+        """Variance that neighbours in the projections show as noise."""
         return noise_of(self.again) if self.own_noise is None else self.own_noise
 
 

@@ -206,12 +206,13 @@ class OnDevice:
         gpu.demand(prepare)
 
     def add(self, views: Views) -> None:
-        """Weigh and filter views, and add them to the volume on the device; does not wait for
-        the last of its work.
+        """Weigh and filter views, and add them to the volume on the device; does not wait
+        for the last of its work.
 
-        Views are sorted by the noise meter's sign (plus, 0, minus), if there is a meter, and
-        then added to its half volumes as well. `views`: the next ones. Raises gpu.DeviceError:
-        the device fails."""
+        Views are sorted by the noise meter's sign (plus, 0, minus), if there is a meter,
+        and then added to its half volumes as well. Raises gpu.DeviceError: the device
+        fails.
+        """
         signs = np.zeros(len(views.images), np.float32)
         if self.meter is not None:
             signs = self.meter.note(views)

@@ -144,7 +144,7 @@ class FdkPlan:
 
     @property
     def count(self) -> int:
-        """Number of views of the scan."""
+        """Number of views."""
         return len(self.level)
 
     def views_of(self, part: Float32Array, done: int) -> Views:

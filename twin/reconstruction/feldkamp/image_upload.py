@@ -99,7 +99,7 @@ class ImageUpload:
         self._handed.wait(self._reader)
 
     def end(self) -> None:
-        """Record that the chunk's last kernel is launched, so its memory may be refilled."""
+        """Record the launch of the chunk's last kernel: its memory may be refilled."""
         self._read[self._chunk] = _recorded(self._read[self._chunk], self._reader)
 
     def _room(self, name: str, shape: tuple[int, ...], some: slice = slice(None)) -> Any:

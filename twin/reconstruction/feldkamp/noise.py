@@ -326,9 +326,10 @@ class NoiseMeter:
         return np.where(inside, column, 0.0), np.where(inside, factors / depth**2, 0.0)
 
     def found(self) -> NoiseOfViews | None:
-        """Return the noise after all views, which is computed when it is asked for.
+        """Return the noise after all views, computed on request.
 
-        Returns None if at most `MIN_ROW_DISTANCE` + 1 rows see the grid, or no voxel is seen.
+        Returns None if at most `MIN_ROW_DISTANCE` + 1 rows see the grid, or no voxel is
+        seen.
         """
         assert self._means is not None
         if self._means.shape[1] <= MIN_ROW_DISTANCE + 1 or np.isnan(self.data).all():

@@ -197,8 +197,7 @@ def mix_one_by_one(out, left, right, first, count, one, other):
 
 @kernel
 def mix_wide(out, left, right, first, count, one, other):
-    """Apply `mix_one_by_one` to LANES at a time; all need up to LANES - 1 values after
-    their end."""
+    """Apply `mix_one_by_one` to LANES at a time; all need LANES - 1 values after their end."""
     for r in range(0, count, LANES):
         mix_lanes(out, r, left, right, first + r, one, other)
 
@@ -207,8 +206,7 @@ def mix_wide(out, left, right, first, count, one, other):
 def add_line(acc, line, first, count, start, step):
     """Add line at (start + k step), linear, to acc[first + k], 0 <= k < count, in place.
 
-    All places must be inside the line, which needs one sample after the last place;
-    nothing is checked.
+    Unchecked: all places are inside the line, with one sample after the last.
     """
     for k in range(count):
         at = start + k * step
@@ -822,9 +820,10 @@ PARTS = 1024
 
 
 def lanczos() -> Float32Array:
-    """Compute weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1 between samples
-    0 and 1: Lanczos' kernel of three lobes. Returns float32 (PARTS + 1, TAPS), each row's sum
-    1."""
+    """Compute weights of six samples at -2 to 3 for points at 0, 1 / PARTS ... 1 between
+    samples 0 and 1: Lanczos' three lobes. Returns float32 (PARTS + 1, TAPS), each row's
+    sum 1.
+    """
     x = np.arange(PARTS + 1)[:, None] / PARTS - np.arange(-2, 4)
     weights = np.sinc(x) * np.sinc(x / 3.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)

@@ -69,7 +69,7 @@ class View:
 
     @property
     def cut_columns(self) -> FloatArray:
-        """Columns of the projection beyond the left and the right edge, (n, 2)."""
+        """Columns beyond the left and the right edge, (n, 2)."""
         return _beyond(self.left, self.right, self.camera.shape[1])
 
     @property

@@ -93,12 +93,12 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
 
     @property
     def ok(self) -> bool:
-        """Whether the script may run."""
+        """Whether it may run."""
         return not self.errors
 
     @property
     def assumed_s(self) -> float:
-        """Part of the duration that comes from the machine's timing."""
+        """Duration from the machine's timing."""
         return sum(s.assumed_s for s in self.steps)
 
     @property

@@ -195,7 +195,7 @@ class PlannedTube:
         return self.on and time >= self.lit_from
 
     def set(self, time: float, name: str, value: float) -> None:
-        """Change `kV` or `power_W` at `time` [s], and note that the script has set it."""
+        """Set `kV` or `power_W` at `time` [s], as a setting of the script."""
         self._close(time)
         setattr(self, name, value)
         self.said.add(name)

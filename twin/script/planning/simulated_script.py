@@ -107,7 +107,7 @@ class Simulation:
 
     @property
     def end(self) -> float:
-        """Moment at which commands, motion and camera are all done [s]."""
+        """When commands, motion and camera are all done [s]."""
         return max(self.now, self.motors.end, self.camera.free_at)
 
     def run(self, commands: tuple[c.Command, ...]) -> None:

@@ -19,7 +19,7 @@ def bare(solid: ConvexSolid) -> trimesh.Trimesh:
     """Build the mesh of an upright cylinder or polytope, without margin [mm].
 
     An upright cylinder becomes a mesh of 48 sides, a polytope the convex hull of its
-    vertices; any other solid fails an assertion.
+    vertices; another solid fails an assertion.
     """
     if isinstance(solid, UprightCylinder):
         size = 2.0 * solid.radius, solid.height
@@ -29,9 +29,10 @@ def bare(solid: ConvexSolid) -> trimesh.Trimesh:
 
 
 def grown(body: trimesh.Trimesh, margin_mm: float) -> trimesh.Trimesh:
-    """Build the convex body of all points within `margin_mm` of a convex body [mm]. It is the
-    hull of the body's vertices, each with the corners of an icosphere of that radius, so
-    slightly within the exact one."""
+    """Build the convex body of all points within `margin_mm` of a convex body [mm]: the
+    hull of the body's vertices, each with the corners of an icosphere of that radius,
+    slightly within the exact one.
+    """
     ball = trimesh.creation.icosphere(subdivisions=FINENESS, radius=margin_mm).vertices
     corners = np.asarray(body.vertices)[:, None, :] + np.asarray(ball)[None, :, :]
     return _hull(corners.reshape(-1, 3))

@@ -452,7 +452,6 @@ def _not_compared(error: DatasetFormatError) -> Finding:
 
 
 def _member(group: Any, name: str) -> Any:
-    """Return a member of a group; None if there is no such member or no group."""
     if hasattr(group, "get"):
         return group.get(name)
     return None

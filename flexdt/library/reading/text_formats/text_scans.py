@@ -125,8 +125,8 @@ def compared(
 ) -> None:
     """Set the figures of a file aside for a given geometry, and tell where they differ.
 
-    `said`: what the file states; `given`: geometry in its place; `pitch`: of the columns by the
-    file [mm]; `angles_deg`: of the views by the file.
+    `said`: by the file; `given`: geometry in its place; `pitch`: of columns in the file
+    [mm]; `angles_deg`: of views in the file.
     """
     said.give((GEOMETRY, ANGLES), "geometry=")
     for found in (
