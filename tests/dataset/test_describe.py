@@ -63,6 +63,17 @@ def test_projections_that_are_not_there_are_not_counted(
     assert f": {count} projections of 9 x 6 pixels" in capsys.readouterr().out
 
 
+def test_sample_and_beam_are_told_where_the_files_say_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scan = fx.ConeVec.circular(sod=50.0, sdd=100.0, angles=4, shape=(6, 9), pixel=2.0)
+    fx.simulate("gear", scan, tube=fx.Tube(kV=70), noise=1).save(tmp_path / "s")
+    assert run(["describe", str(tmp_path / "s")]) == 0
+    _, *told = capsys.readouterr().out.splitlines()
+    assert told[0] == "sample: gear"
+    assert told[1].startswith("beam: 70 kV")
+
+
 def test_a_notebook_shows_the_table(scan: Path) -> None:
     html = fx.open(scan)._repr_html_()
     assert "<td>unknown_thing</td><td>7</td><td>ignored</td>" in html

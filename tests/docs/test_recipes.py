@@ -155,7 +155,7 @@ def test_a_copy_is_imported_from_its_own_folders(copy: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
+@pytest.mark.campaign(0)
 def test_a_machine_is_added_by_its_recipe(copy: Path) -> None:
     rows = recipes()["A machine"]
     machines, profiles = copy / "twin/data/machines", copy / "twin/data/profiles"
@@ -207,7 +207,7 @@ def test_a_phantom_is_added_by_its_recipe(copy: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(1)
+@pytest.mark.campaign(0)
 def test_a_format_of_geometry_is_added_by_its_recipe(copy: Path) -> None:
     rows = recipes()["A format of geometry"]
     (copy / "twin" / "exchange" / "added.py").write_text(

@@ -42,6 +42,7 @@ ROOMS: tuple[type[FindingCode], ...] = (
     CommissionCode,
     CalibrationCode,
 )
+ROOM_NAMED = {room.__name__: room for room in ROOMS}
 CODES = [code for room in ROOMS for code in room]
 RANK = [Severity.NOTE, Severity.WARNING, Severity.ERROR]
 MADE_BY = {"error": ERROR, "warn": Severity.WARNING, "warning": Severity.WARNING}
@@ -70,12 +71,11 @@ def sources() -> tuple[ast.Module, ...]:
 
 def member(node: ast.Attribute) -> FindingCode | None:
     """Return the code that an expression such as `ScriptCode.LIMIT` names; None for others."""
-    rooms = {room.__name__: room for room in ROOMS}
     match node:
         case ast.Attribute(
             value=ast.Name(id=room) | ast.Attribute(attr=room), attr=name
-        ) if room in rooms:
-            return rooms[room][name]
+        ) if room in ROOM_NAMED:
+            return ROOM_NAMED[room][name]
     return None
 
 

@@ -555,8 +555,9 @@ def describe(dataset: Path = argument(..., "DATASET")) -> Answer:
 
     Yields:
         The document of --json (name, projections, shape, complete, warnings, provenance;
-        of a geometry's file views in place of projections and complete), then a line and
-        the table. Warnings go to standard error.
+        of a geometry's file views in place of projections and complete), then a line, what
+        is known of sample, beam, scanner and correction, and the table. Warnings go to
+        standard error.
     """
     from flexdt.library.datasets.exchange import is_geometry_file, stated_in
     from flexdt.library.datasets.scan_files import is_scan_file
@@ -590,6 +591,7 @@ def describe(dataset: Path = argument(..., "DATASET")) -> Answer:
     taken = len(data.present)
     count = f"{taken}" if taken == len(data) else f"{taken} of {len(data)}"
     yield f"{data.name}: {count} projections of {columns} x {rows} pixels"
+    yield from (f"{name}: {said}" for name, said in data.known_facts.items())
     yield from data.provenance.lines
 
 

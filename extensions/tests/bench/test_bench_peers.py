@@ -52,6 +52,7 @@ def agree(runner, volume, view, worst: float, mean: float) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.campaign
 @needs("itk-rtk")
 def test_rtk_joseph_in_its_own_process() -> None:
     volume, view = smooth(), circle(3, SHAPE, pitch=1.2, tilt_deg=TILT_DEG)

@@ -110,7 +110,7 @@ def one_scenario_each(*words: Any, **options: Any) -> list[WorkUnit]:
 
 
 @pytest.mark.slow
-@pytest.mark.campaign(4)
+@pytest.mark.campaign
 @pytest.mark.parametrize("scenarios", ["one", "all"])
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_in_images_runs_to_its_end(

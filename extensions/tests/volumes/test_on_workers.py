@@ -288,7 +288,7 @@ def test_dask_workers_write_the_same_bytes_however_many(
     wanted = Request(shape=(200, 70, 61), voxel_mm=0.5)
     here = tmp_path / "here.zarr"
     reconstruct_dataset(load_dataset(scan), here, wanted, workers=nullcontext(Here()))
-    for count in (1, 3):
+    for count in (3,):
         with distributed.LocalCluster(
             n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0",
             local_directory=str(tmp_path),

@@ -264,7 +264,7 @@ class ImageSet:
         known, complete or not, and how many warnings (none: left out).
         """
         rows, cols = self.shape
-        known = self._known_facts()
+        known = self.known_facts
         of = known.get("sample", self.name)
         sample = "" if of == self.name else f" of {of!r}"
         beam = f", {known['beam'].partition(',')[0]}" if "beam" in known else ""
@@ -288,7 +288,7 @@ class ImageSet:
         rows, cols = self.shape
         facts = {
             "projections": f"{len(self)} of {rows} x {cols} pixels",
-            **self._known_facts(),
+            **self.known_facts,
             "complete": "yes" if self.complete else "no",
             "dark, flat images": ", ".join(map(str, self._reference_counts())),
             **{f"warning {i}": text for i, text in enumerate(self.warnings, 1)},
@@ -301,8 +301,9 @@ class ImageSet:
         values = values_table(heads, stated) if stated else ""
         return facts_table(f"DataSet {self.name}", facts) + values + picture
 
-    def _known_facts(self) -> dict[str, str]:
-        """Return what is known of sample, beam, scanner and correction, in words; what nobody
+    @property
+    def known_facts(self) -> dict[str, str]:
+        """What is known of sample, beam, scanner and correction, in words; what nobody
         states is left out. A simulated scan's truth goes before its files, these before the
         texts.
         """

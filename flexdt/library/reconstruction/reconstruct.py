@@ -1042,7 +1042,7 @@ def _source(dataset: ImageSet, request: VolumeRequest) -> _Source:
     if figures and made != "poly":
         raise TwinError(
             f"{dataset.where} was made with physics {made}, one energy: its line integrals are "
-            "straight, and a correction of beam hardening would bend them",
+            "straight, and a correction of beam hardening would bend them; leave out the material",
             {"asked": "material", "allowed": "physics poly, or a scanner's data"},
         )
     return _Source(kV, TubeModel.of_figures(figures))
