@@ -251,7 +251,7 @@ function told(state) {
 on("job", (job) => {
   if (job.job !== mine) return;
   if (job.state === "done") {
-    setText(note, "Reconstructing all of it, beside its truth.");
+    setText(note, "Reconstructing the whole scan, then comparing it with the truth.");
     mine = null;
     reconstruct(folder(job), true);
     return;

@@ -233,6 +233,7 @@ on("volume", (m) => {
   progress.value = working ? (m.comparing ?? 0) : (m.done ?? 0);
   if (!m.size) {
     if (m.done === undefined) wait(m.phase ?? BEGINS);
+    else if (m.done === 1) setText(note, `${other}reconstructed: its slices follow`);
     else setText(note, `${other}reading and reconstructing: ${fixed(100 * m.done, 0)} %`);
     return;
   }
