@@ -118,6 +118,7 @@ class Page:
         self.orbit: Any = None
         """The focal spot's path over the plan, for later scenes of this page."""
         self.recorded: str | None = None
+        self.saturated: float | None = None  # of the data set that is open
         """The data set whose images this page shows instead of live ones."""
         self.block = ""
         """The key of the last block of a volume offered to the page."""

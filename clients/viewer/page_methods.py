@@ -485,6 +485,7 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
     if name is not None:
         told = await page.link.request("dataset.get", {"name": name, "points": 1000})
     page.recorded = name
+    page.saturated = None if name is None else told["info"]["saturated"]
     page.plan = page.orbit = None
     lab.plan.unghost(clients)
     if name is None:
@@ -529,6 +530,7 @@ async def recorded_image(viewer: Viewer, page: Page, params: RecordedImage) -> o
     names = ("name", "index", "file", "image", "projection", "time_s", "positions")
     about = {key: told[key] for key in names}
     about["problem"] = ""
+    about["saturated"] = page.saturated
     pixels = wire_image.decode(told)
     virtual = None
     if params.virtual and told["image"] == "projection" and told["positions"]:

@@ -84,6 +84,8 @@ class DatasetInfo(Result):
     exposure_ms: float | None = None
     mode: str | None = None
     shape: Shape2 | None = None
+    saturated: float | None = None
+    """share of its projections' pixels that are saturated, as predicted"""
     problem: str = ""
     """why the rest is not known"""
     thumbnail: ImageValue | None = None

@@ -414,6 +414,7 @@ def _info(path: Path, modified: float, scan: _Scan) -> p.DatasetInfo:
         exposure_ms=detector.exposure_ms,
         mode=detector.mode,
         shape=(detector.rows, detector.cols),
+        saturated=document.saturated,
     )
 
 

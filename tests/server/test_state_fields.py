@@ -32,6 +32,7 @@ NOT_SHOWN = {
     AxisState: {"acceleration"},
     SafetyState: {"blocked_attempts"},
     JobStatus: {"retry_s"},
+    ImageFlags: {"truncated"},
 }
 """Fields that the page in the browser does not show."""
 REQUIRED: dict[type[BaseModel], str] = {

@@ -205,6 +205,18 @@ def test_the_surface_of_a_box_is_closed_and_has_its_volume() -> None:
     np.testing.assert_allclose(mesh.bounds, [low, low + sides], atol=0.5 * cell_mm)
 
 
+def test_dense_beads_do_not_hide_the_brick_that_they_stand_on() -> None:
+    """A brick of plastic with five beads of steel: its surface is the brick's."""
+    rng = np.random.default_rng(2)
+    grown = rng.normal(0.0, 0.002, (120, 120, 60)).astype(np.float32)
+    grown[30:90, 40:80, 10:50] += 0.02
+    for k in range(5):
+        grown[35 + 10 * k : 39 + 10 * k, 45:49, 20:24] = 0.5
+    vertices, faces = mesh_of(surface(grown, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), 60))
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.volume == pytest.approx(60 * 40 * 40, rel=0.1)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_net_of_drawn_balls_is_closed_and_outward(seed: int) -> None:
     """Two balls that may touch: their volume is that of the formula, where they are apart."""

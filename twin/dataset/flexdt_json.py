@@ -542,6 +542,12 @@ class DatasetDocument(_Model):
     frames: Annotated[list[FrameEntry], FailFast()]
     """The images; the first that does not hold ends their validation."""
 
+    @property
+    def saturated(self) -> float | None:
+        """Largest predicted share of saturated pixels among its settings; None: unknown."""
+        shares = [one.saturated for one in self.predicted if one.saturated is not None]
+        return max(shares, default=None)
+
     @classmethod
     def of(cls, record: ScanRecord) -> DatasetDocument:
         """Make the document of a scan: machine, profile, settings, sample, noise,

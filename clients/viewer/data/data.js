@@ -20,6 +20,7 @@ import {
 import { allJobs, call, command, emit, enter, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
 import { differences, ofImage, only, sampleOf } from "./fingerprint.js";
+import { scanSaturated } from "./image_words.js";
 import { indexOf, nameOf, NOW } from "./moment.js";
 import { draw as drawTimeline } from "./timeline.js";
 import { offer } from "./share.js";
@@ -184,6 +185,7 @@ function settings(info) {
     beam,
     info.exposure_ms === null ? null : `${fixed(info.exposure_ms, 0)} ms`,
     info.sample || null,
+    scanSaturated(info.saturated),
   ]
     .filter(Boolean)
     .join(" · ");

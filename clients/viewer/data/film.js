@@ -16,7 +16,7 @@ import { call, emit, on, store } from "./link.js";
 import * as measure from "./measure.js";
 import * as compare from "./compare.js";
 import * as marks from "./marks.js";
-import { beamWords, MANY_SATURATED, rating } from "./image_words.js";
+import { beamWords, MANY_SATURATED, rating, scanSaturated } from "./image_words.js";
 import { nameOf } from "./moment.js";
 import { signed } from "./slices.js";
 /** @import { Four, Kind, Pair, Shown } from "../web/viewer.d.ts" */
@@ -217,8 +217,10 @@ function transmission(i) {
   const mean = through.reduce((a, v) => a + v, 0) / through.length;
   const darkest = `${(100 * dark).toFixed(1)} % or less in the darkest 1 % of the pixels`;
   const cut = !i.recorded && (store.state?.image?.saturated ?? 0) >= MANY_SATURATED;
-  const though = cut ? " · as though no pixel were saturated" : "";
-  return `transmission ${darkest} · mean ${(100 * mean).toFixed(1)} %${though}`;
+  const though = cut
+    ? "as though no pixel were saturated"
+    : scanSaturated(i.recorded?.saturated);
+  return `transmission ${darkest} · mean ${(100 * mean).toFixed(1)} %${though && ` · ${though}`}`;
 }
 
 export function draw() {
@@ -343,13 +345,14 @@ let wasDark = false;
 /** @param {number} part */
 const percent = (part) => `${(100 * part).toFixed(part && part < 0.1 ? 1 : 0)} %`;
 on("state", (s) => {
-  for (const what of /** @type {const} */ (["saturated", "starved"]))
-    setText(
-      $(`#${what}`),
-      store.recorded
-        ? `${what}: not judged in a recorded image`
-        : `${what} ${s.image ? percent(s.image[what]) : "–"}`,
-    );
+  const shares = store.recorded
+    ? { saturated: store.image?.recorded?.saturated, starved: null }
+    : s.image;
+  const unknown = store.recorded ? ": not known of this scan" : " –";
+  for (const what of /** @type {const} */ (["saturated", "starved"])) {
+    const part = shares?.[what] ?? null;
+    setText($(`#${what}`), `${what}${part === null ? unknown : ` ${percent(part)}`}`);
+  }
   const dark = unlit(store.image);
   if (dark !== wasDark) ask(); // a dark image has no flags
   wasDark = dark;

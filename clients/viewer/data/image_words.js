@@ -7,6 +7,19 @@ export const MANY_SATURATED = 0.001;
 const RATE_MS = 2000;
 const FEWEST = 4; // images within that time: of fewer no rate is told
 
+/** @param {number} part */
+const percent = (part) => `${(100 * part).toFixed(part < 0.1 ? 1 : 0)} %`;
+
+/**
+ * What saturation does to a recorded scan and its volume; nothing where few pixels saturate.
+ * @param {number | null | undefined} part of the scan's pixels, as predicted
+ * @returns {string}
+ */
+export const scanSaturated = (part) =>
+  (part ?? 0) < MANY_SATURATED
+    ? ""
+    : `${percent(part ?? 0)} of the pixels saturated: attenuation is too low there`;
+
 /**
  * @param {{ lit: boolean; counts: boolean; signed?: boolean }} image
  * @param {{ on: boolean; ready: boolean }} tube as it is now
@@ -16,8 +29,7 @@ const FEWEST = 4; // images within that time: of fewer no rate is told
 export function beamWords({ lit, counts, signed }, tube, saturated) {
   if (lit) {
     if (counts || signed || saturated < MANY_SATURATED) return "";
-    const part = saturated < 0.1 ? (100 * saturated).toFixed(1) : (100 * saturated).toFixed(0);
-    return `${part} % saturated: drawn as though none were`;
+    return `${percent(saturated)} saturated: drawn as though none were`;
   }
   if (tube.on) return tube.ready ? "from before X-rays were on" : "X-rays warming up";
   return counts ? "X-rays off: dark image" : "X-rays off: drawn as though on";

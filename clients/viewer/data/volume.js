@@ -22,6 +22,7 @@ import { reach } from "./filled.js";
 import { extent, index, slices, valueOf } from "./slices.js";
 import { raycast, ROOM } from "./raycast.js";
 import { shared } from "./shared.js";
+import { scanSaturated } from "./image_words.js";
 import { isOver } from "./job_words.js";
 import { otsu } from "./otsu.js";
 import { follow } from "./volume_stage.js";
@@ -241,6 +242,7 @@ on("volume", (m) => {
   const facts = [
     `${m.views ?? "–"} of ${m.of ?? "–"} views${behind(m)}`,
     `${m.size.join(" × ")} voxels of ${fixed(1000 * (m.voxel_mm ?? 0), 0)} µm`,
+    scanSaturated(m.saturated),
     m.geometry,
     m.uncovered && m.uncovered > 5e-4
       ? `${fixed(100 * m.uncovered, 1)} % without data (grey)`

@@ -27,6 +27,11 @@ MAX_FACES: Final = 90_000
 """Largest number of triangles of a surface; a grid with more is made coarser."""
 OTSU_BINS: Final = 256
 Faces = npt.NDArray[np.int32]
+LOW_SHARE: Final = 0.3
+"""Lower end of the window, as a part of the bright values: streaks below air stay
+dark."""
+WINDOW_SAMPLES: Final = 200_000
+"""Number of voxels from which the window is chosen."""
 _EDGES: Final = tuple(
     (np.array(a), np.array(b))
     for a in product((0, 1), repeat=3)
@@ -60,6 +65,19 @@ def otsu(values: npt.NDArray[np.generic]) -> float:
     # Between two classes without values all thresholds are as good: the middle one is taken.
     ties = np.flatnonzero(best >= best.max() * (1.0 - 1e-12))
     return float(edges[1 + (ties[0] + ties[-1]) // 2])
+
+
+def shown_range(values: npt.NDArray[np.generic]) -> tuple[float, float]:
+    """Choose the window of a volume: the 1 % to 99.8 % range of every n-th finite value.
+
+    Its lower end is at least -`LOW_SHARE` of the upper. Without a finite value it is (0, 1).
+    """
+    some = values.reshape(-1)[:: max(1, values.size // WINDOW_SAMPLES)]
+    some = some[np.isfinite(some)]
+    if not some.size:
+        return 0.0, 1.0
+    dark, bright = (float(v) for v in np.percentile(some, (1.0, 99.8)))
+    return max(dark, -LOW_SHARE * abs(bright)), max(bright, dark + 1e-9)
 
 
 def net(data: FloatArray | Float32Array, level: float) -> tuple[FloatArray, Faces]:
@@ -135,7 +153,8 @@ def surface(
     """Find the surface of the dense parts, for the scenes.
 
     The volume is averaged over cubes so that its longest side has at most `cells`, NaN counting
-    as 0; Otsu's threshold of that gives the level. The cubes grow twofold until there are at
+    as 0; Otsu's threshold of that, cut to `shown_range` as a page's histogram, gives the
+    level: a few dense beads do not set it. The cubes grow twofold until there are at
     most `MAX_FACES` faces. Voxels beyond whole cubes are left out; the border is padded with the
     least value, so the mesh is closed.
 
@@ -150,7 +169,8 @@ def surface(
         shape = [max(1, n // factor) for n in grown.shape]
         coarse = np.nan_to_num(_means(grown, shape, factor))
         padded = np.pad(coarse, 1, constant_values=float(coarse.min()))
-        vertices, faces = net(padded, otsu(coarse))
+        level = otsu(np.clip(coarse, *shown_range(coarse)))
+        vertices, faces = net(padded, level)
         if len(faces) <= MAX_FACES:
             break
         factor *= 2

@@ -39,7 +39,11 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from flexdt.clients.viewer.volumes.grown_surface import FINISHED_CELLS, surface
+from flexdt.clients.viewer.volumes.grown_surface import (
+    FINISHED_CELLS,
+    shown_range,
+    surface,
+)
 from flexdt.clients.viewer.volumes.volume_truth import figures, truth_of
 from flexdt.library.data_set import DataSet
 from flexdt.library.reading.folders import load_dataset
@@ -63,11 +67,6 @@ MAX_GROWING_VOXELS: Final = 3 << 20
 """Largest number of voxels of a volume that is sent every second: 6 MB."""
 TOP: Final = 65534
 """Codes are 1 + 0..TOP between the least and the greatest value; 0 is a voxel without data."""
-LOW_SHARE: Final = 0.3
-"""Lower end of the window, as a part of the bright values: streaks below air stay
-dark."""
-WINDOW_SAMPLES: Final = 200_000
-"""Number of voxels from which the window is chosen."""
 MAX_VIEWS: Final = 360
 """Largest number of views; of a longer scan every n-th image is taken."""
 LOOK_S: Final = 0.1
@@ -84,8 +83,7 @@ def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], b
 
     Code 0 is not a number. Voxels beyond whole cubes are left out. The cubes are the
     smallest with at most `most` means; NaN in a cube makes its mean NaN (code 0). The
-    window is the 1 % to 99.8 % range of every n-th value, its lower end at least
-    -`LOW_SHARE` of the upper.
+    window is `shown_range`.
 
     Args:
         data: (z, y, x) [1/mm]; not a number where no data cover.
@@ -110,18 +108,12 @@ def block(data: Float32Array, most: int = MAX_VOXELS) -> tuple[dict[str, Any], b
     with np.errstate(invalid="ignore"):  # not a number becomes 0 below
         codes = ((cubes - low) * (TOP / (high - low)) + 1.5).astype("<u2")
     codes[~there] = 0
-    some = cubes.reshape(-1)[:: max(1, cubes.size // WINDOW_SAMPLES)]
-    some = some[np.isfinite(some)]
-    dark, bright = (
-        (float(v) for v in np.percentile(some, (1.0, 99.8))) if some.size else (low, high)
-    )
-    window = [max(dark, -LOW_SHARE * abs(bright)), max(bright, dark + 1e-9)]
     head = {
         "shape": [nz, ny, nx],
         "factor": factor,
         "low": low,
         "high": high,
-        "window": window,
+        "window": list(shown_range(cubes)),
     }
     return head, codes.tobytes()
 
@@ -211,7 +203,7 @@ def grow(
     told = 0.0
     drawn = 0.0
     held.hold(target.volume().transpose(2, 0, 1), like)
-    held.about["made"] = made_of(data)
+    held.about |= {"made": made_of(data), "saturated": _saturated(data)}
 
     def parts() -> Iterator[Float32Array]:
         """Yield line integrals (1, rows, cols), binned, each as soon as its file is
@@ -274,7 +266,7 @@ def reconstruct(held: Held, folder: Path, side: int) -> None:
     held.say(phase="opening the scan")
     data = load_dataset(folder)
     held.dataset = data
-    held.about["made"] = made_of(data)
+    held.about |= {"made": made_of(data), "saturated": _saturated(data)}
     held.request = VolumeRequest(binning=max(1, round(data.shape[1] / side)))
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
@@ -350,6 +342,10 @@ def made_of(data: DataSet) -> dict[str, Any]:
         "offset": None if sample.offset is None else asdict(sample.offset),
         "correction": correction,
     }
+
+
+def _saturated(data: DataSet) -> float | None:
+    return None if data.document is None else data.document.saturated
 
 
 def _facts(data: DataSet) -> dict[str, Any]:

@@ -60,6 +60,8 @@ export interface AboutImage {
   time_s: number | null;
   positions: Record<string, number> | null;
   problem: string;
+  // Share of its scan's pixels, as predicted; null where nothing predicted it.
+  saturated: number | null;
   geometry: GeometryState | null;
   tube: { kV: number | null; power_W: number | null; on: boolean } | null;
   virtual_origin?: ImageOrigin | null;
@@ -145,6 +147,8 @@ export interface VolumeMessage {
   details?: string;
   volumes?: Name[];
   uncovered?: number;
+  // Share of the scan's pixels, as predicted; null where nothing predicted it.
+  saturated?: number | null;
   sample?: string;
   started?: string;
   kV?: number | null;

@@ -85,7 +85,8 @@ export type DatasetInfo = {
   state: "complete" | "incomplete" | "running" | "unknown"; reason: string; projections: number;
   present: number; machine: string | null; sample: string; kV: number | null;
   power_W: number | null; exposure_ms: number | null; mode: string | null;
-  shape: [number, number] | null; problem: string; thumbnail: ImageValue | null
+  shape: [number, number] | null; saturated: number | null; problem: string;
+  thumbnail: ImageValue | null
 };
 export type DatasetListResult = {
   datasets: Array<DatasetInfo>; total: number; unread: number; left_out: number
