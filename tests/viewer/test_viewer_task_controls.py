@@ -159,6 +159,9 @@ def test_the_close_up_is_a_quarter_of_each_pane_and_the_bar_is_whole(
         page.get_by_role("button", name=views, exact=True).click()
         for view in page.locator(".view:has(.inset)").all():
             pane, inset = view.bounding_box(), view.locator(".inset").bounding_box()
+            if pane["width"] <= 240.0:  # it would hide what it is of
+                assert inset is None
+                continue
             assert inset["height"] > 0.25 * pane["height"]
             assert view.locator(".inset").is_visible()
     cut = page.locator("#bar > .pill, #view-switch").evaluate_all(
