@@ -14,6 +14,7 @@ import pytest
 
 from flexdt.twin.errors import GeometryError
 from flexdt.twin.geometry.cone_vec import ConeVec
+from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.reconstruction.acquisition.trajectory import circle_of
 from flexdt.twin.reconstruction.bias import (
     BiasOnDemand,
@@ -24,6 +25,8 @@ from flexdt.twin.reconstruction.bias import (
 )
 from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan, ScanCopies
 from flexdt.twin.reconstruction.consistency.agreement import Agreement, agreement_of
+from flexdt.twin.reconstruction.consistency.cause_table import CauseTable
+from flexdt.twin.reconstruction.consistency.causes import causes_of
 from flexdt.twin.reconstruction.consistency.doubled_edges import doubled_px
 from flexdt.twin.reconstruction.consistency.opposed_rays import OpposedRays
 from flexdt.twin.reconstruction.consistency.view_pairs import (
@@ -94,6 +97,39 @@ def test_a_wrong_geometry_is_named_with_its_size(name: str) -> None:
     if size is None:
         size = np.sign(told[0].size) * {"roll": 2.0, "yaw": 6.0}[name]
     assert abs(told[0].size - size) < max(3.0 * told[0].sigma, 0.05 * abs(size))
+
+
+@pytest.mark.parametrize("name", ["roll", "pitch", "yaw"])
+def test_a_tilt_of_any_size_leaves_pixels_as_large_as_they_are(name: str) -> None:
+    """Sheared by 15 degrees, a panel was 3.4 % larger, and explained a wrong distance."""
+    (tilt,) = (one for one in causes_of(np.zeros(2)) if one.name == name)
+    stated = ConeVec(scan().true)
+    assert tilt.views is not None
+    there = tilt.views(stated, np.full(len(stated), 15.0))
+    for side in ("u", "v"):
+        sizes = np.linalg.norm(getattr(there, side), axis=1)
+        np.testing.assert_allclose(sizes, PIXEL, rtol=1e-9)
+    angle = (there.u * stated.v).sum(axis=1) / PIXEL**2
+    turned = {"roll": np.sin(np.deg2rad(15.0)), "pitch": 0.0, "yaw": 0.0}[name]
+    np.testing.assert_allclose(np.abs(angle), turned, atol=1e-9)
+
+
+def test_smoothing_does_not_hide_the_error_of_sampling() -> None:
+    """Of sums over a row, which it leaves as wrong as they were: beside 9 rays a pixel."""
+    box = claims.Body(0, (0.0, 0.0, 0.0), (8.0, 5.0, 6.0), 0.4, 0.05)
+    thin = scan(bodies=(box,), counts=0.0)
+    views = ConeVec(thin.true)
+
+    def numbers(drawn: claims.Drawn) -> FloatArray:
+        images = drawn.images()
+        table = CauseTable.of(images, views, circle_of(views), ANGLES, 3.0)
+        assert table is not None
+        (pairs,) = [one for kind, one in table.rows if isinstance(kind, ViewPairs)]
+        return np.array([pairs.first - pairs.second, np.sqrt(pairs.variance)])
+
+    off, predicted = numbers(thin)
+    off = off - numbers(replace(thin, rays=9))[0]
+    assert 0.7 < np.sqrt(np.mean(predicted**2) / np.mean(off**2)) < 5.0
 
 
 @pytest.mark.slow

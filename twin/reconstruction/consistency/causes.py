@@ -177,11 +177,18 @@ def _below(views: ConeVec, sizes: FloatArray) -> ConeVec:
 
 
 def _tilted(views: ConeVec, sizes: FloatArray, axis: FloatArray) -> ConeVec:
-    """Turn panels about axes (n, 3) through their centres [degrees], to first order in what
-    is small."""
-    turn = np.deg2rad(sizes)[:, None] * axis
-    u, v = (side + np.cross(turn, side) for side in (views.u, views.v))
-    return ConeVec.from_vectors(views.source, views.detector, u, v)
+    """Turn panels about unit vectors (n, 3) through their centres [degrees]: exactly, because
+    sheared pixels are larger, too, and large tilts would be told of a wrong distance."""
+    angle = np.deg2rad(sizes)[:, None]
+    cos, sin = np.cos(angle), np.sin(angle)
+
+    def turned(side: FloatArray) -> FloatArray:
+        along = (axis * side).sum(axis=1, keepdims=True) * axis
+        return np.asarray(along + cos * (side - along) + sin * np.cross(axis, side))
+
+    return ConeVec.from_vectors(
+        views.source, views.detector, turned(views.u), turned(views.v)
+    )
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

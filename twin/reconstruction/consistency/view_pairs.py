@@ -138,7 +138,11 @@ class ViewPairs:
         return found[0], found[1]
 
     def condition(
-        self, images: Float32Array, cone_vec: ConeVec, noise: float
+        self,
+        images: Float32Array,
+        cone_vec: ConeVec,
+        noise: float,
+        sampled: Float32Array | None = None,
     ) -> Condition:
         """Integrate the planes, with the variance of the two integrals' difference.
 
@@ -149,6 +153,8 @@ class ViewPairs:
         Args:
             images: (n, rows, cols).
             cone_vec: n views.
+            sampled: the images before they were smoothed along rows, which leaves the error of
+                sampling in a row's sum, and hides it from even and odd columns.
             noise: variance of a line's sum for weights whose squares sum to 1.
         """
         variance = np.zeros(self.seen.shape)
@@ -160,8 +166,11 @@ class ViewPairs:
             terms = _interpolated(images, views, low, share) * weights
             numbers.append(terms.sum(axis=-1)[self.seen])
             signs = 1.0 - 2.0 * (np.arange(images.shape[2]) % 2)
-            variance += _about(np.square((terms * signs).sum(axis=-1)))
-            variance += noise * np.square(weights).sum(axis=-1)
+            if sampled is not None:
+                terms = _interpolated(sampled, views, low, share) * weights
+            apart = _about(np.square((terms * signs).sum(axis=-1)))
+            # Even and odd columns differ by their noise, too.
+            variance += np.maximum(apart, noise * np.square(weights).sum(axis=-1))
             if images.shape[1] > 2:
                 bend = (_bend(images, views, low, share) * weights).sum(axis=-1)
                 variance += np.square(ROUNDING * bend)
