@@ -92,7 +92,7 @@ def test_axe_finds_nothing_after_a_run_and_with_a_data_set_open(
     wait(lambda: "measuring" not in page.inner_text("#record-note"), "all lanes")
     assert str(name).endswith(page.inner_text("#record-name"))
     assert findings(page) == []
-    assert page.inner_text("#saturated") == "saturated: not judged in a recorded image"
+    assert page.inner_text("#saturated") == "saturated 0 %"  # of its scan, as predicted
     lanes = page.locator("#record .lanes")
     assert lanes.evaluate("e => e.scrollHeight <= e.clientHeight + 1"), (
         "no lane is cut off"
