@@ -101,7 +101,7 @@ class CauseTable:
                 interpolation reduces would show as an error that moves rays between pixels.
             whole: see the class.
         """
-        from scipy.ndimage import gaussian_filter, gaussian_filter1d
+        from scipy.ndimage import gaussian_filter
 
         along = min(blur, 0.25 * (images.shape[1] - 1))
         smooth = gaussian_filter(images, (0.0, along, blur), mode="nearest")
@@ -111,7 +111,7 @@ class CauseTable:
         rows: list[tuple[ViewPairs | OpposedRays, Condition]] = []
         pairs = ViewPairs.of(smooth, cone_vec, circle, along) if whole else None
         if pairs is not None:
-            sampled = gaussian_filter1d(images, along, axis=1, mode="nearest")
+            sampled = gaussian_filter(images, (0.0, along, 0.0), mode="nearest")
             rows.append((pairs, pairs.condition(smooth, cone_vec, noise * kept, sampled)))
         rays = OpposedRays.of(smooth, cone_vec, circle, blur)
         if rays is not None:
