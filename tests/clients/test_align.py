@@ -17,6 +17,7 @@ import pytest
 
 import flexdt as fx
 from flexdt.clients.cli.command_tree import run
+from flexdt.twin.calibration.without_phantom.plane_pairs import PlanePairs
 from flexdt.twin.calibration.without_phantom.tile_gap import (
     averaged_rows,
     local_gaps,
@@ -220,6 +221,30 @@ def row_pull(found: object, scanner: Scanner) -> tuple[float, float]:
     assert told["value"] == pytest.approx(seen, abs=1e-6)  # the correction says the same
     error = told["value"] - scanner.row()
     return error, error / told["sigma"]
+
+
+@pytest.mark.daily(1)
+def test_a_pattern_that_stays_on_the_panel_says_nothing_of_the_row() -> None:
+    """All frames of a scan share the noise of its flat image: it changes no sum of squares,
+    while that of the frames still tells a height from another."""
+    scanner = Scanner(0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
+    lines = scanner.lines(bodies(np.random.default_rng(1)), np.radians(DEGREES))
+
+    def views(at: np.ndarray) -> fx.ConeVec:
+        return fx.ConeVec.circular(
+            sod=SOD, sdd=SDD, angles=DEGREES, shape=SHAPE, pixel=PITCH,
+            offset=(0.0, scanner.panel_z + float(at[0]) * PITCH),
+        )  # fmt: skip
+
+    pairs = PlanePairs(lines, lines.mean(axis=0, dtype=np.float64), 1, views, np.zeros(1))
+    pattern = np.random.default_rng(5).normal(0, 0.05, (SHAPE[1], SHAPE[0] + 1))
+    spoilt = pairs.sums + np.cumsum(pattern, axis=1, dtype=np.float32)
+    totals = []
+    for height in (0.0, 2.0, 9.0):
+        alone, both = (pairs.costs(np.array([height]), s) for s in (None, spoilt))
+        totals.append(pairs.total(alone))
+        assert pairs.total(both) == pytest.approx(totals[-1], rel=0.01)
+    assert (totals[2] > 1.5 * totals[0]).all()
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,8 @@ class PlanePairs:
 
     def costs(self, at: FloatArray, sums: Float32Array | None = None) -> FloatArray:
         """Compute sums of squared differences between both views, without offsets common
-        to all bins (air that is not 0); bins that are not valid do not count.
+        to all bins (air that is not 0) or to all pairs as far apart (the flat image's
+        noise); bins that are not valid do not count.
 
         Each coarser level adds up neighbouring bins and pairs before it squares, and gives
         each pair the mean of its group. A group counts only its bins that are valid in all
@@ -194,7 +195,7 @@ class PlanePairs:
             heights, (levels, q + distances * BLOCKS).
         """
         found, ones = self.integrals(at, sums=sums)
-        rest = found[:, 0] - found[:, 1]
+        rest = self._own(found[:, 0] - found[:, 1])
         pairs = np.zeros((len(LEVELS), len(rest)))
         blocks = np.zeros((len(LEVELS), len(self.starts), BLOCKS))
         wide = {bins: (_widened(rest, bins), _widened(ones, bins)) for bins, _ in LEVELS}
@@ -208,6 +209,17 @@ class PlanePairs:
             of_kind = np.add.reduceat(square, np.searchsorted(first, self.starts), axis=0)
             blocks[i] = np.add.reduceat(of_kind, np.arange(BLOCKS) * k // BLOCKS, axis=1)
         return np.hstack([pairs, blocks.reshape(len(LEVELS), -1)])
+
+    def _own(self, rest: FloatArray) -> FloatArray:
+        """Subtract from differences of pairs, (q, k), the mean over all pairs as far apart.
+
+        A pattern that stays on the panel, such as the noise of the one flat image, is the
+        same in all of them and no average lessens it. A turn's mean is a body of
+        revolution, whose planes agree at any height: what is lost says nothing of it.
+        """
+        total = np.add.reduceat(rest * self.valid, self.starts, axis=0)
+        count = np.add.reduceat(self.valid, self.starts, axis=0, dtype=np.intp)
+        return rest - np.repeat(total / np.maximum(count, 1), self.sizes, axis=0)
 
     def scales(self, costs: FloatArray) -> FloatArray:
         """Compute 1 / usual cost of pairs as far apart as each one, laid out as `costs`;
