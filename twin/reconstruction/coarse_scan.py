@@ -382,7 +382,8 @@ class CoarseScan:
     @property
     def at_sight(self) -> list[str]:
         """Causes of large errors that geometry and images show without a volume: an object
-        beyond the panel's sides, rays through it that climb by `MAX_CLIMB`, an open beam beside
+        beyond the panel's sides, or beyond the near one where less than a turn never shows it
+        from the other side, rays through it that climb by `MAX_CLIMB`, an open beam beside
         it that is `WARNING_BOUND` of the largest line integral.
         """
         if self.cut_off:
@@ -398,6 +399,10 @@ class CoarseScan:
             ]
             climb = np.abs(ray[..., 2]) / np.linalg.norm(ray[..., :2], axis=-1)
             found += ["cone"] * bool(climb.max() > MAX_CLIMB)
+        low, high = self.ends
+        near = np.abs(self.images[:, :, 0 if high < low else -1].mean(axis=1))
+        if not self.whole and near.max() > ACCURACY * self.images.max():
+            found.append("aside")
         beside = np.abs(self.images[:, :, [0, -1]].mean(axis=1)).min(axis=1)
         if float(beside.mean()) > WARNING_BOUND * float(self.images.max()):
             found.append("drift")
