@@ -261,7 +261,7 @@ def test_setup_names_the_physics_and_draws_the_spectrum(page: Any, wait: Wait) -
     page.click("#tabs [data-tab=setup]")
     wait(lambda: "mean" in page.inner_text("#spectrum-note"), "the spectrum")
     assert page.inner_text("#physics") == "ideal"
-    assert "Voltage does nothing" in page.inner_text("#physics-note")
+    assert "Voltage does not change line integrals" in page.inner_text("#physics-note")
     assert page.inner_text("#filters") == "0.50 mm Al"
     for kV in (40, 90):
         told = page.evaluate("kV => flexdt.call('viewer.spectrum', {kV})", kV)

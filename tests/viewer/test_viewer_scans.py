@@ -449,13 +449,14 @@ def test_corrections_are_shown_with_units_and_digits_that_say_something(
 ) -> None:
     page.click("#tabs [data-tab=calibrate]")
     assert page.locator("#revert").is_disabled()
-    parameters = {"dO_x": 0.41234567, "alpha": 0.0000321, "angle_scale": 1.000125}
+    shown = {"dO_x": 0.41234567, "alpha": 0.00321, "angle_scale": 1.000125}
+    parameters = {**shown, "dO_z": 2e-9}
     page.evaluate("p => flexdt.call('calibration.apply', {parameters: p})", parameters)
     page.locator("#in-force", has_text="angle_scale").wait_for()
     rows = [r.split("\t") for r in page.locator("#in-force tr").all_inner_texts()]
     assert {name: (value, unit) for name, value, _, unit in rows} == {
         "axis sideways dO_x": ("0.412", "mm"),
-        "start angle alpha": ("0.0000321", "°"),
+        "start angle alpha": ("0.0032", "°"),
         "scale of angles angle_scale": ("1.000125", ""),
     }
     page.click("#revert")
