@@ -367,11 +367,12 @@ class BiasOnDemand:
         if self._doubtful and self._contradiction is not None:
             return [str(self._contradiction)]
         scan = self._copied(NODES)
-        causes = scan.at_sight
         if scan.cut_off:
             # A drifted flat looks like an object beyond the panel: what it does tells them apart.
             cut = self._bounded.accuracy(grid)
-            causes = causes if cut is not None and cut.most > WARNING_BOUND else []
+            causes = ["beyond"] if cut is not None and cut.most > WARNING_BOUND else []
+        else:
+            causes = scan.at_sight
         if self._bent is not None and self._bent.strong:
             causes.append("hardening")
         if scan.few and not scan.cut_off and self._streaked(grid):

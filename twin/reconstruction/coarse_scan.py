@@ -381,13 +381,11 @@ class CoarseScan:
 
     @property
     def at_sight(self) -> list[str]:
-        """Causes of large errors that geometry and images show without a volume: an object
-        beyond the panel's sides, or beyond the near one where less than a turn never shows it
-        from the other side, rays through it that climb by `MAX_CLIMB`, an open beam beside
-        it that is `WARNING_BOUND` of the largest line integral.
+        """Causes of large errors that geometry and images show without a volume, of an object
+        that is not `cut_off`: it goes on beyond the near side of a panel aside and less than a
+        turn never shows it from the other side, rays through it climb by `MAX_CLIMB`, or the
+        open beam beside it is `WARNING_BOUND` of the largest line integral.
         """
-        if self.cut_off:
-            return ["beyond"]
         found = []
         sizes = np.abs(self.images).mean(axis=(0, 2))
         rows = np.flatnonzero(sizes > ACCURACY * sizes.max())

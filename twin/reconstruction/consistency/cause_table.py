@@ -104,14 +104,14 @@ class CauseTable:
         from scipy.ndimage import gaussian_filter
 
         along = min(blur, 0.25 * (images.shape[1] - 1))
-        smooth = gaussian_filter(images, (0.0, along, blur), mode="nearest")
+        sampled = gaussian_filter(images, (0.0, along, 0.0), mode="nearest")
+        smooth = gaussian_filter(sampled, (0.0, 0.0, blur), mode="nearest")
         noise = noise_of(images)
         # Squares of the kernel's values sum to 1 / (2 sqrt(pi) blur), along a line or each way.
         kept = min(1.0, 0.28 / max(along, 0.28))
         rows: list[tuple[ViewPairs | OpposedRays, Condition]] = []
         pairs = ViewPairs.of(smooth, cone_vec, circle, along) if whole else None
         if pairs is not None:
-            sampled = gaussian_filter(images, (0.0, along, 0.0), mode="nearest")
             rows.append((pairs, pairs.condition(smooth, cone_vec, noise * kept, sampled)))
         rays = OpposedRays.of(smooth, cone_vec, circle, blur)
         if rays is not None:

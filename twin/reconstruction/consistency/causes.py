@@ -179,16 +179,11 @@ def _below(views: ConeVec, sizes: FloatArray) -> ConeVec:
 def _tilted(views: ConeVec, sizes: FloatArray, axis: FloatArray) -> ConeVec:
     """Turn panels about unit vectors (n, 3) through their centres [degrees]: exactly, because
     sheared pixels are larger, too, and large tilts would be told of a wrong distance."""
-    angle = np.deg2rad(sizes)[:, None]
-    cos, sin = np.cos(angle), np.sin(angle)
+    from scipy.spatial.transform import Rotation
 
-    def turned(side: FloatArray) -> FloatArray:
-        along = (axis * side).sum(axis=1, keepdims=True) * axis
-        return np.asarray(along + cos * (side - along) + sin * np.cross(axis, side))
-
-    return ConeVec.from_vectors(
-        views.source, views.detector, turned(views.u), turned(views.v)
-    )
+    turn = Rotation.from_rotvec(np.deg2rad(sizes)[:, None] * axis).as_matrix()
+    u, v = (np.einsum("nij,nj->ni", turn, side) for side in (views.u, views.v))
+    return ConeVec.from_vectors(views.source, views.detector, u, v)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
