@@ -93,10 +93,13 @@ def filled(now: Picture) -> bool:
 def test_what_is_shown_is_each_persons_own(open_page: Callable[..., Any]) -> None:
     """In the live scene and in the viewer's own picture; and the browser remembers it."""
     mine, other = (open_page("iso", (900, 600)) for _ in range(2))
+    # Names come when their places are known: without them a picture changes by choice alone.
+    for page in (mine, other):
+        page.click("#tabs [data-tab=setup]")
+        page.click("#layer-names")
     length = f"{STILL}.then((r) => r.arrayBuffer()).then((b) => b.byteLength)"
     before = [settled(of(page), filled) for page in (mine, other)]
     assert mine.evaluate(length) == other.evaluate(length)
-    mine.click("#tabs [data-tab=setup]")
     mine.click("#layer-machine")
     settled(of(mine), lambda now: apart(now, before[0]) > MANY_PX)
     assert apart(still(of(other)), before[1]) < MANY_PX / 20
@@ -104,9 +107,8 @@ def test_what_is_shown_is_each_persons_own(open_page: Callable[..., Any]) -> Non
     assert mine.evaluate(length) != other.evaluate(length)
     mine.reload()
     mine.wait_for_function("window.flexdt?.store.layers.machine === false")
-    # Names and the image come when they come, so the other page is what this one is compared
-    # with, from the same place: a camera that still holds all stays where an earlier state put
-    # it.
+    # The image comes when it comes, so the other page is what this one is compared with, from
+    # the same place: a camera that still holds all stays where an earlier state put it.
     of(other).locator(".home").click()
     settled(of(mine), lambda now: apart(now, still(of(other))) > MANY_PX)
     mine.click("#layer-machine")
