@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from flexdt.message_words import reason_of
+from flexdt.message_words import nearest_name, reason_of
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.image_files import Pixels, as_counts, read_pixels
 from flexdt.runtime.files.reading_within import opened, within
@@ -202,9 +202,20 @@ def list_folder(path: Path) -> Folder:
             links = inside is None
             names = frozenset(e.name for e in entries if e.is_file(follow_symlinks=links))
     except OSError as error:
-        message = f"cannot read folder {path}: {reason_of(error)}"
+        near = _near_folder(path) if inside is None else ""
+        message = f"cannot read folder {path}: {reason_of(error)}{near}"
         raise ds.DatasetMissingError(message, {"path": str(path)}) from None
     return Folder(path, names)
+
+
+def _near_folder(path: Path) -> str:
+    """Suggest the folder beside `path` whose name is most like its own; "" if none is."""
+    try:
+        beside = sorted(entry.name for entry in path.parent.iterdir() if entry.is_dir())
+    except OSError:
+        return ""
+    near = nearest_name(path.name, [name for name in beside if name != path.name])
+    return "" if near is None else f"; did you mean {str(path.with_name(near))!r}?"
 
 
 def read_text(path: Path, most: int = MAX_TEXT_BYTES) -> str:

@@ -260,6 +260,9 @@ def test_folders_that_are_none(tmp_path: Path, written: Written) -> None:
         DatasetMissingError, match=r"cannot read folder .*nowhere: No such file"
     ):
         load_dataset(tmp_path / "nowhere")
+    (tmp_path / "first").mkdir()
+    with pytest.raises(DatasetMissingError, match=r"; did you mean '.*/first'\?$"):
+        load_dataset(tmp_path / "fist")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetMissingError, match="no projections"):
         load_dataset(tmp_path / "empty")

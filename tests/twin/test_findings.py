@@ -61,12 +61,13 @@ collections = st.lists(findings, max_size=12).map(Findings)
 
 @cache
 def sources() -> tuple[ast.Module, ...]:
-    """Return the syntax trees of the program's modules."""
-    return tuple(
-        ast.parse(file.read_text(encoding="utf-8"))
+    """Return the syntax trees of the program's modules that have a code's name in them."""
+    texts = (
+        file.read_text(encoding="utf-8")
         for folder in FOLDERS
         for file in sorted((ROOT / folder).rglob("*.py"))
     )
+    return tuple(ast.parse(text) for text in texts if "Code" in text)
 
 
 def member(node: ast.Attribute) -> FindingCode | None:
