@@ -30,7 +30,7 @@ from flexdt.clients.client.kept_connection import KeptConnection, TwinAddress, U
 from flexdt.clients.client.transport import ConnectionLost
 from flexdt.clients.viewer.page_words import for_reader
 from flexdt.clients.viewer.scenes.layers import Shown
-from flexdt.clients.viewer.scenes.stage_volume import StageVolume
+from flexdt.clients.viewer.scenes.stage_volume import MadeOf, StageVolume
 from flexdt.clients.viewer.watched_tasks import watched
 from flexdt.protocol import METHODS, Code, RpcError, parse_params
 from flexdt.protocol.rpc_errors import busy, clip, internal, link_down
@@ -118,8 +118,10 @@ class Page:
         self.orbit: Any = None
         """The focal spot's path over the plan, for later scenes of this page."""
         self.recorded: str | None = None
-        self.saturated: float | None = None  # of the data set that is open
         """The data set whose images this page shows instead of live ones."""
+        self.made: MadeOf | None = None
+        """Of what those images are."""
+        self.saturated: float | None = None  # of the data set that is open
         self.block = ""
         """The key of the last block of a volume offered to the page."""
         self._connection = connection

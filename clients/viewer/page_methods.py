@@ -34,6 +34,7 @@ from flexdt.clients.viewer.front import Download
 from flexdt.clients.viewer.page import Page, person_name, without_bytes
 from flexdt.clients.viewer.scenes.lab_scene import LabScene
 from flexdt.clients.viewer.scenes.layers import LAYERS
+from flexdt.clients.viewer.scenes.stage_volume import MadeOf
 from flexdt.clients.viewer.scenes.views import FREE
 from flexdt.clients.viewer.scenes.world import motors
 from flexdt.clients.viewer.shown_images import ShownImage, grey, packed, window_of
@@ -486,6 +487,8 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
         told = await page.link.request("dataset.get", {"name": name, "points": 1000})
     page.recorded = name
     page.saturated = None if name is None else told["info"]["saturated"]
+    page.made = None if name is None else MadeOf.of(told["made"])
+    viewer.show_layers()
     page.plan = page.orbit = None
     lab.plan.unghost(clients)
     if name is None:
@@ -899,7 +902,7 @@ async def export(viewer: Viewer, page: Page, params: Export) -> object:
             exports.scene_file,
             viewer.viser,
             camera,
-            lab.nodes(page.shown, viewer.near),
+            lab.nodes(viewer.shown_by(page), viewer.near),
             exports.title_of(viewer.state, "scene"),
             exports.beside(viewer.state, viewer.feeds["line_integral"].newest),
         )

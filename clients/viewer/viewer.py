@@ -41,6 +41,7 @@ from flexdt.clients.viewer.scenes.stage_volume import (
     Manner,
     StageDrawing,
     StageVolume,
+    same_sample,
 )
 from flexdt.clients.viewer.scenes.still_pictures import Stills
 from flexdt.clients.viewer.scenes.world import World, beads_on, world_of
@@ -392,12 +393,22 @@ class Viewer:
             return
         for page in self.pages.values():
             within = self._manner(page) == "stands"
-            nodes = lab.nodes(page.shown, self.near, within)
+            nodes = lab.nodes(self.shown_by(page), self.near, within)
             self.clients.show(page.id, nodes, lab.plain, self._built)
 
     def _shown_by(self, id: str) -> Shown:
         page = self.pages.get(id)
-        return Shown() if page is None else page.shown
+        return Shown() if page is None else self.shown_by(page)
+
+    def shown_by(self, page: Page) -> Shown:
+        """Return the layers that a page's scenes draw: the chosen ones, without the present
+        sample and its image while the page shows images of another one.
+        """
+        if page.made is None or self.state is None:
+            return page.shown
+        if same_sample(page.made, self.state.sample):
+            return page.shown
+        return page.shown.changed(sample=False, panel=False)
 
     def _link_changed(self) -> None:
         self._heard_at = time.monotonic()

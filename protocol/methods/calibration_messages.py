@@ -12,7 +12,7 @@ from flexdt.protocol import fields as f
 from flexdt.protocol.field_checks import few
 from flexdt.protocol.fields import ImageValue, Integral, Params, Result, Shape2, ShortText
 from flexdt.protocol.method import command, read
-from flexdt.protocol.state_model import Correction
+from flexdt.protocol.state_model import Correction, SamplePlacement
 
 DataSetName = Annotated[ShortText, Len(1, 255)]
 ImageKind = Literal["dark", "flat", "projection"]
@@ -115,10 +115,26 @@ class StatedValue(Result):
     """what it is used for, or what its being left aside means"""
 
 
+class ScannedSample(Result):
+    """What stood on the stage during a scan, and the correction in force; compare it with
+    the state."""
+
+    sample: str
+    """its name; empty for an empty stage, or where the data set does not say"""
+    revision: str | None = None
+    """of an upload, as in the state"""
+    material: str | None = None
+    offset: SamplePlacement | None = None
+    """null where the data set does not say"""
+    correction: str | None = None
+    """name"""
+
+
 class DatasetResult(Result):
     """A data set over time: lists have one entry for each image of `indices`."""
 
     info: DatasetInfo
+    made: ScannedSample
     images: int
     """that it has, or should have, of all kinds"""
     indices: list[int]

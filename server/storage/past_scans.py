@@ -12,7 +12,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, assert_never
@@ -28,6 +28,7 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import too_large
+from flexdt.protocol.state_model import SamplePlacement
 from flexdt.runtime.files import dataset_folder as files
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.reading_within import confined, opened
@@ -655,6 +656,7 @@ def _get(
     times = [frame.time_s for frame in chosen if frame.time_s is not None]
     return p.DatasetResult(
         info=info,
+        made=_made(scan.document),
         images=len(images),
         indices=at,
         files=[frame.file for frame in chosen],
@@ -669,6 +671,21 @@ def _get(
         warnings=_doubts(scan, info.shape),
         provenance=_stated(scan),
         **(_measure(scan, tuple(at)) if asked.measure else {}),
+    )
+
+
+def _made(document: DatasetDocument | None) -> p.ScannedSample:
+    """Tell the sample of a scan's document, where it stood, and the correction in force."""
+    if document is None:
+        return p.ScannedSample(sample="")
+    sample = document.sample
+    at = None if sample.offset is None else SamplePlacement(**asdict(sample.offset))
+    return p.ScannedSample(
+        sample=sample.name,
+        revision=sample.revision,
+        material=sample.material,
+        offset=at,
+        correction=None if document.correction is None else document.correction.name,
     )
 
 

@@ -90,6 +90,11 @@ def test_a_scan_is_told_as_its_folder_says(server: Process, data: Path) -> None:
         told = client.dataset("first scan", measure=True, script=True)
         assert told.info == info
         assert told.same_machine
+        made = told.made.model_dump()
+        assert made.pop("correction") == (document["correction"] or {}).get("name")
+        sample = document["sample"]
+        assert made.pop("sample") == sample["name"]
+        assert made == {key: sample[key] for key in made}
         assert told.images == len(frames)
         assert told.indices == list(range(len(frames)))
         assert told.files == [f["file"] for f in frames]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import random
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from flexdt.clients.viewer.scenes.layers import Shown
 from flexdt.clients.viewer.scenes.stage_volume import (
     NODE,
     MadeOf,
@@ -16,6 +18,7 @@ from flexdt.clients.viewer.scenes.stage_volume import (
     StageVolume,
     fits,
 )
+from flexdt.clients.viewer.viewer import Viewer
 from flexdt.protocol.state_model import SampleState, State
 
 CHANGES = {
@@ -68,6 +71,22 @@ def test_a_volume_fits_what_it_was_made_of_and_nothing_else() -> None:
         assert fits(made, state(stands, in_force)) is not other
     unknown = MadeOf("gear", None, "abs", None, None)
     assert not fits(unknown, state({"name": "gear", "material": "abs"}, None))
+
+
+@pytest.mark.parametrize("change", [None, *CHANGES])
+def test_a_recorded_image_never_stands_beside_another_sample(change: str | None) -> None:
+    """A correction makes no other sample; without a data set the chosen layers are drawn."""
+    offset = {"x": 1.5, "y": 0.0, "z": 0.0, "rx": 0.0, "ry": 0.0, "rz": 0.0}
+    sample = {"name": "gear", "revision": "a", "material": "abs", "offset": offset}
+    made = MadeOf("gear", "a", "abs", dict(offset), "c")
+    now = CHANGES[change](sample, "c") if change else (sample, "c")
+    viewer: Any = SimpleNamespace(state=state(*now))
+    page: Any = SimpleNamespace(made=made, shown=Shown())
+    own = change in (None, "correction")
+    shown = Viewer.shown_by(viewer, page)
+    assert ("sample" in shown, "panel" in shown, "machine" in shown) == (own, own, True)
+    page.made = None
+    assert Viewer.shown_by(viewer, page) == page.shown
 
 
 class Scene:

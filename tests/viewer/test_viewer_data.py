@@ -418,6 +418,43 @@ def test_a_recorded_image_beside_the_virtual_one(
     page.select_option("#kind", "line_integral")
 
 
+def test_the_scene_has_no_other_sample_than_the_image_beside_it(
+    page: Any, scans: Any, lab: Any
+) -> None:
+    """The scan's own stays, another one leaves the pictures, and a line says so."""
+    still = """fetch(`/still.jpg?view=sample&w=200&h=200&page=${window.pageId}`)
+      .then((r) => r.arrayBuffer()).then((b) => new Uint8Array(b).join())"""
+    find(page, "whole")
+    page.locator(".data-set[data-name='whole scan']").click()
+    shows(page, 2)
+    page.click("#tabs [data-tab=setup]")
+    page.locator("#record-note", has_text="clearance").wait_for()
+    assert "no sample" not in page.locator("#record-note").inner_text()
+    own = page.evaluate(still)
+    page.uncheck("#layer-sample")
+    until(lambda: page.evaluate(still) != own)
+    page.check("#layer-sample")
+    with lab.client() as twin:
+        twin.set_sample("gear")
+        try:
+            page.locator(
+                "#record-note", has_text="on the stage is another sample now (gear)"
+            ).wait_for()
+            page.wait_for_timeout(500)
+            other = page.evaluate(still)
+            page.uncheck("#layer-sample")
+            page.wait_for_timeout(500)
+            assert page.evaluate(still) == other
+            page.check("#layer-sample")
+            page.wait_for_timeout(500)
+            assert page.evaluate(still) == other
+            page.evaluate("flexdt.data.open(null)")
+            until(lambda: page.evaluate(still) != other)
+        finally:
+            twin.set_sample("lego")
+            twin.control("release")
+
+
 def test_playing_ends_with_the_last_image(page: Any, scans: Any) -> None:
     page.evaluate("flexdt.data.open('whole scan')")
     shows(page, 2)

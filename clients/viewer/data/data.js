@@ -19,7 +19,14 @@ import {
 } from "./dom.js";
 import { allJobs, call, command, emit, enter, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
-import { differences, ofImage, only, sampleOf } from "./fingerprint.js";
+import {
+  differences,
+  listed as namesOf,
+  ofImage,
+  ofVolume,
+  only,
+  sampleOf,
+} from "./fingerprint.js";
 import { scanSaturated } from "./image_words.js";
 import { indexOf, nameOf, NOW } from "./moment.js";
 import { draw as drawTimeline } from "./timeline.js";
@@ -229,7 +236,11 @@ function row(info) {
   node.setAttribute("aria-current", String(info.name === told?.info.name));
   if (info.state !== "incomplete" || !lacks(info)) return [node];
   const title = `Make the images of ${info.name} that are missing`;
-  const go = { class: "small data-resume", title, onclick: () => resume(info.name) };
+  const go = {
+    class: "small data-resume",
+    title,
+    onclick: () => resume(info.name),
+  };
   return [node, el("button", go, `Resume ${info.name}`)];
 }
 async function list(start = 0) {
@@ -420,10 +431,22 @@ function virtualWords(scanned) {
     typeof correction === "string" ? `correction ${correction}` : "nominal geometry";
   return `virtual: ${shown}${other}, ${geometry}`;
 }
+/**
+ * Why the scene draws no sample: another one stands there than the scan's; "" where it is the
+ * scan's own.
+ * @param {DatasetResult["made"]} made
+ */
+function apartWords(made) {
+  if (!made.offset) return "the scene has no sample: where the scan’s stood is not known";
+  const differ = differences(only(ofVolume(made), "sample", "placement"), store.now ?? {});
+  if (!differ.length) return "";
+  const name = store.state?.sample.name ?? "none";
+  return `the scene has no sample: on the stage is another ${namesOf(differ)} now (${name})`;
+}
 function note() {
   if (!told) return "";
   /** @type {string[]} */
-  const parts = [];
+  const parts = [apartWords(told.made)].filter(Boolean);
   if (!Object.keys(told.positions).length)
     parts.push("poses and times are not known: only images are shown");
   else if (!told.same_machine)
@@ -527,9 +550,10 @@ async function show(wanted) {
     } catch (error) {
       why = words(error);
       if (kind !== "counts")
-        about = await call("viewer.recorded_image", { index: at, kind: "counts" }).catch(
-          () => null,
-        );
+        about = await call("viewer.recorded_image", {
+          index: at,
+          kind: "counts",
+        }).catch(() => null);
     }
     if (!still(name)) break;
     moment = about ? (about.time_s ?? at) : told.times_s ? null : at;
@@ -597,6 +621,7 @@ on("image", () => {
   if (told) setText($("#record-note"), note());
 });
 on("state", () => {
+  if (told) setText($("#record-note"), note());
   const made = virtualMade();
   if (!made || !store.now || compare.how() === "recorded") return;
   if (!differences(made, store.now).length) return;

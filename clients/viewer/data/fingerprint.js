@@ -123,7 +123,7 @@ export function ofImage(origin, coneVec, twin) {
 }
 
 /**
- * A volume, by what its data set says.
+ * A volume or an image, by what its data set says.
  * @param {NonNullable<VolumeMessage["made"]>} told
  * @returns {Fingerprint}
  */

@@ -289,7 +289,8 @@ class LabScene:
         """
         if "labels" not in shown:
             if "names" in shown:
-                return names_of_image(world, self._top_mm(world))
+                named = names_of_image(world, self._top_mm(world))
+                return [name for name in named if name[0] != SAMPLE or SAMPLE in shown]
             return []
         first = _scale_mm(self.machine)
         out: list[Name] = [

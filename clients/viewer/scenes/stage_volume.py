@@ -16,7 +16,7 @@ import numpy.typing as npt
 import viser
 
 from flexdt.clients.viewer.scenes.world import MM
-from flexdt.protocol.state_model import State
+from flexdt.protocol.state_model import SampleState, State
 from flexdt.twin.geometry.conventions import FloatArray
 
 SURFACE: Final = (70, 190, 255)
@@ -31,7 +31,7 @@ Manner = Literal["stands", "ghost"]
 
 @dataclass(frozen=True)
 class MadeOf:
-    """What a volume was made of; `offset` is None where the data set does not say."""
+    """What a volume or an image was made of; `offset` is None where the data set does not say."""
 
     sample: str
     revision: str | None
@@ -41,22 +41,24 @@ class MadeOf:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> MadeOf:
-        """Read it from the facts of the reconstruction's process."""
+        """Read it from the facts of the reconstruction's process, or from the twin's answer."""
         return cls(**{name: told[name] for name in cls.__dataclass_fields__})
 
 
 def fits(made: MadeOf, state: State) -> bool:
-    """Check that a volume is of what stands on the stage: sample, content, material, place and
-    correction.
+    """Check that a volume is of what stands on the stage, under the correction in force."""
+    now = None if state.correction is None else state.correction.name
+    return made.correction == now and same_sample(made, state.sample)
 
-    One whose data set does not say where its sample stood fits nothing.
+
+def same_sample(made: MadeOf, sample: SampleState) -> bool:
+    """Check that a scan's sample stands on the stage: name, content, material and place.
+
+    That of a data set which does not say where its sample stood does not.
     """
-    sample = state.sample
     if made.offset is None:
         return False
-    now = None if state.correction is None else state.correction.name
-    same = (made.sample, made.revision, made.correction)
-    if same != (sample.name or "", sample.revision, now):
+    if (made.sample, made.revision) != (sample.name or "", sample.revision):
         return False
     if sample.name and made.material != sample.material:
         return False

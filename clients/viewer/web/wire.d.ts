@@ -92,8 +92,8 @@ export type DatasetListResult = {
   datasets: Array<DatasetInfo>; total: number; unread: number; left_out: number
 };
 export type DatasetResult = {
-  info: DatasetInfo; images: number; indices: Array<number>; files: Array<string>;
-  kinds: Array<"dark" | "flat" | "projection">; present: Array<boolean>;
+  info: DatasetInfo; made: ScannedSample; images: number; indices: Array<number>;
+  files: Array<string>; kinds: Array<"dark" | "flat" | "projection">; present: Array<boolean>;
   times_s: Array<number> | null; positions: Record<string, Array<number | null>>;
   same_machine: boolean; counts: Array<number | null> | null;
   clearance_mm: Array<number | null> | null; clearance_of: string; script: string | null;
@@ -226,6 +226,10 @@ export type SampleUpload = {
   start?: number; data: string; unit?: "um" | "mm" | "cm" | "m" | "inch" | null;
   place?: "keep" | "centred" | null; material?: string | null;
   shape?: [number, number, number] | null; voxel_mm?: [number, number, number] | null
+};
+export type ScannedSample = {
+  sample: string; revision: string | null; material: string | null; offset: SamplePlacement | null;
+  correction: string | null
 };
 export type Scene = {
   schema: 1; flexdt?: string; name?: string; saved?: string; machine: string; profile: string;
