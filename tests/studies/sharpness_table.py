@@ -6,9 +6,10 @@ A turned box with a bore is projected, six rays a pixel, and spoilt: blurred by 
 rotation, with the axis moved, turned too far, frames lost or moved, noisy, or of few views.
 The truth: the box's own faces, along which the voxels of a volume without noise
 are sorted by their distance (slanted edge, 10 to 90 %), the distance of doubled edges as drawn,
-and rings of the spectrum that noise leaves, beside the volume without noise. Prints a line a
-scan, and the ratios by kind. Exits with 1 where
-a sound scan is said to be doubled, or half of those with a moved axis are not; widths are printed.
+and rings of the spectrum that noise leaves, beside the volume without noise. What
+`accuracy.edges_mm` claims is true where half of the tiles of the sides' faces are no wider.
+Prints a line a scan, and the ratios by kind. Exits with 1 where a sound scan is said to be
+doubled, or half of those with a moved axis are not; widths are printed.
 """
 
 from __future__ import annotations
@@ -138,9 +139,9 @@ def drawn(seed: int, number: int) -> Case:
     return Case(kind, figure, noisy, clean, stated, box, apart, voxel)
 
 
-def true_width(volume: fx.Volume, box: Solid, axis: int) -> float:
+def true_width(volume: fx.Volume, box: Solid, axis: int, share: float = 25.0) -> float:
     """Width from 10 to 90 % of the box's two faces across a local axis, in tiles of the
-    faces: that of the sharpest quarter [mm].
+    faces: that of the sharpest `share` of 100 [mm].
     """
     z, y, x = np.meshgrid(*volume.centers()[::-1], indexing="ij")
     local = box.local(np.stack([x, y, z], -1)) * box.half
@@ -161,7 +162,7 @@ def true_width(volume: fx.Volume, box: Solid, axis: int) -> float:
             width = width_of(away[near][here] / voxel, volume.data[near][here])
             if width is not None:
                 widths.append(width * voxel)
-    return float(np.percentile(widths, 25.0))
+    return float(np.percentile(widths, share))
 
 
 def width_of(away: np.ndarray, values: np.ndarray) -> float | None:
@@ -228,7 +229,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     ratios: dict[str, list[float]] = defaultdict(list)
     told: dict[str, list[bool]] = defaultdict(list)
-    wrong = []
+    wrong, within = [], []
     for number in range(options.count):
         case = drawn(options.seed, number)
         cells = int(2 * 14.0 / case.voxel_mm)
@@ -241,6 +242,13 @@ def main() -> None:
         detail = true_detail(volume, clean)
         told[case.kind].append(found.doubled)
         parts = []
+        accuracy = volume.accuracy
+        if accuracy is not None and accuracy.edges_mm is not None:
+            true = max(true_width(clean, case.box, axis, 50.0) for axis in (0, 1))
+            ratios[f"{case.kind} edges"].append(accuracy.edges_mm / true)
+            within.append(accuracy.edges_mm >= true)
+            why = accuracy.edges_cause or "as measured"
+            parts.append(f"edges {accuracy.edges_mm:.3f} ({why}) of {true:.3f}")
         for name, width, true in (
             ("across", found.across, truth),
             ("along", found.along, along),
@@ -269,6 +277,7 @@ def main() -> None:
         print(f"{kind}: {sum(said)} of {len(said)} doubled")
     sound = sum(sum(said) for kind, said in told.items() if kind not in DOUBLED)
     print(f"widths more than a fifth off: {sum(wrong)} of {len(wrong)}")
+    print(f"edges within what is claimed: {sum(within)} of {len(within)}")
     if sound or np.mean(told["axis"] or [1.0]) < 0.5:
         sys.exit(1)
 

@@ -90,10 +90,14 @@ class Accuracy:
         figure: size of the cause with its standard error, where the images tell one.
         taken: what is taken as stated, because the images do not decide it, by how much it
             would change the volume.
-        next: the next of the errors that images tell, with its size; "" without one.
-        doubled: distance at which those errors double edges [pixels, as seen by a view].
-        edges: distance within which opposite views show an edge, by these errors and by two
-            standard errors of others [pixels]; None where it was not found.
+        next: the next of the errors that images tell, of `CAUSES`; "" without one.
+        next_figure: its size, likewise.
+        doubled_mm: distance at which the errors that images tell double edges, at the axis; 0
+            of less than `MIN_DOUBLED_VOXELS`.
+        edges_mm: width of edges across the axis, at most: as measured (`Sharpness.across`) with
+            two standard errors, or as these errors and two standard errors of others double
+            them, whichever is more; None where neither was found.
+        edges_cause: of `CAUSES`, of the latter; "" of a measured width.
     """
 
     half: float
@@ -103,8 +107,10 @@ class Accuracy:
     figure: str = ""
     taken: tuple[str, ...] = ()
     next: str = ""
-    doubled: float = 0.0
-    edges: float | None = None
+    next_figure: str = ""
+    doubled_mm: float = 0.0
+    edges_mm: float | None = None
+    edges_cause: str = ""
 
     def __str__(self) -> str:
         """Return the accuracy sentence, at most 30 words: largest errors [%] of values in nine of
@@ -114,7 +120,7 @@ class Accuracy:
         if self.cut_off:
             return NOT_BOUNDED
         first, *more = self._stated or ("",)
-        edges = "" if self.edges is None else f", edges within {self.edges:.2g} pixels"
+        edges = "" if self.edges_mm is None else f", edges within {self.edges_mm:.2g} mm"
         taken = _as_stated(first, "more" if more else "")
         return f"{self._values}{edges}, mainly {CAUSES[self.cause]}{taken}"
 
@@ -122,13 +128,19 @@ class Accuracy:
     def details(self) -> str:
         """All that the sentence is made of, as one longer sentence."""
         figure = f" ({self.figure})" if self.figure else ""
-        further = f", then {self.next}" if self.next else ""
-        doubled = f", edges doubled by {self.doubled:.2g} pixels" if self.doubled else ""
+        further = ""
+        if self.next:
+            further = f", then {CAUSES[self.next]} ({self.next_figure})"
+        edges = ""
+        if self.edges_mm is not None:
+            why = f" ({CAUSES[self.edges_cause]})" if self.edges_cause else ""
+            edges = f", edges within {self.edges_mm:.2g} mm{why}"
+        doubled = f", doubled by {self.doubled_mm:.2g} mm" if self.doubled_mm else ""
         *first, last = self._stated or ("",)
         values = f"{self._values} ({_percent(self.half)} in half)"
         bound = f"{NOT_BOUNDED}; estimate: " if self.cut_off else ""
         return (
-            f"{bound}{values}, mainly {CAUSES[self.cause]}{figure}{further}{doubled}"
+            f"{bound}{values}, mainly {CAUSES[self.cause]}{figure}{further}{edges}{doubled}"
             f"{_as_stated(', '.join(first), last) if first else _as_stated(last)}"
         )
 
@@ -206,10 +218,12 @@ class Sharpness:
         detail_mm: size of the finest details that two half scans have in common (Fourier
             ring correlation on planes, half-bit criterion); None where it was not
             measured.
-        doubled_mm: distance at which opposite views show the same edge, on that plane
-            where it is largest; None where it was not measured.
-        doubled_error_mm: its standard error.
+        doubled_mm: distance at which opposite views show the same edge: as measured on that
+            plane where it is largest, or, if that is more, as the errors that images tell
+            double edges (`Accuracy.doubled_mm`); None where neither was found.
+        doubled_error_mm: standard error of the measured one; 0 of the other.
         voxel_mm: edge of a voxel; details are at least two, edges about one.
+        doubled_cause: of `CAUSES`; "" of a measured distance.
 
     Example:
         >>> Sharpness(None, None, 0.21, 0.0, 0.01, 0.1).doubled
@@ -222,6 +236,7 @@ class Sharpness:
     doubled_mm: float | None
     doubled_error_mm: float | None
     voxel_mm: float
+    doubled_cause: str = ""
 
     @property
     def doubled(self) -> bool:
@@ -240,18 +255,20 @@ class Sharpness:
         return f"<{self}>"
 
     def __str__(self) -> str:
-        """Say in one sentence how wide edges are, what details are told, and whether
-        edges are doubled.
+        """Say in one sentence whether edges are doubled, how wide they are (each of two that
+        are farther apart), and what details are told.
         """
+        apart = self.doubled_mm if self.doubled and self.doubled_mm is not None else 0.0
         said = [
-            f"edges {width.mm:.2g} mm wide {where}"
+            f"{'each' if apart > width.mm else 'edges'} {width.mm:.2g} mm wide {where}"
             for width, where in ((self.across, "across"), (self.along, "along the axis"))
             if width is not None
         ]
         if self.detail_mm is not None:
             said.append(f"details from {self.detail_mm:.2g} mm")
-        if self.doubled:
-            said.append(f"edges doubled by {self.doubled_mm:.2g} mm")
+        if apart:
+            why = f" ({CAUSES[self.doubled_cause]})" if self.doubled_cause else ""
+            said.insert(0, f"edges doubled by {apart:.2g} mm{why}")
         if not said:
             return "sharpness: not known, no edges"
         return f"sharpness: {', '.join(said)} (voxels of {self.voxel_mm:.2g} mm)"

@@ -28,7 +28,6 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection import Grid, Volume
 from flexdt.twin.projection.volume import (
-    CAUSES,
     MIN_DOUBLED_VOXELS,
     MIN_TWO_EDGES_PX,
     WARNING_BOUND,
@@ -51,7 +50,8 @@ from flexdt.twin.reconstruction.consistency.agreement import (
     looked_at,
 )
 from flexdt.twin.reconstruction.consistency.cause_table import Finding
-from flexdt.twin.reconstruction.consistency.doubled_edges import doubled_px
+from flexdt.twin.reconstruction.consistency.causes import pixel_at_axis
+from flexdt.twin.reconstruction.consistency.doubled_edges import doubled_mm
 from flexdt.twin.reconstruction.consistency.suspects import SIDES, suspects
 from flexdt.twin.reconstruction.consistency.view_pairs import sampling_error
 from flexdt.twin.reconstruction.feldkamp.fdk_plan import plan_fdk
@@ -116,7 +116,8 @@ class Bias:
             bounded.
         figures: cause -> its size, in words.
         taken: what is taken as stated, because the images do not decide it.
-        doubled: cause -> distance at which it doubles edges [pixels], of errors that images tell.
+        doubled: cause -> distance at which it doubles edges, at the axis [mm], of errors that
+            images tell.
         edges: likewise of the others, `SIGMAS` standard errors; None where it was not found.
     """
 
@@ -149,10 +150,10 @@ class Bias:
         """Bound at the nodes [1/mm]."""
         return np.asarray(self.shift + SIGMAS * self.spread, np.float32)
 
-    def doubling(self, least_px: float) -> str:
-        """Return the cause that doubles edges most, by at least so many pixels; "" without."""
+    def doubling(self, least_mm: float) -> str:
+        """Return the cause that doubles edges most, by at least so much; "" without."""
         most = max(self.doubled, key=lambda cause: self.doubled[cause], default="")
-        return most if self.doubled.get(most, 0.0) >= least_px else ""
+        return most if self.doubled.get(most, 0.0) >= least_mm else ""
 
     def bound(self, grid: Volume) -> Float32Array | None:
         """Compute the bound of the error at each voxel of a grid, interpolated from the nodes.
@@ -207,29 +208,39 @@ class Bias:
             if cause in off and cause != worst
         }
         following = max(told, key=lambda cause: told[cause], default="")
-        doubling = self.doubling(MIN_DOUBLED_VOXELS)
-        doubled = max(self.doubled.values(), default=0.0)
+        doubling = self.doubling(MIN_DOUBLED_VOXELS * float(np.max(grid.voxel_mm)))
         if doubling in told:
             following = doubling  # it may hardly change values
         elif following and told[following] <= FLOOR:
             following = ""
-        further = ""
-        if following:
-            further = f"{CAUSES[following]} ({self.figures[following]})"
-        figure = self.figures.get(worst, "")
-        cut_off = "beyond" in off
-        edges = None if self.edges is None else round(doubled + self.edges, 2)
+        edges, of_edges = self._edges(grid, doubling)
         return Accuracy(
             half,
             most,
             worst,
-            cut_off,
-            figure,
-            self.taken,
-            further,
-            round(doubled, 2),
-            edges,
+            cut_off="beyond" in off,
+            figure=self.figures.get(worst, ""),
+            taken=self.taken,
+            next=following,
+            next_figure=self.figures.get(following, ""),
+            doubled_mm=self.doubled.get(doubling, 0.0),
+            edges_mm=edges,
+            edges_cause=of_edges,
         )
+
+    def _edges(self, grid: Grid | Volume, doubling: str) -> tuple[float | None, str]:
+        """Compute how wide edges across the axis are at most [mm]: as measured, or as errors
+        double them, whichever is more; and the cause, "" of a measured width.
+
+        `doubling`: the cause that doubles edges most."""
+        found: list[tuple[float, str]] = []
+        if self.edges is not None:
+            told = max(self.doubled.values(), default=0.0)
+            found.append((told + self.edges, doubling or "geometry"))
+        width = grid.sharpness.across if isinstance(grid, Volume) else None
+        if width is not None:
+            found.append((width.mm + SIGMAS * width.error_mm, ""))
+        return max(found, default=(None, ""))
 
 
 def _within(share: float, shift: FloatArray, spread: FloatArray) -> float:
@@ -383,7 +394,7 @@ class BiasOnDemand:
             accuracy = told.accuracy(grid) if told.causes else None
             if accuracy is not None and accuracy.most > WARNING_BOUND:
                 causes.append(accuracy.cause)
-            doubling = told.doubling(MIN_TWO_EDGES_PX)
+            doubling = told.doubling(MIN_TWO_EDGES_PX * self._pixel_mm)
         return doubt_words(list(dict.fromkeys(causes)), doubling)
 
     def _streaked(self, grid: Grid | Volume) -> bool:
@@ -496,14 +507,28 @@ class BiasOnDemand:
             doubled=doubled,
         )
 
+    def doubling(self) -> tuple[str, float]:
+        """Return the error of those that images tell that doubles edges most, and by how much
+        at the axis [mm]; "" and 0 without one."""
+        told = self._told
+        cause = told.doubling(0.0)
+        return cause, told.doubled.get(cause, 0.0)
+
+    @cached_property
+    def _pixel_mm(self) -> float:
+        """Width of a pixel of the panel at the axis."""
+        scan = self._copied(NODES)
+        across, _ = pixel_at_axis(scan.cone_vec, scan.circle.centre)
+        return float(across.mean()) / scan.binned[1]
+
     def _doubled(self, one: Finding) -> float:
-        """Compute by how much an error doubles edges [pixels of the panel]."""
+        """Compute by how much an error doubles edges, at the axis [mm]."""
         scan = self._copied(NODES)
         if one.cause.views is None:
             return 0.0
-        sizes = one.size / one.cause.whole_unit(scan.binned) * one.course(scan.share)
+        sizes = one.size * one.course(scan.share)
         centre = np.append(scan.circle.centre, scan.grid.center_mm[2])
-        pixels = doubled_px(
+        return doubled_mm(
             scan.cone_vec,
             one.cause.views(scan.cone_vec, sizes),
             (scan.images.shape[1], scan.images.shape[2]),
@@ -511,7 +536,6 @@ class BiasOnDemand:
             0.5 * max(scan.ends),
             0.25 * scan.grid.size_mm[2],
         )
-        return pixels * scan.binned[1]
 
     def _sampling(self, bounded: Bias) -> FloatArray:
         """Compute what the pixels' sampling does to the coarse volume: a line integral that
@@ -554,7 +578,6 @@ class BiasOnDemand:
             GeometryError: FDK cannot use the views.
         """
         scan = self._copied(NODES)
-        size /= one.cause.whole_unit(scan.binned)
         images, views = one.cause.corrected(
             scan.images, scan.cone_vec, size * one.course(scan.share)
         )
@@ -603,7 +626,7 @@ class BiasOnDemand:
             name = STATED.get(one.cause.name, one.cause.name)
             if decided(name, moved.astype(np.float32)):
                 squares += np.square(_about(change, bounded.even))
-                if doubled < MIN_TWO_EDGES_PX:
+                if doubled < MIN_TWO_EDGES_PX * self._pixel_mm:
                     edges = float(np.hypot(edges, doubled))
                 else:  # as the angles of a ball: it is its edges that are taken as stated
                     taken.setdefault(name, 0.0)

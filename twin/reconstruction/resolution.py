@@ -49,14 +49,17 @@ def sharpness_of(volume: Volume) -> Sharpness:
         across = edges.width(up < ACROSS, every * voxel)
         along = edges.width(up > ALONG, every * voxel)
     noise: Any = getattr(volume, "_noise", None)  # of `volume_errors.with_errors`
+    bias: Any = getattr(volume, "_bias", None)
     halves: HalfScans | None = getattr(noise, "half_scans", None)
-    if halves is None:
-        return Sharpness(across, along, None, None, None, voxel)
-    doubled = displacement(halves)
-    distance = error = None
-    if doubled is not None:
-        distance, error = doubled
-    return Sharpness(across, along, detail_mm(halves), distance, error, voxel)
+    measured = None if halves is None else displacement(halves)
+    distance, error = (None, None) if measured is None else measured
+    cause, told = ("", 0.0) if bias is None else bias.doubling()
+    if cause and told > (distance or 0.0):  # two edges far apart are not found as one
+        distance, error = told, 0.0
+    else:
+        cause = ""
+    detail = None if halves is None else detail_mm(halves)
+    return Sharpness(across, along, detail, distance, error, voxel, cause)
 
 
 def detail_mm(halves: HalfScans) -> float | None:

@@ -43,6 +43,11 @@ class BoundOf(Protocol):
     def accuracy(self, grid: Volume) -> Accuracy | None:
         """Compute the accuracy of uniform regions in a grid; None if unknown."""
 
+    @abstractmethod
+    def doubling(self) -> tuple[str, float]:
+        """Return the known error that doubles edges most, of `CAUSES`, and by how much at the
+        axis [mm]; "" and 0 without one."""
+
 
 def with_errors(
     volume: Volume, noise: SigmaOf | None = None, bias: BoundOf | None = None

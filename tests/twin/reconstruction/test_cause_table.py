@@ -5,6 +5,7 @@ Images are those of the study's own closed forms, which share nothing with the p
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -27,7 +28,7 @@ from flexdt.twin.reconstruction.coarse_scan import FINE_NODES, CoarseScan, ScanC
 from flexdt.twin.reconstruction.consistency.agreement import Agreement, agreement_of
 from flexdt.twin.reconstruction.consistency.cause_table import CauseTable
 from flexdt.twin.reconstruction.consistency.causes import causes_of
-from flexdt.twin.reconstruction.consistency.doubled_edges import doubled_px
+from flexdt.twin.reconstruction.consistency.doubled_edges import doubled_mm
 from flexdt.twin.reconstruction.consistency.opposed_rays import OpposedRays
 from flexdt.twin.reconstruction.consistency.view_pairs import (
     ViewPairs,
@@ -82,7 +83,7 @@ def test_numbers_of_the_conditions_agree_in_a_right_scan() -> None:
 
 
 GEOMETRIES = {
-    "axis": (claims._moved(scan().true, 1.7), -1.7),
+    "axis": (claims._moved(scan().true, 1.7), -1.7 * PIXEL * SOD / SDD),
     "roll": (claims.circle(ANGLES, SOD, SDD, PIXEL, tilts=(2.0, 0.0, 0.0)), None),
     "yaw": (claims.circle(ANGLES, SOD, SDD, PIXEL, tilts=(0.0, 0.0, 6.0)), None),
 }
@@ -102,7 +103,9 @@ def test_a_wrong_geometry_is_named_with_its_size(name: str) -> None:
 @pytest.mark.parametrize("name", ["roll", "pitch", "yaw"])
 def test_a_tilt_of_any_size_leaves_pixels_as_large_as_they_are(name: str) -> None:
     """Sheared by 15 degrees, a panel was 3.4 % larger, and explained a wrong distance."""
-    (tilt,) = (one for one in causes_of(np.zeros(2)) if one.name == name)
+    (tilt,) = (
+        one for one in causes_of(ConeVec(scan().true), np.zeros(2)) if one.name == name
+    )
     stated = ConeVec(scan().true)
     assert tilt.views is not None
     there = tilt.views(stated, np.full(len(stated), 15.0))
@@ -235,15 +238,21 @@ def test_an_axis_half_a_pixel_off_doubles_edges_and_is_doubted_at_first_sight() 
     bias = BiasOnDemand(copied(off))
     accuracy = bias.accuracy(bias.found)
     assert accuracy is not None
-    assert accuracy.doubled == pytest.approx(1.2, abs=0.1)
-    assert "edges within 1.2 pixels" in str(accuracy)
-    assert "the axis offset (-0.59" in accuracy.details
+    two = 1.2 * PIXEL * SOD / SDD
+    assert accuracy.doubled_mm == pytest.approx(two, rel=0.08)
+    assert (accuracy.cause, accuracy.edges_cause) == ("axis", "axis")
+    assert (
+        f"edges within {accuracy.edges_mm:.2g} mm (the axis offset)" in accuracy.details
+    )
+    size, sigma, *_ = re.findall(r"[\d.]+", accuracy.figure)
+    assert float(size) == pytest.approx(0.5 * two, abs=3.0 * float(sigma))
+    assert len(size) == len(sigma)
     assert bias.warnings(bias.found) == [
         "edges doubled: the axis offset; see its accuracy"
     ]
     right = BiasOnDemand(copied(scan()))
     assert right.warnings(right.found) == []
-    assert right.accuracy(right.found).doubled < 0.1  # type: ignore[union-attr]
+    assert right.accuracy(right.found).doubled_mm == 0.0  # type: ignore[union-attr]
 
 
 def test_edges_are_doubled_by_what_no_motion_of_the_object_explains() -> None:
@@ -251,7 +260,8 @@ def test_edges_are_doubled_by_what_no_motion_of_the_object_explains() -> None:
     right = ConeVec(scan().true)
     place = (np.array([0.0, 0.0, 0.0]), 9.0, 4.0)
     aside = ConeVec(claims._moved(scan().true, 0.8))
-    assert doubled_px(right, aside, SHAPE, *place) == pytest.approx(1.6, abs=0.05)
+    two = 1.6 * PIXEL * SOD / SDD
+    assert doubled_mm(right, aside, SHAPE, *place) == pytest.approx(two, rel=0.03)
     turn = np.deg2rad(3.0)
     cos, sin = np.cos(turn), np.sin(turn)
     turned = right.rows.reshape(-1, 4, 3) @ np.array(
@@ -259,7 +269,7 @@ def test_edges_are_doubled_by_what_no_motion_of_the_object_explains() -> None:
     )
     turned[:, :2] += [0.05, -0.02, 0.03]
     elsewhere = ConeVec(turned.reshape(-1, 12))
-    assert doubled_px(right, elsewhere, SHAPE, *place) < 0.03
+    assert doubled_mm(right, elsewhere, SHAPE, *place) < 0.02 * two
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ direction, order, span) are compared by likelihood. What remains is stated as su
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -123,7 +123,6 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
     if found is None:
         return Agreement()
     told, table = found
-    told = [_of_panel(one, scan.binned) for one in told]
     there, base = scan, table
     if not first.doubtful and not any(one.told for one in told):
         # What images leave open is seen as well with fewer pixels.
@@ -168,12 +167,6 @@ def agreement_of(scan: CoarseScan, *, sides_known: bool = False) -> Agreement:
         min(1.0, _probability(fitting[0][0]) * len(better)),
     )
     return Agreement(contradiction, told, left, (), compared=True)
-
-
-def _of_panel(one: Finding, binned: tuple[int, int]) -> Finding:
-    """Convert coarse pixels to the panel's."""
-    pixels = one.cause.whole_unit(binned)
-    return replace(one, size=pixels * one.size, sigma=pixels * one.sigma)
 
 
 def _some(scan: CoarseScan) -> tuple[slice, FloatArray]:

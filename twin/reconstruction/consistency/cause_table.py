@@ -11,6 +11,7 @@ its estimates differ is part of their standard error.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -298,8 +299,7 @@ class CauseTable:
         both = [one for one in both if _key(one) not in map(_key, errors)]
         fine = self._beside(errors, both)
         coarse = half._beside(told, [usual[_key(one)] for one in both])
-        units = np.array([one[0].whole_unit(self._binned) for one in (*errors, *both)])
-        off = np.abs(fine - units * coarse)
+        off = np.abs(fine - coarse)
         if not both:
             return off[: len(errors)], 1.0
         shared = np.array([self._products.shared[one] for one in both])
@@ -385,7 +385,7 @@ class CauseTable:
         found: dict[Error, FloatArray] = {}
         size = float(np.sqrt(np.square(self.differences).sum() + self.variance.sum()))
         views = np.concatenate([one.views for _, one in self.rows])
-        for cause in causes_of(self.circle.centre):
+        for cause in causes_of(self.cone_vec, self.circle.centre):
             parts = [self._derivative(cause, kind, one) for kind, one in self.rows]
             first, second = (
                 np.concatenate([one[side] for one in parts]) for side in (0, 1)
@@ -483,7 +483,20 @@ class Finding:
             where = " in the course of the scan"
         if self.course.kind == "step":
             where = f" from {100.0 * self.course.number:.0f} % of the scan on"
-        return f"{self.size:+.2g} ± {self.sigma:.1g} {self.cause.unit}{where}"
+        size, sigma = rounded(self.size, self.sigma)
+        return f"{size} ± {sigma} {self.cause.unit}{where}"
+
+
+def rounded(size: float, sigma: float) -> tuple[str, str]:
+    """Write a size, with its sign, and its standard error with the same decimals: two digits of
+    the standard error.
+
+    Example:
+        >>> rounded(-0.98712, 0.0123), rounded(1234.0, 45.6)
+        (('-0.987', '0.012'), ('+1234', '46'))
+    """
+    decimals = max(0, 1 - math.floor(math.log10(sigma))) if sigma > 0.0 else 6
+    return f"{size:+.{decimals}f}", f"{sigma:.{decimals}f}"
 
 
 def findings(

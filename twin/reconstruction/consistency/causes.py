@@ -25,7 +25,7 @@ class Cause:
 
     Attributes:
         name: of `flexdt.twin.projection.volume.CAUSES`.
-        unit: of its size, as it is printed.
+        unit: of its size, as it is printed; mm are those at the axis.
         step: for its derivative [unit].
         most: that can be told: beyond it a scan is not nearly the stated one (assumed).
         views: geometry, sizes (n,) [unit] -> the geometry that is right if the stated one
@@ -52,14 +52,6 @@ class Cause:
     turns: bool = False
     fine: bool = False
     of_integral: bool = False
-
-    def whole_unit(self, binned: tuple[int, int]) -> float:
-        """Return how many units of the panel one of a binned copy is.
-
-        `binned`: rows and columns of the panel that are one of the copy."""
-        if self.unit != "px":
-            return 1.0
-        return binned[0] if self.name in ("height", "slip") else binned[1]
 
     def corrected(
         self, images: Float32Array, cone_vec: ConeVec, sizes: FloatArray
@@ -108,12 +100,38 @@ def courses(cause: Cause) -> list[Course]:
     return found
 
 
-def causes_of(centre: FloatArray) -> list[Cause]:
+def pixel_at_axis(cone_vec: ConeVec, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Compute how large a pixel of each view is at the axis, along u and along v, (n,) [mm].
+
+    `centre`: (x, y) of the axis."""
+    normal = _unit(np.cross(cone_vec.u, cone_vec.v))
+    far = ((cone_vec.detector - cone_vec.source) * normal).sum(axis=1)
+    near = ((centre - cone_vec.source[:, :2]) * normal[:, :2]).sum(axis=1)
+    smaller = np.abs(near / far)
+    u, v = (np.linalg.norm(side, axis=1) for side in (cone_vec.u, cone_vec.v))
+    return u * smaller, v * smaller
+
+
+def causes_of(cone_vec: ConeVec, centre: FloatArray) -> list[Cause]:
     """List the errors that are looked for.
 
     Args:
+        cone_vec: n views, whose pixels limit what is told.
         centre: (x, y) of the rotation axis.
     """
+    across, down = (float(side.mean()) for side in pixel_at_axis(cone_vec, centre))
+
+    def beside(views: ConeVec, sizes: FloatArray) -> ConeVec:
+        """Move each panel along its rows [mm at the axis]."""
+        pixels = sizes / pixel_at_axis(views, centre)[0]
+        panel = views.detector + pixels[:, None] * views.u
+        return ConeVec.from_vectors(views.source, panel, views.u, views.v)
+
+    def below(views: ConeVec, sizes: FloatArray) -> ConeVec:
+        """Move each panel along its columns [mm at the axis]."""
+        pixels = sizes / pixel_at_axis(views, centre)[1]
+        panel = views.detector + pixels[:, None] * views.v
+        return ConeVec.from_vectors(views.source, panel, views.u, views.v)
 
     def turned(views: ConeVec, sizes: FloatArray) -> ConeVec:
         """Turn each view about the axis [degrees]."""
@@ -135,9 +153,9 @@ def causes_of(centre: FloatArray) -> list[Cause]:
         return turned(views, 0.01 * sizes * np.rad2deg(azimuth - azimuth.mean()))
 
     return [
-        Cause("axis", "px", 0.05, 20.0, _beside, course=True),
-        Cause("height", "px", 0.05, 20.0, _below, nuisance=True),
-        Cause("slip", "px", 0.05, 20.0, _below, constant=False, course=True),
+        Cause("axis", "mm", 0.05 * across, 20.0 * across, beside, course=True),
+        Cause("height", "mm", 0.05 * down, 20.0 * down, below, nuisance=True),
+        Cause("slip", "mm", 0.05 * down, 20.0 * down, below, constant=False, course=True),
         Cause("roll", "deg", 0.1, 20.0, _rolled),
         Cause("pitch", "deg", 0.3, 45.0, _pitched, nuisance=True),
         Cause("yaw", "deg", 0.3, 45.0, _yawed),
@@ -164,16 +182,6 @@ def causes_of(centre: FloatArray) -> list[Cause]:
         ),
         Cause("lens", "%", 1.0, 20.0, images=_bulged, fine=True),
     ]
-
-
-def _beside(views: ConeVec, sizes: FloatArray) -> ConeVec:
-    panel = views.detector + sizes[:, None] * views.u
-    return ConeVec.from_vectors(views.source, panel, views.u, views.v)
-
-
-def _below(views: ConeVec, sizes: FloatArray) -> ConeVec:
-    panel = views.detector + sizes[:, None] * views.v
-    return ConeVec.from_vectors(views.source, panel, views.u, views.v)
 
 
 def _tilted(views: ConeVec, sizes: FloatArray, axis: FloatArray) -> ConeVec:

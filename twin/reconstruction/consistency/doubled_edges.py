@@ -13,6 +13,7 @@ import numpy as np
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray
+from flexdt.twin.reconstruction.consistency.causes import pixel_at_axis
 
 AZIMUTHS: Final = 8
 """Points about the axis at each of three heights."""
@@ -20,7 +21,7 @@ STEP: Final = 1e-3
 """Of the motions, over the radius of the points; projections are nearly linear in them."""
 
 
-def doubled_px(
+def doubled_mm(
     stated: ConeVec,
     right: ConeVec,
     shape: tuple[int, int],
@@ -28,7 +29,7 @@ def doubled_px(
     radius: float,
     half_height: float,
 ) -> float:
-    """Compute by how many pixels two geometries double edges, (column's and row's together).
+    """Compute by how much two geometries double edges, at the axis [mm].
 
     Args:
         stated, right: n views each, of the same panel.
@@ -37,8 +38,8 @@ def doubled_px(
         radius, half_height: of a cylinder in which it is [mm].
 
     Returns:
-        Twice the root mean square of a point's displacement in a view; 0 where a view does not
-        project the points.
+        Twice the root mean square of a point's displacement in a view, as far from the source
+        as the axis; 0 where a view does not project the points.
     """
     turn = np.arange(AZIMUTHS) * 2.0 * np.pi / AZIMUTHS
     around = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(AZIMUTHS)]) * radius
@@ -48,11 +49,12 @@ def doubled_px(
     moves = [np.broadcast_to(step * axis, points.shape) for axis in np.eye(3)]
     moves += [STEP * np.cross(axis, points) for axis in np.eye(3)]
     moves.append(STEP * points)
+    side = np.stack(pixel_at_axis(stated, centre[:2]), axis=-1)[:, None]
     there = stated.project_points(points + centre, shape)
-    off = (right.project_points(points + centre, shape) - there).ravel()
+    off = (side * (right.project_points(points + centre, shape) - there)).ravel()
     columns = np.array(
         [
-            (stated.project_points(points + m + centre, shape) - there).ravel()
+            (side * (stated.project_points(points + m + centre, shape) - there)).ravel()
             for m in moves
         ]
     ).T
