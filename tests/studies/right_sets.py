@@ -2,9 +2,9 @@
 
 `python tests/studies/right_sets.py [--scans 500] [--seed 0] [--kind as_assumed] [--json]`
 draws scanners and phantoms from their assumed tolerances (`RIGHT` of `faults_drawn`: all
-offsets of detector and axis, stretches and shears of the phantom), calibrates their spots with
-all causes, and counts refusals, truths inside the 95 % intervals, and those of all parameters
-together inside the joint regions of LEVELS.
+offsets of detector and axis, the pixel pitch, the phantom's scale, stretches and shears),
+calibrates their spots with all causes, and counts refusals, truths inside the 95 % intervals,
+and those of all parameters together inside the joint regions of LEVELS.
 
 What the calibration assumes of causes is drawn with `--kind with_causes`, and with
 `--kind with_motion` also what moves. `as_assumed` has none of the causes that a calibration
@@ -73,7 +73,7 @@ def covered(kind: str, seed: int) -> Covered | None:
     certificate = result.fit.certificate
     known = {}
     for name, e in certificate.estimates.items():
-        true = scan.truth.get(name, (0.0, 0.0))[0]
+        true = scan.truth[name][0]  # No default: what is not stated is not 0.
         if name == "alpha":
             true = e.value + (true - e.value + 180.0) % 360.0 - 180.0
         known[name] = true

@@ -989,23 +989,38 @@ def usual(draft: Draft, rng: Rng) -> Draft:
     return replace(draft, world=world, beside=("priors_narrow",))
 
 
+STRAIN: Final = 1e-3
+"""Of what every phantom is strained by, and its scale is off by."""
+PITCH: Final = 3e-6
+"""Of the pixel pitch over the told one."""
+
+
+def _of_lengths(draft: Draft, rng: Rng, scale: float) -> Draft:
+    """Draw the pixel pitch, and state it and the phantom's scale as true lengths over the told
+    ones. The generator's later draws stay as they are.
+    """
+    pitch = PITCH * float(rng.spawn(1)[0].normal())
+    world = replace(draft.world, pixel=draft.world.pixel * (1.0 + pitch))
+    return replace(draft, world=world, truth={"phantom": scale, "pixel": pitch})
+
+
 def _right(draft: Draft, rng: Rng) -> Draft:
     """Draw a phantom and a scanner within their assumed tolerances: the phantom's scale,
     and each of its strains, to 0.1 % rms; findings of strain or narrow priors are
     allowed, none is right, too.
     """
     draft = usual(draft, rng)
-    change = (1.0 + 1e-3 * rng.normal()) * np.eye(3) + 1e-3 * rng.normal(size=(3, 3))
+    scale = STRAIN * float(rng.normal())
+    change = (1.0 + scale) * np.eye(3) + STRAIN * rng.normal(size=(3, 3))
     world = replace(draft.world, beads=reshaped(draft.world.beads, change))
-    return replace(draft, world=world, silent=True,
-                   names=("phantom_strained|priors_narrow",))  # fmt: skip
+    draft = _of_lengths(replace(draft, world=world), rng, scale)
+    return replace(draft, silent=True, names=("phantom_strained|priors_narrow",))
 
 
 CAUSE_ODDS: Final = 0.1
 """Of each cause, present to absent, as the calibration assumes them; so are the widths here."""
-STRAIN: Final = 1e-3
 STRAIN_WIDTHS: Final = (2.5e-3, 6e-3, 1.5e-2, 4e-2)
-"""Of what every phantom is strained by, and of phantoms of another shape."""
+"""Of strains of phantoms of another shape."""
 BEAD_SHARES: Final = tuple(2e-4 * 2.0**k for k in range(8))
 PANEL_WIDTHS_PX: Final = tuple(0.004 * 2.5**k for k in range(9))
 GAP_WIDTHS_PX: Final = (0.1, 0.5, 2.0, 8.0)
@@ -1036,13 +1051,16 @@ def _with_causes(moving: bool) -> Fault:
             return pick if there else 0.0
 
         draft = usual(draft, rng)
-        world = draft.world
-        beads = world.beads
-        stretch = width(*STRAIN_WIDTHS) or STRAIN
+        beads = draft.world.beads
+        wide = width(*STRAIN_WIDTHS)
         shear = width(*STRAIN_WIDTHS) or STRAIN
         change = shear * rng.normal(size=(3, 3))
-        np.fill_diagonal(change, stretch * rng.normal(size=3))
-        change += (1.0 + stretch * rng.normal()) * np.eye(3)
+        np.fill_diagonal(change, (wide or STRAIN) * rng.normal(size=3))
+        common = float(rng.normal())
+        # The scale that wide stretches share is theirs, beside the file's own.
+        scale = STRAIN * (float(rng.spawn(1)[0].normal()) if wide else common)
+        change += (1.0 + scale + wide * common) * np.eye(3)
+        draft = _of_lengths(draft, rng, scale)
         place = width(*BEAD_SHARES) * float(np.ptp(beads, axis=0).max())
         beads = reshaped(beads, change) + place * rng.normal(size=beads.shape)
         arc = math.sqrt(min(width(ARC_WIDTH) * abs(rng.normal()), 1.0))
@@ -1050,8 +1068,10 @@ def _with_causes(moving: bool) -> Fault:
         gap = width(*GAP_WIDTHS_PX) * rng.normal(size=2)
         axis = int(rng.integers(2))
         border = draft.world.shape[1 - axis] * rng.uniform(LEAST_TILE, 1.0 - LEAST_TILE)
+        world = draft.world
         world = replace(world, beads=beads, arc=arc * 360.0 / len(world.angles))
         truth = {n: float(np.ravel(v)[0]) for n, v in world.offsets.items()}
+        truth |= draft.truth
         moved = dict(world.offsets)
         for name in MAY_MOVE if moving else ():
             sizes = (

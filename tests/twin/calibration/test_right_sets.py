@@ -39,6 +39,16 @@ def test_regions_of_another_size_are_told() -> None:
     assert off_of(levels(0.8))[0.95] < -FAR_SIGMAS
 
 
+def test_told_lengths_of_a_drawn_scan_are_compared_with_what_was_drawn() -> None:
+    """A phantom 0.23 % smaller than its file says: compared with the file's scale, which images
+    do not tell, the scale had no error, and the others were beyond the 99.99 % region."""
+    one = covered("as_assumed", 59018)
+    assert one is not None
+    assert one.pulls["phantom"] == pytest.approx(2.3, abs=0.1)
+    assert 0.01 < abs(one.pulls["pixel"]) < 4.0
+    assert one.level < 0.95
+
+
 @pytest.fixture(scope="module")
 def plain() -> Certificate:
     """Of six parameters, without a bend."""
