@@ -35,6 +35,7 @@ from flexdt.twin.calibration.fit.problem import (
     as_poses,
     build_problem,
 )
+from flexdt.twin.calibration.repeated_frames import ROBUST
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import FloatArray, stage_rotation
@@ -78,8 +79,6 @@ MOST_FAR = 25.0
 spot may be another's shadow."""
 WEIGHED_FRAMES = 60
 """Frames in which spots are compared with beads in size and contrast."""
-ROBUST = 1.4826
-"""Standard deviation over the median of absolute deviations."""
 FREE_TURNS = (np.arange(1, 8) * 0.25 * math.pi).tolist()
 """Turns that stand for all, where every one looks alike [rad]."""
 AXIS_PX = 0.1

@@ -21,13 +21,15 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 CHANCE: Final = 0.05
 """Probability that a scan has a repeated frame, before the images; assumed."""
 REPORTED_ODDS: Final = 100.0
-"""Odds of a repeat from which it is reported."""
+"""Odds of a repeated frame, or of a gap between tiles, from which it is reported, and odds
+against a gap from which it is excluded."""
 MOST_REPEATED: Final = 0.25
 """Share of frames above which nothing is told: the object, not the list, is at rest."""
 SMOOTHING_PX: Final = 1.5
 """Standard deviation of the smoothing that separates structures from noise [px]."""
 SCATTER_FREEDOM: Final = 8.0
-"""Degrees of freedom of the scatter of turned frames (Student)."""
+"""Degrees of freedom of the scatter of turned frames, and of the evidence of tiles (Student): a
+third of the fewest borders."""
 NEIGHBOURS: Final = 3
 """Frames on each side whose smoothness is usual for a place."""
 MIN_RELIABLE: Final = 0.5

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from flexdt.twin.calibration.fit.fit import RAYLEIGH_MEDIAN
 from flexdt.twin.calibration.fit.problem import (
     STRAINS,
     ColumnLayout,
@@ -34,8 +35,6 @@ PER_FRAME: Final = (*MOVABLE, *LEANS)
 """Parameters that may differ from frame to frame, in the order of their slopes."""
 OUTLIER_SPREADS: Final = 5.0
 """Robust standard deviations beyond which a position counts less."""
-RAYLEIGH_MEDIAN: Final = 1.1774100225154747
-"""Median length of a 2-vector with independent unit normal parts."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
 from scipy.special import log_softmax, logsumexp, softmax
 
-from flexdt.twin.calibration.repeated_frames import ROBUST
+from flexdt.twin.calibration.repeated_frames import ROBUST, SCATTER_FREEDOM
 from flexdt.twin.calibration.without_phantom.gaps.gradient_step import (
     gradient_steps,
     scatter_of_sums,
@@ -43,8 +43,6 @@ EVIDENCE_SHARES: Final = np.array([0.3, 0.65, 1.0])
 SHOWN_COLUMNS: Final = (1, 2)
 """Whole columns that are left out, to see how visible a gap would be: sigmas of its
 evidence grow linearly with its width between them, and beyond."""
-SCATTER_FREEDOM: Final = 8.0
-"""Degrees of freedom of the scatter of evidence (Student): a third of the fewest borders."""
 EDGE_SHARE: Final = 0.2
 """Part of all places there that is compared, those with most change."""
 NOISE_QUANTILE = 0.2

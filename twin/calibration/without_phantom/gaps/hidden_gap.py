@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d
 
+from flexdt.twin.calibration.repeated_frames import REPORTED_ODDS
 from flexdt.twin.calibration.without_phantom.conjugate_rays import (
     ConjugateRays,
     Profile,
@@ -31,7 +32,6 @@ from flexdt.twin.calibration.without_phantom.gaps.frame_evidence import (
 from flexdt.twin.calibration.without_phantom.gaps.mirror_steps import (
     FOOLED_CHANCE,
     LOG_PRIOR,
-    REPORTED_ODDS,
     WIDTHS_PX,
     MirrorSteps,
     over_widths,

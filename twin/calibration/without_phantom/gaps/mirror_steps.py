@@ -31,6 +31,7 @@ from scipy.ndimage import (
 )
 from scipy.special import log_softmax, logsumexp, softmax
 
+from flexdt.twin.calibration.repeated_frames import REPORTED_ODDS
 from flexdt.twin.calibration.without_phantom.circular_scan import CircularScan
 from flexdt.twin.calibration.without_phantom.conjugate_rays import SMOOTHING
 from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
@@ -41,8 +42,6 @@ from flexdt.twin.calibration.without_phantom.mirror_symmetry import (
 from flexdt.twin.calibration.without_phantom.turn import MEDIAN_OF_CHI_SQUARE
 from flexdt.twin.geometry.conventions import FloatArray
 
-REPORTED_ODDS: Final = 100.0
-"""Odds of a gap from which it is reported, and odds against one from which it is excluded."""
 WIDTHS_PX: Final = np.arange(0.25, 3.01, 0.25)
 """Widths of gaps that are tried [px]."""
 WIDTH_SPREAD_PX: Final = 1.0
