@@ -136,14 +136,12 @@ def best_dip(cost: FloatArray, apart: float) -> tuple[int, float]:
 
     Returns:
         Index of the least cost, and the ratio, of minima more than `apart` away: inf
-        without another, 0 if the least cost is at an end or next to a trial that was not made.
+        without another, 0 if the least cost is at an end or next to one that was not tried.
     """
     best = int(cost.argmin())
-    inner = cost[1:-1]
-    dips = (
-        np.flatnonzero((inner <= cost[:-2]) & (inner <= cost[2:]) & np.isfinite(inner))
-        + 1
-    )
+    inner, made = cost[1:-1], np.isfinite(cost)
+    low = (inner <= cost[:-2]) & (inner <= cost[2:])
+    dips = np.flatnonzero(low & made[:-2] & made[2:]) + 1
     if best not in dips:
         return best, 0.0
     others = cost[dips[np.abs(dips - best) > apart]]
