@@ -17,7 +17,7 @@ VIEWS = ConeVec.circular(
     sod=100.0, sdd=200.0, angles=[0.0, 90.0], shape=(9, 9), pixel=1.0
 )
 NAMES = sorted(
-    {STATED.get(one.name, one.name) for one in causes_of(VIEWS, np.zeros(2))}
+    {STATED.get(one.name, one.name) for one in causes_of(VIEWS, np.zeros(2), np.zeros(2))}
     | {"rotation", "order", "geometry", "distances"}
     | {*UNKNOWN_BEAM.taken, *CORRECTED_BEAM.taken}
 )

@@ -100,11 +100,25 @@ def test_a_wrong_geometry_is_named_with_its_size(name: str) -> None:
     assert abs(told[0].size - size) < max(3.0 * told[0].sigma, 0.05 * abs(size))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("begin", "part"), [(0.0, 1.2), (2.0, -0.9), (4.4, 0.5)])
+def test_a_scale_of_angles_is_told_wherever_the_scan_begins(
+    begin: float, part: float
+) -> None:
+    true = claims.circle(begin + (1.0 + 0.01 * part) * ANGLES, SOD, SDD, PIXEL)
+    stated = claims.circle(begin + ANGLES, SOD, SDD, PIXEL)
+    told = [one for one in found(scan(true=true, stated=stated)).findings if one.told]
+    assert [one.cause.name for one in told] == ["turn"]
+    assert abs(told[0].size - part) < 3.0 * told[0].sigma < 0.3
+
+
 @pytest.mark.parametrize("name", ["roll", "pitch", "yaw"])
 def test_a_tilt_of_any_size_leaves_pixels_as_large_as_they_are(name: str) -> None:
     """Sheared by 15 degrees, a panel was 3.4 % larger, and explained a wrong distance."""
     (tilt,) = (
-        one for one in causes_of(ConeVec(scan().true), np.zeros(2)) if one.name == name
+        one
+        for one in causes_of(ConeVec(scan().true), np.zeros(2), np.zeros(len(ANGLES)))
+        if one.name == name
     )
     stated = ConeVec(scan().true)
     assert tilt.views is not None

@@ -385,7 +385,7 @@ class CauseTable:
         found: dict[Error, FloatArray] = {}
         size = float(np.sqrt(np.square(self.differences).sum() + self.variance.sum()))
         views = np.concatenate([one.views for _, one in self.rows])
-        for cause in causes_of(self.cone_vec, self.circle.centre):
+        for cause in causes_of(self.cone_vec, self.circle.centre, self.share):
             parts = [self._derivative(cause, kind, one) for kind, one in self.rows]
             first, second = (
                 np.concatenate([one[side] for one in parts]) for side in (0, 1)
@@ -487,6 +487,64 @@ class Finding:
         return f"{size} ± {sigma} {self.cause.unit}{where}"
 
 
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A scan, corrected by errors of some sizes.
+
+    Attributes:
+        table: of the corrected images and geometry, smoothed.
+        images: corrected, (n, rows, cols).
+        cone_vec: likewise.
+        sizes: that were taken off.
+    """
+
+    table: CauseTable
+    images: Float32Array
+    cone_vec: ConeVec
+    sizes: dict[Key, float]
+
+    def without(self, errors: list[Error], least: float = 0.5) -> Corrected | None:
+        """Correct by errors as they are fitted; None where that explains less than a share of
+        what it would if the differences were linear, or a size is not believed.
+
+        `least`: the share."""
+        table = self.table
+        steps = [size for size, _ in table.fit(errors, sampling=False)]
+        sizes = dict(self.sizes)
+        images, cone_vec = self.images, self.cone_vec
+        for (cause, course), step in zip(errors, steps, strict=True):
+            key = cause.name, course
+            sizes[key] = sizes.get(key, 0.0) + step
+            if abs(sizes[key]) > cause.most:
+                return None
+            images, cone_vec = cause.corrected(
+                images, cone_vec, step * course(table.share)
+            )
+        closer = CauseTable.of(
+            images, cone_vec, table.circle, table.share, table.blur, table.whole
+        )
+        hoped = table.surprises_without(errors, steps)
+        most = table.surprises - least * (table.surprises - hoped)
+        if closer is None or closer.surprises > most:
+            return None
+        return Corrected(closer, images, cone_vec, sizes)
+
+    def settled(self) -> Corrected:
+        """Correct by what is known already until it changes by less than a standard error
+        (Gauss and Newton); where it does not settle, do nothing."""
+        scan = self
+        for _ in range(MOST_STEPS):
+            known = _again(scan.table, scan.sizes)
+            steps = scan.table.fit(known, sampling=False)
+            if all(abs(step) <= sigma for step, sigma in steps):
+                return scan
+            closer = scan.without(known, 0.0)
+            if closer is None:
+                break
+            scan = closer
+        return self
+
+
 def rounded(size: float, sigma: float) -> tuple[str, str]:
     """Write a size, with its sign, and its standard error with the same decimals: two digits of
     the standard error.
@@ -521,34 +579,26 @@ def findings(
             continue  # no large error
         if table is None or table.blur != blur:
             table = CauseTable.of(images, cone_vec, circle, share, blur)
+        if table is None:
+            return None
+        scan = Corrected(table, images, cone_vec, sizes)
         for _ in range(MOST_STEPS):
-            if table is None:
-                return None
-            known = _again(table, sizes)
-            error = table.most_telling(known)
-            if error is None or len(sizes) >= MOST_ERRORS:
+            scan = scan.settled()
+            known = _again(scan.table, scan.sizes)
+            error = scan.table.most_telling(known)
+            if error is None or len(scan.sizes) >= MOST_ERRORS:
                 break
             # What is known already is fitted anew: errors are not quite linear.
-            chosen = [error, *known]
-            steps = [size for size, _ in table.fit(chosen, sampling=False)]
-            there = images, cone_vec
-            for (cause, course), size in zip(chosen, steps, strict=True):
-                there = cause.corrected(*there, size * course(share))
-            closer = CauseTable.of(*there, circle, share, blur)
-            whole = [
-                sizes.get(_key(one), 0.0) + size
-                for one, size in zip(chosen, steps, strict=True)
-            ]
-            if any(
-                abs(size) > one[0].most for one, size in zip(chosen, whole, strict=True)
-            ):
-                break
-            hoped = table.surprises_without(chosen, steps)
-            if closer is None or closer.surprises > 0.5 * (hoped + table.surprises):
+            closer = scan.without([error, *known])
+            if closer is None:
                 break  # far from linear
-            table, (images, cone_vec) = closer, there
-            for one, size in zip(chosen, steps, strict=True):
-                sizes[_key(one)] = sizes.get(_key(one), 0.0) + size
+            scan = closer
+        table, images, cone_vec, sizes = (
+            scan.table,
+            scan.images,
+            scan.cone_vec,
+            scan.sizes,
+        )
     assert table is not None
     return _findings(table, sizes), table
 

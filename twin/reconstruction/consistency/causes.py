@@ -15,6 +15,8 @@ Views = Callable[[ConeVec, FloatArray], ConeVec]
 Images = Callable[[Float32Array, FloatArray], Float32Array]
 WAVES: Final = 6
 """Half waves of a course through the scan, up to which movement is smooth."""
+CHANGING: Final = ("line", "wave", "sine", "step")
+"""Kinds of courses in which a size changes."""
 STEPS: Final = 15
 """Places of a scan at which something may have stepped."""
 
@@ -32,8 +34,7 @@ class Cause:
             is wrong by them; None for an error of the images.
         images: line integrals (n, rows, cols), sizes (n,) -> what the error adds to them;
             None for an error of the geometry.
-        constant: the same in all views may be told from a right scan.
-        course: a course through the scan may be.
+        courses: kinds of `Course` that may be told from a right scan.
         nuisance: fitted in every table, and never told: nearly the same as another object.
         turns: views about the axis.
         fine: told in hardly smoothed images alone.
@@ -45,9 +46,8 @@ class Cause:
     step: float
     most: float
     views: Views | None = None
+    courses: tuple[str, ...] = ("constant",)
     images: Images | None = None
-    constant: bool = True
-    course: bool = False
     nuisance: bool = False
     turns: bool = False
     fine: bool = False
@@ -91,13 +91,11 @@ class Course:
 
 def courses(cause: Cause) -> list[Course]:
     """List the courses of an error that are told."""
-    found = [Course()] * cause.constant
-    if cause.course:
-        found.append(Course("line"))
-        for kind, first in (("wave", 2), ("sine", 1)):
-            found += [Course(kind, float(k)) for k in range(first, WAVES + 1)]
-        found += [Course("step", k / (STEPS + 1.0)) for k in range(1, STEPS + 1)]
-    return found
+    every = [Course(), Course("line")]
+    for kind, first in (("wave", 2), ("sine", 1)):
+        every += [Course(kind, float(k)) for k in range(first, WAVES + 1)]
+    every += [Course("step", k / (STEPS + 1.0)) for k in range(1, STEPS + 1)]
+    return [one for one in every if one.kind in cause.courses]
 
 
 def pixel_at_axis(cone_vec: ConeVec, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -112,12 +110,13 @@ def pixel_at_axis(cone_vec: ConeVec, centre: FloatArray) -> tuple[FloatArray, Fl
     return u * smaller, v * smaller
 
 
-def causes_of(cone_vec: ConeVec, centre: FloatArray) -> list[Cause]:
+def causes_of(cone_vec: ConeVec, centre: FloatArray, share: FloatArray) -> list[Cause]:
     """List the errors that are looked for.
 
     Args:
         cone_vec: n views, whose pixels limit what is told.
         centre: (x, y) of the rotation axis.
+        share: (n,) of the scan before each view.
     """
     across, down = (float(side.mean()) for side in pixel_at_axis(cone_vec, centre))
 
@@ -148,28 +147,31 @@ def causes_of(cone_vec: ConeVec, centre: FloatArray) -> list[Cause]:
         return ConeVec.from_vectors(source, panel, about(views.u), about(views.v))
 
     def scaled(views: ConeVec, sizes: FloatArray) -> ConeVec:
-        """Stretch the angles about their mean [%]."""
-        azimuth = np.unwrap(np.arctan2(*(views.source[:, :2] - centre).T[::-1]))
+        """Stretch the angles, as they followed each other, about their mean [%]."""
+        order = np.argsort(share, kind="stable")
+        azimuth = np.arctan2(*(views.source[:, :2] - centre).T[::-1])
+        azimuth[order] = np.unwrap(azimuth[order])
         return turned(views, 0.01 * sizes * np.rad2deg(azimuth - azimuth.mean()))
 
     return [
-        Cause("axis", "mm", 0.05 * across, 20.0 * across, beside, course=True),
+        Cause(
+            "axis", "mm", 0.05 * across, 20.0 * across, beside, ("constant", *CHANGING)
+        ),
         Cause("height", "mm", 0.05 * down, 20.0 * down, below, nuisance=True),
-        Cause("slip", "mm", 0.05 * down, 20.0 * down, below, constant=False, course=True),
+        Cause("slip", "mm", 0.05 * down, 20.0 * down, below, CHANGING),
         Cause("roll", "deg", 0.1, 20.0, _rolled),
         Cause("pitch", "deg", 0.3, 45.0, _pitched, nuisance=True),
         Cause("yaw", "deg", 0.3, 45.0, _yawed),
         Cause("distance", "%", 0.2, 10.0, _farther),
         Cause("turn", "%", 0.1, 20.0, scaled, turns=True),
-        Cause("lost", "deg", 0.1, 45.0, turned, constant=False, course=True, turns=True),
+        Cause("lost", "deg", 0.1, 45.0, turned, CHANGING[1:], turns=True),  # line: scale
         Cause(
             "gain",
             "% of the mean",
             1.0,
             30.0,
             images=_gained,
-            constant=False,
-            course=True,
+            courses=CHANGING,
         ),
         Cause(
             "haze",
