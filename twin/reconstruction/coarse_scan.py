@@ -50,8 +50,7 @@ COMPARED_ROWS: Final = 16
 """Least rows of that scan, if the panel has so many."""
 MAX_CLIMB: Final = 0.176
 """Tangent of rays through the object with the plane of the circle from which on the cone angle is
-warned of unasked: 10 degrees, up to which FDK is taken as accurate (Feldkamp, Davis, Kress, J. Opt.
-Soc. Am. A 1 (1984) 612)."""
+warned of unasked: 10 degrees, up to which FDK is taken as accurate (assumed)."""
 PEAK_COLUMNS: Final = 2
 """Largest number of columns in which a view of a right scan has the scan's largest value."""
 MAX_FLAT_VIEWS: Final = 0.05

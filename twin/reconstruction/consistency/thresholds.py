@@ -57,10 +57,9 @@ SOURCES: Final[dict[str, dict[Source, str]]] = {
         Source.ASSUMED: "OTHERWISE_FACTOR PRISM_ERROR_SHARE FLOOR MAX_VOXEL_NODES",
     },
     f"{_BASE}.coarse_scan": {
-        Source.LITERATURE: "MAX_CLIMB",
         Source.WORK: "NODES FINE_NODES VIEWS COMPARED_VIEWS COMPARED_ROWS",
         Source.ASSUMED: (
-            "MIN_AXIS_COLUMNS PEAK_COLUMNS MAX_FLAT_VIEWS PARALLEL_SOURCE_RADII"
+            "MAX_CLIMB MIN_AXIS_COLUMNS PEAK_COLUMNS MAX_FLAT_VIEWS PARALLEL_SOURCE_RADII"
         ),
     },
     f"{_BASE}.uniform_nodes": {
