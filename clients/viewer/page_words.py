@@ -36,6 +36,11 @@ SENTENCES: Final[tuple[tuple[str, str], ...]] = (
         r"the twin has not been seen yet|Connect call failed|connection (was )?(lost|refused)",
         "The twin does not answer: what is pressed now does not reach it.",
     ),
+    (
+        r"^(tube|camera) (?P<what>[^\W_]+)\w* (?P<asked>\S+) is outside "
+        r"\[(?P<low>\S+), (?P<high>\S+)\](?P<unit>.*)$",
+        "{what} {asked}{unit} is outside {low} to {high}{unit}",
+    ),
 )
 """What a refusal says somewhere -> the page's sentence in its place."""
 

@@ -12,14 +12,12 @@ from pydantic import Field, model_validator
 from flexdt.protocol import fields as f
 from flexdt.protocol.field_checks import require_extent
 from flexdt.protocol.fields import (
-    Exposure,
     Integral,
     Params,
-    Power,
     RoiAsked,
+    Setting,
     ShortText,
     SpeedUp,
-    Voltage,
 )
 from flexdt.protocol.method import Method, by_hand, command, read
 from flexdt.protocol.methods.document_messages import Averages, Frames, Placement
@@ -136,15 +134,15 @@ class ClockSet(Params):
 class TubeSet(Params):
     """X-ray tube settings; missing ones stay."""
 
-    kV: Voltage | None = None
-    power_W: Power | None = None
+    kV: Setting | None = None
+    power_W: Setting | None = None
     on: bool | None = None
 
 
 class CameraSet(Params):
     """Camera settings; missing ones stay."""
 
-    exposure_ms: Exposure | None = None
+    exposure_ms: Setting | None = None
     mode: ShortText | None = None
     roi: RoiAsked | None = None
     """left, top, right, bottom; inclusive, unbinned"""

@@ -88,6 +88,8 @@ def test_every_refusal_of_the_code_is_said_in_words_of_the_page() -> None:
         ("this viewer was started without --data", "its viewer cannot read the scans"),
         ("rot_obj target 10000 deg is outside [-7200, 7200] deg",
          "rot_obj target 10000 deg is outside [-7200, 7200] deg"),
+        ("camera exposure_ms -3 is outside [1, 60000] ms",
+         "exposure -3 ms is outside 1 to 60000 ms"),
         ("/srv/lab/data/scan-3 cannot be read", "scan-3 cannot be read."),
         ("use fx.open(FOLDER)", FALLBACK),
     ],

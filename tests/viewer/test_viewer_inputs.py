@@ -16,6 +16,7 @@ from looking import answered, point_at, released, seen
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
+from flexdt.twin.machine.description import builtin_machine
 
 pytestmark = pytest.mark.browser
 Wait = Callable[..., Any]
@@ -239,6 +240,12 @@ def test_what_the_tube_refuses_goes_back(page: Any, twin: TwinClient, wait: Wait
     page.locator(".note.error", has_text="The tube refuses").first.wait_for()
     wait(lambda: float(page.input_value("#kV")) == before, "back")
     assert "typed" not in page.get_attribute("#kV", "class")
+    panel = builtin_machine("flexray").detector
+    page.fill("#exposure", "-3")
+    page.press("#exposure", "Enter")
+    least, most = panel.min_exposure_ms, panel.max_exposure_ms
+    said = f"exposure -3 ms is outside {least:g} to {most:g} ms"
+    page.locator(".note.error", has_text=said).first.wait_for()
     page.fill("#kV", "61,5")
     page.press("#kV", "Escape")
     assert float(page.input_value("#kV")) == before
