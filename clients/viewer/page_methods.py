@@ -239,7 +239,7 @@ class Compose(Params):
     """The scan to compose a script for."""
 
     kind: KindOfScan = "fly"
-    frames: Annotated[int, Ge(1), Le(1_000_000)] = 73
+    frames: Annotated[int, Ge(1), Le(1_000_000)]
     exposure_ms: Exposure = 100.0
     kV: Voltage | None = None
     power_W: Power | None = None

@@ -521,15 +521,22 @@ def test_control_is_taken_released_and_taken_over(
     assert twin.state().controller == session
     other = open_page()
     other.locator("#holder", has_text=session).wait_for()
-    before = twin.state().axes["tra_obj"].target
     field = other.locator("[data-axis=tra_obj] .num")
-    field.fill("3")
-    field.press("Enter")
-    other.locator(".note.error").filter(has_text="controller").first.wait_for()
-    assert twin.state().axes["tra_obj"].target == before
+    inert = "(e) => e.closest('[inert]') !== null"
+    why = f"{session} controls: take over first"
+    other.locator("#move-down", has_text=f"Nothing moves: {why}.").wait_for()
+    other.locator("#scan-it-note", has_text=f"No scan: {why}.").wait_for()
+    assert field.evaluate(inert)
+    assert [other.is_disabled(f"#{id}") for id in ("scan-it", "beam")] == [True, True]
+    assert [page.is_disabled(f"#{id}") for id in ("scan-it", "beam")] == [False, False]
+    assert not page.locator("#move-down").is_visible()
+    assert not any(other.is_disabled(f"#{id}") for id in ("estop", "stop", "take"))
     other.click("#take")
     other.locator("#holder", has_text="you control").wait_for()
     page.locator("#holder", has_text="held by").wait_for()
+    other.locator("#move-down").wait_for(state="hidden")
+    assert page.is_disabled("#scan-it")
+    assert not field.evaluate(inert)
     field.fill("4")
     field.press("Enter")
     wait(settled(twin, "tra_obj", 4.0))

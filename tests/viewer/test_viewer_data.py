@@ -81,7 +81,7 @@ def pixels(page: Any) -> Any:
 def test_data_sets_are_found_by_words(page: Any, scans: Any) -> None:
     find(page, "scan lego")
     page.locator(".data-set[data-name='cut scan']").wait_for()
-    page.locator("#data-count", has_text="2 of 2").wait_for()
+    page.locator("#data-count", has_text="2 scans").wait_for()
     whole = page.locator(".data-set[data-name='whole scan']")
     assert "9 projections · 90 kV 20 W · 100 ms · lego" in whole.inner_text()
     assert whole.locator(".state.complete").count() == 1
@@ -100,7 +100,7 @@ def test_frames_are_gone_through_with_the_machine(page: Any, scans: Any) -> None
         "frames"
     ]
     find(page, "whole")
-    page.locator("#data-count", has_text="1 of 1").wait_for()
+    page.locator("#data-count", has_text="1 scan").wait_for()
     page.locator(".data-set[data-name='whole scan']").click()
     shows(page, 2)  # the first projection
     page.select_option("#kind", "counts")
@@ -438,7 +438,7 @@ def test_the_scene_has_no_other_sample_than_the_image_beside_it(
         twin.set_sample("gear")
         try:
             page.locator(
-                "#record-note", has_text="on the stage is another sample now (gear)"
+                "#record-note", has_text="no sample in the scene: now gear stands there"
             ).wait_for()
             page.wait_for_timeout(500)
             other = page.evaluate(still)
@@ -472,7 +472,7 @@ def test_a_reload_brings_everything_back(
     page.fill("#script", script)
     page.wait_for_function("location.hash.startsWith('#script=')")
     find(page, "whole")
-    page.locator("#data-count", has_text="1 of 1").wait_for()
+    page.locator("#data-count", has_text="1 scan").wait_for()
     page.locator(".data-set[data-name='whole scan']").click()
     shows(page, 2)
     page.click("#record-next")

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import base64
 import io
+import math
+import re
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from looking import picture, until
+from looking import begun, picture, seen, until
 from PIL import Image
 
 from flexdt.clients.client.client import TwinClient
@@ -103,6 +105,63 @@ def test_an_empty_script_says_why_it_does_not_run(page: Any) -> None:
     assert page.locator("#run").is_enabled()
     assert not page.locator("#empty-note").is_visible()
     page.fill("#script", "")
+
+
+def test_what_is_not_ready_does_not_run_and_what_runs_has_one_after_it(
+    page: Any, twin: TwinClient
+) -> None:
+    page.click("#tabs [data-tab=scan]")
+    page.fill("#script", "nonsense\tdo\t3\n")
+    page.click("#check")
+    page.locator("#report .verdict.bad").wait_for()
+    run = page.locator("#run")
+    assert run.is_disabled()
+    assert "not ready" in run.get_attribute("title")
+    page.fill("#script", "scanner\tpause\t30\n")
+    assert run.is_enabled()
+    assert run.inner_text() == "Run"
+    job = begun(page, twin)
+    page.locator("#run", has_text="Run next").wait_for()
+    assert "primary" not in run.get_attribute("class")
+    twin.abort_job(job)
+    page.locator("#run.primary", has_text=re.compile("^Run$")).wait_for()
+    page.fill("#script", "")
+
+
+def test_the_scan_proposes_the_images_that_the_sample_needs(
+    page: Any, twin: TwinClient
+) -> None:
+    """Steps at the sample's rim of a voxel of 256 across, an odd number of 91 to 151; the least
+    for beads."""
+    page.click("#tabs [data-tab=scan]")
+    field = page.locator("#wish-frames")
+    page.select_option("#wish-kind", "fly")
+    field.press("Escape")
+    counts = []
+    twin.control("force")
+    for name, sod in (("gear", 350.0), ("lego", 450.0), ("lego", 900.0)):
+        twin.set_sample(name)
+        twin.move({"mag_obj": sod}, wait=True)
+        state = twin.state()
+        seen(page, twin)
+        across_mm = page.evaluate("flexdt.store.across_mm")
+        voxel_mm = state.geometry.voxel_size_mm * state.camera.shape[1] / 256
+        steps = math.ceil(math.pi / 2 * across_mm / voxel_mm)
+        counts.append(min(151, max(91, steps)) | 1)
+        page.wait_for_function(
+            "n => document.querySelector('#wish-frames').value === String(n)",
+            arg=counts[-1],
+        )
+    assert len(set(counts)) > 1, counts
+    field.fill("45")
+    twin.move({"mag_obj": 350.0}, wait=True)
+    seen(page, twin)
+    assert field.input_value() == "45"
+    field.press("Escape")
+    page.select_option("#wish-kind", "calibration")
+    page.wait_for_function("document.querySelector('#wish-frames').value === '91'")
+    page.select_option("#wish-kind", "fly")
+    twin.control("release")
 
 
 def test_gamma_brightens_what_is_thin_and_keeps_black_and_white(page: Any) -> None:

@@ -19,14 +19,7 @@ import {
 } from "./dom.js";
 import { allJobs, call, command, emit, enter, on, store } from "./link.js";
 import { asked, remember } from "./address.js";
-import {
-  differences,
-  listed as namesOf,
-  ofImage,
-  ofVolume,
-  only,
-  sampleOf,
-} from "./fingerprint.js";
+import { differences, ofImage, ofVolume, only, sampleOf } from "./fingerprint.js";
 import { scanSaturated } from "./image_words.js";
 import { indexOf, nameOf, NOW } from "./moment.js";
 import { draw as drawTimeline } from "./timeline.js";
@@ -184,7 +177,7 @@ const dated = (info) =>
 function settings(info) {
   const frames =
     info.present < info.projections
-      ? `${info.present} of ${info.projections} projections`
+      ? `${info.present}${info.state === "running" ? " saved" : ""} of ${info.projections} projections`
       : `${info.projections} projections`;
   const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
   return [
@@ -262,7 +255,9 @@ async function list(start = 0) {
   $button("#data-more").hidden = listed.length >= answer.total;
   const left = answer.left_out ? ` · ${answer.left_out} folders left out` : "";
   const none = search.value ? "none is found" : "none yet: run a scan";
-  const all = answer.total ? `${listed.length} of ${answer.total}${left}` : none;
+  const shown = listed.length < answer.total ? `${listed.length} of ${answer.total} scans` : "";
+  const whole = answer.total === 1 ? "1 scan" : `${answer.total} scans`;
+  const all = answer.total ? (shown || whole) + left : none;
   setText(
     $("#data-count"),
     answer.unread ? `${answer.total} data sets · reading ${answer.unread} more …` : all,
@@ -437,11 +432,12 @@ function virtualWords(scanned) {
  * @param {DatasetResult["made"]} made
  */
 function apartWords(made) {
-  if (!made.offset) return "the scene has no sample: where the scan’s stood is not known";
+  const none = "no sample in the scene:";
+  if (!made.offset) return `${none} where the scan’s stood is not known`;
   const differ = differences(only(ofVolume(made), "sample", "placement"), store.now ?? {});
-  if (!differ.length) return "";
-  const name = store.state?.sample.name ?? "none";
-  return `the scene has no sample: on the stage is another ${namesOf(differ)} now (${name})`;
+  if (differ.includes("sample"))
+    return `${none} now ${store.state?.sample.name || "nothing"} stands there`;
+  return differ.length ? `${none} the scan’s has been moved since` : "";
 }
 function note() {
   if (!told) return "";

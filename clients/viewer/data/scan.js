@@ -29,7 +29,7 @@ import { tellSubmitted } from "./scan_job.js";
 import { NOW } from "./moment.js";
 import { effect } from "./signals.js";
 import { exposure_ms, frames, kind, sameWish, wished, wishWords } from "./scan_wish.js";
-import { isDown } from "./warnings.js";
+import { hindered } from "./warnings.js";
 /**
  * @import { CheckResult, CheckStep, Pair, PlanDocument, Problem, ScriptInput }
  *   from "../web/viewer.d.ts"
@@ -54,6 +54,8 @@ let planned = "";
 let lost = false;
 let sent = "";
 let starting = false;
+// Whether the newest report of the script as it stands says that it may not run.
+let unfit = false;
 
 designer.place($("#tab-scan .card"));
 clicks({
@@ -95,15 +97,21 @@ function marks() {
   paint();
 }
 
-/** Nothing runs before a stop is released, nor another script than the fields ask for. */
+/**
+ * Nothing runs where nothing moves for this page, nor another script than the fields ask for, nor
+ * one that is not ready; while a scan runs another one waits for it.
+ */
 function allow() {
-  const down = store.state !== null && isDown(store.state);
-  const why = down ? "A stop is in force: RESET first" : otherScript();
+  const why = hindered(store.state) || otherScript() || (unfit ? "not ready: see below" : "");
   const run = $button("#run");
+  const waits = store.job !== null && !isOver(store.job);
   run.disabled = starting || !text.value.trim() || why !== "";
-  run.title = why;
+  run.title = why || (waits ? "It waits for the scan that runs" : "");
+  run.classList.toggle("primary", !why && !waits);
+  setText(run, starting ? "Starting …" : waits ? "Run next" : "Run");
 }
 on("state", allow);
+on("job", allow);
 
 /** @param {number} line */
 const said = (line) =>
@@ -164,7 +172,7 @@ function outdated() {
   problems = [];
   marks();
   $("#report").textContent = "";
-  $button("#run").classList.add("primary");
+  unfit = false;
   tellWish();
   forget();
   rememberScript(text.value);
@@ -375,7 +383,7 @@ async function checkAndPlan() {
 }
 
 const MOVING_PARTS =
-  "Of parts that move against each other; those that stand or move together are not counted";
+  "Other parts than these stand or move together during the script; they may be nearer";
 
 /**
  * @param {Report} report
@@ -384,7 +392,7 @@ const MOVING_PARTS =
 function clearance({ min_clearance_mm: mm, min_clearance_pair: pair }) {
   if (!isNumber(mm) || problems.some(({ code }) => code === "collision")) return "";
   const parts = pair ? pair.map(partWords).join(" and ") : "moving parts";
-  return `${parts} come closest, ${fixed(mm, 1)} mm apart`;
+  return `of what it moves, ${parts} come closest during it: ${fixed(mm, 1)} mm`;
 }
 
 /**
@@ -443,7 +451,8 @@ export function show(r, made = now()) {
   if (r.steps.length)
     box.append(el("div", { class: "steps mono" }, ...r.steps.slice(0, 500).map(stepRow)));
   checked = made;
-  $button("#run").classList.toggle("primary", r.ok);
+  unfit = !r.ok;
+  allow();
 }
 // A report holds for what a script begins with. While a scan runs, the machine is on its way:
 // what it then differs in is known when it has ended, and after a run of this script it is
@@ -645,15 +654,12 @@ canvas.addEventListener("keydown", (e) => {
 new ResizeObserver(redraw).observe(canvas);
 
 async function run() {
-  const button = $button("#run");
   starting = true;
   allow();
-  setText(button, "Starting …");
   try {
     await submit();
   } finally {
     starting = false;
-    setText(button, "Run");
     marks();
   }
 }

@@ -14,7 +14,7 @@ import {
 import { estimates } from "./estimate.js";
 import { forgetJob } from "./scan_job.js";
 import { folder, open as openData } from "./data.js";
-import { isDown } from "./warnings.js";
+import { hindered } from "./warnings.js";
 /** @import { JobStatus } from "../web/viewer.d.ts" */
 
 const bar = $("#scan-bar");
@@ -91,7 +91,7 @@ function offer(job) {
   for (const [name, visible] of Object.entries(shown))
     $button(`#job-${name}`).hidden = !visible;
   $button("#job-pause").disabled = job.state !== "running";
-  const down = store.state !== null && isDown(store.state);
+  const down = hindered(store.state) !== "";
   $button("#job-step").disabled = down || job.state !== "paused";
   $button("#job-resume").disabled = down || (job.state !== "paused" && !isUnfinished(job));
   $button("#job-back").disabled = down || Boolean(store.state?.job);

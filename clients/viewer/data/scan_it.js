@@ -5,18 +5,14 @@ import { $, $button, $input, $select, clicks, el, setText, words } from "./dom.j
 import { command, call, emit, on, store } from "./link.js";
 import { folder } from "./data.js";
 import { isOver } from "./job_words.js";
-import { across } from "./sample_outline.js";
 import { tellSubmitted } from "./scan_job.js";
+import { isShown, turning, viewsFor } from "./view_count.js";
 import { nearSample } from "./views.js";
-import { isDown } from "./warnings.js";
+import { hindered } from "./warnings.js";
 import { reconstruct, watch } from "./volume.js";
 /** @import { Answers, State } from "../web/viewer.d.ts" */
 
-const LEAST_VIEWS = 91;
-const MOST_VIEWS = 151;
 const EXPOSURE_MS = 100;
-// Voxels across the image of the volume that is shown.
-const SHOWN_VOXELS = 256;
 // Part of the image, in width and height, that the sample takes.
 const FILL = 0.8;
 // How often, and after which time, the page looks for a sample that was just put there.
@@ -40,25 +36,6 @@ let exchanged = Promise.resolve();
 let busy = false;
 // Until the first image: then the stage stands where it turns, and the camera goes there.
 let far = false;
-
-/**
- * Whether the page's own state is of a sample: only then does it know what is across it.
- * @param {State["sample"]} some
- */
-const isShown = (some) =>
-  some.name === store.state?.sample.name && some.revision === store.state.sample.revision;
-
-/**
- * Size of what turns, across and upright, in mm; null where nobody has said it.
- * @param {State} state
- * @returns {[across: number, upright: number] | null}
- */
-function turning({ sample: some }) {
-  const { x, y, rx, ry } = some.offset;
-  const width = across(some, isShown(some) ? store.across_mm : null);
-  if (!some.size_mm || width === null) return null;
-  return [width + 2 * Math.hypot(x, y), rx || ry ? width : some.size_mm[2]];
-}
 
 /**
  * The state of the twin, once the page's own is of the same sample or has had time for it.
@@ -88,19 +65,6 @@ export function filling(state) {
   const [rows, columns] = state.camera.shape;
   if (!size) return null;
   return (1000 * Math.max(size[0] / columns, size[1] / rows)) / FILL;
-}
-
-/**
- * As many views as keep steps at the rim of the sample within a voxel of what is shown.
- * @param {State} state
- * @param {number} voxel_um
- * @returns {number}
- */
-export function viewsFor(state, voxel_um) {
-  const size = turning(state);
-  const shown_mm = (voxel_um / 1000) * Math.max(1, state.camera.shape[1] / SHOWN_VOXELS);
-  const wanted = size ? Math.ceil((Math.PI / 2) * (size[0] / shown_mm)) : MOST_VIEWS;
-  return Math.min(MOST_VIEWS, Math.max(LEAST_VIEWS, wanted)) | 1;
 }
 
 /**
@@ -203,10 +167,10 @@ export function takeUp(job) {
   watch();
 }
 
-/** Nothing is scanned of an empty stage, nor before a stop is released. */
+/** Nothing is scanned of an empty stage, nor where nothing moves for this page. */
 function allow() {
   const state = store.state;
-  go.disabled = pressed || !state?.sample.name || isDown(state);
+  go.disabled = pressed || !state?.sample.name || hindered(state) !== "";
 }
 
 on("state", (state) => {
@@ -244,7 +208,8 @@ function told(state) {
   if (!state.sample.name || voxel_um === null) return "The stage is empty: choose a sample.";
   const own = viewsFor(state, voxel_um);
   wanted.placeholder = String(own);
-  if (isDown(state)) return "Reset the stop before scanning.";
+  const why = hindered(state);
+  if (why) return `No scan: ${why}.`;
   const waits = store.job && !isOver(store.job) ? "After the current scan: one" : "One";
   return `${waits} turn of ${wanted.value || own} images; the volume grows in the scene.`;
 }

@@ -3,16 +3,19 @@
 import { $, $input, $select, setText } from "./dom.js";
 import { batch, computed, effect, signal } from "./signals.js";
 import { on } from "./link.js";
+import { LEAST_VIEWS, viewsFor } from "./view_count.js";
 /** @import { Compose } from "../web/viewer.d.ts" */
 
-const FRAMES = 73;
 const EXPOSURE_MS = 100;
 /** @typedef {NonNullable<Compose["kind"]>} Kind */
 
+const typedFrames = signal(/** @type {number | null} */ (null));
+const proposedFrames = signal(LEAST_VIEWS);
 const typedExposure_ms = signal(/** @type {number | null} */ (null));
 const cameraExposure_ms = signal(EXPOSURE_MS);
 export const kind = signal(/** @type {Kind} */ ("fly"));
-export const frames = signal(FRAMES);
+// Those that the sample needs where it stands, until somebody types another number.
+export const frames = computed(() => typedFrames.get() ?? proposedFrames.get());
 // The camera's, until somebody types another one.
 export const exposure_ms = computed(() => typedExposure_ms.get() ?? cameraExposure_ms.get());
 
@@ -24,7 +27,8 @@ const exposureField = $input("#wish-exposure");
 function read() {
   batch(() => {
     kind.set(/** @type {Kind} */ (kindField.value));
-    frames.set(framesField.valueAsNumber);
+    const count = framesField.valueAsNumber;
+    if (!Object.is(count, frames.get())) typedFrames.set(count);
     const typed = exposureField.valueAsNumber;
     if (!Object.is(typed, exposure_ms.get())) setExposure(typed);
   });
@@ -36,11 +40,21 @@ export function setExposure(ms) {
 }
 for (const field of [kindField, framesField, exposureField])
   field.addEventListener("input", read);
-exposureField.addEventListener("keydown", (e) => {
-  if (e.key === "Escape") typedExposure_ms.set(null);
-});
+for (const [field, typed] of /** @type {const} */ ([
+  [framesField, typedFrames],
+  [exposureField, typedExposure_ms],
+]))
+  field.addEventListener("keydown", (e) => {
+    if (e.key === "Escape") typed.set(null);
+  });
 effect(() => {
   setText($("#wish-what"), kind.get() === "tiled" ? "frames a tile" : "frames");
+});
+effect(() => {
+  const count = frames.get();
+  if (Number.isFinite(count) && framesField.valueAsNumber !== count)
+    framesField.value = String(count);
+  framesField.classList.toggle("typed", typedFrames.get() !== null);
 });
 effect(() => {
   const ms = exposure_ms.get();
@@ -50,8 +64,9 @@ effect(() => {
   }
   exposureField.classList.toggle("typed", typedExposure_ms.get() !== null);
 });
-on("state", ({ camera }) => {
-  cameraExposure_ms.set(camera.exposure_ms);
+on("state", (state) => {
+  cameraExposure_ms.set(state.camera.exposure_ms);
+  proposedFrames.set(kind.get() === "calibration" ? LEAST_VIEWS : viewsFor(state));
 });
 
 /**

@@ -17,7 +17,7 @@ import {
 } from "./dom.js";
 import { differences, listed, only } from "./fingerprint.js";
 import { allSamples, call, command, emit, on, store } from "./link.js";
-import { isDown } from "./warnings.js";
+import { hindered } from "./warnings.js";
 import { curve } from "./plots.js";
 /**
  * @import { ExposurePrediction, Placement, PredictedSetting, Requests, State }
@@ -332,8 +332,8 @@ function show(state) {
   const is = ready ? "X-rays are ON" : "X-rays warming up";
   xrays.textContent = on ? `${is}: switch off` : "Switch X-rays on";
   xrays.classList.toggle("beam-on", on);
-  xrays.title = on ? "Switch X-rays off" : "Switch X-rays on";
-  xrays.disabled = !on && isDown(state);
+  xrays.title = on ? "Switch X-rays off" : hindered(state) || "Switch X-rays on";
+  xrays.disabled = !on && hindered(state) !== "";
   const c = state.camera;
   put("exposure", c.exposure_ms, 3);
   put("averages", c.averages);

@@ -5,7 +5,7 @@ import { listed, sampleOf } from "./fingerprint.js";
 import { toYou } from "./names.js";
 import { command, imageMade, isMe, on, person, rename, store, unanswered } from "./link.js";
 import { OLD_S } from "./moment.js";
-import { isDown, stopped } from "./warnings.js";
+import { hindered, isDown, stopped } from "./warnings.js";
 import "./readouts.js";
 /** @import { ClockState, State } from "../web/viewer.d.ts" */
 
@@ -113,8 +113,10 @@ function release(s) {
   reset.hidden = $("#emergency").hidden = stop === null;
   if (stop !== null) setText($("#emergency-what"), stopped(s));
   document.body.dataset.down = String(stop !== null);
-  for (const id of ["#mains", "#axes"]) $(id).inert = stop !== null;
-  $("#move-down").hidden = stop === null;
+  const why = hindered(s);
+  for (const id of ["#mains", "#axes"]) $(id).inert = why !== "";
+  $("#move-down").hidden = !why;
+  setText($("#move-down"), `Nothing moves: ${why}.`);
   $button("#xrays-off").hidden = stop === null || !s.tube.on;
   if (stop === shown) return;
   shown = stop;

@@ -10,8 +10,9 @@ import { folder } from "./data.js";
 import { isOver } from "./job_words.js";
 import { scanIt, takeUp, turnOf } from "./scan_it.js";
 import { BY_HAND, sameCorrection, STEP, stepOf } from "./story_steps.js";
+import { LEAST_VIEWS } from "./view_count.js";
 import { reconstruct } from "./volume.js";
-import { isDown } from "./warnings.js";
+import { hindered } from "./warnings.js";
 /**
  * @import { Found } from "./belief.js"
  * @import { JobStatus } from "../web/viewer.d.ts"
@@ -20,8 +21,6 @@ import { isDown } from "./warnings.js";
 // What is scanned, and the phantom whose beads tell the geometry.
 const OBJECT = "gear";
 const PHANTOM = "lego";
-// Views of the phantom's turn: beads are found in each.
-const PHANTOM_VIEWS = 45;
 const NOT_BEGUN = "The scan did not begin: the note says why.";
 // What is estimated: the usual parameters, and the panel's roll. Beads hardly tell its tilt
 // from their height.
@@ -157,7 +156,7 @@ function stepWords() {
   return at === STEP.calibrate ? `${compared()} ${words}` : words;
 }
 function allow() {
-  const down = store.state !== null && isDown(store.state);
+  const down = hindered(store.state) !== "";
   const at = step();
   STEPS.forEach(([id], k) => {
     /** @type {HTMLButtonElement} */
@@ -240,7 +239,7 @@ async function scan() {
 /** Scans the phantom; its beads are looked for once its images are there. */
 async function fit() {
   wait("The bead phantom is on the stage, and turns once.");
-  told.phantomJob = await turnOf(PHANTOM, PHANTOM_VIEWS);
+  told.phantomJob = await turnOf(PHANTOM, LEAST_VIEWS);
   if (told.phantomJob) show(told.says);
   else failed(NOT_BEGUN);
 }

@@ -20,6 +20,17 @@ const TOUCH_MM = 2;
 export const isDown = (s) => s.safety.estop || s.safety.state !== "ok";
 
 /**
+ * Why nothing moves that this page asks for: a stop, or another's control; "" where it does.
+ * @param {State | null} s
+ * @returns {string}
+ */
+export function hindered(s) {
+  if (!s) return "";
+  if (isDown(s)) return "reset the stop first";
+  return s.controller && !isMe(s.controller) ? `${s.controller} controls: take over first` : "";
+}
+
+/**
  * @param {State} state
  * @returns {string}
  */

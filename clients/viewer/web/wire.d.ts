@@ -53,9 +53,8 @@ export type ClockState = {
   time_s: number; speed_up: number | "max"; real_time_factor: number | null
 };
 export type Compose = {
-  kind?: "fly" | "step" | "tiled" | "helical" | "calibration"; frames?: number;
-  exposure_ms?: number; kV?: number | null; power_W?: number | null; voxel_um?: number | null;
-  keep?: Array<string>
+  kind?: "fly" | "step" | "tiled" | "helical" | "calibration"; frames: number; exposure_ms?: number;
+  kV?: number | null; power_W?: number | null; voxel_um?: number | null; keep?: Array<string>
 };
 export type Control = { action: "acquire" | "release" | "force" };
 export type ControlResult = { controller: string | null; yours: boolean };
