@@ -176,6 +176,7 @@ def test_running_makes_a_data_set(
     dataset = load_dataset(folder).require_complete()
     assert len(dataset.frames) == 5
     page.locator("#thumbs canvas").first.wait_for()
+    assert page.locator("#thumbs-of").text_content() == f"Some images of {folder.name}"
     # The finished scan comes back onto the timeline, wherever the machine is by now.
     page.fill("#script", "")
     page.evaluate("flexdt.call('axes.move', {targets: {rot_obj: 10}})")

@@ -1,5 +1,5 @@
 // Thumbnails of the running scan: images as they were saved, each by the name of its file.
-import { $, $$, el, pressed, putImage } from "./dom.js";
+import { $, $$, el, pressed, putImage, setText } from "./dom.js";
 import { folder, open as openData } from "./data.js";
 import { isOver } from "./job_words.js";
 import { call, on, store } from "./link.js";
@@ -22,6 +22,7 @@ on("scan", (fresh) => {
     $("#thumb-card").hidden = true;
     steps = new Set();
     dataset = job ? folder(job) : "";
+    setText($("#thumbs-of"), `Some images of ${dataset}`);
   }
   if (job?.state === "done" && steps.size < LEAST_THUMBS) void fill(job.frames_total);
 });

@@ -33,7 +33,8 @@ export function note(kind, title, body = "", life = kind === "error" ? 12000 : 6
 on("note", (kind, title, body) => note(kind, title, body));
 /** What the bar of a stop says is not said twice. */
 const ofStop = /^E-stop by /;
-const TOOK = " took control from you";
+/** What is said of another's control holds no longer than that. */
+const OTHERS = / took control from you$| is the controller; /;
 on("log", (entry) => {
   if (!["warning", "error"].includes(entry.level) || ofStop.test(entry.message)) return;
   const kind = entry.level === "error" ? "error" : "warning-note";
@@ -63,7 +64,8 @@ function holder() {
   const pill = $("#holder");
   const who = store.state?.controller ?? null;
   const mine = isMe(who);
-  if (mine) for (const n of $$("#notes .note")) if (n.dataset.key?.endsWith(TOOK)) n.remove();
+  if (mine || who === null)
+    for (const n of $$("#notes .note")) if (OTHERS.test(n.dataset.key ?? "")) n.remove();
   // Without the twin nobody knows who may; with it the next state says.
   pill.dataset.state = !store.twin ? "none" : mine ? "mine" : who ? "other" : "none";
   setText(
