@@ -335,6 +335,11 @@ def test_one_click_ends_with_a_volume_beside_its_truth(
     noise = {share: float(np.abs(np.diff(one[8:40, 8:90, 0], axis=1)).mean())
              for share, one in seen.items()}  # fmt: skip
     assert noise[0] < 0.2 < noise[1000], "the truth has no noise in air, the scan has"
+    # What is said of its volume ends where another one takes its place, or none.
+    page.click("#scan-it")
+    page.locator("#scan-it-note", has_text="Reconstructing the whole scan").wait_for()
+    page.select_option("#volume-side", "")
+    page.locator("#scan-it-note", has_text="One turn of").wait_for()
     page.close()
 
 

@@ -9,7 +9,7 @@ import { tellSubmitted } from "./scan_job.js";
 import { isShown, turning, viewsFor } from "./view_count.js";
 import { nearSample } from "./views.js";
 import { hindered } from "./warnings.js";
-import { reconstruct, watch } from "./volume.js";
+import { reconstruct, wantedOf, watch } from "./volume.js";
 /** @import { Answers, State } from "../web/viewer.d.ts" */
 
 const EXPOSURE_MS = 100;
@@ -34,6 +34,8 @@ let exchanging = false;
 let exchanged = Promise.resolve();
 // From the press of the button until the volume stands beside its truth.
 let busy = false;
+// The scan whose volume it is then.
+let awaited = "";
 // Until the first image: then the stage stands where it turns, and the camera goes there.
 let far = false;
 
@@ -178,6 +180,8 @@ on("state", (state) => {
   const stands = state.sample.name ?? EMPTY;
   const names = [...new Set([stands, ...offered])];
   const key = names.join("\n");
+  // Another volume has taken its place.
+  if (mine === null && !pressed && wantedOf() !== awaited) busy = false;
   if (!busy && !exchanging) setText(note, told(state));
   if (sample.dataset.names !== key && document.activeElement !== sample) {
     sample.dataset.names = key;
@@ -218,7 +222,8 @@ on("job", (job) => {
   if (job.state === "done") {
     setText(note, "Reconstructing the whole scan, then comparing it with the truth.");
     mine = null;
-    reconstruct(folder(job), true);
+    awaited = folder(job);
+    reconstruct(awaited, true);
     return;
   }
   if (far && job.frames_done > 0) {

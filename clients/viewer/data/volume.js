@@ -194,6 +194,8 @@ export function reconstruct(name, compared = false) {
   ask();
   $("#volume-card").scrollIntoView({ block: "nearest" });
 }
+/** The past scan whose volume is wanted here; null for none. */
+export const wantedOf = () => past;
 export function watch() {
   size.value ||= "128";
   past = null;
