@@ -139,6 +139,7 @@ def test_the_scan_proposes_the_images_that_the_sample_needs(
     field.press("Escape")
     counts = []
     twin.control("force")
+    before = twin.state()
     for name, sod in (("gear", 350.0), ("lego", 450.0), ("lego", 900.0)):
         twin.set_sample(name)
         twin.move({"mag_obj": sod}, wait=True)
@@ -161,6 +162,8 @@ def test_the_scan_proposes_the_images_that_the_sample_needs(
     page.select_option("#wish-kind", "calibration")
     page.wait_for_function("document.querySelector('#wish-frames').value === '91'")
     page.select_option("#wish-kind", "fly")
+    twin.move({"mag_obj": before.axes["mag_obj"].position}, wait=True)
+    twin.set_sample(before.sample.name)
     twin.control("release")
 
 
