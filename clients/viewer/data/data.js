@@ -175,9 +175,10 @@ const dated = (info) =>
     : new Date(1000 * info.modified).toISOString().slice(0, 16).replace("T", " ");
 /** @param {DatasetInfo} info */
 function settings(info) {
+  const saved = info.state === "running" ? " saved" : "";
   const frames =
     info.present < info.projections
-      ? `${info.present}${info.state === "running" ? " saved" : ""} of ${info.projections} projections`
+      ? `${info.present}${saved} of ${info.projections} projections`
       : `${info.projections} projections`;
   const beam = info.kV === null ? null : `${fixed(info.kV, 0)} kV ${fixed(info.power_W, 0)} W`;
   return [
