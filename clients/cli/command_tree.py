@@ -279,7 +279,7 @@ def build(words: Sequence[str] | None = None) -> typer.Typer:
         token_file: TokenFile = None,
         verbose: Verbose = None,
     ) -> None:
-        """Take the options before a command; `completed` commands read them from the context."""
+        """Take the options before a command."""
         speak(quiet=verbose is False, verbose=verbose is True)
 
     for name, command in COMMANDS.items():

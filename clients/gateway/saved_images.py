@@ -167,10 +167,7 @@ class Recording:
         return len(document.frames)
 
     def write_settings(self, state: State) -> None:
-        """Store a state whose motor positions the settings texts show from now on; rewrite the
-        texts if the folder has images.
-
-        Raises DatasetError: the texts cannot be written; the state is stored."""
+        """Store a state, and rewrite the settings texts if there are images."""
         with self._turn:
             self._settings = state
             if self._folder is not None and self._blocks:
@@ -343,7 +340,7 @@ def _blocks(frames: Sequence[FrameEntry], start: float) -> list[FrameBlock]:
     """Split a document's frames into runs of equal kind, camera setting and X-rays; times
     count from `start` [s].
 
-    The order is kept; frames are only joined to neighbours. A change of mode, region,
+    The order is kept; frames are only joined to neighbors. A change of mode, region,
     exposure or averages, too, begins a new block.
     """
 

@@ -91,8 +91,8 @@ def known_commands(component: str) -> tuple[str, ...]:
 def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
     """Read the command of an event, also one of the interface alone, such as stop.
 
-    The axis name is read in any letter case. Arguments beyond those of the command have
-    to be empty.
+    The axis name is read in any letter case. Arguments beyond those of a
+    script's command have to be empty; the interface's own take none and ignore them.
 
     Args:
         event: from a client.
@@ -100,7 +100,7 @@ def read_command(event: AcquilaEvent, axes: Collection[str]) -> c.Command:
 
     Raises:
         Refusal: no such component or command, with those allowed, or arguments that are
-            wrong or in excess.
+            wrong, or in excess for a script's command.
     """
     name = grammar.own_name(event.component, axes)
     event = replace(event, component=name)

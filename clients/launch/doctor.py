@@ -282,11 +282,11 @@ def disk(data: Path) -> CheckOutcome:
             begun = time.perf_counter()
             os.fsync(file.fileno())
             took = time.perf_counter() - begun
+        free = free_bytes(folder)
     except OSError as error:
         return CheckOutcome(
             "disk", "error", f"{folder} cannot be written: {reason_of(error)}", "--data"
         )
-    free = free_bytes(folder)
     found = f"{folder}: {free / 2**30:.1f} GiB free, 1 MiB reaches the disk in {1000 * took:.1f} ms"
     if free < LITTLE_ROOM_BYTES:
         return CheckOutcome(

@@ -268,11 +268,7 @@ def load(
     shape: Shape2 | None,
     pixel: float | Sequence[float] | None,
 ) -> ConeVec:
-    """Read a geometry from a file; see `ConeVec.load`.
-
-    Doubts about it, and what of its file is not applied or not known, are warnings.
-
-    Args and errors as of `load_stated`."""
+    """Read a geometry from a file, with warnings; see `ConeVec.load`."""
     stated = load_stated(file, format, shape, pixel)
     for note in stated.notes:
         warn_caller(note)

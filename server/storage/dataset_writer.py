@@ -1,7 +1,7 @@
 """Writes one data set: images, the scanner's texts, the script, flexdt.json.
 
 Each file appears only when complete. Until `finish` the data set is marked incomplete, so
-a killed server leaves a folder that states its condition. Existing images are recognised,
+a killed server leaves a folder that states its condition. Existing images are recognized,
 so a scan can be resumed. `put` may be called from several threads. A name with folders,
 an image of another shape or type than the scan's, and finishing while an image is missing
 are errors.
@@ -69,7 +69,9 @@ class DatasetWriter:
             root: the data directory.
             record: the scan; its name names the folder.
             script: byte for byte; None for none.
-            resume: allow a folder that holds files of the same scan.
+            resume: allow a folder with files of the same scan (compared if it has
+                `flexdt.json`, whose start and correction `record` takes over); its
+                unfinished files are removed.
             sync, write: see `Directory`.
 
         Raises:

@@ -505,7 +505,7 @@ def test_the_beam_at_home_goes_through_the_middle_of_the_sample() -> None:
         ),
         (
             "[geometry]\nsource_angle = { R = 1.0 }",
-            "a known quantity: .* not modelled .*C-arms",
+            "a known quantity: .* not modeled .*C-arms",
         ),
         (
             "[geometry]\nsource_x = { R = 1.0 }",

@@ -1,7 +1,7 @@
 """Materials by name: composition and density, from which attenuation at every energy follows.
 
 `data/materials.toml` is the one list: of phantoms and uploads, of the tube's filters, of the
-page's colours. A material that is not in it is written FORMULA@DENSITY, such as C8H8@1.05
+page's colors. A material that is not in it is written FORMULA@DENSITY, such as C8H8@1.05
 (g/cm3). `mu_per_mm` is stated at one documented effective energy.
 """
 
@@ -46,7 +46,7 @@ class Material:
         substance: composition and density, for attenuation at every energy.
         effective_energy_keV: where `mu_per_mm` is stated.
         source: provenance of the numbers.
-        color: (r, g, b) in the page, 0 to 255; None for one without a colour of its own.
+        color: (r, g, b) in the page, 0 to 255; None for one without a color of its own.
     """
 
     name: str
@@ -117,16 +117,11 @@ def stated_keV() -> float:
 def material(name: str) -> Material:
     """Look up the material called `name`, or parse FORMULA@DENSITY [g/cm3].
 
-    A density that its composition hardly has is a warning (`PlausibilityWarning`), at the
-    first use of that text.
-
-    Args:
-        name: of the list, in lower case, or a formula such as C8H8@1.05.
+    Warns of a doubtful density.
 
     Raises:
-        UnknownNameError: lists the materials there are; or an unknown element.
-        LimitError: a formula that cannot be read, or a density that the composition does
-            not allow.
+        UnknownNameError: of a material or element.
+        LimitError: formula or density is not valid.
 
     Example:
         >>> material("steel").name, material("Al@2.70").name

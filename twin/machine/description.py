@@ -71,7 +71,7 @@ with the sample and are along the world's x and y at angle 0.
 _COMPONENTS_OF_SCRIPTS = ("camera", "tube", "scanner")
 """Words of scripts that are not allowed as names of axes."""
 NOT_MODELLED = (
-    "not modelled (docs/limits.md): source and detector that turn about the sample (C-arms, "
+    "not modeled (docs/limits.md): source and detector that turn about the sample (C-arms, "
     "gantries), stages that tilt, curved panels, parallel beams"
 )
 """Scanners that a machine file cannot describe, for error messages."""
@@ -80,7 +80,7 @@ SAMPLE: Final = "sample"
 _AREA_SLACK_MM: Final = 0.5
 """Amount by which the panel's body may be smaller than the active area on each side [mm].
 
-The FleX-ray's table has whole millimetres.
+The FleX-ray's table has whole millimeters.
 """
 MAX_POINTS: Final = 256
 """Largest number of corners of a convex part."""
@@ -92,7 +92,7 @@ _CONTAINED_PLACES: Final = {
     "tube": "the focal spot, which is its 0, 0, 0",
     "sample_holder": "the rotation axis, which is its x = y = 0",
     "sample_mount": "the rotation axis, which is its x = y = 0",
-    "panel": "the active area, whose centre is its 0, 0, 0",
+    "panel": "the active area, whose center is its 0, 0, 0",
 }
 """Role of a component -> place that its body must contain, for error messages."""
 Corners = Callable[[str], Sequence[Vector3]]
@@ -101,13 +101,13 @@ around the mesh [mm, its own frame], at most `MAX_POINTS`."""
 Raw = dict[str, Any]
 _ONE_DETECTOR: Final = "a machine has one tube and one flat panel, [tube] and [detector]"
 _KEY_LIMITS: Final = {
-    "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modelled",
+    "beam": "the beam is a cone from one focal spot; parallel and fan beams are not modeled",
     "tube": _ONE_DETECTOR,
     "source": _ONE_DETECTOR,
     "detector": _ONE_DETECTOR,
-    "shape": "curved panels and line detectors are not modelled",
+    "shape": "curved panels and line detectors are not modeled",
     "unit": 'linear axes are in mm, axes with kind = "rotation" in deg',
-    "kind": "axes slide or turn about the vertical; what tilts is not modelled",
+    "kind": "axes slide or turn about the vertical; what tilts is not modeled",
 }
 """Key of a machine file -> limitation by docs/limits.md, for error messages."""
 
@@ -241,7 +241,7 @@ class DetectorSpec(_Frozen):
 
     model: str
     shape: Literal["flat"] = "flat"
-    """Curved panels are not modelled."""
+    """Curved panels are not modeled."""
     columns: int = Field(gt=0)
     rows: int = Field(gt=0)
     pitch_mm: Positive
@@ -295,17 +295,8 @@ class DetectorSpec(_Frozen):
         return tuple(dict.fromkeys([self.mode, *self.modes, *names]))
 
     def check_mode(self, mode: str) -> str:
-        """Check that a camera mode exists; case and a prefixed number do not matter.
-
-        Spaces around it are ignored; case and a prefixed number too, but not in the
-        machine's own modes (`modes`), whose names must agree exactly.
-
-        Returns:
-            `mode`, unchanged.
-
-        Raises:
-            LimitError: lists the modes that exist.
-        """
+        """Return a camera mode that exists, unchanged; only names in `modes` have to agree
+        in case and prefixed number. Raises LimitError: lists the modes."""
         unnumbered = {
             without_number(name) for name in self.mode_names if name not in self.modes
         }
@@ -415,7 +406,7 @@ class TubeSpec(_Frozen):
 
 
 def _box_around(points: Iterable[Vector3]) -> tuple[Vector3, Vector3]:
-    """Compute size and centre of the upright box around points, at least one: (x, y, z)
+    """Compute size and center of the upright box around points, at least one: (x, y, z)
     each [mm]."""
     (x, x_), (y, y_), (z, z_) = ((min(c), max(c)) for c in zip(*points, strict=True))
     return (x_ - x, y_ - y, z_ - z), ((x + x_) / 2, (y + y_) / 2, (z + z_) / 2)
@@ -425,9 +416,9 @@ class Component(_Frozen):
     """A convex part of the machine on its kinematic chain; upright in world axes, mm.
 
     A part moves with its own motor and with those of its parents. `center_mm` is its
-    centre with every quantity of `geometry` at zero; along the directions in which its
+    center with every quantity of `geometry` at zero; along the directions in which its
     chain moves it, or in which `fixed` has its anchor's place, it is therefore measured
-    from the focal spot, the rotation axis or the panel's centre (see `anchor`), along the
+    from the focal spot, the rotation axis or the panel's center (see `anchor`), along the
     others from the world's origin.
     """
 
@@ -460,10 +451,10 @@ class Component(_Frozen):
 
     @model_validator(mode="after")
     def _round(self) -> Component:
-        """Check that size, centre and points agree with the shape.
+        """Check that size, center and points agree with the shape.
 
         A cylinder is as wide in x as in y. A hull, and no other shape, has points; size
-        and centre are exactly those of the box around them. Returns the component
+        and center are exactly those of the box around them. Returns the component
         unchanged.
 
         Raises:
@@ -540,11 +531,7 @@ class Timing(_Frozen):
         )
 
     def seconds(self, kind: str) -> float:
-        """Return the time of a kind of command that has one [s].
-
-        Raises:
-            AttributeError: a name that is not in `kinds`.
-        """
+        """Return the time of one of `kinds` [s]."""
         value: float = getattr(self, f"{kind}_s")
         return value
 
@@ -1111,7 +1098,7 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
     """Replace the meshes of components by their convex bodies, in place.
 
     The corners are moved by `mesh_at_mm`, if it is given; shape becomes "hull" with size
-    and centre of their box. Components without a mesh stay.
+    and center of their box. Components without a mesh stay.
 
     Args:
         own: content of a machine file; it is changed.
@@ -1121,7 +1108,7 @@ def _meshed(own: Raw, corners: Corners | None) -> Raw:
         `own` itself.
 
     Raises:
-        UnknownNameError: a shape, size, centre or points beside a mesh; a `mesh_at_mm`
+        UnknownNameError: a shape, size, center or points beside a mesh; a `mesh_at_mm`
             that is not three numbers; a name that is no text; no reader; or the reader's
             error. Names the component and its problem.
     """

@@ -332,7 +332,7 @@ class Operator:
         return TorchOperator(self.geometry, self.like, self.detector_shape)
 
     def odl(self) -> Any:
-        """Return the map as an `odl.Operator`, from a discretised function space in mm (z, y,
+        """Return the map as an `odl.Operator`, from a discretized function space in mm (z, y,
         x). Needs the extra `odl`. Both spaces have the weight 1, so that ODL's adjoint is the
         transpose. Raises TwinError: ODL is not installed."""
         _require("odl", "pip install 'flexdt[odl]'")
@@ -341,11 +341,8 @@ class Operator:
         return odl_operator(self._forward, self._back, self.like, self.image_shape)
 
     def cil(self) -> Any:
-        """Return the map as a `LinearOperator` of CIL, with CIL geometries of voxels and panel.
-
-        CIL's algorithms, its power method and its dot test were run on it with CIL 26.0. CIL's
-        geometry has the distances and sizes for CIL's displays; the rays are this operator's.
-        Raises TwinError: CIL is not installed."""
+        """Return the map as a `LinearOperator` of CIL (tried with 26.0), for its algorithms;
+        rays are this operator's. Raises TwinError: CIL is not installed."""
         _require("cil", "conda install -c ccpi cil")
         from flexdt.twin.projection.for_odl_and_cil import cil_operator
 

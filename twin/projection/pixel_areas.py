@@ -1,6 +1,6 @@
 """A pixel is an area: how many rays each needs, and line integrals along several rays of some.
 
-One ray, to a pixel's centre, has the mean over the pixel of a line integral that changes evenly
+One ray, to a pixel's center, has the mean over the pixel of a line integral that changes evenly
 there. Where an edge of the object is in the way it has not, and n x n or n x (n + 1) rays come
 nearer.
 `rays_needed` finds these pixels from the shapes alone, by closed forms: no part that lies
@@ -252,7 +252,7 @@ def area_means(
         shape: detector (rows, cols).
         rays: along each side of a pixel that an edge reaches; "auto": so many that the
             error there is `SHARE_OF_MAXIMUM` of the largest line integral.
-        images: line integrals of the pixels' centres, changed in place; None to compute
+        images: line integrals of the pixels' centers, changed in place; None to compute
             them.
 
     Returns:
@@ -455,14 +455,15 @@ def _within_mesh(
 
 
 def _mark_voxels(volume: Volume, geometry: ConeVec, marks: Marks) -> None:
-    """Raise the marks of all pixels that voxels can darken."""
-    layout = volume.layout
-    if layout.empty or not marks.size:
+    """Set the marks in each view's rectangle around the shadow of the occupied box, and a pixel
+    more, to `voxel_rays_a_side` rays a side (`rays_of`)."""
+    occupied = volume.layout
+    if occupied.empty or not marks.size:
         return
     shape = (marks.shape[1], marks.shape[2])
     side = voxel_rays_a_side(volume, geometry)
-    low = np.array(layout.low_mm)
-    high = low + np.array(layout.counts) * layout.voxel_mm
+    low = np.array(occupied.low_mm)
+    high = low + np.array(occupied.counts) * occupied.voxel_mm
     corners = np.array(list(product(*zip(low, high, strict=True))))
     rays = run_through(geometry, corners).rays(shape)
     for view, (r0, r1, c0, c1) in enumerate(corner_shadows(corners, rays, shape)):
@@ -503,7 +504,7 @@ def rays_of(marks: Marks) -> IntArray:
 
 
 def ray_offsets(mark: int) -> tuple[FloatArray, FloatArray]:
-    """Place a pixel's rays from its centre, (columns, rows) of (rays,): no two in a row
+    """Place a pixel's rays from its center, (columns, rows) of (rays,): no two in a row
     or column, so that edges along them get as many steps.
     """
     a, b = (mark + 1) // 2, mark // 2 + 1

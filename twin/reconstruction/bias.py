@@ -358,7 +358,7 @@ class BiasOnDemand:
             return bounded
         if not self._agreement.compared:
             return replace(bounded, taken=(*self._known.taken, "geometry"))
-        return self._open(bounded, accuracy.most)
+        return self._with_undecided(bounded, accuracy.most)
 
     def bound(self, grid: Volume) -> Float32Array | None:
         """Compute the bound of the error at each voxel of a grid; see `Bias.bound`."""
@@ -594,8 +594,12 @@ class BiasOnDemand:
         """The coarse volume, 0 where no data cover it."""
         return np.nan_to_num(self._copied(NODES).volume)
 
-    def _open(self, bounded: Bias, claimed: float) -> Bias:
-        """Add what the images leave open.
+    def _with_undecided(self, bounded: Bias, claimed: float) -> Bias:
+        """Add the errors that the images do not decide.
+
+        To the cause "geometry" and to `edges` where they change the volume by no more than
+        `claimed`; else they are named in `taken`, as are another rotation or order. The
+        distances are always named.
 
         Args:
             bounded: the errors without it.
@@ -605,8 +609,8 @@ class BiasOnDemand:
         nodes = UniformNodes.of(self._volume, scan.rim)
         taken: dict[str, float] = {}
 
-        def decided(name: str, moved: Float32Array) -> bool:
-            """Note what changes the volume by more than all that is claimed."""
+        def negligible(name: str, moved: Float32Array) -> bool:
+            """Return whether a change is within what is claimed; if not, note it in `taken`."""
             size = nodes.change(nodes.found + moved)
             if size > claimed:
                 taken[name] = max(taken.get(name, 0.0), size)
@@ -624,7 +628,7 @@ class BiasOnDemand:
             change = self._changed(one, one.sigma)
             moved = SIGMAS * _smooth_about(change, bounded.even)
             name = STATED.get(one.cause.name, one.cause.name)
-            if decided(name, moved.astype(np.float32)):
+            if negligible(name, moved.astype(np.float32)):
                 squares += np.square(_about(change, bounded.even))
                 if doubled < MIN_TWO_EDGES_PX * self._pixel_mm:
                     edges = float(np.hypot(edges, doubled))
@@ -636,7 +640,9 @@ class BiasOnDemand:
                 shifted = self._moved(suspect.images, suspect.cone_vec)
             except GeometryError:
                 continue
-            decided("rotation" if suspect.kind in SIDES else "order", smoothed(shifted))
+            negligible(
+                "rotation" if suspect.kind in SIDES else "order", smoothed(shifted)
+            )
         largest = sorted(taken, key=lambda name: -taken[name])
         listed = dict.fromkeys([*largest, *self._known.taken, "distances"])
         causes = {**bounded.causes, "geometry": np.sqrt(squares)}

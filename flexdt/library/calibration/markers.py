@@ -150,8 +150,8 @@ def read_markers(source: str | PathLike[str] | Sequence[Mark], views: int) -> Ma
     """Read the markers of a CSV or NumPy file, or collect given marks.
 
     `source`: the file's path (.npy: NumPy, else CSV), or the marks; `views`: how many
-    frames there are. Raises TwinError: the file cannot be read or is invalid; names the
-    line.
+    frames there are. Returns markers by name; without marks there are none. Raises TwinError:
+    the file cannot be read or is invalid; names the line.
     """
     if not isinstance(source, str | PathLike):
         return _gathered((_mark(f"mark {i}", row) for i, row in enumerate(source)), views)

@@ -100,7 +100,7 @@ FIT_NOISE = 0.008
 """Noise of the line integrals above which complete spots are fitted too: a fit weighs
 photons as they count, and halves the error of a centroid there (measured)."""
 FIT_BLUR_PX = 0.4
-"""Least blur for that: an unblurred ball sampled at pixel centres misleads a fit by 0.015
+"""Least blur for that: an unblurred ball sampled at pixel centers misleads a fit by 0.015
 px."""
 FEW_WINDOWS = 600
 """Up to so many windows a bead is rendered with `RADIUS_RAYS` along its radius."""
@@ -109,7 +109,7 @@ FEWER_RADIUS_RAYS = 12
 LARGEST_PX = 0.6
 """A larger systematic error of a rendered spot is not believed."""
 NEAR_PX = 0.15
-"""Largest distance of a spot from its prediction for a judgement of its background [px]."""
+"""Largest distance of a spot from its prediction for a judgment of its background [px]."""
 MAX_MISFIT = 10.0
 """Misfit of a background, relative to the others', from which a spot is left out."""
 MAX_LOST_SHARE = 0.3
@@ -172,29 +172,21 @@ def measure_beads(
     turning: Turning | None = None,
     smear: Smear = UNMEASURED,
 ) -> Refined:
-    """Measure every bead in its window.
-
-    Complete, free spots get their centroid (a fit in noisy, blurred images), cut ones a
-    fit if at least `MIN_SHARE` of them is inside. The phantom's body is subtracted if the
-    images show it. Blur, sizes and contrasts are estimated from the spots. The error of
-    rendering with finite rays (`rendering_error`) is added to the covariances.
+    """Measure every bead in its window, and from all spots blur, sizes, contrasts and arc.
 
     Args:
         images: (n, k, side, side) line integrals from `crop`; not changed.
-        windows: their places.
-        cone: geometry the windows were planned with.
-        model: the beads.
-        contrast: line integral through the middle of a bead, one or (k,), as detected.
-        scene: the phantom's solids; all but beads are subtracted. None: only planes are.
-        draft: leave out the correction by rendered beads, which takes most of the time
-            and needs a geometry that is right to a few hundredths of a pixel.
-        known: blur and size that an earlier measurement of these images found (`as_fitted`);
-            None, or values that were not seen: they are estimated.
-        turning: geometry within an exposure; None: the object is at rest.
-        smear: the arc of an exposure that an earlier measurement of these images found.
+        windows, cone: their places, and the geometry they were planned with.
+        model, contrast: the beads, and line integrals through their middles, one or (k,).
+        scene: solids to subtract, but beads; None: only planes are.
+        draft: leave out the correction by rendered beads.
+        known: blur and size that an earlier measurement found (`as_fitted`); None: estimated.
+        turning: geometry within an exposure, whose arc is looked for unless `smear` has it;
+            None: the object is at rest.
+        smear: the arc that an earlier measurement found.
 
     Returns:
-        Positions, nan where a spot fails the checks of `_accept`.
+        Positions with covariances, nan where `_accept` refuses a spot; blur, size, body, arc.
     """
     if turning is not None and draft:
         windows = exposed(windows, model, turning, smear.share)
@@ -202,7 +194,7 @@ def measure_beads(
     known = start.blur(known, smear.told)
     if turning is not None and smear.told and not draft:
         return _with_arc(start, known, turning, smear)
-    return _without_arc(start, known, turning, smear, draft)
+    return _looking_for_arc(start, known, turning, smear, draft)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +285,7 @@ class _Drawn:
         )
 
 
-def _without_arc(
+def _looking_for_arc(
     start: _Start, known: Sharp, turning: Turning | None, smear: Smear, draft: bool
 ) -> Refined:
     """Measure spots whose arc is not told, and look for it where the object may turn; with
@@ -339,7 +331,7 @@ def _with_arc(start: _Start, known: Sharp, turning: Turning, smear: Smear) -> Re
     if not smear.told:
         known = start.blur(known, told=False)
         return replace(
-            _without_arc(start, known, None, UNMEASURED, draft=False), smear=smear
+            _looking_for_arc(start, known, None, UNMEASURED, draft=False), smear=smear
         )
     windows = exposed(start.windows, start.model, turning, smear.share)
     sharp = replace(sharp, true=smear.blur)
@@ -536,8 +528,8 @@ def _measured(
 ) -> Refined:
     """Measure centroids and fits, corrected by the same measurement of rendered beads.
 
-    The rendered spots contain the effects of pixels and blur on a ball, its neighbours,
-    and the displacement of a ball's spot from the projection of its centre; corrections
+    The rendered spots contain the effects of pixels and blur on a ball, its neighbors,
+    and the displacement of a ball's spot from the projection of its center; corrections
     of `LARGEST_PX` or more are not applied. Bent backgrounds, fading and the slope behind
     spots that are not complete are removed first. Complete spots are fitted too where the
     noise exceeds `FIT_NOISE` and the blur

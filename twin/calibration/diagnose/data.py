@@ -383,7 +383,7 @@ def convincing(found: Identification) -> bool:
 
 
 def _flipped(detections: Sequence[Detections], axis: int) -> list[Detections]:
-    """Mirror the spot centres of all frames in columns (`axis` 0) or in rows (1); shapes
+    """Mirror the spot centers of all frames in columns (`axis` 0) or in rows (1); shapes
     and covariances stay. Returns copies.
     """
     out = []
@@ -731,8 +731,8 @@ def _frame_by_frame(
 
 
 def _factor_of(turned: FloatArray, stated: FloatArray) -> float | None:
-    """Find the factor on stated angles with which frames turn as they show; None if the angles
-    follow none to `ONE_FRAME_TURN`.
+    """Find the factor f, 0.5 to 2, for which turned = f * stated + a constant: the one of least
+    median difference; None if that is `ONE_FRAME_TURN` or more.
 
     `turned`: what single frames show, up to whole turns [rad]; `stated`: of the same frames
     [rad].

@@ -143,11 +143,12 @@ def _frames_off(
 
 
 def _aside(fit: FitResult, frames: Sequence[int]) -> FloatArray | None:
-    """Compute by how much all spots of some frames stand aside from where the fit has them.
+    """Compute by how much spots of some frames stand aside: measured minus predicted.
 
     `fit`: to all frames; `frames`: the frames.
     Returns (2,) columns and rows [px]: the median; None if it leaves more than `ASIDE_REST` of
-    the distances: what turns moves the shadows of near and far beads apart.
+    the distances (what turns moves shadows of near and far beads apart), or for fewer than
+    `LEAST_ASIDE` spots.
     """
     off = (fit.problem.pixels - fit.problem.residuals(fit.solution.x)[0])[list(frames)]
     off = off[np.isfinite(off).all(axis=-1)]

@@ -185,19 +185,13 @@ class Profile:
         `radius`: distance from the axis [px].
         """
         place = self._place(radius, self.certain)
-        step = self.beside_axis(radius)
+        step = self.at_certain(radius)
         if self._has_inside[place]:
             return step
         return step._replace(sigma=math.inf, least=math.inf)
 
-    def beside_axis(self, radius: float) -> Step:
-        """Estimate the step at the radius next to one, also if only the innermost bin
-        separates it from a shift of the axis; structures that pass the axis itself move
-        that bin.
-
-        Args:
-            radius: distance from the axis [px].
-        """
+    def at_certain(self, radius: float) -> Step:
+        """Estimate as `at`, always with finite sigma."""
         return self._at(self._place(radius, self.certain))
 
     def at_rim(self, radius: float) -> Step:

@@ -19,22 +19,10 @@ MAX_KEPT_RESPONSES: Final = 8
 
 
 def ramp(reach: int, pitch_mm: float, window: str = PLAIN) -> Float32Array:
-    """Compute the frequency response of the windowed ramp filter, times the pitch.
+    """Compute the windowed ramp's frequency response, nearly |f|: (length / 2 + 1,) [1/mm].
 
-    It is the transform of the filter sampled in space, which keeps the mean right (Kak
-    and Slaney), padded to a fast even length of at least twice the reach.
-
-    Args:
-        reach: least distance between columns that do not act on each other; the number of
-            columns of a row, or less where not all filtered values are needed.
-        pitch_mm: between columns.
-        window: of `WINDOWS`.
-
-    Returns:
-        (length / 2 + 1,) [1/mm].
-
-    Raises:
-        UnknownNameError: lists the windows.
+    `reach`: columns that act on each other; `pitch_mm`: between columns; `window`: of
+    `WINDOWS`. Raises UnknownNameError: lists them.
     """
     if window not in WINDOWS:
         raise UnknownNameError.among(

@@ -294,7 +294,7 @@ def _evidence_of_rays(
     beside = columns - 0.5 - axis
     certain = np.abs(beside) <= profile.last
     steps = [
-        profile.beside_axis(abs(b)) if sure else profile.at_rim(abs(b))
+        profile.at_certain(abs(b)) if sure else profile.at_rim(abs(b))
         for b, sure in zip(beside.tolist(), certain.tolist(), strict=True)
     ]
     width = np.array([step.width for step in steps]) * np.sign(beside)

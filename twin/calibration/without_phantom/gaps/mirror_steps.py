@@ -371,8 +371,8 @@ def _ratios(radius: FloatArray, squares: FloatArray, border: FloatArray) -> Floa
         border: distances of borders from the axis, (c,) [px].
 
     Returns:
-        The sum without a step over that with one, (w, c); 1 where no place is beyond the
-        border.
+        The sum without a step over that with one, (w, c); at most 1 where no place is
+        beyond the border.
     """
     step = float(FINE_PX[1] - FINE_PX[0])
     bent = np.square(radius / radius[-1])
