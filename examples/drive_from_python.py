@@ -14,7 +14,7 @@ from flexdt.twin.geometry.cone_vec import ConeVec
 
 def main(host: str = "127.0.0.1", port: int = 55000) -> None:
     """Put a sample on a twin's stage, move, and print distances, an image's figures and
-    where the sample's centre falls in it.
+    where the sample's center falls in it.
     """
     with TwinClient(host, port) as client:
         client.set_sample("normal-5")

@@ -1,4 +1,4 @@
-"""A misalignment learnt back from images by gradients, and the gradients' cost.
+"""A misalignment learned back from images by gradients, and the gradients' cost.
 
     python examples/learn_geometry.py [--trials 10] [--views 32] [--voxels 80] [--sharp]
     [--peer] python examples/learn_geometry.py --cost 256
@@ -12,7 +12,7 @@ moves the image. With all three free, the distance between images of points by t
 the true geometry counts; the singular values of the Jacobian name the direction that
 the images determine least.
 
-With --peer the same task, by the same optimiser (L-BFGS on loss and gradient), for diffdrr
+With --peer the same task, by the same optimizer (L-BFGS on loss and gradient), for diffdrr
 (pip install diffdrr) beside flexdt. Prints JSON.
 """
 
@@ -125,7 +125,7 @@ def render(
     integrals are 2 w and 4/3 a w^3.
 
     Args:
-        ellipsoids: centre, matrix to the unit ball, and value [1/mm] of each.
+        ellipsoids: center, matrix to the unit ball, and value [1/mm] of each.
         rows: (n, 12) cone_vec.
         shape: (rows, cols).
         sharp: whether each has its value everywhere inside; else value * (1 - rho^2) at

@@ -1,4 +1,4 @@
-"""Read a data set: its size, normalised projections, and the geometry of each.
+"""Read a data set: its size, normalized projections, and the geometry of each.
 
 Run `flexdt demo --no-viewer`, then `python examples/read_a_dataset.py
 flexdt-demo/data/lego-...`.

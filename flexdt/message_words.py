@@ -1,4 +1,4 @@
-"""Words of messages at every door: what a value must be, and which name was meant.
+"""Words of messages of all interfaces: what a value must be, and which name was meant.
 
 Both the wire and the core use it, so it imports nothing of either. What pydantic finds is said
 in flexdt's words, by the table `NEEDED` of its kinds of problems.

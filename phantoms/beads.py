@@ -1,6 +1,6 @@
 """Bead phantoms: cuboids of Table 6.2 with beads on a spiral, and the chiral sign-test phantom.
 
-Everything is in the object's frame, centred on the rotation axis at the sample's
+Everything is in the object's frame, centered on the rotation axis at the sample's
 reference height. Width is along x, breadth along y, height along z. Beads must be inside
 their body.
 """
@@ -42,13 +42,13 @@ MAX_BEADS: Final = 10_000
 def spiral_positions(
     size_mm: Sequence[float], beads: int, radius_mm: float
 ) -> FloatArray:
-    """Compute bead centres on the elliptic spiral that fits a cuboid.
+    """Compute bead centers on the elliptic spiral that fits a cuboid.
 
     Beads may overlap.
 
-    Unity's y_k = (k/(K-1) - 1/2)(H - 2r) at angle 2 pi k / K on semi-axes W/2 - r (x) and
-    B/2 - r (z); a single bead sits at mid-height, angle 0 (the thesis describes the
-    spiral but not its formula: assumed).
+    The thesis's Unity application computes y_k = (k/(K-1) - 1/2)(H - 2r) at angle
+    2 pi k / K on semi-axes W/2 - r (x) and B/2 - r (z); a single bead sits at
+    mid-height, angle 0 (the thesis describes the spiral but not its formula: assumed).
 
     Args:
         size_mm: width (x), breadth (y), height (z) [mm].
@@ -99,7 +99,7 @@ def spiral_positions(
 
 
 def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> FloatArray:
-    """Compute bead centres on one turn of a rectangular loop inside a cuboid, equally
+    """Compute bead centers on one turn of a rectangular loop inside a cuboid, equally
     spaced in height.
 
     The layout of the thesis's public code: from (x max, y min) along y min, x min, y max
@@ -110,7 +110,7 @@ def loop_positions(size_mm: Sequence[float], beads: int, inset_mm: float) -> Flo
     Args:
         size_mm: width (x), breadth (y), height (z) [mm].
         beads: K >= 1.
-        inset_mm: of the centres from the faces [mm].
+        inset_mm: of the centers from the faces [mm].
 
     Returns:
         (K, 3) [mm], object frame.
@@ -150,7 +150,7 @@ def bead_phantom(
 
     Args:
         name_or_dims: a name of Table 6.2, (width, breadth, height) [mm], or the beads'
-            centres (k, 3) [mm], in the object's frame.
+            centers (k, 3) [mm], in the object's frame.
         beads: K; not used with positions.
         bead_radius_mm: 2 mm in the thesis's simulations.
         body_material: of the cuboid (assumed: the thesis does not say); not used with
@@ -241,7 +241,7 @@ def cuboid_with_beads(
     A bead's solid has its material's attenuation less the body's, as attenuation adds up;
     overlaps are not checked.
 
-    `name`: the phantom's name; `size_mm`: width, breadth, height [mm]; `beads`: (k, 3) centres
+    `name`: the phantom's name; `size_mm`: width, breadth, height [mm]; `beads`: (k, 3) centers
     [mm]; `radii_mm`: (k,) or one for all [mm]; `body_material`: None leaves the beads in air;
     `bead_materials`: one for each bead; `description`: one line for people; `assumed`: facts
     without a source.

@@ -61,7 +61,7 @@ def lego_data() -> dict[str, Any]:
 
 
 def _bead_positions(stack: Brickwork, radius: float) -> FloatArray:
-    """Compute the bead centres of the LEGO phantom, one a brick, bottom first.
+    """Compute the bead centers of the LEGO phantom, one a brick, bottom first.
 
     They are on an elliptic spiral, inside the walls by the clearance and the bead's
     radius, each at the same height in its brick.
@@ -192,7 +192,7 @@ class Brickwork:
         Holes are solids of negative attenuation; the plastic is the assumed one.
 
         Args:
-            beads: centres (k, 3) [mm].
+            beads: centers (k, 3) [mm].
             radius_mm: of the beads.
             metal: of the beads.
             turn_deg: about z, from brick to brick.

@@ -2,7 +2,7 @@
 
 Line integrals at one energy add up whatever the material is; a spectrum needs the path
 through each material. A solid may be a difference ("this bead instead of that plastic"):
-it is recognised by its attenuation and becomes one material in and the other out. Voxels
+it is recognized by its attenuation and becomes one material in and the other out. Voxels
 of attenuation without a material are treated as water of matching attenuation, which the
 result mentions.
 

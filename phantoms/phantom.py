@@ -1,7 +1,7 @@
 """The phantom as a frozen value: one object for X-rays and for the scene, with one origin.
 
 `scene` holds analytic solids (exact for X-rays), `surface` a triangle mesh and `voxels` a
-ready volume. Whichever are present share the object's frame, centred on the rotation axis
+ready volume. Whichever are present share the object's frame, centered on the rotation axis
 at the sample's reference height. `mesh()` and `volume()` derive the other representation
 on demand, so that the two cannot drift apart; derived arrays are not kept.
 
@@ -70,8 +70,8 @@ class Phantom(ArrayValue):
         name: as the command line and the wire name it.
         description: one line for people.
         scene: analytic solids, additive; may be empty.
-        size_mm: full extent along x, y, z [mm], centred on the origin.
-        beads: float64 (k, 3) bead centres [mm], object frame, read-only; k may be 0.
+        size_mm: full extent along x, y, z [mm], centered on the origin.
+        beads: float64 (k, 3) bead centers [mm], object frame, read-only; k may be 0.
         bead_radius_mm: float64 (k,) [mm], read-only.
         assumed: facts without a public source.
         tolerance: how well the places of its beads are known; None: not stated.
@@ -169,7 +169,7 @@ class Phantom(ArrayValue):
         `voxel_mm`: voxel edge [mm]; default: 256 voxels along the longest side. `oversample`:
         samples per voxel along each side.
         Returns volume of attenuation [1/mm], data [z, y, x], about the origin (voxels: about
-        their own centre).
+        their own center).
         Raises PhantomError: voxels together with other parts, or as `voxelise`.
         """
         if self.voxels is not None:

@@ -76,8 +76,8 @@ ALLOWED_FORMS: Final = (
 def shepp_logan(size_mm: float = 50.0) -> Phantom:
     """Make the Shepp-Logan phantom in a cube, [-1, 1] in its definition.
 
-    Its attenuation 1 is that of water; `size_mm` of the phantom is that of the skull,
-    less than the cube.
+    An attenuation of 1 in the definition is that of water. The phantom's `size_mm` is the
+    extent of the skull, which is smaller than the cube.
 
     Args:
         size_mm: side of the cube.
@@ -141,7 +141,7 @@ def is_shipped(name: str) -> bool:
 
 @public
 def load_phantom(name: str) -> Phantom:
-    """Make the phantom called `name`; a bare cuboid's name has five beads.
+    """Make the phantom called `name`; a cuboid without a number has five beads.
 
     Names: special phantoms, cuboids, and cuboids with -K for K beads.
 

@@ -61,7 +61,7 @@ def parts_of(
         scene: analytic solids.
         surfaces: triangle meshes.
         voxels: ready grid, or None.
-        beads: (k, 3) bead centres [mm]: spheres there are never holes.
+        beads: (k, 3) bead centers [mm]: spheres there are never holes.
         around: round solids are inside their meshes, not the other way round.
 
     Returns:
@@ -108,7 +108,7 @@ def _is_hole(solid: analytic.Solid, beads: FloatArray) -> bool:
     """Return whether a solid is a hole: negative, and not a bead that absorbs less
     than its body.
 
-    A bead is a ball whose centre is exactly among `beads`.
+    A bead is a ball whose center is exactly among `beads`.
     """
     if solid.mu_per_mm >= 0.0:
         return False

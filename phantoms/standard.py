@@ -114,7 +114,7 @@ def ball_plate(
 
     Args:
         balls: along a side, 2 or more.
-        pitch_mm: distance of neighbours [mm].
+        pitch_mm: distance between neighboring balls [mm].
         ball_radius_mm: of the balls [mm].
         odd_radius_mm: of the ball in a lower corner, which tells how the phantom stands; None: as
             the others.
@@ -150,7 +150,7 @@ def ball_bar(
 
     Args:
         balls: 3 or more.
-        pitch_mm: distance of neighbours [mm].
+        pitch_mm: distance between neighboring balls [mm].
         lean_deg: of the bar; 0: upright, so that it looks alike at every angle.
         ball_radius_mm: of the balls [mm].
         material: of the balls.

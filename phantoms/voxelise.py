@@ -1,7 +1,7 @@
 """A phantom as voxels of attenuation: exact coverage along z, sub-columns across.
 
 Analytic solids and triangle meshes are voxelised along the same columns. A mesh is filled
-by the winding number with an edge rule on which both neighbours of an edge agree, so that
+by the winding number with an edge rule on which both neighbors of an edge agree, so that
 closed meshes cannot leak. Open meshes, and grids that do not fit into memory, are errors.
 """
 
@@ -165,7 +165,7 @@ def _add_surface(
 def _range(low: float, high: float, n: int, voxel_mm: float) -> tuple[int, int]:
     """Return the first voxel, and the last plus one, that an extent [mm] touches along one axis.
 
-    The grid of `n` voxels is centred on 0; the range is cut to it.
+    The grid of `n` voxels is centered on 0; the range is cut to it.
     """
     return (
         max(math.floor(low / voxel_mm + n / 2.0 - 1e-9), 0),

@@ -123,7 +123,7 @@ def _height(t, px, py):
 
 @linked
 def _span(low, high, n):
-    """Compute the sub-column indices whose centres i + 0.5 can be in [low, high]."""
+    """Compute the sub-column indices whose centers i + 0.5 can be in [low, high]."""
     return max(int(np.floor(low - 0.5)), 0), min(int(np.ceil(high - 0.5)) + 1, n)
 
 

@@ -6,7 +6,7 @@ is too long or broken comes out as `Malformed`; a JSON connection recovers at th
 newline, a MessagePack connection at the end of the frame. The caller owns the network. No
 received bytes make a method block or raise; only the end of the stream may be an error
 (`receive_end`). Other framings that are common (a length before JSON, UTF-16, NUL at a
-message's end, documents of many lines) are recognised, and refused by a sentence in JSON.
+message's end, documents of many lines) are recognized, and refused by a sentence in JSON.
 
 Received bytes are divided into complete messages at once; these wait, still as bytes, in
 a queue.

@@ -305,7 +305,7 @@ class PutResult(f.Result):
     total: int
     complete: bool
     warnings: list[str] = Field(default_factory=list)
-    """doubts about the volume, such as grey values in the place of attenuation"""
+    """doubts about the volume, such as gray values in the place of attenuation"""
 
 
 class VolumeList(f.Result):
@@ -330,11 +330,11 @@ class Array(f.Result):
     parts: int | None = None
     data: Buffer | None = None
     warnings: list[str] = Field(default_factory=list)
-    """doubts about a geometry and its volume, such as metres for mm"""
+    """doubts about a geometry and its volume, such as meters for mm"""
 
 
 class Cancelled(f.Result):
-    """Whether the request was still there to be cancelled."""
+    """Whether the request was still there to be canceled."""
 
     cancelled: bool
 

@@ -158,7 +158,7 @@ def link_down(why: str) -> RpcError:
 
 
 def cancelled(request: object) -> RpcError:
-    """Make the error for a request that its sender cancelled."""
+    """Make the error for a request that its sender canceled."""
     return RpcError(Code.CANCELLED, "cancelled by its sender", {"request": request})
 
 

@@ -35,18 +35,19 @@ class ConnectionLimits:
 
     Attributes:
         max_message: largest line or frame received (MessagePack: below 16 MiB anyway);
-            beyond it error -32008, and the connection goes on.
+            larger ones get error -32008, and the connection stays open.
         max_batch: messages in a batch; beyond it -32008.
-        max_clients: connections at a time, with a token those that have shown it. Beyond
-            it hello, stop, emergency stop, ping and abort are served (the newest 16 such
-            clients), the rest is answered with -32003.
-        max_waiting: queued requests of one connection above which it is not read.
+        max_clients: maximum number of connections; with a token, only those that have
+            presented it count. Beyond it the 16 newest clients can still call hello, stop,
+            emergency stop, ping and abort; all other requests get -32003.
+        max_waiting: when a connection has this many queued requests, the server stops
+            reading from it.
         max_events: ordered events (job, log) queued for a client that does not read;
-            beyond it the client is cut off.
+            beyond it the client is disconnected.
         max_unsent: bytes of replies queued for a client, above which its next request
             waits.
-        send_timeout_s: a client that takes nothing for so long is cut off.
-        message_timeout_s: a message begun must be complete after this.
+        send_timeout_s: a client that reads nothing for this long is disconnected.
+        message_timeout_s: a message must be complete within this time after it begins.
         hello_timeout_s: with a token, session.hello must come within this.
         end_timeout_s: after the client's end of file, replies may take this long.
         requests_per_s: rate above which requests are refused with -32003, but never
@@ -81,18 +82,20 @@ class TwinLimits:
     Attributes:
         max_jobs: jobs in the queue; beyond it error -32003.
         max_ended_jobs: ended jobs that are known; beyond them the oldest is forgotten.
-        ended_job_days: after which an ended job is forgotten [days].
+        ended_job_days: age at which an ended job is forgotten [days].
         max_upload: size of an uploaded sample; beyond it -32008.
-        max_samples: uploads there may be; -32001 until some are deleted.
-        max_observer_samples: uploads there may be that came while another client had
-            control; beyond it -32001.
+        max_samples: maximum number of uploads; beyond it, -32001 until some are deleted.
+        max_observer_samples: maximum number of uploads that came while another client had
+            control; beyond it, -32001.
         max_observer_bytes: size of these together.
-        max_corrections: corrections there may be; -32001 until some are deleted.
+        max_corrections: maximum number of corrections; beyond it, -32001 until some are
+            deleted.
         disk_quota: size of the data directory, checked before a scan or an upload begins
             (-32001); None is what the disk holds, less 16 MiB.
         max_subscriptions: topics that all connections together follow; beyond it -32003.
-        max_views: different kinds and binnings in which they want their events, beyond it
-            -32003; an image is rendered and encoded once for each.
+        max_views: maximum number of distinct combinations of kind and binning that
+            subscribers may request; beyond it, -32003. An image is rendered and encoded
+            once for each.
         control_idle_s: a controller idle for this long loses control to the next client
             that requests it [s].
     """
@@ -116,7 +119,8 @@ class ViewerLimits:
     """Limits on the cost of all pages of a viewer together.
 
     Attributes:
-        max_pages: pages open at a time; each is a connection to the twin, and four views.
+        max_pages: maximum number of open pages; each uses one connection to the twin and
+            up to four views.
     """
 
     max_pages: int = 64

@@ -82,7 +82,7 @@ class FairTurns:
         self._give()
 
     def _give(self) -> None:
-        """Give a place to the next who waits; cancelled ones are skipped."""
+        """Give a place to the next who waits; canceled ones are skipped."""
         while self._waiting:
             who = next(
                 (w for w, queue in self._waiting.items() if queue[0][0].first()),

@@ -153,7 +153,7 @@ class Supervisor:
         """Start the services one after the other, each once the one before has its
         address; announce all addresses when all are ready.
 
-        Then they are kept alive until one is given up or this is cancelled; their
+        Then they are kept alive until one is given up or this is canceled; their
         processes go on.
 
         Raises:

@@ -240,7 +240,7 @@ class Workers:
         """Have one piece of work done by an idle or a new worker, once there is a free
         place.
 
-        If this is cancelled, the worker is stopped. Afterwards a worker that may have
+        If this is canceled, the worker is stopped. Afterwards a worker that may have
         further work becomes idle.
 
         Args:

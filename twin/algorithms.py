@@ -2,7 +2,8 @@
 list of each.
 
 `flexdt reconstruct`, its help and completion, the library and the table of
-`docs/reconstruction.md` iterate it. Names are there without an import of what computes.
+`docs/reconstruction.md` iterate it. The names are available without importing the
+code that computes.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Kind = Literal["direct", "iterative"]
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm that makes a volume of line integrals.
+    """An algorithm that makes a volume from line integrals.
 
     Attributes:
         name: as users write it.

@@ -1,7 +1,7 @@
 """Public functions and classes: what their signatures say, said to the caller.
 
 `public` compares the arguments of a call with the annotations of the signature, so that a
-misspelt keyword, two arguments in the wrong order or a value of another type is one sentence
+misspelled keyword, two arguments in the wrong order or a value of another type is one sentence
 that says what was given and what is allowed. Values are checked by what is called, as before.
 """
 

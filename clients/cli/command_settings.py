@@ -70,7 +70,7 @@ class SampleSettings(Settings):
     """`flexdt sample`.
 
     Attributes:
-        place: Stand a mesh so: keep (as its file has it), centred (on the axis).
+        place: Stand a mesh so: keep (as its file has it), centered (on the axis).
     """
 
     command = "sample"

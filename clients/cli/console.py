@@ -89,7 +89,7 @@ def waited_for(words: Sequence[str]) -> Iterator[None]:
 
     Without a terminal on stderr, without words, or while the shell completes words
     nothing is shown. The display is taken off by the first output, or at the end; the
-    help option is recognised by a leading minus.
+    help option is recognized by a leading minus.
 
     Args:
         words: of the command line; nothing is shown of help, completion, servers and

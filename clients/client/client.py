@@ -479,7 +479,7 @@ class AsyncTwinClient(SharedMethods):
     """A connection to a twin server; an async context manager.
 
     It connects on entering, or with the first call. Errors are `TwinClient`'s. A call that is
-    cancelled may still be carried out by the server (use `stop` to end a motion).
+    canceled may still be carried out by the server (use `stop` to end a motion).
 
     Args:
         host, port: of the server.
@@ -611,7 +611,7 @@ def _loop() -> asyncio.AbstractEventLoop:
 
 
 def _end_links() -> None:
-    """End the connections of clients that were not closed, by cancelling all tasks of the
+    """End the connections of clients that were not closed, by canceling all tasks of the
     clients' loop; called as Python exits.
 
     It waits until they have ended.

@@ -97,7 +97,7 @@ class Projection:
 
     def _repr_png_(self) -> bytes:
         """Return a PNG for notebooks: dense parts dark, windowed between percentiles,
-        marks in colour."""
+        marks in color."""
         from flexdt.library.datasets.pictures import png
 
         return png(

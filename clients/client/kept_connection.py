@@ -134,7 +134,7 @@ class KeptConnection:
         return None
 
     async def run(self) -> None:
-        """Keep the connection until cancelled: connect again after each loss, with growing
+        """Keep the connection until canceled: connect again after each loss, with growing
         pauses; may be called again after that.
 
         `problem` is the reason why there is none, and `on_change` is called when that

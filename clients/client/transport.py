@@ -191,7 +191,7 @@ class TcpTransport:
         self._wire = Connection(self.codec)
 
     async def send(self, message: Message) -> None:
-        """Send one message; all its bytes are queued at once, so a cancelled call breaks
+        """Send one message; all its bytes are queued at once, so a canceled call breaks
         nothing.
 
         Waits until the stream's buffer has room. A message that cannot be encoded raises
@@ -291,7 +291,7 @@ class Link:
     ) -> object:
         """Send a request and wait for its result.
 
-        The id is freed if the call is cancelled or timed out, and a late answer is
+        The id is freed if the call is canceled or timed out, and a late answer is
         ignored. The result is as the codec decoded it, not validated.
 
         Args:
@@ -401,7 +401,7 @@ class Link:
             self._on_end()
 
     def _take(self, message: Message) -> None:
-        """Give a message's answers to the requests that wait for them (cancelled ones are
+        """Give a message's answers to the requests that wait for them (canceled ones are
         skipped), and its events to `on_event`; the rest is ignored.
 
         Only notifications named "event" with an object as params count as events.

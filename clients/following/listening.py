@@ -70,7 +70,7 @@ async def listen(
     link: Callable[[bool, str], None],
     clock: Callable[[], float],
 ) -> None:
-    """Listen to the scanner's messages in a thread until cancelled, and call the
+    """Listen to the scanner's messages in a thread until canceled, and call the
     callbacks in the event loop.
 
     The thread is waited for before the call ends. A lost connection is made again by the

@@ -148,7 +148,7 @@ class FollowSession:
         self.changed(mirror)
 
     async def run(self, address: str) -> None:
-        """Listen to the scanner at `address` and check ahead of its script, until cancelled.
+        """Listen to the scanner at `address` and check ahead of its script, until canceled.
 
         Two tasks: listen for messages, and look ahead; an error in one ends both.
         Raises ExceptionGroup: with the error of a task, such as the ValueError or zmq.ZMQError
@@ -196,7 +196,7 @@ class FollowSession:
                 )
 
     async def show_frames(self, folder: Path, beside: FramesBeside) -> None:
-        """Write each new frame of a folder with its radiograph, until cancelled.
+        """Write each new frame of a folder with its radiograph, until canceled.
 
         Looks every `FRAMES_S` seconds at the newest frame; one that is there at the
         beginning is left out. A frame is written once two looks in a row found it
@@ -228,7 +228,7 @@ class FollowSession:
 
     async def _look_ahead(self) -> None:
         """Check current moves and the rest of the script, again whenever either changes,
-        and keep the findings as alarms; until cancelled.
+        and keep the findings as alarms; until canceled.
 
         It looks every `TICK_S`, checks in a thread, and does nothing while neither
         targets nor the next line have changed.

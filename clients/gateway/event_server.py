@@ -112,10 +112,10 @@ class Gateway:
         """Components on which commands of clients run."""
 
     async def run(self) -> None:
-        """Serve until cancelled: receive events, and echo changes by others; then cancel
+        """Serve until canceled: receive events, and echo changes by others; then cancel
         tasks, close recording and sockets.
 
-        An event that fails is logged, and serving goes on after `PAUSE_S`. Cancelled
+        An event that fails is logged, and serving goes on after `PAUSE_S`. Canceled
         tasks answer their commands with ERR; closing waits at most `LINGER_MS` for events
         to be sent.
         """
@@ -193,7 +193,7 @@ class Gateway:
 
     async def _echo(self) -> None:
         """Send clients the commands of others: over the twin's wire, from the viewer, by a
-        script. Runs until cancelled, also after errors.
+        script. Runs until canceled, also after errors.
 
         After a refusal or an error it waits `PAUSE_S`. Notes in `twin.lively` whether
         anything moves or a job is known. Components with running commands of clients are
@@ -241,7 +241,7 @@ class Gateway:
         ERR.
 
         Refusals and errors are answered with ERR, not raised; the control of the twin is
-        released before the last reply. If cancelled, the command is cancelled and
+        released before the last reply. If canceled, the command is canceled and
         answered with ERR. The state after the command is stored, so that it is not
         echoed. FDB is sent when the exchange says so, with the progress text; the task is
         waited for between.
@@ -299,7 +299,7 @@ class Gateway:
         self, event: AcquilaEvent, command: c.Command, progress: CommandProgress
     ) -> str:
         """Run a command's action and return its reply; its line is in the recording's
-        transcript meanwhile, and stays unless it fails (or is cancelled).
+        transcript meanwhile, and stays unless it fails (or is canceled).
 
         A command that is not of scripts has no line.
         """
@@ -342,7 +342,7 @@ class Gateway:
         """Send on the reply of a component elsewhere, and wake the command that waits for
         it; an echo of one of our own events is dropped.
 
-        Recognised are the last 256 events sent.
+        Recognized are the last 256 events sent.
         """
         text = format_event(event)
         if hash(text) in self._recent:
@@ -385,7 +385,7 @@ class Gateway:
                 self._log_failure("session.control")
 
     def _send(self, event: AcquilaEvent) -> None:
-        """Format an event, remember its hash (of the last 256) to recognise its echo, and
+        """Format an event, remember its hash (of the last 256) to recognize its echo, and
         publish it without waiting. A subscriber that is too slow does not get it; characters
         outside UTF-8 are replaced."""
         text = format_event(event)
@@ -430,7 +430,7 @@ class Gateway:
     def _bind(
         self, port: int, inbound: int | None
     ) -> tuple[zmq.asyncio.Socket, zmq.asyncio.Socket, int, int]:
-        """Bind PUB and SUB; if any free port will do, find two neighbouring ones.
+        """Bind PUB and SUB; if any free port will do, find two neighboring ones.
 
         SUB has a limit of `MAX_BYTES` a message and `MAX_HELD` messages a sender.
 

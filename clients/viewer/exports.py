@@ -44,7 +44,7 @@ def picture(client: viser.ClientHandle, width: int, height: int, dark: bool) -> 
     Translucent pixels are blended with `LIGHT` or `DARK`.
 
     `client`: one open view, whose browser renders it; `width`: [px]; `height`: [px]; `dark`: the
-    page's colours.
+    page's colors.
     Raises RuntimeError, TimeoutError: the browser does not answer within 30 s.
     """
     rgba = client.get_render(height, width, transport_format="png", timeout=30.0).astype(
@@ -120,9 +120,9 @@ def replay_file(
 def _file(serializer: Any, form: Form, dark: bool, title: str, beside: str = "") -> bytes:
     """Convert an exported scene to the content of a file.
 
-    Only html has colours, title and `beside`. The title is escaped, `beside` is not.
+    Only html has colors, title and `beside`. The title is escaped, `beside` is not.
 
-    `serializer`: viser's, of the scene; `form`: "html" or "viser"; `dark`: the page's colours;
+    `serializer`: viser's, of the scene; `form`: "html" or "viser"; `dark`: the page's colors;
     `title`: of the page; `beside`: HTML at its end.
     """
     match form:

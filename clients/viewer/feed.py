@@ -129,7 +129,7 @@ class ImageFeed:
         """Take each new image coarse at once, and once more in full when no other follows
         within `SETTLE_S` seconds.
 
-        Runs until cancelled; an image that cannot be shown is logged, once until one can.
+        Runs until canceled; an image that cannot be shown is logged, once until one can.
         `take` runs in a thread, one image at a time; images that come meanwhile are
         skipped but for the newest.
         """

@@ -172,7 +172,7 @@ class Page:
         what: str,
         died: Callable[[], None] = lambda: None,
     ) -> asyncio.Task[None]:
-        """Run work in a task that is cancelled when the page closes.
+        """Run work in a task that is canceled when the page closes.
 
         Returns the task; a failure is logged, not raised.
         `work`: to run; `what`: word for the log if it fails; `died`: called if it fails."""

@@ -220,7 +220,7 @@ class SceneClients:
         Args:
             page: its id.
             view: name of the view.
-            at: (3,) centre [mm].
+            at: (3,) center [mm].
             radius_mm: of the ball around it.
 
         Raises:
@@ -294,7 +294,7 @@ class SceneClients:
         """Set a client's camera, unless it was put there last and has not been moved
         since.
 
-        The camera is stored as put, so that a person's move is recognised.
+        The camera is stored as put, so that a person's move is recognized.
         """
         put = Put(camera, client.camera.aspect)
         if self._sent.get(client.client_id) == put and self._untouched(client):

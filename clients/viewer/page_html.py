@@ -43,7 +43,7 @@ def token_form(wrong: bool) -> bytes:
 
 
 def boxes(layers: tuple[Layer, ...]) -> str:
-    """Make (HTML) a labelled checkbox for each layer, a line each, named "layer-NAME".
+    """Make (HTML) a labeled checkbox for each layer, a line each, named "layer-NAME".
 
     Titles are escaped.
     """

@@ -600,7 +600,7 @@ async def thumbnail(viewer: Viewer, page: Page, params: Thumbnail) -> object:
 
     Returns:
         `name`, `index` and `file` of the image, and `image`: its shape, at most about
-        `side` columns, and its counts as 8-bit grey between their percentiles, in base64.
+        `side` columns, and its counts as 8-bit gray between their percentiles, in base64.
 
     Raises:
         RpcError: the twin refuses, such as an image that is not there yet.

@@ -1,6 +1,6 @@
 """Images as the panel and the pages get them.
 
-For the scene line integrals and counts become 8-bit grey by window and level. A page applies
+For the scene line integrals and counts become 8-bit gray by window and level. A page applies
 its own window: it gets 16-bit integers with a scale, deflated, or, while things move, a JPEG.
 """
 
@@ -101,7 +101,7 @@ def packed(
 
     Pixels are uint16 with a scale. Exact ones are the differences from column to column
     (mod 2^16), first the low bytes of all, then the high ones, deflated (zlib). Coarse
-    ones are a grey JPEG of their high bytes. The rows of a virtual image follow those of
+    ones are a gray JPEG of their high bytes. The rows of a virtual image follow those of
     an exact one. Line integrals and coarse images are scaled between their least and
     greatest values; exact counts keep scale 1. The window is chosen from the image, with
     its virtual one below.
@@ -109,7 +109,7 @@ def packed(
     Args:
         image: to send.
         coarse: send the mean over 2 x 2 pixels instead, as a JPEG.
-        beads: predicted bead centres (column, row) in pixels of the full image.
+        beads: predicted bead centers (column, row) in pixels of the full image.
         facts: more entries of the header.
     """
     full = image.pixels.shape
@@ -149,7 +149,7 @@ def packed(
 
 
 def _jpeg(raw: npt.NDArray[np.uint16]) -> bytes:
-    """Encode a grey image (rows, cols) as JPEG.
+    """Encode a gray image (rows, cols) as JPEG.
 
     Sixteen bits are reduced to eight. The quality is `JPEG_QUALITY`.
 

@@ -22,7 +22,7 @@ def watched(
     Args:
         work: the coroutine.
         what: name of the work, for the log.
-        died: called when it has failed, not when it was cancelled.
+        died: called when it has failed, not when it was canceled.
 
     Returns:
         The task; an error of the work is logged, not raised.

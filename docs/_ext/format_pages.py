@@ -8,7 +8,7 @@ from typing import Any
 ROLE_WORDS = {
     "used": "used: {}",
     "ignored": "ignored: {}",
-    "not applied": "told, not applied: {}",
+    "not applied": "reported, not applied: {}",
     "refused": "refused: {}",
 }
 """Role of a field -> how the page says it."""
@@ -44,9 +44,9 @@ def _described(title: str, table: Any, lines: list[str]) -> str:
         *lines,
         "```",
         "",
-        f"Facts from {table.source}.",
+        f"Sources: {table.source}.",
         "",
-        f"Of two statements of one thing: {_cell(table.rule)}",
+        f"If a file states the same quantity twice: {_cell(table.rule)}",
         "",
         "`data.provenance` and `flexdt describe FILE` list every value of a file with its "
         "use. What is not in this table is named in one warning.",

@@ -265,9 +265,9 @@ def benchmark() -> str:
         "# Projector beside peers",
         "",
         "Commands: `flexdt bench --out out/bench`, `python tests/studies/further_bench.py "
-        "--out out/further`. Ratios are taken turn by turn in the same run; errors are of the "
-        "maximum; cases are those of [the projector's "
-        "page](../../performance.md#measure). LEAP is "
+        "--out out/further`. Ratios compare runs that alternate within one session; errors are "
+        "relative to the maximum of the image; the cases are listed under [cases of the "
+        "benchmark](projector.md#cases-of-the-benchmark). LEAP is "
         "not on PyPI and was not run: its rows are derived from its times and itk-rtk's, "
         "measured "
         "together once on two Zen 4 cores of about 2.9 GHz.",

@@ -71,8 +71,9 @@ def limits() -> str:
     out = [
         "# Limits of the servers",
         "",
-        "`--limit NAME=VALUE`, as often as needed, on `flexdt up`, `twin`, `projector` (those "
-        "of connections) and `viewer` (those of the page). Sizes are in bytes.",
+        "Set a limit with `--limit NAME=VALUE`, repeated as needed, on `flexdt up`, `twin`, "
+        "`projector` (connection limits only) and `viewer` (page limits only). Sizes are in "
+        "bytes.",
         "",
     ]
     for title, made in (

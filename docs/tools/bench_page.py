@@ -57,12 +57,12 @@ class Target:
     find: Callable[[Entries], Found]
 
     def verdict(self, value: float) -> str:
-        """Judge a figure: "wanted: met", else "accepted: met", else "**missed**"; a
+        """Judge a figure: "goal met", else "minimum met", else "**missed**"; a
         figure on the bar meets it.
         """
         for bar, words in (
-            (self.wanted, "wanted: met"),
-            (self.accepted, "accepted: met"),
+            (self.wanted, "goal met"),
+            (self.accepted, "minimum met"),
         ):
             if bar is not None and (value >= bar if self.more else value <= bar):
                 return words
@@ -82,7 +82,7 @@ def target_table(document: Mapping[str, Any]) -> list[str]:
     """
     entries = {entry["name"]: entry for entry in document["cases"]}
     lines = [
-        "| target | to be accepted | wanted | measured | |",
+        "| target | minimum | goal | measured | |",
         "|---|---|---|---|---|",
     ]
     for target in TARGETS:
@@ -321,7 +321,7 @@ def _runs(cases: Sequence[dict[str, Any]]) -> list[str]:
         return []
     most = runs.most_common(1)[0][0]
     others = (case["name"] for case in cases if case.get("measured") != most)
-    return [f"Of another run than the rest: {', '.join(others)}.", ""]
+    return [f"These cases come from a different run: {', '.join(others)}.", ""]
 
 
 def _cases(cases: Sequence[dict[str, Any]]) -> list[str]:

@@ -110,7 +110,7 @@ class Sheet:
 
     def svg(self, title: str) -> str:
         """Return the drawing as the text of an SVG, with a title, arrow heads in each
-        colour and a white ground.
+        color and a white ground.
         """
         heads = "".join(
             f'<marker id="{c[1:]}" viewBox="0 0 10 10" refX="8" refY="5" markerWidth="6" '

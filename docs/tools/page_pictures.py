@@ -5,7 +5,7 @@ rendering.
 
 Starts a lab of its own, unless it is given the address of one whose machine stands at home.
 Writes viewer-first.png, viewer-four-views.png, viewer-scan-it.png, viewer-scan.png,
-viewer-design.png and viewer-virtual.png, in COLORS colours, and viewer-turning.gif; `--only`
+viewer-design.png and viewer-virtual.png, in COLORS colors, and viewer-turning.gif; `--only`
 writes those of one function. Needs Debian's chromium, playwright and Pillow.
 """
 
@@ -110,7 +110,7 @@ def opened(browser: Any, url: str, view: str, tab: str) -> Any:
 
 
 def taken(page: Any, path: Path) -> None:
-    """Save a picture of the page as PNG of `COLORS` colours, once two pictures of its
+    """Save a picture of the page as PNG of `COLORS` colors, once two pictures of its
     scenes are equal and none is marked as old.
     """
     last = b""

@@ -41,7 +41,7 @@ LIQUID_G_CM3 = {
 
 
 def spectra(out: Path) -> None:
-    """Compute the spectra of spekpy at all voltages and write them with the centres of
+    """Compute the spectra of spekpy at all voltages and write them with the centers of
     their bins."""
     import spekpy
 

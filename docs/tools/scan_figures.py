@@ -33,7 +33,7 @@ WIDTH_INCH = 7.2
 HEIGHT_INCH = 2.5
 DPI = 100
 COLOURS = 64
-"""Levels of a picture in grey, so that a file is small."""
+"""Levels of a picture in gray, so that a file is small."""
 
 Image = npt.NDArray[np.floating[Any]]
 Numbers = dict[str, float]
@@ -43,7 +43,7 @@ Figure = Any
 def slices(
     images: Mapping[str, Image], low: float, high: float, unit: str = "1/mm"
 ) -> Figure:
-    """Draw images beside each other in one window of grey, with one colour bar.
+    """Draw images beside each other in one window of gray, with one color bar.
 
     Args:
         images: title -> image; the first row is drawn lowest.
@@ -650,7 +650,7 @@ FIGURES: dict[str, Callable[[], tuple[Figure, Numbers]]] = {
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG of `COLOURS` colours, and close it."""
+    """Write a figure as PNG of `COLOURS` colors, and close it."""
     from PIL import Image as Picture
 
     figure.savefig(path, dpi=DPI, metadata={"Software": None})

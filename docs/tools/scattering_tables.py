@@ -3,7 +3,7 @@ ships.
 
 Run it only to renew them: `pip install xraylib numpy`, then `python
 docs/tools/scattering_tables.py twin/attenuation/data/scattering.npz`. Every number comes from
-xraylib (BSD licence), which took both functions from EPDL97, and EPDL97 from Hubbell et al.,
+xraylib (BSD license), which took both functions from EPDL97, and EPDL97 from Hubbell et al.,
 J. Phys. Chem. Ref. Data 4 (1975) 471 (incoherent) and Hubbell and Overbo, 8 (1979) 69
 (coherent). Nothing is fitted or smoothed here.
 """

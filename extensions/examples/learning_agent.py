@@ -38,7 +38,7 @@ Policy = Callable[[Array, Array], Array]
 def features(images: Array) -> Array:
     """Compute four features of images (k, rows, cols, 1) of 0 to 255: (k, 4).
 
-    They are the horizontal variance of the mass in half widths (times 10), the highest grey
+    They are the horizontal variance of the mass in half widths (times 10), the highest gray
     value of 1, the mass (over 100), and the steepest step between columns of the column sums
     (over 5).
     """

@@ -24,7 +24,7 @@ class ClusterWatch(threading.Thread):
         tend: called at each look; acts on the workers and prints.
 
     Attributes:
-        error: that ended the work, which then ends with cancelled futures.
+        error: that ended the work, which then ends with canceled futures.
     """
 
     def __init__(self, client: Any, tend: Tend) -> None:

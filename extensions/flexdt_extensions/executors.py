@@ -108,7 +108,7 @@ def processes(jobs: int | None) -> Iterator[Executor]:
 
     They are spawned, as the kernels' threads (OpenMP) would end a fork. Meanwhile the
     environment limits libraries to one thread; it is restored at the end, where waiting
-    tasks are cancelled.
+    tasks are canceled.
     """
     before = {name: os.environ[name] for name in SINGLE if name in os.environ}
     pool = ProcessPoolExecutor(

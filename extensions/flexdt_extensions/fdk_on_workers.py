@@ -262,7 +262,7 @@ class VolumeFormat:
         """Read a volume from its store.
 
         Returns:
-            Values (z, y, x), edges of a voxel and centre of the first one (x, y, z) [mm], and
+            Values (z, y, x), edges of a voxel and center of the first one (x, y, z) [mm], and
             True, which marks that place.
         """
         group = opened(path)

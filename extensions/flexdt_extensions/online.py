@@ -122,7 +122,7 @@ def begin(
     Args:
         phantom: the scanned one.
         free: parameters to estimate.
-        start: offsets to begin with, on which the priors are centred.
+        start: offsets to begin with, on which the priors are centered.
         priors: standard deviations of other offsets [mm, deg, 1]; see `fit.priors`. None:
             they are exactly known, and sigmas are those of the images' noise alone, which
             more frames can lower.

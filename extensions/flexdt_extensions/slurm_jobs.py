@@ -1,5 +1,5 @@
 """Jobs of a SLURM queue that run dask workers: submitted, watched, submitted again,
-cancelled.
+canceled.
 
 A job that has left the queue, as one whose walltime is over, is submitted again while the
 work goes on. Messages of sbatch, squeue and sacct are passed on unchanged. Jobs that end

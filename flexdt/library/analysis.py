@@ -157,7 +157,7 @@ def reconstruct(
         algorithm: fdk, sirt, sart, cgls, em or tv.
         voxel: edge of a voxel [mm]; default: the pixel's size at the rotation axis.
         shape: (z, y, x) of the volume; default: the field of view.
-        center: (x, y, z) of the volume's centre [mm]; default: the middle of the field of view,
+        center: (x, y, z) of the volume's center [mm]; default: the middle of the field of view,
             or the origin where `shape` is given.
         binning: mean over so many pixels a side first.
         every: use every n-th frame.

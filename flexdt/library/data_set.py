@@ -340,7 +340,7 @@ class DataSet(ImageSet):
         return data_page(self)
 
     def plot(self, index: int = 0, axes: Any = None) -> Any:
-        """Show one projection's line integrals; needs matplotlib (the extra `plots`).
+        """Show one projection's line integrals; needs matplotlib.
 
         Args:
             index: of the projection.

@@ -1,6 +1,6 @@
 """Figures as SVG text, drawn with matplotlib; pages are of `flexdt.library.report_page`.
 
-matplotlib comes with the extra `plots`; it is imported when the first figure is drawn.
+matplotlib is imported when the first figure is drawn.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def plot(
 ) -> str:
     """Draw lines and dots over two axes, as an SVG element.
 
-    Colours repeat after the last one. x and y of a series are data units.
+    Colors repeat after the last one. x and y of a series are data units.
 
     Args:
         series: the lines and dots; points that are not finite are left out.
@@ -204,7 +204,7 @@ def ellipse_plot(covariance: npt.ArrayLike, names: tuple[str, str], scale: float
 def image_under(
     values: npt.ArrayLike, points: Sequence[Series], *, title: str, width: int = 730
 ) -> str:
-    """Draw a grey image with points over it.
+    """Draw a gray image with points over it.
 
     Large values are dark; without points there is no legend.
 

@@ -32,7 +32,7 @@ DOT_PT = 6.0
 """Size of the dots of sources and panels."""
 GEOMETRY_INCH = (7.0, 5.5)
 BAR_WIDTH = 0.05
-"""Of a colour bar, as a share of its picture's width."""
+"""Of a color bar, as a share of its picture's width."""
 RESIDUALS_INCH = (12.0, 3.6)
 MOVIE_MS = 400
 """Time of a view in a movie of residuals."""
@@ -89,7 +89,7 @@ def plot_geometry(cone_vec: ConeVec, axes: Any = None) -> Any:
 
 
 def plot_projection(data: ImageSet, index: int, axes: Any = None) -> Any:
-    """Plot line integrals of one projection, as the source sees it, with a colour bar.
+    """Plot line integrals of one projection, as the source sees it, with a color bar.
 
     `data`: the data set. `index`: of the projection. `axes`: matplotlib's, to draw into; None
     makes a figure.
@@ -258,7 +258,7 @@ def plot_plan(plan: ScanPlan, report: CheckReport) -> Any:
 
 
 def _room(axes: Any) -> Any:
-    """Return axes in whose figure colour bars and titles get room of their own: those given,
+    """Return axes in whose figure color bars and titles get room of their own: those given,
     or of a new figure. A figure's own layout stays if it has one.
     """
     if axes is None:
@@ -270,7 +270,7 @@ def _room(axes: Any) -> Any:
 
 
 def _colour_bar(axes: Any, shown: Any, label: str) -> None:
-    """Draw a colour bar as high as the picture beside it."""
+    """Draw a color bar as high as the picture beside it."""
     beside = axes.inset_axes((1.03, 0.0, BAR_WIDTH, 1.0))
     axes.figure.colorbar(shown, cax=beside, label=label)
 

@@ -139,7 +139,7 @@ class Truth:
         return tuple(dict.fromkeys(p.assumed for p in self.parts if p.assumed))
 
     def paths_mm(self, views: slice = slice(None)) -> Float32Array:
-        """Compute the path of the ray to each pixel's centre through each material,
+        """Compute the path of the ray to each pixel's center through each material,
         float32 (materials, n, rows, cols) [mm]."""
         return self._paths(self.geometry[views])
 

@@ -158,10 +158,10 @@ def _pass_on(task: asyncio.Task[Any]) -> None:
 def _work(
     done: asyncio.Future[Any], func: Callable[..., Any], args: tuple[Any, ...]
 ) -> None:
-    """Run a function, even if its future was cancelled, as a thread would, and complete
+    """Run a function, even if its future was canceled, as a thread would, and complete
     the future.
 
-    The future gets the result or the `Exception` raised, unless it was cancelled. Other
+    The future gets the result or the `Exception` raised, unless it was canceled. Other
     exceptions, such as KeyboardInterrupt, pass.
     """
     try:

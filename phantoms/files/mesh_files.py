@@ -280,7 +280,7 @@ def voxel_phantom(
         data: [z, y, x], attenuation [1/mm].
         voxel_mm: voxel edge, one or along x, y, z [mm].
         name: its name.
-        center_mm: place of the grid's centre in the object's frame [mm].
+        center_mm: place of the grid's center in the object's frame [mm].
         material: its material, for its spectrum: a voxel's amount is its
             attenuation over the material's. None: water of varying density.
 
@@ -366,7 +366,7 @@ def _parse(raw: bytes, kind: str) -> trimesh.Trimesh:
         kind: one of `FORMATS`.
 
     Returns:
-        The triangles alone, without colours and normals; they may be open.
+        The triangles alone, without colors and normals; they may be open.
 
     Raises:
         PhantomError: not readable, too large, or without triangles.
@@ -587,7 +587,7 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
         label: of the mesh, for messages.
 
     Returns:
-        `mesh`, or a new one where neighbouring faces had to be turned to agree.
+        `mesh`, or a new one where neighboring faces had to be turned to agree.
 
     Raises:
         PhantomError: it is open.
@@ -613,11 +613,11 @@ def _closed(mesh: trimesh.Trimesh, label: str) -> trimesh.Trimesh:
 
 
 def _wound(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Turn faces so that neighbours agree, in each body the way most of its faces already are.
+    """Turn faces so that neighbors agree, in each body the way most of its faces already are.
 
     The mesh must be closed. In a tie either half of a body's faces may be turned.
 
-    Every face has two nodes, as it is and turned; neighbours link those that agree. A
+    Every face has two nodes, as it is and turned; neighbors link those that agree. A
     body then falls into two components, mirror images of each other, and either is a
     consistent choice.
 

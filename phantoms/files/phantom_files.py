@@ -229,7 +229,7 @@ def solids_of(value: object, where: str) -> tuple[Solid, ...]:
 def _mesh(value: object, where: str, folder: Path | None) -> tuple[Phantom, float]:
     """Read the mesh of a scene file and its priority.
 
-    With a position the mesh is centred there, without one it stays as it is in its file.
+    With a position the mesh is centered there, without one it stays as it is in its file.
     The unit is the format's unless stated; the priority 0.
 
     Args:

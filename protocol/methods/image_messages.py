@@ -43,7 +43,7 @@ class RayGet(f.Params):
     """A pixel of the image of this moment."""
 
     pixel: f.PixelAsked
-    """(column, row); (0, 0) is the centre of the top left one"""
+    """(column, row); (0, 0) is the center of the top left one"""
 
 
 class ExposurePredict(f.Params):

@@ -287,7 +287,7 @@ def read_image(
 def read_values(
     path: Path, shape: tuple[int, int] | None = None, image: int | None = None
 ) -> npt.NDArray[Any]:
-    """Read an image of real numbers of any kind, grey values with row 0 on top.
+    """Read an image of real numbers of any kind, gray values with row 0 on top.
 
     Args:
         path: of the file, of any of `IMAGE_FORMATS`.

@@ -1,6 +1,6 @@
 """Read image files of any format that flexdt knows, told by their first bytes.
 
-`IMAGE_FORMATS` is the only list of them. Whatever the format, an image comes out as grey
+`IMAGE_FORMATS` is the only list of them. Whatever the format, an image comes out as gray
 values with row 0 on top and column 0 at the left, or not at all, with the cause.
 """
 
@@ -164,7 +164,7 @@ def image_head(path: Path) -> ImageHead:
 
 
 def read_pixels(path: Path, image: int = 0) -> Pixels:
-    """Read an image of a file, grey values (rows, cols) in this machine's byte order, and its
+    """Read an image of a file, gray values (rows, cols) in this machine's byte order, and its
     head.
 
     Args:

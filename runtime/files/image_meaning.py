@@ -1,6 +1,6 @@
 """What the numbers of an image file mean, whatever its format: one rule for each question.
 
-A reader of a format takes samples and statements out of a file; the functions here make grey
+A reader of a format takes samples and statements out of a file; the functions here make gray
 values of them, row 0 on top and column 0 at the left, or refuse with the cause.
 """
 
@@ -50,7 +50,7 @@ class ImageHead:
 
     Attributes:
         shape: (rows, cols) of each image, upright.
-        dtype: of its grey values, in this machine's byte order.
+        dtype: of its gray values, in this machine's byte order.
         bits: of a sample in the file, 12 where two pixels share three bytes.
         images: number of images of this shape in the file.
         facts: statements of the file, in its order.
@@ -137,10 +137,10 @@ def unpacked(
 
 
 def grey(samples: npt.NDArray[Any], colours: int, inverted: int = 0) -> npt.NDArray[Any]:
-    """Make grey values of the samples of an image.
+    """Make gray values of the samples of an image.
 
-    Three colours are one grey value where they are equal in every pixel. A sample beyond the
-    colours (opacity) is left out where it is the same in every pixel.
+    Three colors are one gray value where they are equal in every pixel. A sample beyond the
+    colors (opacity) is left out where it is the same in every pixel.
 
     Args:
         samples: (rows, cols, samples).
@@ -151,7 +151,7 @@ def grey(samples: npt.NDArray[Any], colours: int, inverted: int = 0) -> npt.NDAr
         (rows, cols); white is the largest value.
 
     Raises:
-        UnreadImageError: colours, or an opacity that changes from pixel to pixel.
+        UnreadImageError: colors, or an opacity that changes from pixel to pixel.
     """
     for k in range(colours, samples.shape[2]):
         beyond = samples[..., k]
@@ -205,7 +205,7 @@ def turns_sides(orientation: int) -> bool:
 
 
 def identity_palette(colours: npt.NDArray[Any], top: int) -> bool:
-    """Return whether a palette maps each value to the grey of that value.
+    """Return whether a palette maps each value to the gray of that value.
 
     Args:
         colours: (entries, 3), of which `top` is white.

@@ -45,7 +45,7 @@ class Stack:
         offset: of the first number [bytes].
         stored: type of the numbers as stored.
         unpack: from the file and its bytes, of compressed ones; None for none.
-        column_first: the numbers of a column are neighbours, as in Fortran's order.
+        column_first: the numbers of a column are neighbors, as in Fortran's order.
         between: bytes between two images.
     """
 
@@ -439,10 +439,10 @@ def numpy_image(path: Path) -> Stack:
 
 
 def png_head(file: BinaryIO) -> tuple[ImageHead, int]:
-    """Read the header of a PNG image: its head, and the number of its colours.
+    """Read the header of a PNG image: its head, and the number of its colors.
 
     Raises:
-        UnreadImageError: no such header, colours from a table that is no grey ramp, or fewer
+        UnreadImageError: no such header, colors from a table that is no gray ramp, or fewer
             than 8 bits.
     """
     raw = file.read(33)
@@ -476,10 +476,10 @@ def png_head(file: BinaryIO) -> tuple[ImageHead, int]:
 
 
 def read_png(file: BinaryIO) -> tuple[npt.NDArray[Any], ImageHead]:
-    """Read a PNG image, grey values (rows, cols), and its head.
+    """Read a PNG image, gray values (rows, cols), and its head.
 
     Raises:
-        UnreadImageError: it is damaged or in colour, or imagecodecs is not installed.
+        UnreadImageError: it is damaged or in color, or imagecodecs is not installed.
     """
     head, colours = png_head(file)
     try:
@@ -499,10 +499,10 @@ def read_png(file: BinaryIO) -> tuple[npt.NDArray[Any], ImageHead]:
 
 
 def read_bmp(file: BinaryIO) -> tuple[npt.NDArray[Any], ImageHead]:
-    """Read an image of Windows (BMP), grey values (rows, cols), and its head.
+    """Read an image of Windows (BMP), gray values (rows, cols), and its head.
 
     Raises:
-        UnreadImageError: it is damaged, compressed or in colour.
+        UnreadImageError: it is damaged, compressed or in color.
     """
     raw = file.read(54)
     if len(raw) < 54:

@@ -67,7 +67,7 @@ PHOTOMETRICS: Final[Mapping[int, str]] = {
     4: "a mask", 5: "CMYK", 6: "YCbCr", 8: "CIELab", 9: "ICCLab", 10: "ITULab",
     32803: "a colour filter array", 32844: "LogL", 32845: "LogLuv", 51177: "a depth map",
 }  # fmt: skip
-"""Photometric interpretations that are no grey values -> their names."""
+"""Photometric interpretations that are no gray values -> their names."""
 MAX_KNOWN: Final = 16
 """Layouts of plain files that are remembered."""
 
@@ -116,7 +116,7 @@ def read_tiff(file: BinaryIO, image: int) -> tuple[npt.NDArray[Any], ImageHead]:
         image: index of the image, 0 for the first.
 
     Returns:
-        Grey values (rows, cols) in this machine's byte order, and the head of the file.
+        Gray values (rows, cols) in this machine's byte order, and the head of the file.
 
     Raises:
         UnreadImageError: no TIFF, or one whose images are not read.
@@ -212,7 +212,7 @@ def _read_like(file: BinaryIO, size: int, known: Plain) -> npt.NDArray[Any] | No
 
 
 def _remember(file: BinaryIO, size: int, tiff: Any, page: Any, head: ImageHead) -> None:
-    """Remember the layout of a file of one plain page: grey values in one piece, upright,
+    """Remember the layout of a file of one plain page: gray values in one piece, upright,
     black zero.
 
     Its parts are the bytes of its header, its tags, and of those values beside the tags that
@@ -356,10 +356,10 @@ def _photometric(page: Any) -> int:
 
 
 def _colours(page: Any) -> int:
-    """Return the number of colours of a pixel, 1 for grey values, or 3.
+    """Return the number of colors of a pixel, 1 for gray values, or 3.
 
     Raises:
-        UnreadImageError: a palette that is no grey ramp, or other colours.
+        UnreadImageError: a palette that is no gray ramp, or other colors.
     """
     kind = _photometric(page)
     if kind == PALETTE:
@@ -381,7 +381,7 @@ def _colours(page: Any) -> int:
 
 
 def _grey(page: Any, samples: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Make grey values of samples (rows, cols, samples) by the page's photometry."""
+    """Make gray values of samples (rows, cols, samples) by the page's photometry."""
     inverted = _bits(page) if _photometric(page) == WHITE_IS_ZERO else 0
     return grey(samples, _colours(page), inverted)
 

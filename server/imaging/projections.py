@@ -708,7 +708,7 @@ def digest_of(body: Body) -> str:
     process.
 
     A scene is hashed as its dictionary, names included. A mesh: corners as float64,
-    triangles as int64. A volume: shape, voxel size, centre, and float32 values.
+    triangles as int64. A volume: shape, voxel size, center, and float32 values.
 
     Returns:
         The first 16 hexadecimal digits of the SHA-256.

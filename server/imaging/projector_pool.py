@@ -227,7 +227,7 @@ class ProjectorPool:
         A request is late after `LATE_S` and `LATE_FACTOR` times the time that its views
         usually take. A projector that fails rests (`_ask`), and the request goes to the
         next. Waits without a limit while all are busy; failures count only once none of
-        its requests runs. Requests that lose are cancelled only if this one ends with
+        its requests runs. Requests that lose are canceled only if this one ends with
         an error; else they keep their place until answered.
 
         Args:

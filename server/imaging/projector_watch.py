@@ -71,13 +71,13 @@ class ProjectorWatch:
         return next(filter(None, self._working.values()), None)
 
     async def run(self) -> None:
-        """Watch all projectors at once, until cancelled."""
+        """Watch all projectors at once, until canceled."""
         async with asyncio.TaskGroup() as group:
             for client in self.clients:
                 group.create_task(self._watch(client))
 
     async def _watch(self, client: Watched) -> None:
-        """Check one projector, wait `every_s`, and so on until cancelled; skipped while
+        """Check one projector, wait `every_s`, and so on until canceled; skipped while
         nobody asks.
 
         The wait begins when the projector has answered or failed."""

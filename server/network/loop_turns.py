@@ -40,7 +40,7 @@ class LoopTurns:
     def _give_turn(self) -> None:
         """Give the first waiting connection of the most urgent lane its turn.
 
-        Its further waits come last in the lane. Cancelled waits are skipped. Scheduled
+        Its further waits come last in the lane. Canceled waits are skipped. Scheduled
         for the next round of the loop again if others wait; nothing if nobody does.
         """
         self._due = False

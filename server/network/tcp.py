@@ -999,7 +999,7 @@ class _Link(asyncio.BufferedProtocol):
 
     def _crashed(self, task: asyncio.Task[None]) -> None:
         """Log the failure of a task and abort the connection; nothing if it succeeded or was
-        cancelled. Handlers' failures are answered before that."""
+        canceled. Handlers' failures are answered before that."""
         if not task.cancelled() and (error := task.exception()) is not None:
             self.log("connection failed", logging.ERROR, error_type=repr(error))
             self.transport.abort()

@@ -163,7 +163,7 @@ class ComputeThread:
         """Compute queued steps in order until `close` is called; results and errors go to
         the steps' futures.
 
-        A step whose future was cancelled before it begins is skipped.
+        A step whose future was canceled before it begins is skipped.
         """
         while (put := self._steps.get()) is not None:
             future, step = put

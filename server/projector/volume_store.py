@@ -252,7 +252,7 @@ def _bad_chunk(name: str, asked: int, allowed: int) -> RpcError:
 def _info(name: str, value: Body) -> wire.VolumeInfo:
     """Describe a volume, mesh or scene.
 
-    All have name, kind and bytes; a mesh its triangles, a volume shape, voxel and centre
+    All have name, kind and bytes; a mesh its triangles, a volume shape, voxel and center
     [mm], a scene its number of solids.
 
     Args:

@@ -242,7 +242,7 @@ class FrameLink(asyncio.BufferedProtocol):
     async def _send_payload(self, payload: memoryview) -> None:
         """Send a payload in slices of `SLICE_BYTES`, each once the transport takes it.
 
-        If it is cancelled, the connection is aborted, as half a frame has gone out.
+        If it is canceled, the connection is aborted, as half a frame has gone out.
         """
         try:
             for start in range(0, len(payload), SLICE_BYTES):
@@ -378,7 +378,7 @@ class ProjectorLink:
         shape: tuple[int, ...] | None,
         dtype: npt.DTypeLike = np.float32,
     ) -> tuple[object, npt.NDArray[Any] | None]:
-        """Send a request and wait for its answer and parts; cancel it if this is cancelled.
+        """Send a request and wait for its answer and parts; cancel it if this is canceled.
 
         Only a request that may have been sent can still be answered; such answers are
         ignored.

@@ -252,9 +252,9 @@ class Acquisition:
 
 
 async def _ended(work: Coroutine[Any, Any, None]) -> None:
-    """Wait until work in a thread has ended, also where the wait is cancelled meanwhile.
+    """Wait until work in a thread has ended, also where the wait is canceled meanwhile.
 
-    A thread cannot be cancelled: after this it writes nothing more.
+    A thread cannot be canceled: after this it writes nothing more.
     """
     task = asyncio.ensure_future(work)
     try:

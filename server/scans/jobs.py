@@ -348,7 +348,7 @@ class Jobs:
     def pause(self, job: Job) -> None:
         """Pause a running job; one that is paused stays so.
 
-        A planned retry is cancelled: only `resume` continues the job.
+        A planned retry is canceled: only `resume` continues the job.
         Raises RpcError: -32003, it neither runs nor is paused."""
         runner = self._runner(job, "pause", ("running", "paused"))
         self._take_over()
@@ -357,7 +357,7 @@ class Jobs:
 
     def resume(self, job: Job) -> None:
         """Let a paused job go on; nothing changes for one that runs but that a planned retry is
-        cancelled.
+        canceled.
 
         Raises RpcError: -32003, it neither runs nor is paused."""
         runner = self._runner(job, "resume", ("running", "paused"))
@@ -366,7 +366,7 @@ class Jobs:
         runner.resume()
 
     def step(self, job: Job) -> None:
-        """Run a paused job for one step; a planned retry is cancelled.
+        """Run a paused job for one step; a planned retry is canceled.
 
         Raises RpcError: it is not paused."""
         runner = self._runner(job, "step", ("paused",))
@@ -404,7 +404,7 @@ class Jobs:
         """Pause the current job after a stop from outside (stop, E-stop), also one that is being
         opened or resumed.
 
-        A planned retry is cancelled; only `resume` continues the job. A paused job stays paused,
+        A planned retry is canceled; only `resume` continues the job. A paused job stays paused,
         with its reason.
         `reason`: shown as the job's error.
         """

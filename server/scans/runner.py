@@ -578,7 +578,7 @@ class ScanRunner:
         While the run is paused the work goes on, with the clock running.
 
         Args:
-            work: that takes real but no twin time; cancelled if the run ends.
+            work: that takes real but no twin time; canceled if the run ends.
             moment: plan time at which a paused run goes on [s].
 
         Raises:

@@ -410,9 +410,9 @@ class ObstacleMoves:
 async def wait_for_way(task: asyncio.Task[None]) -> list[str]:
     """Wait for the end of the task that moves along a way, and list what ended it early.
 
-    The task is not cancelled if this wait is.
+    The task is not canceled if this wait is.
 
-    Returns one warning if it was cancelled or refused a leg; [] if it arrived.
+    Returns one warning if it was canceled or refused a leg; [] if it arrived.
     Raises Exception: any error of the task but a TwinError.
     """
     await asyncio.wait([task])

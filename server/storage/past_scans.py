@@ -539,7 +539,7 @@ def _as_it_runs(info: p.DatasetInfo, context: TwinContext) -> p.DatasetInfo:
 
 
 def _list_row(path: Path, modified: float) -> p.DatasetInfo | str:
-    """Read and summarise a data set; what cannot be read is the problem in the summary.
+    """Read and summarize a data set; what cannot be read is the problem in the summary.
 
     Documents above `MAX_LISTED_DOCUMENT_BYTES` are not read. Paths in the problem are relative
     to the data directory.
@@ -579,7 +579,7 @@ def _with_thumbnail(
         """Read the middle projection and shrink it to an 8-bit image of at most `side`
         pixels a side.
 
-        It is binned, or sampled if one side has fewer pixels than the factor. Grey values
+        It is binned, or sampled if one side has fewer pixels than the factor. Gray values
         run from the 0.5 % to the 99.5 % quantile.
 
         Returns:
@@ -855,7 +855,7 @@ def _clearances(scan: _Scan, at: tuple[int, ...]) -> tuple[list[float | None], s
 def _frame(
     root: Directory, asked: p.DatasetFrame, context: TwinContext, codec: Codec
 ) -> p.DatasetFrameResult:
-    """Answer dataset.frame: one image, normalised and binned as requested.
+    """Answer dataset.frame: one image, normalized and binned as requested.
 
     Line integrals are of projections only. Counts are rounded after binning. With a
     document the image must have its shape.

@@ -39,7 +39,7 @@ class UploadHead(SampleUpload):
 
     Attributes:
         unit: of mesh coordinates.
-        place: of a mesh; those of older servers were all centred.
+        place: of a mesh; those of older servers were all centered.
         revision: names the content, in the document; those of older servers have none.
         observer: whether it came while another client had control; in the document.
     """

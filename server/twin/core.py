@@ -494,7 +494,7 @@ class TwinServer:
     def _apply_last(self) -> None:
         """Put the previous server's correction in force at the start.
 
-        The stage is initialised empty and without a guard, also if there is no
+        The stage is initialized empty and without a guard, also if there is no
         correction.
 
         One that is lost or does not fit leaves none in force, with a warning in the log.

@@ -89,7 +89,7 @@ def test_hounsfield_units_are_said_or_refused(hounsfield, door):
             said = [str(one.message) for one in caught]
         except fx.TwinError as error:
             said = [str(error)]
-    assert any("Hounsfield" in one or "grey values" in one for one in said)
+    assert any("Hounsfield" in one or "gray values" in one for one in said)
 
 
 @pytest.mark.parametrize("method", [fdk, sirt])

@@ -375,7 +375,7 @@ PROBE = FormatTable(
         used("images", "names of the projections", "the images"),
         used("flats", "names of the flat images", "the flat image"),
     ),
-    "There are no two statements of one thing.",
+    "this format states nothing twice.",
     example='fx.open("scan.probe")',
 )
 '''

@@ -60,7 +60,7 @@ def project(rows: np.ndarray[Any, Any]) -> dict[str, Any]:
     [
         (BODY, "", ""),
         (BODY - 1000.0, "Hounsfield units", ""),
-        (np.where(BODY > 0, 3000.0, 0.0), "", "grey values"),
+        (np.where(BODY > 0, 3000.0, 0.0), "", "gray values"),
         (BODY + np.nan, "not finite", ""),
     ],
 )

@@ -5,7 +5,7 @@ incoherent (Compton) scattering Klein and Nishina's (Z. Phys. 52 (1929) 853) tim
 incoherent scattering function S(x); x = sin(theta / 2) / lambda [1/A]. F and S are
 Hubbell's (J. Phys. Chem. Ref. Data 4 (1975) 471 and 8 (1979) 69) by way of EPDL97 and
 xraylib; `docs/tools/scattering_tables.py` made the file. The atoms of a compound scatter
-independently here: the interference between neighbouring atoms, which shapes coherent
+independently here: the interference between neighboring atoms, which shapes coherent
 scattering below x = 0.3 in liquids, plastics and metals, is left out.
 """
 

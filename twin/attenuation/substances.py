@@ -35,7 +35,7 @@ class Tables:
     """The shipped tables; all arrays are read-only.
 
     Attributes:
-        energy_keV: (e,) centres of the bins of spectra [keV].
+        energy_keV: (e,) centers of the bins of spectra [keV].
         kV: (k,) tube voltages of the spectra, growing.
         fluence: (k, e) photons per cm2 and mAs in each bin, 1 m from a tungsten anode, no
             filter.

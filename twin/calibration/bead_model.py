@@ -24,11 +24,11 @@ LEAST_SPREAD_MM: Final = 1e-6
 
 @runtime_checkable
 class BeadPhantom(Protocol):
-    """Anything with bead centres (k, 3) [mm, object frame] and bead radii [mm]."""
+    """Anything with bead centers (k, 3) [mm, object frame] and bead radii [mm]."""
 
     @property
     def beads(self) -> FloatArray:
-        """Bead centres, (k, 3) [mm]."""
+        """Bead centers, (k, 3) [mm]."""
 
     @property
     def bead_radius_mm(self) -> FloatArray | float:
@@ -87,7 +87,7 @@ class BeadModel:
     """The beads of a phantom, read-only float64.
 
     Attributes:
-        beads: centres in the object's frame, (k, 3) [mm].
+        beads: centers in the object's frame, (k, 3) [mm].
         bead_radius_mm: (k,) [mm].
         tolerance_mm: standard deviation of each coordinate of each bead about `beads` [mm]; 0
             if the phantom is exact.
@@ -143,7 +143,7 @@ class BeadModel:
 
     @property
     def about_middle(self) -> FloatArray:
-        """Bead centres from their middle, (k, 3) [mm]."""
+        """Bead centers from their middle, (k, 3) [mm]."""
         return np.asarray(self.beads - self.middle)
 
     @property
@@ -182,7 +182,7 @@ class BeadModel:
 
 
 def bead_model(phantom: BeadPhantom | BeadModel | npt.ArrayLike) -> BeadModel:
-    """Make the bead model of a phantom, or of bare bead centres (k, 3) (radius then 1 mm,
+    """Make the bead model of a phantom, or of bare bead centers (k, 3) (radius then 1 mm,
     exact).
 
     A bead model is returned as it is. Of a phantom, tolerances, name and scene are
@@ -236,7 +236,7 @@ def with_contrast(model: BeadModel, scene: Scene | None) -> BeadModel:
 
 
 def _ball_of(balls: Sequence[Solid], centre: FloatArray) -> Solid:
-    """Return the ball whose centre is nearest."""
+    """Return the ball whose center is nearest."""
     return min(balls, key=lambda ball: float(np.linalg.norm(_centre(ball) - centre)))
 
 

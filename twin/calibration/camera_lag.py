@@ -60,7 +60,7 @@ def lag_of(
     Args:
         images: (n, k, side, side) windows of the plan, line integrals.
         frames: of the scan, in the order in which they were taken; windows of
-            neighbouring frames are read.
+            neighboring frames are read.
         plan: windows round the beads of each frame.
         usable: (n,) frames that show the beads where the plan has them; None: all.
 

@@ -251,7 +251,7 @@ def _exact_judged(
 
 
 def _centre(asked: CalibrationRequest) -> dict[str, float]:
-    """Return the centres of a request's priors, in edge units; told lengths have 0."""
+    """Return the centers of a request's priors, in edge units; told lengths have 0."""
     return from_printed_reading(asked.start, asked.reading).to_edge()
 
 

@@ -1,6 +1,6 @@
 """Where calibration gets its images from: a small protocol, images held in memory, and a scan.
 
-A source detects beads in its frames and cuts windows out of them. How it reads and normalises
+A source detects beads in its frames and cuts windows out of them. How it reads and normalizes
 the images, and on how many threads, is left to the source. Scans are checked before anything is
 measured in them.
 """

@@ -62,7 +62,7 @@ shears: 0.06 are 3.4 deg."""
 MAX_FINALISTS = 4
 """Number of hypotheses finished on all frames."""
 STARTS_BETWEEN = 4.0
-"""Start angles from a bead to its neighbour, where a turn brings one to the other."""
+"""Start angles from a bead to its neighbor, where a turn brings one to the other."""
 MAX_RIVAL_LOG = 12.5
 """Largest logarithm of the likelihood of the best hypothesis over a rival's."""
 AS_LIKELY_LOG = math.log(20.0)
@@ -224,7 +224,7 @@ def identify(
     Args:
         detections: of each of the n frames.
         phantom: the beads.
-        geometry: rough geometry of each frame; positions may be off by centimetres and
+        geometry: rough geometry of each frame; positions may be off by centimeters and
             the start angle may be anything, but the angles between frames must be right.
         start: offsets to begin with.
         search: settings; None is the default.
@@ -336,7 +336,7 @@ def identified(
 
 @dataclass(frozen=True, eq=False)
 class _Shadows:
-    """Detections of all frames, padded to the same number: (n, m, 2) relative to the centre."""
+    """Detections of all frames, padded to the same number: (n, m, 2) relative to the center."""
 
     points: FloatArray
     covariances: FloatArray
@@ -351,7 +351,7 @@ class _Shadows:
         """Pack the spots of all frames into arrays (n frames, largest number of spots, at
         least one).
 
-        Points are from the image's centre [px]; padding is infinite in points, NaN in
+        Points are from the image's center [px]; padding is infinite in points, NaN in
         covariances, else 0.
 
         Args:
@@ -508,7 +508,7 @@ def _vote(problem: FitProblem, shadows: _Shadows, x: FloatArray) -> FloatArray:
 
 
 def _predicted(problem: FitProblem, x: FloatArray) -> FloatArray:
-    """Predict spots (n, k, 2) from the image's centre [px]."""
+    """Predict spots (n, k, 2) from the image's center [px]."""
     return problem.residuals(x)[0] - problem.origin[:, None, :]
 
 
@@ -802,7 +802,7 @@ def _report(
     Of those as likely as the best the one that turns the phantom least is the best. Where
     the turn is stated, the best is the best of those so near the start, unless another is
     beyond a rival; those near it are no rivals if they see the same beads in all spots. Spots
-    that overlap their neighbours in the prediction get no track. The start angle is reduced
+    that overlap their neighbors in the prediction get no track. The start angle is reduced
     to half a turn about that of `start`.
 
     Args:

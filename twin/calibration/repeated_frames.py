@@ -96,7 +96,7 @@ def measure_changes(views: Float32Array, gaps: FloatArray) -> Changes:
     """Measure the change of each frame from the one before it, apart from shifts of the
     image and of its level.
 
-    The change is compared with that of its smoothed neighbours on either side, times the
+    The change is compared with that of its smoothed neighbors on either side, times the
     gap's share of theirs. The first frame follows the last.
 
     Args:
@@ -197,7 +197,7 @@ def _usual(changes: Changes) -> FloatArray:
 
 
 def _neighbourhood() -> FloatArray:
-    """Mark the neighbours of a frame, but not the frame itself, (2 NEIGHBOURS + 1,)."""
+    """Mark the neighbors of a frame, but not the frame itself, (2 NEIGHBOURS + 1,)."""
     near = np.ones(2 * NEIGHBOURS + 1)
     near[NEIGHBOURS] = 0.0
     return near

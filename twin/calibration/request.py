@@ -41,7 +41,7 @@ class CalibrationRequest:
         free: parameters to estimate.
         per_scan: those with a value of their own in every scan.
         reading: of eq. 5.4.
-        start: offsets to begin with, and the centre of every prior; parameters that are
+        start: offsets to begin with, and the center of every prior; parameters that are
             neither free nor have a prior stay there.
         bead_tolerance_mm: > 0: bead positions are unknowns with this prior. 0: they are
             at their stated places. None: the phantom may be strained by STRAIN, and

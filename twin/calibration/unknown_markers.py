@@ -46,14 +46,14 @@ def link(
 ) -> tuple[Index, FloatArray, Offsets]:
     """Find the marker of each spot.
 
-    Tried from the axis centred on the spots and from `start`; the better one is refined
+    Tried from the axis centered on the spots and from `start`; the better one is refined
     by two fits (axis and roll free) with narrower gates. Markers seen in fewer than three
     frames, or than `MIN_SEEN_SHARE` of those with spots, are left out.
 
     Args:
         detections: spots of each of the n frames, one at least.
         poses: nominal geometry; angles must be right, distances may be off by
-            centimetres.
+            centimeters.
         start: offsets to begin with.
 
     Returns:

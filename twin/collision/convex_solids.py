@@ -186,7 +186,7 @@ def box(size: npt.ArrayLike, center: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Polytop
 def hull(points: npt.ArrayLike) -> Polytope:
     """Compute the convex hull of points, with faces turned outwards.
 
-    Vertices inside are dropped. A flat or thin set is thickened by a micrometre in all
+    Vertices inside are dropped. A flat or thin set is thickened by a micrometer in all
     directions, so that every hull is a solid.
 
     Args:

@@ -113,7 +113,7 @@ def _least(
 
 
 def _from_size(size: SampleSize | None) -> tuple[ConvexSolid, ...]:
-    """Make an upright cylinder of a sample's size, centred on the stage's origin; () for
+    """Make an upright cylinder of a sample's size, centered on the stage's origin; () for
     no body.
 
     No body without a size or diameter; without a height it is as high as wide."""

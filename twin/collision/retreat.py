@@ -264,7 +264,7 @@ class _Overlap:
         unit vector (1, 3).
 
         From the best of the known directions, in `REFINEMENT_STEPS` steps to the best of
-        six neighbours along x, y, z; the step shrinks where none is better. A local
+        six neighbors along x, y, z; the step shrinks where none is better. A local
         search.
 
         Args:

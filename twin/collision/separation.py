@@ -109,7 +109,7 @@ def _improved(
     differences.
 
     It stops within `MAX_DEFICIT_MM` of the distance, after `MAX_SEARCH_STEPS`, or where
-    the least squares fail. fcl is off by millimetres where two edges are parallel, as
+    the least squares fail. fcl is off by millimeters where two edges are parallel, as
     those of upright boxes are.
 
     Args:
@@ -153,7 +153,7 @@ def _as_fcl(solid: ConvexSolid) -> tuple[Any, FloatArray]:
     Args:
         solid: in its own frame.
 
-    Returns the shape, and its own centre in the solid's frame (3,) [mm]; the origin for a
+    Returns the shape, and its own center in the solid's frame (3,) [mm]; the origin for a
     polytope.
     Raises TypeError: neither cylinder nor polytope.
     """

@@ -401,7 +401,7 @@ class FrameEntry(_Model):
     positions: dict[str, float]
     """Motor -> position [mm, deg], script's sign."""
     cone_vec: Annotated[Row, FailFast()]
-    """Nominal, uncorrected: source, detector centre, u, v in the object's frame [mm]."""
+    """Nominal, uncorrected: source, detector center, u, v in the object's frame [mm]."""
 
     @classmethod
     def all_of(cls, record: ScanRecord, block: FrameBlock) -> Iterator[FrameEntry]:

@@ -17,7 +17,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 from flexdt.twin.geometry.poses import Poses
 
 EDGE = 0.5
-"""Coordinate of the centre of pixel 0, measured from the edge [px]."""
+"""Coordinate of the center of pixel 0, measured from the edge [px]."""
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ class CircularScan:
 
     def cone_vec(self) -> ConeVec:
         """Compute one view for each angle: source, detector, u and v turned about z by
-        the angle, about the circle's centre.
+        the angle, about the circle's center.
         """
         standing = np.concatenate([self.source, self.detector, self.u, self.v])
         return ConeVec(np.tile(standing, (len(self.angle), 1))).moved(

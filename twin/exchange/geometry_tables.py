@@ -20,7 +20,7 @@ from flexdt.twin.dataset.format_table import (
 
 NO_JAWS: Final = ("1.7976931348623157e308", "1.79769313486232e+308", "1.79769e+308", "")
 """Places of jaws that hide nothing: RTK writes the largest number."""
-ONE: Final = "There are no two statements of one thing."
+ONE: Final = "this format states nothing twice."
 
 
 def placed(names: str, meaning: str, unit: str = "mm") -> tuple[Field, ...]:
@@ -64,10 +64,10 @@ RTK: Final = FormatTable(
 )
 ASTRA: Final = FormatTable(
     "ASTRA",
-    "ASTRA's page on cone_vec; Zenodo's .geom files beside images",
+    "ASTRA's documentation of cone_vec, and .geom files published on Zenodo with their images",
     (
         *placed("vectors", "12 numbers a view: source, panel, u, v", "one unit"),
-        dropped("comment", "text behind #", "no unit or shape is taken from it"),
+        dropped("comment", "text after #", "no unit or shape is taken from it"),
     ),
     ONE,
     example='fx.ConeVec.load("scan.geom", shape=(760, 956))',

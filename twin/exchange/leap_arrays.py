@@ -1,8 +1,8 @@
 """LEAP's modular beam: the arguments of its `set_modularbeam`, by name (compared with commit
 0c8846f).
 
-LEAP's frame is ours, with the object's centre in the middle of its volume. A colVector points
-to the next column and a rowVector to the next row; the module's centre is the middle of all
+LEAP's frame is ours, with the object's center in the middle of its volume. A colVector points
+to the next column and a rowVector to the next row; the module's center is the middle of all
 pixels. One pixel size holds for all views, and rows and columns are orthogonal. LEAP keeps
 single precision. Its filtered backprojection wants rows that grow upwards (rowVectors within 5
 deg of +z) and heights of the source that differ by less than half a panel:
@@ -44,7 +44,7 @@ NAMES: Final = (*COUNTS, *SIZES, SOURCE, DETECTOR, ROWS, COLUMNS)
 def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
     """Convert a geometry to LEAP's arguments by name, in double precision.
 
-    Source and panel centre [mm], unit vectors of rows and columns, (n, 3) each; counts and pixel
+    Source and panel center [mm], unit vectors of rows and columns, (n, 3) each; counts and pixel
     sizes are scalars.
     `geometry`: with the detector's shape.
     Raises ExchangeError: skew pixels, several pixel sizes, or an unknown shape.
@@ -61,7 +61,7 @@ def leap_arrays(geometry: ScanGeometry) -> dict[str, npt.NDArray[np.generic]]:
 def read_leap(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
     """Convert LEAP's arguments to a geometry.
 
-    Unit vectors are not required: directions are normalised.
+    Unit vectors are not required: directions are normalized.
 
     Args:
         arrays: name -> array, those of `NAMES`.

@@ -241,9 +241,7 @@ def read_tomosipo(
 
 
 def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
-    """Check rows that came from a file, and make a geometry of them.
-
-    The first such view is named.
+    """Check rows read from a file, and make a geometry from them.
 
     Args:
         numbers: (n, 12) [mm].
@@ -251,7 +249,7 @@ def cone_vec_of(numbers: npt.ArrayLike, file: str) -> ConeVec:
 
     Raises:
         ExchangeError: there are no rows, a number is not finite, or u and v span no
-            panel; the first such view is named.
+            panel; the first invalid view is named.
     """
     rows = np.asarray(numbers, dtype=np.float64).reshape(-1, 12)
     if not len(rows):

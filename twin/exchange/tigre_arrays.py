@@ -6,7 +6,7 @@ without offset opposite; u points to +y and the rows grow upwards at a = 0. So i
 is ours less 90 deg, and the rows of a panel that grow downwards are a pitch of 180 deg.
 `offOrigin` moves source and panel together, `offDetector` the panel in its plane before
 it turns, and `rotDetector` (about x, y and z, the turn about z last) turns it about its
-centre. The angle is that of the panel's normal, so that DSD and DSO are those along it,
+center. The angle is that of the panel's normal, so that DSD and DSO are those along it,
 by which TIGRE's FDK weighs; it reads offsets of a panel aside where one holds for all
 views, so an attribute that is the same in all views is written once.
 """
@@ -160,7 +160,7 @@ def read_tigre(arrays: Arrays, file: str = "<npz>") -> ScanGeometry:
         file: for messages.
 
     Raises:
-        ExchangeError: an attribute is missing or not valid, or there is a centre of
+        ExchangeError: an attribute is missing or not valid, or there is a center of
             rotation (COR).
     """
     require_names(arrays, (*PER_VIEW, "nDetector", "dDetector", ANGLES), file)

@@ -134,7 +134,7 @@ def sizes_of(arrays: Arrays, name: str, file: str, shape: tuple[int, ...]) -> Fl
 
 
 def directions_of(arrays: Arrays, name: str, file: str, count: int) -> FloatArray:
-    """Read an array (count, 3) of directions and normalise them to unit vectors, float64.
+    """Read an array (count, 3) of directions and normalize them to unit vectors, float64.
 
     Raises:
         ExchangeError: it has another shape or other content, or a vector of length zero;

@@ -1,6 +1,6 @@
 """The cone-beam geometry as a value: n rows of twelve numbers, exactly ASTRA's `cone_vec`.
 
-A row is source, detector centre, u (step to the next column), v (step to the next row),
+A row is source, detector center, u (step to the next column), v (step to the next row),
 in mm and in the object's frame (see `conventions`). A geometry may carry the number of
 its detector's pixels; methods that need it take it as an argument otherwise, and an
 argument that contradicts it is an error. Files, other programs' objects and figures are
@@ -51,7 +51,7 @@ class ConeVec:
     """A frozen stack of cone_vec rows, and the shape of the detector if it is known.
 
     Attributes:
-        rows: float64 (n, 12) [mm], read-only: source, detector centre, u, v of each view.
+        rows: float64 (n, 12) [mm], read-only: source, detector center, u, v of each view.
         detector_shape: (rows, cols) of the detector, or None.
 
     Raises:
@@ -105,7 +105,7 @@ class ConeVec:
         other.
 
         Args:
-            source, detector, u, v: focal spot, detector centre, steps to the next column
+            source, detector, u, v: focal spot, detector center, steps to the next column
                 and row.
             shape: detector (rows, cols), or None.
 
@@ -152,7 +152,7 @@ class ConeVec:
                 ASTRA's do.
             shape: detector (rows, cols).
             pixel: pitch of the pixels [mm], or (along columns, along rows).
-            offset: of the detector's centre towards growing columns (right, seen from the
+            offset: of the detector's center towards growing columns (right, seen from the
                 source) and growing rows (down) [mm].
             tilts: roll, pitch and yaw of the detector [deg], right-handed: yaw about v,
                 then pitch about the turned u, then roll about the turned normal u x v.
@@ -637,7 +637,7 @@ class ConeVec:
         return known
 
     def with_shape(self, shape: Shape2 | None) -> ConeVec:
-        """Replace the detector's (rows, cols) about the same centre, or remove it.
+        """Replace the detector's (rows, cols) about the same center, or remove it.
 
         Example:
             >>> scan = ConeVec.circular(sod=600, sdd=1059, angles=4, shape=(76, 96), pixel=0.15)
@@ -661,8 +661,7 @@ class ConeVec:
         return backend("notebook").show_geometry(self)
 
     def plot(self, axes: Any = None) -> Any:
-        """Plot source, detector and rays in three dimensions; needs matplotlib
-        (the extra `plots`).
+        """Plot source, detector and rays in three dimensions; needs matplotlib.
 
         Args:
             axes: matplotlib's 3D axes to draw into; None makes a figure.
@@ -687,7 +686,7 @@ class ConeVec:
 
     @property
     def detector(self) -> FloatArray:
-        """Detector centre of each view, (n, 3) [mm]."""
+        """Detector center of each view, (n, 3) [mm]."""
         return self.rows[:, 3:6]
 
     @property
@@ -714,7 +713,7 @@ class ConeVec:
         return np.asarray(np.sum((self.detector - self.source) * self.normal, axis=1))
 
     def rays(self, shape: Shape2 | None = None) -> FloatArray:
-        """Compute the rays of each view as a projector needs them: source, centre of the
+        """Compute the rays of each view as a projector needs them: source, center of the
         first pixel minus source, u and v, (n, 12) [mm].
 
         The ray to pixel (row, column) is the second of these + column * u + row * v.
@@ -749,7 +748,7 @@ class ConeVec:
             shape: detector (rows, cols), if the geometry has none; see `of_shape`.
 
         Returns:
-            (n, k, 2) pixel coordinates (column, row); pixel centres are integers. A point
+            (n, k, 2) pixel coordinates (column, row); pixel centers are integers. A point
             in the plane of the source parallel to the detector gives inf or nan: it has
             no projection.
 
@@ -787,7 +786,7 @@ class ConeVec:
         """Compute the foot of the perpendicular from the focal spot on each detector
         plane, (n, 2) pixels (column, row).
 
-        It may be outside the detector; pixel centres are whole numbers.
+        It may be outside the detector; pixel centers are whole numbers.
 
         Args:
             shape: detector (rows, cols), if the geometry has none; see `of_shape`.
@@ -809,7 +808,7 @@ class ConeVec:
         )
 
     def pixel_centers(self, shape: Shape2 | None = None) -> FloatArray:
-        """Compute the positions of all pixel centres in the object frame, (n, rows, cols,
+        """Compute the positions of all pixel centers in the object frame, (n, rows, cols,
         3) [mm].
 
         Args:
@@ -860,7 +859,7 @@ class ConeVec:
         """Bin the image by `factor`; columns and rows beyond a multiple of it are cut
         off.
 
-        The centre moves with the pixels that are cut off. The result has a detector shape
+        The center moves with the pixels that are cut off. The result has a detector shape
         only if this one has.
 
         Args:

@@ -4,14 +4,14 @@ World frame, right-handed: +x to the right as seen from the source (traversal), 
 source to detector (magnification), +z up. Origin: the lowest central point of the source
 (thesis 4.3.1).
 
-Object frame: centred on the rotation axis at the sample's reference height. It coincides
+Object frame: centered on the rotation axis at the sample's reference height. It coincides
 with the world's directions at rot_obj = 0 and turns with the stage; growing rot_obj turns
 the object CLOCKWISE seen from above. cone_vec rows are always in this frame, so a turn by
 phi is ASTRA's `cone` angle +phi.
 
 Detector: u = +x is the step to the next column, v = -z the step to the next row, so
 frame[0, 0] is the top left pixel seen from the source. The normal u x v is +y, away from
-the source. Integer pixel coordinates (column, row) are pixel centres, counted from (0,
+the source. Integer pixel coordinates (column, row) are pixel centers, counted from (0,
 0).
 
 Unity's frame of the thesis is left-handed with (x traversal, y vertical, z
@@ -146,7 +146,7 @@ def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
     """Compute right-handed rotations (..., 3, 3) by `angle` [rad] about directions (...,
     3) (Rodrigues).
 
-    Directions are normalised; one of length 0 gives NaN. All are turned by the one angle.
+    Directions are normalized; one of length 0 gives NaN. All are turned by the one angle.
 
     Example:
         >>> bool(np.allclose(rotation_about([0, 0, 2], 0.3), rotation_z(0.3)))

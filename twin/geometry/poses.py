@@ -36,7 +36,7 @@ class Poses:
     Attributes:
         source: focal spot, (n, 3) [mm].
         axis: point of the rotation axis at the sample's reference height, (n, 3) [mm].
-        detector: centre of the region of interest, (n, 3) [mm].
+        detector: center of the region of interest, (n, 3) [mm].
         u: step to the next column, (n, 3) [mm].
         v: step to the next row, (n, 3) [mm].
         angle: accumulated stage angle, (n,) [rad]; growing turns the object clockwise

@@ -98,7 +98,7 @@ class Rigid:
     ) -> Rigid:
         """Make a right-handed turn about an axis through a point.
 
-        A direction is normalised.
+        A direction is normalized.
 
         Args:
             axis: "x", "y", "z", or a direction (3,).

@@ -102,7 +102,7 @@ def symmetry(beads: FloatArray, tolerance_mm: float) -> Symmetry:
 
 
 def spacing(beads: FloatArray) -> float:
-    """Compute the angle between neighbours that a turn about the beads' middle may mistake for
+    """Compute the angle between neighbors that a turn about the beads' middle may mistake for
     each other: the median, over the beads, of the least turn that brings one near another's
     place; pi where no two are alike [rad].
 

@@ -1,6 +1,6 @@
 """Told lengths: what motors, the panel's data sheet and the phantom's file say, as parameters.
 
-A scan's millimetres have several witnesses: the ways of the stage and of the panel (a helix's
+A scan's millimeters have several witnesses: the ways of the stage and of the panel (a helix's
 lead, placements, steps of the SOD), the pixel pitch, and the phantom's beads. None is exact.
 Each is a parameter of the fit beside the seventeen offsets, 0 where the told length is right,
 with a standard deviation before the scan, so that no witness overrules another.

@@ -127,11 +127,11 @@ class CameraSettings:
         return across * self.binning, up * self.binning
 
     def roi_shift_mm(self, grid: PixelGrid) -> tuple[float, float]:
-        """Compute the shift of the image's centre from the sensor's centre [mm].
+        """Compute the shift of the image's center from the sensor's center [mm].
 
         For the thesis's ROI 32 8 1943 1527 that is (+1.1968, 0), as flexDATA has it.
 
-        The centre is that of the whole binned pixels: a rest of the ROI that fills none
+        The center is that of the whole binned pixels: a rest of the ROI that fills none
         is cut off at the right and below.
 
         Args:

@@ -78,12 +78,12 @@ def motor_poses(
     """Compute nominal poses for motor positions as they were read, without limits.
 
     The pixel's directions follow the profile's roll only; no correction is applied. The
-    detector's place includes the shift of the ROI's centre.
+    detector's place includes the shift of the ROI's center.
 
     Args:
         machine: whose motors these are.
         profile: zero offsets in force.
-        camera: decides pixel pitch and the place of the image's centre on the sensor.
+        camera: decides pixel pitch and the place of the image's center on the sensor.
         positions: motor -> scalar or (n,) [mm, deg], broadcast together; motors left out
             are at home.
 

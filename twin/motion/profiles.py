@@ -3,7 +3,7 @@
 A `Trajectory` gives position and velocity at any time; nothing is stepped. Builders make
 the trapezoidal profile of thesis 4.5.1 (triangular when short) from any state of motion,
 the stop with deceleration, and the jog. Arrival is exact: after the end the position is
-the target (the thesis's 1 mm arrival threshold is a simulation artefact). Limits are
+the target (the thesis's 1 mm arrival threshold is a simulation artifact). Limits are
 checked by the callers. An `AxisPath` is the same as arrays: for sweeps and plans, which
 evaluate many moments at once.
 """

@@ -1,7 +1,7 @@
 """Blur of images and of their noise: the scintillator's light, the focal spot.
 
 The blur has the requested variance, however narrow it is. From 0.7 pixels on its kernel
-is a Gaussian at the pixels' centres, whose modulation is a Gaussian's up to the Nyquist
+is a Gaussian at the pixels' centers, whose modulation is a Gaussian's up to the Nyquist
 frequency. Samples of a narrower one would lose variance: there it is the discrete
 Gaussian exp(-t) I_n(t), whose modulation is exp(-2 t sin^2(pi f)) and so more than a
 Gaussian's at high frequencies.

@@ -115,7 +115,7 @@ def transmitted(
 
     Args:
         beam: its effective energies.
-        paths_mm: float32 (m, ..., rows, cols), to the pixels' centres [mm].
+        paths_mm: float32 (m, ..., rows, cols), to the pixels' centers [mm].
         areas: pixels of (..., rows, cols) that have several rays.
 
     Returns:
@@ -147,7 +147,7 @@ def expected_signal(
             blur.
         exposure: tube and time; with X-rays off all is 0.
         areas: pixels whose signal is the mean of several rays'; the other pixels have that
-            of their centre.
+            of their center.
 
     Returns:
         Electrons of one read-out and their variance, float32 (rows, cols) each.
@@ -174,7 +174,7 @@ def expected_signal(
 
 
 def open_noise(chain: Chain, view: npt.ArrayLike, exposure: ExposureSettings) -> float:
-    """Compute the noise of a pixel of the open beam at the panel's centre, relative to
+    """Compute the noise of a pixel of the open beam at the panel's center, relative to
     its signal (standard deviation); infinite without a signal.
 
     `chain`: tube and panel; its materials are not used. `view`: cone_vec row (12,) [mm].
@@ -224,7 +224,7 @@ def brightest_flux(view: npt.ArrayLike, shape: tuple[int, int]) -> float:
 
 def _panel_from_source(view: npt.ArrayLike) -> tuple[float, float, float, float, float]:
     """Describe the panel of a cone_vec row as the source sees it: distance of its plane,
-    the source's foot point from its centre along u and v, and both pitches [mm]."""
+    the source's foot point from its center along u and v, and both pitches [mm]."""
     row = np.asarray(view, dtype=np.float64)
     away = row[0:3] - row[3:6]
     u = row[6:9]
@@ -251,7 +251,7 @@ def flux_map(
     obliquity.
 
     `distance`: from the source to the panel's plane [mm]; `foot_u` and `foot_v`: foot point of
-    the source, from the panel's centre along u and v [mm]; `pixel_u` and `pixel_v`: pitch [mm];
+    the source, from the panel's center along u and v [mm]; `pixel_u` and `pixel_v`: pitch [mm];
     `shape`: (rows, cols).
     Returns float32 (rows, cols), read-only; the last 16 are kept.
     """

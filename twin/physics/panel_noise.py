@@ -51,7 +51,7 @@ class NoiseTerm:
 
     Attributes:
         name: of the source.
-        spreads: whether the scintillator's light spreads it over neighbours; otherwise it
+        spreads: whether the scintillator's light spreads it over neighbors; otherwise it
             is white.
         draw: makes the noise of a saved image before it spreads, float32 (rows, cols)
             [electrons].

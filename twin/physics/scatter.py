@@ -353,7 +353,7 @@ def _lit(
     thing: Object, row: FloatArray, shape: tuple[int, int], collimated: bool
 ) -> tuple[float, float, float, float]:
     """Project the object's box on the panel's plane: least and greatest column and row,
-    from its centre.
+    from its center.
 
     Args:
         thing: the object with its box [mm].

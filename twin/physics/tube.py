@@ -1,6 +1,6 @@
 """The tube: how many photons of each energy it emits, and how large its focal spot is.
 
-Spectra come from the shipped tables, linear between neighbouring voltages; a voltage
+Spectra come from the shipped tables, linear between neighboring voltages; a voltage
 outside the tables is an error. The anode angle is the tables' 12 degrees; filters and
 focal spot come from the machine file, whose defaults are assumed, since nothing public
 states them for this tube. `Tube` is the user's description for `flexdt.simulate`; it
@@ -46,7 +46,7 @@ class TubeModel:
         filters: from the anode to the sample; 0.5 mm aluminium, for window and inherent
             filtration.
         spot_mm_per_W: the electron beam of microfocus tubes is widened with power so that
-            the anode does not melt; about a micrometre a watt is usual.
+            the anode does not melt; about a micrometer a watt is usual.
         smallest_spot_mm: focal spot at little power (full width at half maximum).
         spot_points: from which the twin's rays start; 1 for one blur of the image.
     """
@@ -133,7 +133,7 @@ class Spectrum:
 
     @property
     def energy_keV(self) -> FloatArray:
-        """(e,) bin centres [keV]."""
+        """(e,) bin centers [keV]."""
         return tables().energy_keV
 
     @property

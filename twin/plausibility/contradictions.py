@@ -49,7 +49,7 @@ class PlausibilityCode(FindingCode):
     HOUNSFIELD = (
         "Hounsfield",
         ERROR,
-        "Hounsfield units or grey values where attenuation belongs",
+        "Hounsfield units or gray values where attenuation belongs",
     )
     COUNTS = "counts", ERROR, "counts of a detector where line integrals belong"
     TRANSMISSION = "transmission", WARNING, "transmission where line integrals belong"

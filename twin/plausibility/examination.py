@@ -91,7 +91,7 @@ def _found(
     Arcs are checked only for an iterative method whose spans are fine. Placement
     needs `boxes` and `shape`, the grid check needs `grid` and `shape`;
     the panel counts as real only when simulating, layers above and below it count unless
-    FDK. Inclination is checked for FDK with a `grid`, about the grid's centre.
+    FDK. Inclination is checked for FDK with a `grid`, about the grid's center.
     """
     yield from geometry_findings(geometry, shape)
     spans = tuple(span_findings(geometry))

@@ -37,7 +37,7 @@ TAIL: Final = 1e-3
 MAX_PER_MM: Final = 200.0
 """Largest attenuation of any element at energies of tubes [1/mm]."""
 MIN_ATTENUATION: Final = -200.0
-"""Value below which a volume is in Hounsfield units: artefacts never bring attenuation
+"""Value below which a volume is in Hounsfield units: artifacts never bring attenuation
 so low."""
 
 
@@ -130,7 +130,7 @@ def _range_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
         yield warning(PlausibilityCode.NEGATIVE, cause, remedy, figure=low)
     elif high > MAX_GIVEN_INTEGRAL:
         cause = f"line integrals of up to {high:.4g}, at which no photon passes"
-        remedy = "are they grey values, or scaled?"
+        remedy = "are they gray values, or scaled?"
         yield warning(PlausibilityCode.SCALED, cause, remedy, figure=high)
 
 
@@ -197,7 +197,7 @@ def volume_findings(values: npt.NDArray[Any]) -> Iterator[Finding]:
         yield error(PlausibilityCode.HOUNSFIELD, cause, remedy, figure=low)
     elif high > MAX_PER_MM:
         cause = f"attenuation of up to {high:.5g} /mm, more than any element has"
-        remedy = "grey values need a scale to 1/mm, labels material={1: NAME}"
+        remedy = "gray values need a scale to 1/mm, labels material={1: NAME}"
         yield warning(PlausibilityCode.HOUNSFIELD, cause, remedy, figure=high)
     elif low < 0.0 and high <= MAX_POSITIVE_SHARE * -low:
         cause = f"attenuation from {low:.5g} to {high:.5g} /mm is negative"

@@ -26,7 +26,7 @@ MIN_BLOCKS_SHARE: Final = 1e-3
 STRIP_PART: Final = 0.03
 """Width of a strip at an image's edge, as a share of its columns."""
 MAX_STRIP_DIFFERENCE: Final = 0.004
-"""Largest relative difference of neighbouring strips in the open beam."""
+"""Largest relative difference of neighboring strips in the open beam."""
 STRIP_BLOCKS: Final = 4
 """Parts of a strip that are compared with each other."""
 MIN_OPEN_VIEWS_SHARE: Final = 0.8
@@ -103,7 +103,7 @@ def below_dark_findings(
 
     Without X-rays a panel counts least: a block of `DARK_BLOCK` pixels of a row whose mean is
     below the dark image's by more than `NOISE_SIGMAS` standard errors, and by a count,
-    contradicts it. Noise is that of neighbours in a row. Yields at most one warning, its figure
+    contradicts it. Noise is that of neighbors in a row. Yields at most one warning, its figure
     the share of such blocks, above `MIN_BLOCKS_SHARE`.
 
     Args:

@@ -1,4 +1,4 @@
-"""Where a geometry meets a sample: numbers that fit no scan, such as metres for mm."""
+"""Where a geometry meets a sample: numbers that fit no scan, such as meters for mm."""
 
 from __future__ import annotations
 

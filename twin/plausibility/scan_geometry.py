@@ -217,7 +217,7 @@ def _round_degrees(span: float, step: float) -> bool:
 
 def arc_deg(cone_vec: ConeVec) -> float:
     """Compute the arc that the views of a circular scan cover [deg]: the full turn
-    without its widest gap between neighbouring directions of beams (0 for one view)."""
+    without its widest gap between neighboring directions of beams (0 for one view)."""
     return _arc_of(azimuths(cone_vec))
 
 
@@ -341,7 +341,7 @@ def inclination_findings(cone_vec: ConeVec, centre: npt.ArrayLike) -> Iterator[F
 
     Yields at most one finding, a warning above 10 deg or a refusal above 20 deg
     (`INCLINED_DEG`); its figure is the smallest inclination of any view's beam to the
-    panel's centre or to the grid's. Nothing for fewer than 3 views, a scan that is not
+    panel's center or to the grid's. Nothing for fewer than 3 views, a scan that is not
     about z or whose source rises, or if grid and panel are on different sides of the
     plane.
 

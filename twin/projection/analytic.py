@@ -51,8 +51,8 @@ LEVEL_VIEW = ConeVec.from_vectors((0, -10, 0), (0, 10, 0), (1, 0, 0), (0, 0, -1)
 END_ON_VIEW = ConeVec.from_vectors((0, 0, -10), (0, 0, 10), (1, 0, 0), (0, 1, 0))
 IntArray = npt.NDArray[np.int64]
 RAY_OFFSET_PX = (1.37e-7, 0.73e-7)
-"""Offset of each ray from its pixel's centre [columns, rows]. Made objects have
-corners exactly on pixel centres; there, rounding alone would decide which triangles a
+"""Offset of each ray from its pixel's center [columns, rows]. Made objects have
+corners exactly on pixel centers; there, rounding alone would decide which triangles a
 ray meets."""
 
 

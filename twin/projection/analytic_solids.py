@@ -284,7 +284,7 @@ def _ellipsoid_ranges(
 ) -> Ranges:
     """Compute the ranges of the shadows of balls and ellipsoids.
 
-    With the centre q and semi-axes F in pixels and depths, a plane through the source
+    With the center q and semi-axes F in pixels and depths, a plane through the source
     with normal m touches an ellipsoid when (m . q)^2 = |F' m|^2. For the normals of columns
     and rows, (1, 0, -x) and (0, 1, -x), that is a quadratic in x.
 
@@ -382,7 +382,7 @@ def _positive(shape: Shape, *sizes: float) -> None:
 
 
 def _unit(shape: Shape, direction: Vector) -> FloatArray:
-    """Check that a direction of a shape is a unit vector, and return it normalised, (3,).
+    """Check that a direction of a shape is a unit vector, and return it normalized, (3,).
 
     Raises GeometryError: its length differs from 1 by more than `UNIT_TOLERANCE`.
     """

@@ -42,7 +42,7 @@ TILE_COLUMNS = 8
 
 
 def runs(views: FloatArray, shape: tuple[int, int]) -> Iterator[tuple[slice, bool]]:
-    """Yield ranges of neighbouring views of one orientation, each with its transposition.
+    """Yield ranges of neighboring views of one orientation, each with its transposition.
 
     The second value is True when rows and columns of these views are exchanged; such a
     range holds at most as many views as fit into `MAX_TRANSPOSED_BYTES` (at least one),

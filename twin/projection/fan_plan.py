@@ -6,7 +6,7 @@ other in x and y. Views in which z is seen (nearly) end on have no fans. Pure ge
 voxels are touched.
 
 For the transpose, `Turns` says which fans may add to the voxels at the same time. Seen along z
-a fan is a wedge with its point in the source. Neighbouring fans share voxel columns, fans with
+a fan is a wedge with its point in the source. Neighboring fans share voxel columns, fans with
 enough others between them share none. So the jobs of a view are gathered into units, and first
 all even units are worked on, each by one thread, then all odd ones: no locks, no second copy of
 the volume, and sums in the same order every time. Where wedges are too narrow for that (source
@@ -49,7 +49,7 @@ MAX_LEVEL_OFFSET_VOXELS = 1e-12
 """Largest distance in x and y of the ends of a detector column parallel to z [voxels]."""
 MIN_UNIT_WIDTH = 8.0
 """Least width of a unit where it enters the volume [voxels]. A fan reaches at most two
-voxel columns beyond its own lines, and so does its second neighbour."""
+voxel columns beyond its own lines, and so does its second neighbor."""
 
 
 def lying(views: FloatArray, shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
@@ -80,7 +80,7 @@ class FanPlan:
 
     Attributes:
         lines: (m, 2) boundaries c = a + b r.
-        jobs: (k, 3) view, first line, last line; neighbouring lines enclose a fan.
+        jobs: (k, 3) view, first line, last line; neighboring lines enclose a fan.
         room: bound on the rays of a fan.
         widest: bound on the columns of a job in any row.
         alone: indices of the views that have no fans.
@@ -108,7 +108,7 @@ def plan_fans(
     much, gets no fans: `alone` lists it.
 
     Args:
-        views: (n, 12) source, first pixel centre minus source, u, v in voxel units of the
+        views: (n, 12) source, first pixel center minus source, u, v in voxel units of the
             box.
         counts: (nx, ny, nz) voxels of the box.
         shape: detector (rows, cols), of rays.
@@ -309,7 +309,7 @@ def plan_turns(
     """Order the jobs of a plan so that threads never add to the same voxel at a time.
 
     The jobs of a view are gathered to units at least `MIN_UNIT_WIDTH` voxels wide; every
-    second unit is of one turn, the rest of the next. Neighbouring views with fewer than
+    second unit is of one turn, the rest of the next. Neighboring views with fewer than
     three units, and all with one worker, are one unit for one thread.
 
     Args:

@@ -39,7 +39,7 @@ def voxel_rays_a_side(
     """Compute the rays along each side of a pixel: as many as are asked for, or so many that
     `RAYS_A_VOXEL` are within a voxel's shadow, at least as many, at most `MAX_RAYS`.
 
-    The shadow is that of the smallest edge at the volume's centre, in the view in which it
+    The shadow is that of the smallest edge at the volume's center, in the view in which it
     is smallest.
 
     Raises:

@@ -59,7 +59,7 @@ class TorchOperator:
                 batch dimensions before them.
             rows: the geometry as a tensor (n, 12) [mm], for all of the batch; with
                 `requires_grad` it gets the derivative. Take float64: single precision rounds
-                distances of a metre to 0.06 um, which is felt in sums over many pixels.
+                distances of a meter to 0.06 um, which is felt in sums over many pixels.
 
         Returns float32 tensor, batch dimensions as given.
         Raises GeometryError: a shape does not fit; NotBuiltError: a tensor is on a device other

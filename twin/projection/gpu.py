@@ -508,7 +508,7 @@ def launcher(
     lanes meet; else ray by ray.
 
     One array goes there: views by kernel, each with the number of its image. Views of a
-    detector on its side take its columns for rows, so that lanes are neighbours along z
+    detector on its side take its columns for rows, so that lanes are neighbors along z
     there, too.
 
     Args:

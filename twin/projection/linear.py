@@ -1,4 +1,4 @@
-"""The projector of smooth volumes: values between voxel centres are linear, pixels are areas.
+"""The projector of smooth volumes: values between voxel centers are linear, pixels are areas.
 
 `forward` and `back` of `operators` call it for `model="linear"`; the kernels' page says what is
 computed. Levels are stacked along the axis that rays are most nearly at right angles to, and
@@ -17,7 +17,7 @@ from flexdt.twin.geometry.conventions import Float32Array, FloatArray
 from flexdt.twin.projection.kernels.fan_types import Box
 
 Model = Literal["exact", "linear"]
-"""Voxels of one value each, or values between their centres."""
+"""Voxels of one value each, or values between their centers."""
 MODELS: Final = ("exact", "linear")
 EXCHANGED: Final = [0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8]
 """Order of a view's numbers with u and v exchanged."""

@@ -3,7 +3,7 @@ the voxel projectors.
 
 Arguments are checked and brought into voxel units here. A CUDA device computes where there is
 one with room for the volume, the processor otherwise; both give exact Siddon lengths. Rays run
-from the focal spot through the pixel's centre and on: a panel before or inside the volume cuts
+from the focal spot through the pixel's center and on: a panel before or inside the volume cuts
 none of them (`virtual_panel`).
 
 Each view is walked along the axis on which its levels are stacked, or ray by ray. A ray acts
@@ -108,7 +108,7 @@ def in_order(geometry: ConeVec, order: Order) -> ConeVec:
 def by_level_axis(
     volume: Volume, geometry: ConeVec, shape: tuple[int, int]
 ) -> Iterator[tuple[slice, Order, bool]]:
-    """Yield ranges of neighbouring views with the best axis to stack levels along, by
+    """Yield ranges of neighboring views with the best axis to stack levels along, by
     estimated time; nothing without views.
 
     Returns:
@@ -134,7 +134,7 @@ def level_axes(
     level axis.
 
     Args:
-        rays: (n, 12) source relative to the volume's centre, first pixel minus source, u,
+        rays: (n, 12) source relative to the volume's center, first pixel minus source, u,
             v in voxel units.
         counts: (nz, ny, nx) voxels.
         shape: detector (rows, cols).
@@ -208,7 +208,7 @@ def forward(
     """Compute line integrals of a volume.
 
     Exact: path length times value over voxels (Siddon 1985), along one ray a pixel or as the
-    mean of several. Linear: of values between voxel centres, averaged over the pixel
+    mean of several. Linear: of values between voxel centers, averaged over the pixel
     (docs/operator.md has which one when).
 
     Args:
@@ -357,7 +357,7 @@ def _of_areas(
 def _by_steepness(
     volume: Volume, geometry: ConeVec, shape: Shape2
 ) -> Iterator[tuple[slice, Order]]:
-    """Yield ranges of neighbouring views with the order of axes in which the model "linear"
+    """Yield ranges of neighboring views with the order of axes in which the model "linear"
     projects them."""
     rays = geometry.rays(shape) / np.tile(volume.voxel_xyz, 4)
     axes = linear.level_axes(rays, shape)
@@ -706,7 +706,7 @@ def as_cone_vec(cone_vec: ConeVec | npt.ArrayLike) -> ConeVec:
 def check_out(out: Float32Array | None, shape: tuple[int, int, int]) -> Float32Array:
     """Return `out` if it fits, or a new array if it is None.
 
-    The new array is not initialised.
+    The new array is not initialized.
 
     Raises:
         GeometryError: out has another shape or type, is not C-ordered, or cannot be
@@ -746,7 +746,7 @@ def geometry_gradient(
         weights: (n, rows, cols), dimensionless.
 
     Returns:
-        float64 (n, 12) [1/mm]: with respect to source, detector centre, u and v of each
+        float64 (n, 12) [1/mm]: with respect to source, detector center, u and v of each
             view.
 
     Raises:

@@ -89,7 +89,7 @@ class SingleViews:
         """Fill an image with line integrals.
 
         Args:
-            row: (12,) source, detector's centre, u and v [mm].
+            row: (12,) source, detector's center, u and v [mm].
             image: (rows, cols) filled.
 
         Returns whether it is filled; False where `gpu` has to project the view. Without the
@@ -327,7 +327,7 @@ def project(volume: Volume, box: Box, row: FloatArray, image: Float32Array) -> b
 
     What is prepared for single views is kept with the volume's copy.
     `volume`: whose layout has a copy on the device; `box`: of its layout; `row`: (12,) source,
-    detector's centre, u and v [mm]; `image`: (rows, cols) filled.
+    detector's center, u and v [mm]; `image`: (rows, cols) filled.
     Returns whether it is filled; False where `gpu` has to project the view, or the device
     failed.
     """

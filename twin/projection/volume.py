@@ -317,8 +317,7 @@ class Residuals:
         return self.views[np.argsort(-self.by_view, kind="stable")[:count]]
 
     def plot(self) -> Any:
-        """Draw the residual by view and by pixel, and the worst view; needs matplotlib
-        (the extra `plots`).
+        """Draw the residual by view and by pixel, and the worst view; needs matplotlib.
 
         Returns:
             The three axes.
@@ -327,7 +326,7 @@ class Residuals:
 
     def movie(self, count: int = 12) -> Any:
         """Make an animation of the worst views, in the order of the scan; needs
-        matplotlib (the extra `plots`). A notebook shows `.to_jshtml()` of it.
+        matplotlib. A notebook shows `.to_jshtml()` of it.
 
         Args:
             count: of views.
@@ -474,7 +473,7 @@ class Volume:
     Attributes:
         data: float32 (nz, ny, nx), linear attenuation [1/mm]; index grows with +z, +y, +x.
         voxel_mm: edge lengths (x, y, z) [mm]; a single number is taken for all three.
-        center_mm: object-frame position of the volume's centre [mm].
+        center_mm: object-frame position of the volume's center [mm].
 
     Raises:
         GeometryError: data is not three-dimensional or has an empty side, a voxel size is not
@@ -493,7 +492,7 @@ class Volume:
     center_mm: Vector3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check data, voxel sizes and centre, and store them: data as a read-only view,
+        """Check data, voxel sizes and center, and store them: data as a read-only view,
         sizes as (x, y, z).
 
         Raises:
@@ -532,7 +531,7 @@ class Volume:
         return self.data.__dlpack_device__()
 
     def __repr__(self) -> str:
-        """Describe the volume in one line: shape (z, y, x), voxel and centre [mm]."""
+        """Describe the volume in one line: shape (z, y, x), voxel and center [mm]."""
         sizes = [f"{size:g}" for size in self.voxel_xyz]
         if len(set(sizes)) == 1:
             voxel = sizes[0]
@@ -614,7 +613,7 @@ class Volume:
         what: str = "data",
         window: Sequence[float] | Volume | None = None,
     ) -> Any:
-        """Show the layer in the middle; needs matplotlib (the extra `plots`).
+        """Show the layer in the middle; needs matplotlib.
 
         Args:
             axes: matplotlib's axes to draw into; None makes a figure.
@@ -802,7 +801,7 @@ class Volume:
         return np.array([self.center_mm - half, self.center_mm + half])[None]
 
     def centers(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Compute object-frame positions of voxel centres along x (nx,), y (ny,), z (nz,)
+        """Compute object-frame positions of voxel centers along x (nx,), y (ny,), z (nz,)
         [mm].
 
         Example:
@@ -1005,7 +1004,7 @@ class Grid:
     Attributes:
         shape: (nz, ny, nx).
         voxel_mm: edge of a voxel [mm].
-        center_mm: (x, y, z) of the grid's centre [mm].
+        center_mm: (x, y, z) of the grid's center [mm].
 
     Example:
         >>> Grid((100, 200, 200), 0.1).bytes

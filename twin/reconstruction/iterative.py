@@ -65,7 +65,7 @@ def finding_errors(algorithm: Algorithm) -> Algorithm:
 
 
 def far_apart(count: int) -> list[int]:
-    """Order 0 .. count-1 so that neighbours in time are far apart (golden-section)."""
+    """Order 0 .. count-1 so that neighbors in time are far apart (golden-section)."""
     return [int(i) for i in np.argsort((np.arange(count) * 0.6180339887498949) % 1.0)]
 
 
@@ -381,7 +381,7 @@ def em(
     progress: Progress = None,
     errors: bool = False,
 ) -> Volume:
-    """Reconstruct by expectation maximisation: x *= A'(b / A x) / A' 1, always positive.
+    """Reconstruct by expectation maximization: x *= A'(b / A x) / A' 1, always positive.
 
     Negative line integrals (noise) count as zero. Args: as for `sirt`; a first guess must
     be positive wherever the object may be, without one all voxels that a ray meets begin

@@ -47,7 +47,7 @@ from flexdt.twin.reconstruction.uniform_nodes import UniformNodes
 from flexdt.twin.reconstruction.volume_errors import interpolated, with_errors
 
 PROBES: Final = 2
-"""Volumes that are made again for the noise: with the neighbours of a voxel they leave it
+"""Volumes that are made again for the noise: with the neighbors of a voxel they leave it
 known to about a tenth."""
 NEAR_VOXELS: Final = 2.0
 """Standard deviation of the Gaussian over which squares of the changes are averaged [voxels]."""
@@ -413,7 +413,7 @@ class NoiseOfProbes:
 
 
 def in_order(cone_vec: ConeVec) -> npt.NDArray[np.intp]:
-    """Order views so that neighbours see nearly the same: by angle on a circle, else as they
+    """Order views so that neighbors see nearly the same: by angle on a circle, else as they
     are; (n,) numbers."""
     try:
         circle = circle_of(cone_vec)
@@ -429,13 +429,13 @@ def noise_in(
 ) -> tuple[Float32Array, float]:
     """Find a realisation of the noise in each view, and how much more all views share.
 
-    It is the view less the mean of its neighbours, scaled to the variance of one view. Where that
+    It is the view less the mean of its neighbors, scaled to the variance of one view. Where that
     has more than noise in a square of `WINDOW` pixels, by the variance of such line integrals,
     the object moves there, and it is scaled down to the noise.
 
     Args:
         images: (n, rows, cols), three views at least.
-        order: in which views are neighbours.
+        order: in which views are neighbors.
 
     Returns:
         (n, rows, cols); and the variance of the noise common to all views, over that of the mean
@@ -465,7 +465,7 @@ def noise_in(
 def _bend(
     images: Float32Array, order: npt.NDArray[np.intp], place: int
 ) -> tuple[int, FloatArray, FloatArray]:
-    """Return a view's number, what it has less the mean of its neighbours, of a view's variance,
+    """Return a view's number, what it has less the mean of its neighbors, of a view's variance,
     and the mean of the three; the ends take the three outermost."""
     middle = min(max(place, 1), len(order) - 2)
     before, here, after = (

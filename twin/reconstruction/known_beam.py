@@ -1,6 +1,6 @@
 """What is known of the energies of a scan, and how they bend its line integrals.
 
-A spectrum attenuates less, a millimetre, behind much of a material than behind little. Where
+A spectrum attenuates less, a millimeter, behind much of a material than behind little. Where
 tube and filter are known, a material that attenuates as the object does tells by how much; a
 volume is then compared with that of the straightened line integrals.
 """

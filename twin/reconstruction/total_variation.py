@@ -1,6 +1,6 @@
 """Reconstruction with total variation: for few views, noise, and objects of few materials.
 
-The volume minimises
+The volume minimizes
 
     cost(x) = 1/2 sum((A x - b)^2) + strength * TV(x),    x >= 0,    x = 0 outside a mask,
 
@@ -54,7 +54,7 @@ STALLED_ITERATIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class Minimised:
-    """The outcome of a minimisation.
+    """The outcome of a minimization.
 
     Attributes:
         volume: the best volume found [1/mm].
@@ -154,10 +154,10 @@ def minimise_tv(
             raise LimitError.instead(f"{name} {value:g}", value, f"{least:g} or more")
     regular = Regular.of(problem.like, nonnegative, mask)
 
-    with long_work.during("minimising total variation", progress) as advance:
+    with long_work.during("minimizing total variation", progress) as advance:
 
         def minimise(problem: LinearSystem) -> Minimised:
-            """Minimise a problem on the processor or on a device, with the regulariser
+            """Minimise a problem on the processor or on a device, with the regularizer
             copied to where the problem is (with new dual variables there).
             """
             there = isinstance(problem, DeviceProblem)
@@ -380,7 +380,7 @@ class Regular:
 
     @classmethod
     def of(cls, like: Volume, nonnegative: bool, mask: npt.ArrayLike | None) -> Regular:
-        """Create the regulariser of a grid, with all dual variables zero; differences are
+        """Create the regularizer of a grid, with all dual variables zero; differences are
         scaled by the smallest edge of a voxel over that along their axis.
 
         Args:
@@ -468,11 +468,8 @@ class Regular:
     def dual_step(
         self, x: Any, ahead: Any, rate: np.float32, further: np.float32
     ) -> None:
-        """Update `self.dual` and `ahead` in place, by portions of layers; see
-        `tv_kernels.dual_step`.
-
-        `x`: voxels (nz, ny, nx); `ahead`: (3, nz, ny, nx), extrapolated dual variables; `rate`:
-        length of the step; `further`: momentum of the extrapolation."""
+        """Update `self.dual` and `ahead` (3, nz, ny, nx) in place, by portions of layers; see
+        `tv_kernels.dual_step`. `further`: its momentum."""
         from flexdt.twin.reconstruction.kernels import tv_kernels
 
         for first, last in layer_portions(x):
@@ -487,7 +484,7 @@ class DeviceRegular(Regular):
 
     @classmethod
     def of_host(cls, regular: Regular, like: Volume) -> DeviceRegular:
-        """Create the same regulariser on the device, with all dual variables zero.
+        """Create the same regularizer on the device, with all dual variables zero.
 
         `regular`: of the host; `like`: grid of the volume.
         Raises gpu.DeviceError: the device fails."""

@@ -105,7 +105,7 @@ def _neighbours(places: FloatArray, known: FloatArray) -> Neighbours:
 def _between(values: Float32Array, along: Neighbours) -> Float32Array:
     """Interpolate linearly along the first of two axes.
 
-    `values`: (m, k); `along`: neighbours of n places, from `_neighbours`.
+    `values`: (m, k); `along`: neighbors of n places, from `_neighbours`.
     Returns (n, k)."""
     lower, upper, weight = along
     found: Float32Array = values[lower] * (1.0 - weight)[:, None]

@@ -15,8 +15,8 @@ MEDIAN_OF_SQUARES: Final = 0.4549
 def noise_of(images: Float32Array) -> float:
     """Estimate the variance of white noise in images.
 
-    The smaller of two estimates: from mixed second differences of neighbouring rows and
-    columns (of columns alone with one row), and from second differences of neighbouring
+    The smaller of two estimates: from mixed second differences of neighboring rows and
+    columns (of columns alone with one row), and from second differences of neighboring
     views, whichever show less of the object.
 
     Args:

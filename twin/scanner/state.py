@@ -486,7 +486,7 @@ def least_before_source(
     of the axis at the source's height) and the panel's n . d. An affine function has its
     least value over a box in a corner, and which end of each travel that is does not
     depend on the other motors: two poses of each motor tell it. A region of interest
-    shifts the panel's centre in its untilted plane, which with a yaw counts along the
+    shifts the panel's center in its untilted plane, which with a yaw counts along the
     beam: the farthest shift, half a panel, is taken away.
 
     Yields:
@@ -525,7 +525,7 @@ def least_before_source(
 
 def _before_source(machine: Machine, poses: Poses, offsets: Offsets) -> FloatArray:
     """Compute how far axis, axis at the source's height, and the panel under its least
-    favourable region of interest are before the source, (n, 3) [mm].
+    favorable region of interest are before the source, (n, 3) [mm].
 
     Args:
         machine: has the sensor's size.

@@ -1,6 +1,7 @@
 """Acquila scan scripts: text to typed commands to a plan, each step plain data.
 
-Names are looked up on first use: a module of this folder costs no more than it imports itself.
+Names are looked up on first use, so importing one module of this folder loads only what that
+module needs.
 """
 
 from __future__ import annotations

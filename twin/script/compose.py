@@ -58,7 +58,7 @@ def compose_script(request: ScanRequest, machine: Machine, profile: Profile) -> 
     Args:
         request: the scan; it is checked before anything is written.
         machine: whose axes, limits and camera these are.
-        profile: zero offsets, so that source, detector and sample are centred.
+        profile: zero offsets, so that source, detector and sample are centered.
 
     Returns:
         TAB separated lines with CRLF, as `parse_script` reads them.
@@ -247,7 +247,7 @@ class _Writer(MotorTargets):
         """Yield a smooth turn for each tile, the detector moved by 0.9 of its image's
         width between them, the sample into the beam before.
 
-        The tiles are centred about the beam's middle; numbers of images go on.
+        The tiles are centered about the beam's middle; numbers of images go on.
 
         Raises:
             LimitError: a machine without a motor for `detector_x`.

@@ -330,8 +330,8 @@ def read_script(text: Source) -> tuple[c.Script, Findings]:
     Returns:
         The script of the lines that could be read, and all problems. A log, UTF-16 text
         or a binary file gives an empty script and one error. A text without any command
-        is an error; of more than `FEW_PROBLEMS` problems of one the first are listed,
-        after an error that says so.
+        is an error. If one kind of problem occurs more than `FEW_PROBLEMS` times, only
+        the first ones are listed, after an error that says so.
 
     Example:
         >>> script, problems = read_script("camera\tset exposure\tlong\t\tACK\t\t\r\n")

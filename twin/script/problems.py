@@ -160,7 +160,7 @@ class WithProblems:
 
 
 class ScriptError(TwinError):
-    """A script that does not hold; `problems` has every error and warning, in line order."""
+    """A script that is not valid; `problems` has every error and warning, in line order."""
 
     def __init__(self, problems: Iterable[Finding]) -> None:
         """Make the error; the message lists the errors, `data` has all problems, in line order."""

@@ -36,10 +36,10 @@ class ScanRequest:
             where the machine gets there, else its home, or its only one.
         frames: images of one fly scan, of the whole for step and helical.
         exposure_ms, averages: of one image; None is the machine's exposure.
-        height_mm: of source and detector centre above the origin; None is the sample's,
+        height_mm: of source and detector center above the origin; None is the sample's,
             or as for sod_mm.
         turns, rise_mm: of a helical scan, in total.
-        tiles: side by side, for tiled; neighbours share a tenth of the columns.
+        tiles: side by side, for tiled; neighbors share a tenth of the columns.
         placements: for calibration; None is SOD 600 and 800, or as many as the machine
             has room for.
         mode, roi: camera; None is the machine's.

@@ -170,7 +170,7 @@ async def _run(
     """Follow the scanner for some seconds (None: without end), or until it ends, with a
     status line and images from `beside`; raises the session's error, if it has one.
 
-    After the time all tasks are cancelled, without an error. Errors of the status line
+    After the time all tasks are canceled, without an error. Errors of the status line
     and of images are dropped.
     """
     import asyncio
@@ -188,7 +188,7 @@ async def _run(
 
 
 async def _status(session: FollowSession) -> None:
-    """Print every `STATUS_S` seconds, until cancelled: connection, age of the last
+    """Print every `STATUS_S` seconds, until canceled: connection, age of the last
     message, commands under way, number of alarms, and unread messages.
 
     It goes to standard error.

@@ -665,7 +665,7 @@ def save(
     dark_is_dense: bool = False,
     marks: npt.NDArray[Any] | None = None,
 ) -> None:
-    """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in colour.
+    """Write an image as TIFF, or windowed to 8 bit as PNG, with its marks in color.
 
     An existing file is replaced. A TIFF, for any ending but .png, holds the image
     unchanged.
@@ -674,7 +674,7 @@ def save(
         file: its ending selects the format.
         image: (rows, cols).
         dark_is_dense: draw dense parts dark, in a PNG.
-        marks: (rows, cols) of pixels to colour, in a PNG; None for none.
+        marks: (rows, cols) of pixels to color, in a PNG; None for none.
 
     Raises:
         CommandError: it cannot be drawn as PNG.

@@ -29,7 +29,7 @@ def read_log_file(log: Path, machine: Machine) -> tuple[Executed, ...]:
     """Read the lines of an executed script, or of one in a recording of `flexdt follow`; print
     its problems to standard error.
 
-    Recordings are recognised by their first time stamp. Warnings are printed and do not stop
+    Recordings are recognized by their first time stamp. Warnings are printed and do not stop
     the reading. The executed script of a recording is worked out by replaying it. Any
     problem that is an error raises, after all are printed.
 

@@ -1,4 +1,4 @@
-"""The scanner in viser: built once, then moved by every state; metres, one frame for each part.
+"""The scanner in viser: built once, then moved by every state; meters, one frame for each part.
 
 viser sends only what changes. Setters may be called from any one thread at a time.
 """
@@ -387,7 +387,7 @@ class LabScene:
         frame.position = pose[4:]
 
     def _show_beam(self, state: State, world: World) -> None:
-        """Move edges, spot, lamp, cross and axis to a state, and colour them by X-rays on
+        """Move edges, spot, lamp, cross and axis to a state, and color them by X-rays on
         or off; the lamp is lit while the tube warms up, too.
 
         Positions become [m]; the spot is hidden while no X-rays come out. Edges are the eight
@@ -594,7 +594,7 @@ class LabScene:
 
         Only linear axes that carry a part are drawn, with marks at their limits; without
         any, the former lines stay. Each axis has a line between its limits, through the
-        part's centre, and a mark of 50 mm at each end. Correction shifts are not
+        part's center, and a mark of 50 mm at each end. Correction shifts are not
         included.
 
         Args:
@@ -677,9 +677,9 @@ def _axis_points() -> npt.NDArray[np.float32]:
 
 def _cross_points() -> npt.NDArray[np.float32]:
     """Return four lines, (4, 2, 3) [m], of an upright cross in the xz plane with an open
-    centre.
+    center.
 
-    Each line is from 1.5 to 7 mm from the centre.
+    Each line is from 1.5 to 7 mm from the center.
     """
     r = 7.0 * MM
     g = 1.5 * MM

@@ -175,7 +175,7 @@ def leader_end(anchor: FloatArray, corner: FloatArray, size: FloatArray) -> Floa
 
 def names_of_image(world: World, top_mm: float | None = None) -> list[Name]:
     """List the names X-ray source, sample and detector with their places [m]; "detector"
-    is beside the panel's centre.
+    is beside the panel's center.
 
     The sample's place is above its origin, so that its name does not cover it where the
     camera is near; "detector" is a quarter of the image's width to the side.

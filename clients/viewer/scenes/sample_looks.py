@@ -1,4 +1,4 @@
-"""The sample as coloured meshes, one for each material.
+"""The sample as colored meshes, one for each material.
 
 Shipped phantoms are made from their names; meshes of uploads come from the twin, by
 `sample.mesh`, for a bounded time and up to a bounded size. Until an upload's mesh has
@@ -28,7 +28,7 @@ from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.conventions import FloatArray
 
 OTHER_COLOR: Final = (214, 170, 90)
-"""Of materials by formula, and of those without a colour of their own (r, g, b)."""
+"""Of materials by formula, and of those without a color of their own (r, g, b)."""
 MAX_LOOKS: Final = 8
 MAX_FACES: Final = 200_000
 DEFAULT_MATERIAL: Final = "abs"
@@ -217,7 +217,7 @@ def _box(sample: SampleState) -> SampleLook:
     """Show a sample of which only the size is known as a box, marked as not exact;
     nothing without a size.
 
-    The box is centred on the sample's origin and has no beads.
+    The box is centered on the sample's origin and has no beads.
     """
     if sample.size_mm is None:
         return NOTHING

@@ -1,7 +1,7 @@
 """The surface of one page's volume in that page's own scenes.
 
 It stands on the stage only while what it was made of is what stands there; otherwise the page may
-ask for it as a ghost, which has another colour and carries the volume's name.
+ask for it as a ghost, which has another color and carries the volume's name.
 """
 
 from __future__ import annotations

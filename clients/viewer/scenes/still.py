@@ -35,7 +35,7 @@ SKY = 0.62
 KEY = (0.55, -0.6, 0.58)
 """Part of light from all sides, and the direction of the rest."""
 GROUND = {False: ((248, 250, 253), (217, 225, 236)), True: ((42, 49, 64), (15, 19, 26))}
-"""Dark page or not -> colour of the background above and below, as the scenes have it."""
+"""Dark page or not -> color of the background above and below, as the scenes have it."""
 Pose = tuple[float, ...]
 """Quaternion (w, x, y, z) and place [m]."""
 IMAGE_CELLS = (76, 60)
@@ -50,7 +50,7 @@ class Shape:
         corners: (n, 3, 3) [m, world], counter-clockwise from the front.
         color: (3,) or (n, 3), 0 to 255.
         opacity: below 1 the background shows through.
-        lit: whether its colour depends on the light.
+        lit: whether its color depends on the light.
     """
 
     corners: FloatArray
@@ -192,7 +192,7 @@ def jpeg(picture: npt.NDArray[np.uint8], most: int) -> bytes:
 
 
 def _shaded(shape: Shape) -> npt.NDArray[np.float32]:
-    """Compute the colours (n, 3) float32 of a shape's triangles: its colour times the
+    """Compute the colors (n, 3) float32 of a shape's triangles: its color times the
     light on each triangle's normal; unchanged if it is not lit.
 
     Values may exceed 255. A part `SKY` of the light comes from above, the rest from

@@ -2,12 +2,12 @@
 
 Every view but the beam's eye holds tube, sample and image whatever their distances, as
 large as a pane of its width and height allows (`Fitted`); the sample's own picture next
-to it is made in the same way. Source and detector are metres apart and a sample is
-centimetres high, so in none of them can the sample itself be large: the page shows it
+to it is made in the same way. Source and detector are meters apart and a sample is
+centimeters high, so in none of them can the sample itself be large: the page shows it
 close up in each pane.
 
 The beam's eye is in the focal spot and looks along the detector's normal, so the panel is
-an undistorted rectangle. Where the piercing point is off its centre the picture is
+an undistorted rectangle. Where the piercing point is off its center the picture is
 rendered larger and cropped by the page, since a browser's camera is symmetric. Units: m
 for viser, ratios for the page.
 """
@@ -28,7 +28,7 @@ from flexdt.twin.geometry.conventions import FloatArray
 Vector = tuple[float, float, float]
 MAX_SIZE_RATIO = 3.0
 """Largest width or height of the beam's eye, over the panel's; beyond, the camera
-looks at the panel's centre instead and the frame is no longer exact."""
+looks at the panel's center instead and the frame is no longer exact."""
 WIDE = 1.35
 """Aspect (width over height) of a pane whose size is not known yet."""
 MIN_ASPECT = 0.3
@@ -71,7 +71,7 @@ WAYS: Final = {
 
 @dataclass(frozen=True)
 class Standpoint:
-    """A camera: metres, and its vertical opening angle [rad]."""
+    """A camera: meters, and its vertical opening angle [rad]."""
 
     position: Vector
     look_at: Vector
@@ -93,7 +93,7 @@ class Fitted:
         points: (n, 3) [m], all of which are in the picture.
         ways: directions of the look.
         fov: vertical opening [rad].
-        around: (3,) [m], centre of the camera's turns.
+        around: (3,) [m], center of the camera's turns.
     """
 
     points: FloatArray
@@ -223,7 +223,7 @@ def fitted(
         points: (n, 3) [m].
         way: direction of the look.
         fov: vertical opening [rad].
-        around: (3,) [m], centre of the camera's turns.
+        around: (3,) [m], center of the camera's turns.
         aspect: the pane's width over its height.
     """
     ahead = np.asarray(way) / np.linalg.norm(way)

@@ -41,7 +41,7 @@ class World:
 
     Attributes:
         view: geometry of an image of this moment, one row that knows its shape.
-        source, detector: focal spot and centre of the image (3,) [mm].
+        source, detector: focal spot and center of the image (3,) [mm].
         u, v: step to the next column and to the next row (3,) [mm].
         axis: point of the rotation axis at the sample's reference height (3,) [mm].
         stage: from the object's frame to the world.
@@ -91,7 +91,7 @@ class World:
         return self.view.piercing_points().reshape(2)
 
     def pixel(self, column: float, row: float) -> FloatArray:
-        """Compute the centre of a pixel (column, row), in the world's frame, (3,) [mm].
+        """Compute the center of a pixel (column, row), in the world's frame, (3,) [mm].
 
         The first pixel is (0, 0), at the top left; parts of pixels and places outside the
         image are allowed."""
@@ -195,10 +195,10 @@ def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
 def beads_on(
     cone_vec: Sequence[float], beads: FloatArray, world: World, shape: tuple[int, ...]
 ) -> list[list[float]]:
-    """Project bead centres into an image of geometry `cone_vec` (object's frame).
+    """Project bead centers into an image of geometry `cone_vec` (object's frame).
 
     Bead order is kept; beads outside the image, by more than half a pixel, are left out. Pixel
-    centres are whole numbers. `cone_vec`: twelve numbers, with the correction in force; `beads`:
+    centers are whole numbers. `cone_vec`: twelve numbers, with the correction in force; `beads`:
     (k, 3) [mm], the sample's own frame; `world`: pose of the sample on the stage; `shape`:
     (rows, cols) of the image. Returns those within the image, (column, row) in pixels."""
     points = world.stage.inverse @ world.sample @ beads

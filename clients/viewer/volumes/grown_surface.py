@@ -3,7 +3,7 @@ stage.
 
 Voxels above Otsu's threshold are dense. The mesh is a surface net: a vertex in each cell
 with corners on both sides, at the mean of the crossings of its edges, and four
-neighbouring cells joined around each edge that crosses (S. Gibson, Constrained elastic
+neighboring cells joined around each edge that crosses (S. Gibson, Constrained elastic
 surface nets, 1998).
 """
 

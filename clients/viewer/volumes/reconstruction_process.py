@@ -77,9 +77,9 @@ class LiveReconstruction:
 
     def stop(self) -> None:
         """End the running reconstruction, if there is one, and forget the request;
-        its task is cancelled, not waited for.
+        its task is canceled, not waited for.
 
-        Open requests are cancelled (`ask` returns None), and the newest line is cleared.
+        Open requests are canceled (`ask` returns None), and the newest line is cleared.
         `close` waits for the end.
         """
         if self._task is not None:
@@ -133,8 +133,8 @@ class LiveReconstruction:
 
         The newest line is kept in `newest`. However this ends, the process is killed. The
         spare process is used if there is one, else one is started. An answer to a
-        cancelled request is dropped; lines other than answers go to `tell`. After a
-        normal end open requests are cancelled.
+        canceled request is dropped; lines other than answers go to `tell`. After a
+        normal end open requests are canceled.
 
         Args:
             asked: the words of its first line.

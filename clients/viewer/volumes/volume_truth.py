@@ -132,7 +132,7 @@ def _seen(
 
 
 def _means_of_pairs(data: Float32Array, axis: int) -> Float32Array:
-    """Compute the means of neighbours along an axis, one fewer than there are.
+    """Compute the means of neighbors along an axis, one fewer than there are.
 
     The input is not changed; data have at least one entry along `axis`.
     """

@@ -399,7 +399,7 @@ def _work(store: Store, pool: Executor, started: float, tell: Tell | None) -> No
     """Compute the missing items on the pool and store each outcome as it comes.
 
     At least 4 items are in flight, at most `MAX_IN_FLIGHT`, and of `MAX_WAITING_BYTES` in
-    all. At an error the calls that have not begun are cancelled.
+    all. At an error the calls that have not begun are canceled.
 
     Args:
         store: of the batch.

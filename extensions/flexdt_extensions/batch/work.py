@@ -190,7 +190,7 @@ def _camera(
 
     Returns:
         Camera (None for a made-up detector), shape (rows, cols), pixel [mm], and shift of
-        the ROI from the panel's centre along columns and rows [mm].
+        the ROI from the panel's center along columns and rows [mm].
 
     Raises:
         TwinError: the ROI is not on the sensor.
@@ -322,7 +322,7 @@ def _draw_place(
         rng: generator.
 
     Returns:
-        The centre [mm]; None for a ball that does not fit into the cylinder, or if none
+        The center [mm]; None for a ball that does not fit into the cylinder, or if none
         was found in MAX_TRIES.
     """
     if radius > wide or radius > high:
@@ -648,7 +648,7 @@ def _rendered(plan: Plan, item: Item, model: BeadModel) -> Scan:
 
 
 def _seen_points(plan: Plan, item: Item, model: BeadModel) -> Scan:
-    """Project the centres of an item's beads, and add noise.
+    """Project the centers of an item's beads, and add noise.
 
     Args:
         plan: of the batch.

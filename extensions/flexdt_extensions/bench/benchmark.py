@@ -211,7 +211,7 @@ def untuned_cases() -> list[Case]:
         ("near", cube, near, "source 1 mm off the box"),
         ("flat", (4, 1024, 1024), {"height": 100.0}, "4 slices of 1024^2, from above"),
         ("long", (2000, 32, 32), {}, "a rod 2000 voxels long"),
-        ("far", C1_SHAPE, far, "C1, 100 times as far"),
+        ("far", C1_SHAPE, far, "C1, 100 times as far away"),
     ]
     c1 = partial(noise, C1_SHAPE)
     aniso = partial(noise, C1_SHAPE, (0.1, 0.2, 0.05))

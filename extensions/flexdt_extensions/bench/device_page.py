@@ -416,7 +416,7 @@ def page(document: Document) -> str:
     """Format the document of `run_device_bench` as one page of Markdown: device, table of
     targets, and for each case the times by views a call [ms].
     """
-    head = "| target | to be accepted | wanted | measured | met |\n|---|---|---|---|---|"
+    head = "| target | minimum | goal | measured | met |\n|---|---|---|---|---|"
     lines = [f"# {document['device']}", "", head, *map(row, document["targets"]), ""]
     for name, seen in document["cases"].items():
         lines += [f"{name}, by views a call; ms for the whole call:", ""]
@@ -429,7 +429,7 @@ def geometries(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Convert volume and views to ASTRA's dictionaries. Safe without a GPU.
 
-    ASTRA's z, y, x order is flexdt's; its volumes are centred where flexdt's are, in mm.
+    ASTRA's z, y, x order is flexdt's; its volumes are centered where flexdt's are, in mm.
 
     Returns:
         Volume geometry and projection geometry.

@@ -139,7 +139,7 @@ def joseph(
 def rtk_geometry(rows: FloatArray) -> Any:
     """Convert cone_vec rows (n, 12) to RTK's geometry object.
 
-    Panel directions are normalised: pitches are not part of it.
+    Panel directions are normalized: pitches are not part of it.
 
     Raises:
         ValueError: RTK rejects a view.
@@ -179,7 +179,7 @@ def rtk_volume(
 
 
 def rtk_stack(images: Float32Array, rows: FloatArray) -> Any:
-    """Convert projections to an ITK image with the panel's centre at the origin [mm],
+    """Convert projections to an ITK image with the panel's center at the origin [mm],
     pixel (0, 0) first.
 
     Args:

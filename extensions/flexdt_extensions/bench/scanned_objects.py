@@ -30,7 +30,7 @@ NOISE_COUNT: Final = 32
 
 def field_mm(scan: ConeVec, shape: tuple[int, int]) -> float:
     """Compute the radius about the z axis that the first view of a circle sees on both
-    sides [mm], to the centres of the outer columns.
+    sides [mm], to the centers of the outer columns.
     """
     ends = (np.array([0.0, shape[1] - 1.0]) - (shape[1] - 1) / 2)[:, None]
     ray = (scan.detector[0] + ends * scan.u[0] - scan.source[0])[:, :2]

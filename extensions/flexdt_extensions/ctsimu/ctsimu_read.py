@@ -1,6 +1,6 @@
 """A CTSimU scenario (file formats 1.0 to 1.2) to the geometry of its frames.
 
-Centres, orientations, deviations about any axis and pivot and drifts of all amounts are
+Centers, orientations, deviations (about any axis and pivot) and drifts of all of these are
 evaluated frame by frame, once as reconstruction knows them and once as they really are. The
 object's frame is the stage's (u, v, w). Parallel beams, drifting axes and files older than 1.0
 are errors.
@@ -43,7 +43,7 @@ _AXES: Final = {
     for name in reference
 }
 Pose = tuple[FloatArray, ...]
-"""Source, panel's centre, u, v; centre and axes of the stage; all in the world."""
+"""Source, panel's center, u, v; center and axes of the stage; all in the world."""
 Beside = Callable[[str], str]
 """Text of a file by its name in the scenario."""
 
@@ -90,9 +90,9 @@ class PlacedPart:
     Attributes:
         center: at the first frame (3,) [mm].
         axes: u, v, w as columns (3, 3).
-        moves: drifts of the three coordinates of the centre [mm], added to it.
+        moves: drifts of the three coordinates of the center [mm], added to it.
         deviations: in the order in which they are applied.
-        on_stage: whether centre and axes are in the stage's coordinates, not the world's.
+        on_stage: whether center and axes are in the stage's coordinates, not the world's.
     """
 
     center: FloatArray
@@ -300,7 +300,7 @@ class ScenarioReader:
         pitch: Sequence[float],
         real: bool,
     ) -> list[Pose]:
-        """Compute source, detector, u, v, and the stage's centre and axes, for each frame [mm].
+        """Compute source, detector, u, v, and the stage's center and axes, for each frame [mm].
 
         Args:
             parts: source, detector and stage.
@@ -309,7 +309,7 @@ class ScenarioReader:
             real: with the deviations unknown to reconstruction.
 
         Returns:
-            Tuples of a frame: source, detector, u, v, stage's centre (3,), and its axes
+            Tuples of a frame: source, detector, u, v, stage's center (3,), and its axes
             as columns (3, 3).
         """
         still = np.zeros(self._count)
@@ -358,7 +358,7 @@ class ScenarioReader:
         references.
 
         Its vectors need not be of unit length, but at right angles and in the reference
-        of the centre. Keys of file formats before 1.0 (`centre`, `deviation`) are errors.
+        of the center. Keys of file formats before 1.0 (`centre`, `deviation`) are errors.
 
         Args:
             part: its object in the scenario.
@@ -366,8 +366,8 @@ class ScenarioReader:
             allowed: references, each the names of three axes.
 
         Returns:
-            The part: centre [mm], axes, drifts of the centre and deviations, in the
-            reference of its centre.
+            The part: center [mm], axes, drifts of the center and deviations, in the
+            reference of its center.
 
         Raises:
             ExchangeError: names file, key and the allowed values.
@@ -441,7 +441,7 @@ class ScenarioReader:
         """Read a deviation: a translation [mm] or a rotation [rad] about a pivot.
 
         It is unknown to the reconstruction only where `known_to_reconstruction` is false.
-        The axis is normalised; the default pivot is the part's own centre.
+        The axis is normalized; the default pivot is the part's own center.
 
         Args:
             value: its object in the scenario.
@@ -702,7 +702,7 @@ class ScenarioReader:
 
 
 def seen_from(pose: Pose, center: FloatArray, axes: FloatArray) -> FloatArray:
-    """Convert a pose to a cone_vec row (12,) in another frame, whose centre and axes
+    """Convert a pose to a cone_vec row (12,) in another frame, whose center and axes
     are the world's."""
     source, detector, u, v = pose[:4]
     return np.concatenate(
@@ -717,20 +717,20 @@ def place(
     real: bool,
     stage: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute centre and axes of a part in one frame.
+    """Compute center and axes of a part in one frame.
 
     They are in the world, or for a sample on the stage in the stage's (u, v, w). The part
     is turned first, then deviated in order, then moved by its drifts.
 
     Args:
-        part: centre, axes, deviations and drifts.
+        part: center, axes, deviations and drifts.
         turn: (n,) of the part about its w [rad].
         frame: number of the frame.
         real: include deviations and drifts that are unknown to reconstruction.
-        stage: centre and axes of the stage, for a sample.
+        stage: center and axes of the stage, for a sample.
 
     Returns:
-        Centre (3,) [mm], and axes as columns (3, 3).
+        Center (3,) [mm], and axes as columns (3, 3).
     """
     center = part.center.copy()
     axes = part.axes
@@ -764,7 +764,7 @@ def place(
 
 
 def _has_axes(center: object, reference: Sequence[str]) -> bool:
-    """Return whether a centre states a coordinate along each axis of a reference."""
+    """Return whether a center states a coordinate along each axis of a reference."""
     return isinstance(center, dict) and set(reference) <= center.keys()
 
 

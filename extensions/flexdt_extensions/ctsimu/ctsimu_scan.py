@@ -61,10 +61,10 @@ class MeshSample:
         where: its place in the scenario, for errors.
         file: name of the surface in the scenario; the middle of its box is the sample's
             origin.
-        scale_mm: millimetres for each unit of the file, along r, s, t.
+        scale_mm: millimeters for each unit of the file, along r, s, t.
         substance: filling.
         views: (n, 12) cone_vec rows of the unbinned pixels in the sample's r, s, t [mm].
-        on_stage: centre (3,) and axes as columns (3, 3) in the stage's frame; None if it
+        on_stage: center (3,) and axes as columns (3, 3) in the stage's frame; None if it
             moves.
     """
 
@@ -89,15 +89,15 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class GreyValues:
-    """How the energy that a pixel collects becomes its grey value.
+    """How the energy that a pixel collects becomes its gray value.
 
     Attributes:
         imin, imax: without X-rays and of the brightest open pixel of the first frame; `imax` is
             None where one of the next two is given.
-        factor, offset: grey values for each joule, and without any.
-        table: (k, 2) joules and grey value.
+        factor, offset: gray values for each joule, and without any.
+        table: (k, 2) joules and gray value.
         snr: signal-to-noise ratio of the brightest open pixel; None: no noise.
-        noise: (k, 2) grey value and its signal-to-noise ratio, instead of `snr`.
+        noise: (k, 2) gray value and its signal-to-noise ratio, instead of `snr`.
         blur_mm: standard deviation of the unsharpness.
         mtf: (k, 2) frequency [1/mm] and modulation, instead of it.
         lag: part of a frame's signal that the next one still shows.
@@ -134,7 +134,7 @@ class ScenarioScan:
         mAs: (n,) charge of one frame [mAs].
         spot_mm: standard deviations of the focal spot along the panel's u and v.
         response: (e,) energy that a photon leaves in the detector on average [keV].
-        grey: the detector's conversion of energy to grey values.
+        grey: the detector's conversion of energy to gray values.
         averages: frames in a projection.
         dark, flat: reference images.
         scattering: whether scatter is simulated.
@@ -326,7 +326,7 @@ class _ScanReader(ScenarioReader):
     def _material_of(self, given: object, where: str) -> tuple[str, Substance | None]:
         """Read a material: density and mass fractions of its elements.
 
-        Fractions are normalised to 1. A density of 0, or a composition without an amount,
+        Fractions are normalized to 1. A density of 0, or a composition without an amount,
         is vacuum.
 
         Args:
@@ -586,14 +586,14 @@ class _ScanReader(ScenarioReader):
         return part * energy * Spectrum(np.ones_like(energy)).behind(*layers).fluence
 
     def _grey(self) -> GreyValues:
-        """Read the detector's grey values, noise, blur, lag and bits.
+        """Read the detector's gray values, noise, blur, lag and bits.
 
-        Grey values are by a file or factor and offset, else by range. Photons of one
+        Gray values are by a file or factor and offset, else by range. Photons of one
         energy need a range, unless their spectrum is from a file. Missing values are no
         noise, no blur, no lag and 16 bits.
 
         Returns:
-            The conversion from energy to grey values.
+            The conversion from energy to gray values.
 
         Raises:
             ExchangeError: names file, key and the allowed values.

@@ -2,7 +2,7 @@
 
 The scenario's world is (x, y, z) = our (y, -x, z) with the first nominal source at the origin,
 as CTSimU's own examples have it. Nominal motion is the stage's rotation and, where motors move
-otherwise, drifts of centres. Each offset of the correction is a deviation that reconstruction
+otherwise, drifts of centers. Each offset of the correction is a deviation that reconstruction
 knows; any further misalignment is a deviation that reconstruction does not know. The
 orientation of the panel must be the same in all frames.
 """
@@ -337,12 +337,12 @@ def _drift(values: FloatArray, unit: str, known: bool) -> dict[str, Any]:
 def _part(
     places: FloatArray, u: FloatArray, w: FloatArray, deviations: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Make a part's object: centre (with drifts where it moves), orientation, deviations.
+    """Make a part's object: center (with drifts where it moves), orientation, deviations.
 
     Only a coordinate that changes has drifts.
 
     Args:
-        places: (n, 3) of its centre in our world [mm].
+        places: (n, 3) of its center in our world [mm].
         u, w: directions (3,) in the scenario's world.
         deviations: of `_Deviations`.
     """

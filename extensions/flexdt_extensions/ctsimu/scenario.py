@@ -3,7 +3,7 @@ Python.
 
 `ctsimu_scan` reads the scenario; exact paths through the samples' meshes, the spectrum,
 scatter and blur are those of `flexdt.simulate`. Only the detector's conversion of
-collected energy differs: a scenario gives grey values and a signal-to-noise ratio.
+collected energy differs: a scenario gives gray values and a signal-to-noise ratio.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class ScenarioImages:
         seed: of the noise, >= 0; None for images without noise.
         rays: along each side of a pixel that an edge of a sample reaches, whose signals
             are averaged; "auto" keeps the error on an edge below the scenario's noise, or
-            the rounding to grey values, as `flexdt.simulate` does.
+            the rounding to gray values, as `flexdt.simulate` does.
 
     Raises:
         ExchangeError, TwinError: a request of the scenario that is not possible, and its
@@ -124,7 +124,7 @@ class ScenarioImages:
             ) from None
 
     def _mesh(self, sample: MeshSample) -> TriangleMesh:
-        """Read a sample's mesh, from the scenario's folder, centred on its bounding box
+        """Read a sample's mesh, from the scenario's folder, centered on its bounding box
         and scaled to mm.
 
         Raises:
@@ -153,7 +153,7 @@ class ScenarioImages:
         ]
 
     def _distance(self, frame: int) -> Float32Array:
-        """Compute the distance from the source to each pixel's centre in a frame, (rows,
+        """Compute the distance from the source to each pixel's center in a frame, (rows,
         cols) [mm].
         """
         row = self.scan.views[frame]
@@ -165,7 +165,7 @@ class ScenarioImages:
 
     def _with_air(self, paths: Float32Array, distance: Float32Array) -> Float32Array:
         """Add the environment, if there is one, as the last layer: what the samples leave
-        of the distance to the pixel's centre, at least 0 [mm]."""
+        of the distance to the pixel's center, at least 0 [mm]."""
         if self.scan.environment is None:
             return paths
         rest = np.maximum(distance - paths.sum(axis=0), np.float32(0.0))
@@ -291,7 +291,7 @@ class ScenarioImages:
 
     @cached_property
     def _open_noise(self) -> float:
-        """Noise of the brightest open pixel in a projection relative to its grey value, that
+        """Noise of the brightest open pixel in a projection relative to its gray value, that
         of rounding included (standard deviation)."""
         grey = self.scan.grey
         ratio = grey.snr
@@ -307,7 +307,7 @@ class ScenarioImages:
         return float(self._grey(self._open[0].max(keepdims=True)).max())
 
     def _grey(self, energy: Float32Array) -> Float32Array:
-        """Convert collected energy [keV] to grey values: linearly to the range if it has
+        """Convert collected energy [keV] to gray values: linearly to the range if it has
         a maximum (that of the brightest open beam), else by the table over energy [J],
         else by offset and factor.
         """
@@ -363,7 +363,7 @@ class ScenarioImages:
         averages: int,
         noise: int | None,
     ) -> FloatArray:
-        """Compute the grey values of the binned pixels.
+        """Compute the gray values of the binned pixels.
 
         In this order: blur, conversion, noise, clipping to 0 and the detector's largest
         value, mean over each binned pixel. There is no noise without a seed.

@@ -26,7 +26,7 @@ def evidence(
     hand, and, after all results, if a figure is missed.
 
     Yields:
-        For each case its source and licence, a table of published and own figures, and what
+        For each case its source and license, a table of published and own figures, and what
         was not read; then all as document of --json.
     """
     from flexdt_extensions.evidence.real_data import CASES

@@ -1,6 +1,6 @@
 """Real data, their published answers, and flexdt's.
 
-Nothing of the data is in the repository: their licences are their own. Each case names
+Nothing of the data is in the repository: their licenses are their own. Each case names
 its files below the folder of `flexdt evidence --data`, and their origin.
 """
 

@@ -96,7 +96,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
         images; nothing is reconstructed.
 
         Args:
-            seed: of the episode; None goes on with the present random numbers.
+            seed: of the episode; None continues the current random sequence.
             options: not used.
 
         Returns:
@@ -140,7 +140,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
             `best`, `work`.
 
         Raises:
-            LimitError: no action of this environment.
+            LimitError: not an action of this environment.
             ResetNeeded: the episode has not begun, or is over.
         """
         algorithm, strength, nonnegative = choices(
@@ -243,7 +243,7 @@ class ReconstructionEnv(gymnasium.Env[Observation, Action]):
 
 
 def _roughness(volume: Volume) -> float:
-    """Compute the mean step between neighbouring voxels over the rms value, at most 1."""
+    """Compute the mean step between neighboring voxels over the rms value, at most 1."""
     data = np.asarray(volume.data, np.float64)
     steps = np.mean([np.abs(np.diff(data, axis=a)).mean() for a in range(3)])
     return min(1.0, float(steps) / max(float(np.sqrt(np.mean(data**2))), 1e-12))

@@ -78,7 +78,7 @@ class InformationTask:
         self._information = np.eye(len(SIX)) / PRIOR**2
 
     def reset(self, lab: Lab, rng: np.random.Generator) -> None:
-        """Draw new true offsets of a few millimetres and degrees, and forget what was
+        """Draw new true offsets of a few millimeters and degrees, and forget what was
         measured: only the prior is known. `lab` is ignored.
         """
         shift = rng.normal(0.0, 2.0, 3)

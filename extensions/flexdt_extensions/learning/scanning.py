@@ -142,7 +142,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         pose (SOD 600 mm), without a frame.
 
         Args:
-            seed: of the episode; None goes on with the present random numbers.
+            seed: of the episode; None continues the current random sequence.
             options: not used.
 
         Returns:
@@ -173,7 +173,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
             the task's figures with `collision`.
 
         Raises:
-            LimitError: no action of this environment.
+            LimitError: not an action of this environment.
             ResetNeeded: the episode has not begun, or is over.
         """
         if self._over:
@@ -223,7 +223,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
             action: of the kind of this environment.
 
         Raises:
-            LimitError: no action of this environment.
+            LimitError: not an action of this environment.
         """
         if self.kind == "discrete":
             return {"rot_obj": 360.0 * choices(action, [SECTORS])[0] / SECTORS}
@@ -276,7 +276,7 @@ class ScanEnv(gymnasium.Env[Observation, Action]):
         return np.asarray(worth - self.time_weight * seconds)
 
     def _observe(self) -> Observation:
-        """Return the last projection as grey values (rows, cols, 1), or the state as a
+        """Return the last projection as gray values (rows, cols, 1), or the state as a
         vector clipped to -1 to 1: sine and cosine of the angle, places, frames left,
         time, the task's state and the sectors seen.
         """

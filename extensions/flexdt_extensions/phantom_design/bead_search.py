@@ -64,7 +64,7 @@ def share_identified(
     Args:
         model: the beads.
         planned: the scans; at most `frames` frames of them are used.
-        trials: scans; each has a random start angle and offsets of a few millimetres.
+        trials: scans; each has a random start angle and offsets of a few millimeters.
         seed: of angles, offsets and noise.
         frames: see `planned`.
     """
@@ -326,14 +326,14 @@ def design(
         radius_mm: of every bead.
         count: beads to place.
         planned: the scans to be determined.
-        criterion: to be minimised.
+        criterion: to be minimized.
         slots: (m,) number of the brick of each seat; None: all in one.
         per_slot: most beads in one slot; None: any.
         gap_mm: least distance between two beads' surfaces.
         unlike_mm: least `turned_likeness`; symmetric sets have none.
         starts: random starts.
         seed: the same seed gives the same design.
-        bounds_mm: (3,) half extents within which centres may afterwards be moved off the
+        bounds_mm: (3,) half extents within which centers may afterwards be moved off the
             seats.
         resolution_mm: smallest step of those moves.
 
@@ -431,7 +431,7 @@ def turned_likeness(beads: FloatArray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Rules:
-    """Which sets are allowed: beads per slot, distance between centres, and how unlike itself a
+    """Which sets are allowed: beads per slot, distance between centers, and how unlike itself a
     set must be when turned [mm]."""
 
     slot: npt.NDArray[np.int64]
@@ -490,7 +490,7 @@ def _exchange_beads(
         table: of the seats.
         rules: distances, slots and likeness.
         chosen: (k,) seats to begin with.
-        criterion: to be minimised.
+        criterion: to be minimized.
 
     Returns:
         The seats, and their score; inf if no allowed set was found.
@@ -551,7 +551,7 @@ def _polish(
     bounds: FloatArray,
     resolution: float,
 ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Move beads off their seats, one at a time, to the best of 26 neighbours on a grid,
+    """Move beads off their seats, one at a time, to the best of 26 neighbors on a grid,
     while that helps and the rules allow it.
 
     The step begins at an eighth of the largest half extent, and is halved when no bead
@@ -563,7 +563,7 @@ def _polish(
         radius: of the beads [mm].
         planned: the scans.
         weight: of each frame.
-        criterion: to be minimised.
+        criterion: to be minimized.
         rules: distances and likeness.
         bounds: (3,) half extents [mm].
         resolution: smallest step [mm].

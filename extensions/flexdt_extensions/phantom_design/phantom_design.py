@@ -544,7 +544,7 @@ def brick_drawings(
 
     Args:
         work: the stack.
-        beads: centres (k, 3) in the object's frame [mm].
+        beads: centers (k, 3) in the object's frame [mm].
         radius: of a bead [mm].
     """
     v = work.measures
@@ -585,11 +585,11 @@ def level_drawings(
     """Draw each height at which a block holds beads, seen from above, lowest first.
 
     The steps give each bead's place from the axis [mm], and where to interrupt the print.
-    Heights that agree in a thousandth of a millimetre are one.
+    Heights that agree in a thousandth of a millimeter are one.
 
     Args:
         size: of the block along x, y and z [mm].
-        beads: centres (k, 3) in the object's frame [mm].
+        beads: centers (k, 3) in the object's frame [mm].
         radius: of a bead [mm].
     """
     wide, deep, tall = size

@@ -30,7 +30,7 @@ class Seats:
     """Places for beads in a stack, lowest brick first.
 
     Attributes:
-        places: (m, 3) bead centres [mm, object frame].
+        places: (m, 3) bead centers [mm, object frame].
         brick: (m,) number of the brick, 0 the lowest.
     """
 
@@ -128,7 +128,7 @@ def stack_phantom(
     Args:
         work: the stack.
         name: of the phantom.
-        beads: (k, 3) centres, each within 1e-6 mm of a seat [mm, object frame].
+        beads: (k, 3) centers, each within 1e-6 mm of a seat [mm, object frame].
         radius_mm: of every bead.
         bead_material: of every bead.
 
@@ -164,8 +164,8 @@ def stack_phantom(
 
 
 def grid_seats(size_mm: Sequence[float], radius_mm: float, step_mm: float) -> FloatArray:
-    """Make a grid of centres (m, 3) of beads inside a cuboid about the origin that may
-    touch its faces [mm]; its step is about `step_mm`, with at least two centres along
+    """Make a grid of centers (m, 3) of beads inside a cuboid about the origin that may
+    touch its faces [mm]; its step is about `step_mm`, with at least two centers along
     each axis.
 
     Raises:

@@ -216,8 +216,8 @@ def _rotate(x: float, z: float, angle: float | FloatArray) -> FloatArray:
 
 
 def binary_centroids(centres: FloatArray, radius_px: float) -> FloatArray:
-    """Compute centroids (..., 2) [px] of the pixels whose centres are within a radius of
-    each centre, each pixel counted alike.
+    """Compute centroids (..., 2) [px] of the pixels whose centers are within a radius of
+    each center, each pixel counted alike.
     """
     base = np.floor(centres)
     x, y = np.moveaxis(centres - base, -1, 0)[..., None]
@@ -449,7 +449,7 @@ def moved_beads(
 def radiographs(
     scene: Scene, cone: ConeVec, beam: EffectiveBeam, seed: Sequence[int]
 ) -> list[Float32Array]:
-    """Simulate line integrals as a scanner's normalisation gives them, one (rows, cols) a
+    """Simulate line integrals as a scanner's normalization gives them, one (rows, cols) a
     frame.
 
     Args:
@@ -477,9 +477,9 @@ def radiographs(
 def found_beads(
     images: Sequence[Float32Array], cone: ConeVec, model: BeadModel
 ) -> BeadModel:
-    """Reconstruct a scan near the model's beads and find their centres in the volume.
+    """Reconstruct a scan near the model's beads and find their centers in the volume.
 
-    A centre is the mean place of voxels above half the 99.5 % quantile of the bead's
+    A center is the mean place of voxels above half the 99.5 % quantile of the bead's
     grid, weighted by the excess. The beads' tolerance is `TOLERANCE_MM`.
 
     Args:

@@ -44,7 +44,7 @@ def author() -> Mapping[str, Any]:
 
 @lru_cache
 def placements() -> Mapping[str, Any]:
-    """Load object placements of experiment 6.6, labelled assumed."""
+    """Load object placements of experiment 6.6, labeled assumed."""
     return tomllib.loads(_text("placements.toml"))
 
 

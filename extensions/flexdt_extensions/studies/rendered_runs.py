@@ -70,7 +70,7 @@ def intensities(
     shape: tuple[int, int],
     fine: int = FINE,
 ) -> Float32Array:
-    """Compute the transmitted share of the open beam at pixel centres, near beads as a
+    """Compute the transmitted share of the open beam at pixel centers, near beads as a
     mean over the pixel.
 
     Args:

@@ -310,8 +310,8 @@ def heat_map(
     """Draw a table of numbers as SVG, green where they are good and red where not; each
     cell shows its number.
 
-    With `good_below` colours follow the logarithm of value over limit, up to a factor of
-    100 either way; otherwise there are two colours.
+    With `good_below` colors follow the logarithm of value over limit, up to a factor of
+    100 either way; otherwise there are two colors.
 
     Args:
         values: (rows, columns); nan is white.

@@ -32,7 +32,7 @@ class CalibrationOptions(TypedDict, total=False):
             "none" is all exactly. Of a cause (`exclude`) its largest one.
         exclude: causes of residuals that cannot be: gap (the panel is in one piece),
             distortion, shape, beads, arc, rows, angles, motion, spots.
-        start: offsets to begin with [mm, deg, 1], about which priors are centred.
+        start: offsets to begin with [mm, deg, 1], about which priors are centered.
         bound: sigma [mm, deg] above which the result is not identifiable; default: 5.
         markers: CSV or NumPy file with the pixels at which markers were seen, or such marks
             themselves: (frame, marker, column, row, sigma), sigma None where it is not known;

@@ -57,7 +57,7 @@ class DatasetFrames:
         return len(self._dataset)
 
     def look(self, detector: SpotFinder) -> list[FrameSpots]:
-        """Detect the beads of every frame in its normalised image, in threads.
+        """Detect the beads of every frame in its normalized image, in threads.
 
         Returns:
             The spots of each frame, in order; a frame that is missing or unreadable has
@@ -78,7 +78,7 @@ class DatasetFrames:
         return self._each(one)
 
     def windows(self, plan: Windows) -> Float32Array:
-        """Cut the windows of every frame, in threads; only their pixels are normalised.
+        """Cut the windows of every frame, in threads; only their pixels are normalized.
 
         Args:
             plan: corners and side of the windows.

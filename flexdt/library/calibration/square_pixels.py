@@ -95,7 +95,7 @@ class ResampledRows:
             return None
 
     def of(self, image: Counts | Float32Array) -> Float32Array:
-        """Compute means of an image over the new rows, centred on the old ones.
+        """Compute means of an image over the new rows, centered on the old ones.
 
         Args:
             image: (old rows, cols).

@@ -616,7 +616,7 @@ class ImageSet:
         """Return line integrals of one projection as they were recorded or given, (rows,
         cols).
 
-        Given integrals are copied; otherwise the counts are normalised."""
+        Given integrals are copied; otherwise the counts are normalized."""
         arrays = self.arrays
         if arrays is None or arrays.integrals is None:
             return self.normalisation(self.counts(index))

@@ -22,12 +22,12 @@ MARKS: Final = (
     (2, (48, 112, 255), "blue", "starved: hardly a count above dark"),
     (4, (255, 200, 0), "yellow", "edge at which the sample is cut off"),
 )
-"""Bits of a pixel's mark, each with its colour (red, green, blue), the colour's name and
+"""Bits of a pixel's mark, each with its color (red, green, blue), the colour's name and
 the mark's meaning."""
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 PNG_GREY = 0
 PNG_COLOUR = 2
-"""Colour types of a PNG: grey, and red, green and blue."""
+"""Colour types of a PNG: gray, and red, green and blue."""
 PNG_FILTER_UP: Final = 2
 """Filter type of a row that holds differences from the row above."""
 PNG_EFFORT: Final = 3
@@ -71,7 +71,7 @@ def windowed(
 def coloured(
     grey: npt.NDArray[np.uint8], marks: npt.NDArray[np.generic]
 ) -> npt.NDArray[np.uint8]:
-    """Draw the marked pixels of a grey picture (rows, cols) in colour, (rows, cols, 3)
+    """Draw the marked pixels of a gray picture (rows, cols) in color, (rows, cols, 3)
     red first; later marks over earlier ones; those of outermost pixels (bit 4) as a band.
 
     Args:
@@ -102,7 +102,7 @@ def _inward(edge: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
 
 
 def legend(marks: npt.NDArray[np.generic]) -> list[str]:
-    """List the meanings of the colours that occur in a picture of marks, with their share
+    """List the meanings of the colors that occur in a picture of marks, with their share
     of the pixels (but for the band at the edges); [] without marks.
 
     Args:
@@ -130,7 +130,7 @@ def png(
     """Encode an image as PNG, with percentiles as black and white.
 
     `image`: (rows, cols). `dark_is_dense`: encode the negative. `marks`: (rows, cols), see
-    `MARKS`; unless all are zero the picture is in colour. `like`: image whose percentiles are
+    `MARKS`; unless all are zero the picture is in color. `like`: image whose percentiles are
     taken; `image` itself without.
     Raises ValueError: it has no pixels, or is no image.
     """
@@ -148,7 +148,7 @@ def png_of(pixels: npt.NDArray[np.uint8]) -> bytes:
     """Encode 8-bit pixels as PNG, without loss.
 
     Args:
-        pixels: (rows, cols) grey, or (rows, cols, 3) red first.
+        pixels: (rows, cols) gray, or (rows, cols, 3) red first.
 
     Source:
         ISO/IEC 15948: chunks IHDR, IDAT, IEND; each row is stored as its difference from

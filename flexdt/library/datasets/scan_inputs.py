@@ -1,4 +1,4 @@
-"""Carry out what a user says of a scan's images and geometry, the same at every door."""
+"""Carry out what a user says of a scan's images and geometry, the same everywhere."""
 
 from __future__ import annotations
 

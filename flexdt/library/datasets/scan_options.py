@@ -1,4 +1,4 @@
-"""What a user may say of a scan's images, in the same words at every door.
+"""What a user may say of a scan's images, in the same words everywhere.
 
 `ScanOptions` declares it once, for `flexdt.open`, `read_tiffs`, `DataSet.from_arrays` and the
 commands; `image_sources`, `reference_images` and `cutting` carry it out.
@@ -24,7 +24,7 @@ class ScanOptions(TypedDict, total=False):
             number of counts, an array (rows, cols) or (k, rows, cols), a path, several paths, a
             pattern of names in the scan's folder, or FILE.h5:/PATH.
         open_beam: counts of the beam without a sample, a number or an image: for scans without
-            a flat image, such as 65535 of normalised ones.
+            a flat image, such as 65535 of normalized ones.
         angles: of the stage [deg], one for each view in place of the geometry's; a geometry of
             one view is turned to all of them. An array, a text file with a number a line, or
             FILE.h5:/PATH in the unit that it states.

@@ -119,7 +119,7 @@ def data_page(data: ImageSet) -> NotebookPage:
     row.
 
     At most `MAX_PICTURES` of the projections that are present, evenly spread, all in one
-    grey window by percentiles. The sinogram has the rows of these, views downwards.
+    gray window by percentiles. The sinogram has the rows of these, views downwards.
 
     Args:
         data: line integrals are shown, or counts where there is no flat image.
@@ -356,7 +356,7 @@ def _sliding(
     `SIDE_PX`, the slider, and below it the name of the one shown.
 
     Args:
-        pictures: name and grey pixels (rows, columns) of each, at least one.
+        pictures: name and gray pixels (rows, columns) of each, at least one.
         what: name of the pictures.
         tall: height of a pixel over its width.
         start: index of the one that is shown at first.

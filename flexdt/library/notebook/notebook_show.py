@@ -107,7 +107,7 @@ def volume_widgets(
         pictures[name] = widgets.Image(format="png", width=WIDTH_PX)
 
     def draw(_: object = None) -> None:
-        """Draw the three slices in the grey window, each with white lines at the two
+        """Draw the three slices in the gray window, each with white lines at the two
         others; the argument is ignored.
         """
         black, white = chosen.value

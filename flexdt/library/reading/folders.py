@@ -695,7 +695,7 @@ def _from_texts(
     """Read a data set by the scanner's settings texts.
 
     Projections beyond the number in the text are read with a warning; fewer are missing
-    frames. A cancelled script makes the data set incomplete. See `rebuild` for the
+    frames. A canceled script makes the data set incomplete. See `rebuild` for the
     geometry: where machine, motors or profile do not give it, the printed figures do, and
     the data set has no profile.
 

@@ -9,6 +9,7 @@ from flexdt.twin.dataset.format_table import (
     BEAM,
     GEOMETRY,
     FormatTable,
+    dropped,
     noted,
     noted_all,
     used,
@@ -17,15 +18,17 @@ from flexdt.twin.dataset.format_table import (
 INFO: Final = "ImageInfo/"
 ZEISS: Final = FormatTable(
     "Zeiss",
-    "the readers CIL, dxchange, xrmreader and mbirjax; the format is unpublished and no "
-    "scanner's file was at hand",
+    "the readers CIL, dxchange, xrmreader and mbirjax; the format is unpublished, and no "
+    "file from a real scanner was available",
     (
         used(f"{INFO}ImageHeight", "rows", "the images"),
         used(f"{INFO}ImageWidth", "columns", "the images"),
         used(f"{INFO}NoOfImages", "planned images", "the views"),
         used(f"{INFO}ImagesTaken", "images that were taken", "the views"),
         used(f"{INFO}DataType", "type of the pixels", "the images"),
-        used(f"{INFO}XrayGeometry", "1: a cone beam", "a parallel beam is refused"),
+        used(
+            f"{INFO}XrayGeometry", "1: a cone beam", "checked; a parallel beam is refused"
+        ),
         used(
             f"{INFO}StoRADistance",
             "source to axis of each view",
@@ -44,19 +47,22 @@ ZEISS: Final = FormatTable(
         used(
             f"{INFO}YPosition",
             "height of the stage",
-            "a helix is refused",
+            "checked; a helix is refused",
             "um",
             of=GEOMETRY,
         ),
         used(f"{INFO}Angles", "angle of each view", "the views", "deg", of=ANGLES),
         used(f"{INFO}Voltage", "voltage of the tube", "reconstruct with material=", "kV"),
-        used(
-            f"{INFO}CameraOffset", "shift of the camera", "it is not applied", of=GEOMETRY
+        dropped(
+            f"{INFO}CameraOffset",
+            "shift of the camera",
+            "a warning names its value",
+            of=GEOMETRY,
         ),
-        used(
+        dropped(
             f"{INFO}CameraFineRotation",
             "roll of the camera",
-            "it is not applied",
+            "a warning names its value",
             of=GEOMETRY,
         ),
         used(
@@ -70,7 +76,11 @@ ZEISS: Final = FormatTable(
             "Alignment/X-Shifts", "shift of each view", "the panel", "pixels", of=GEOMETRY
         ),
         used(
-            "Alignment/Y-Shifts", "the same upwards", "the panel", "pixels", of=GEOMETRY
+            "Alignment/Y-Shifts",
+            "vertical shift of each view, positive upwards",
+            "the panel",
+            "pixels",
+            of=GEOMETRY,
         ),
         used("ImageData*", "images", "the images"),
         used("ReferenceData/*", "open beam", "the flat image", of=BEAM),
@@ -111,7 +121,7 @@ ZEISS: Final = FormatTable(
             "of the file",
         ),
     ),
-    "There are no two statements of one thing; of the references the first group that has "
-    "images counts.",
+    "nothing is stated twice; of several groups of reference images, the first one that "
+    "contains images is used.",
     example='fx.open("tooth.txrm")',
 )

@@ -1,4 +1,4 @@
-"""Pixels of a data set that do not respond as their neighbours do, interpolated."""
+"""Pixels of a data set that do not respond as their neighbors do, interpolated."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MIN_TURN_SHARE: Final = 0.2
 def without_bad_pixels(
     dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
 ) -> tuple[ImageSet, list[str]]:
-    """Find the pixels of a data set that do not respond as their neighbours do, and mark them to
+    """Find the pixels of a data set that do not respond as their neighbors do, and mark them to
     be interpolated. `dataset`: the scan; `cone_vec`: of all its frames; `counts`: gives those of
     a frame by its index. Returns the data set, and one warning that describes the pixels;
     without any, the data set itself and []."""
@@ -45,7 +45,7 @@ def without_bad_pixels(
 def _bad_pixels(
     dataset: ImageSet, cone_vec: ConeVec, counts: Callable[[int], Counts]
 ) -> BadPixels | None:
-    """Find pixels that do not respond as their neighbours do.
+    """Find pixels that do not respond as their neighbors do.
 
     Views are read evenly spread; they are kept in memory for the next pass as far as they
     need at most `MAX_KEPT_BYTES`. For a panel on its side rows and columns are exchanged

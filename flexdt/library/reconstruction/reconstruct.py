@@ -185,7 +185,7 @@ class ScanFrames:
         sides_known: their geometry is corrected by beads, which determine the direction of
             rotation and mirrored images.
         copies: take the corrected images as they are read, to find the errors of FDK.
-        known: of the energies of their line integrals.
+        known: what is known about the energies of their line integrals.
     """
 
     dataset: ImageSet
@@ -301,11 +301,11 @@ def grid_of(views: ScanFrames, request: VolumeRequest) -> Grid:
     """Choose the grid of a requested volume; missing values are those of the field
     of view, of a helix without the ends that FDK cannot fill.
 
-    A requested shape without centre is centred at the origin.
+    A requested shape without a center is centered at the origin.
 
     Args:
         views: to reconstruct.
-        request: voxel size, shape and centre, each may be None.
+        request: voxel size, shape and center, each may be None.
 
     Raises:
         GeometryError: voxels that are implausibly large for the field of view.
@@ -426,8 +426,8 @@ def reconstruct_dataset(
     """Reconstruct a data set into a file, which appears under its name only when
     complete.
 
-    Each image is read once, but by workers. Those that are needed again are kept in
-    memory, or in a file without a name in the folder of `out`.
+    Each image is read once, except when workers make the slabs. Those that are needed
+    again are kept in memory, or in a file without a name in the folder of `out`.
 
     Args:
         dataset: from `load_dataset`.
@@ -441,7 +441,7 @@ def reconstruct_dataset(
 
     Returns:
         JSON-able: file, slices, algorithm, shape (z, y, x), voxel_mm, center_mm, frames,
-        missing, correction (edge units), accuracy (see `Volume.accuracy`; None but for
+        missing, correction (edge units), accuracy (see `Volume.accuracy`; None except for
         FDK), warnings, seconds.
 
     Raises:
@@ -518,7 +518,7 @@ def reconstruct_dataset(
 
 
 def about_volume(views: ScanFrames, request: VolumeRequest) -> dict[str, str]:
-    """Say of what a volume is and how it was made, for the file: word -> one line.
+    """Say what a volume shows and how it was made, for the file: word -> one line.
 
     Args:
         views: the frames.

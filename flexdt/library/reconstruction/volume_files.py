@@ -243,7 +243,7 @@ class MiddleSlices:
         """Write PNG files next to `path`, named as it is without its ending, with _xy, _xz
         and _yz; returns their paths.
 
-        All three share one grey scale: the 0.5th and 99.5th percentile of their values.
+        All three share one gray scale: the 0.5th and 99.5th percentile of their values.
         """
         every = np.concatenate([image.ravel() for image in self.images.values()])
         written = []

@@ -420,7 +420,7 @@ def _map_values(path: Path, offset: int, sizes: str) -> npt.NDArray[np.float32]:
 
 def _read_nrrd(path: Path) -> Stored:
     """Read voxels (memory-mapped), edges [mm], the first voxel's place [mm] and True (it
-    is the first voxel's, not the centre) from an .nrrd file.
+    is the first voxel's, not the center) from an .nrrd file.
     """
     fields, begin = _header(path, ":", b"\n\n")
     _require_own(fields, NRRD_FIELDS)
@@ -433,7 +433,7 @@ def _read_nrrd(path: Path) -> Stored:
 
 
 def _read_tiff(path: Path) -> Stored:
-    """Read voxels, edge [mm], centre [mm] and False (it is the centre, not the first
+    """Read voxels, edge [mm], center [mm] and False (it is the center, not the first
     voxel's place) from a .tif file.
     """
     import tifffile
@@ -448,7 +448,7 @@ def _read_tiff(path: Path) -> Stored:
 
 def _read_mha(path: Path) -> Stored:
     """Read voxels (memory-mapped), edges [mm], the first voxel's place [mm] and True (it
-    is the first voxel's, not the centre) from an .mha file, or from an .mhd with its values
+    is the first voxel's, not the center) from an .mha file, or from an .mhd with its values
     in a file beside it."""
     fields, begin = _header(path, "=", b"ElementDataFile =")
     with path.open("rb") as file:
@@ -470,7 +470,7 @@ def _read_mha(path: Path) -> Stored:
 
 def _read_nifti(path: Path) -> Stored:
     """Read voxels, edges [mm], the first voxel's place [mm] and True (it is the first
-    voxel's, not the centre) from a .nii.gz file, by its own scale.
+    voxel's, not the center) from a .nii.gz file, by its own scale.
 
     Raises:
         ValueError: another unit of length, values that are not real, or turned axes.
@@ -503,7 +503,7 @@ def _upright(axes: FloatArray) -> list[float]:
 
 
 def _read_hdf5(path: Path) -> Stored:
-    """Read voxels, edge [mm], centre [mm] and False (it is the centre, not the first
+    """Read voxels, edge [mm], center [mm] and False (it is the center, not the first
     voxel's place) from an .h5 file.
     """
     with hdf5_file(path, "a volume in .h5") as file:

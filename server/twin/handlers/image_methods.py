@@ -161,7 +161,7 @@ async def ray(twin: TwinServer, client: Client, params: p.RayGet) -> p.RayResult
     """Compute the path lengths [mm] by material on the ray of a pixel, in the public
     geometry at the present pose.
 
-    The pixel is (column, row) and may be fractional; centres are whole numbers, so the
+    The pixel is (column, row) and may be fractional; centers are whole numbers, so the
     edge is half a pixel further.
 
     Raises:

@@ -33,7 +33,7 @@ async def move(twin: TwinServer, client: Client, params: p.Move) -> p.MoveResult
     """Start a move of motors; with `plan` find and start a way around obstacles instead
     (see `_move_around_obstacles`).
 
-    A way that is under way is cancelled once the motors have the new command; a refused
+    A way that is under way is canceled once the motors have the new command; a refused
     move that changes nothing leaves it. The answer is sent at once, or with `wait` when
     the motors rest.
 
@@ -84,7 +84,7 @@ async def _unreached_targets(twin: TwinServer, wanted: Mapping[str, float]) -> l
 def _cancelling_detour(twin: TwinServer) -> Iterator[None]:
     """Run a command of motion, then cancel a way around obstacles and publish the change.
 
-    The way is cancelled if the command succeeds or has changed the motors' programmes.
+    The way is canceled if the command succeeds or has changed the motors' programmes.
     After a command that raises without a change it goes on.
     """
     before = twin.scanner.programmes
@@ -125,7 +125,7 @@ async def _move_around_obstacles(
     task = twin.detours.go(way)
 
     def report(task: asyncio.Task[None]) -> None:
-        """Log a warning if the way has ended by an error; nothing if it was cancelled."""
+        """Log a warning if the way has ended by an error; nothing if it was canceled."""
         if not task.cancelled() and task.exception() is not None:
             twin.tell("warning", f"the way around ended early: {task.exception()}")
 
@@ -150,7 +150,7 @@ def jog(twin: TwinServer, client: Client, params: p.Jog) -> p.MoveResult:
     """Run an axis at a velocity until the lease ends or as far as it is free (see
     `twin.motion.drives.plan_jog`).
 
-    A way around obstacles is cancelled.
+    A way around obstacles is canceled.
 
     Returns the duration [s], a warning if the jog is cut short, and `moves` None.
     """
@@ -191,7 +191,7 @@ async def set_axis(
 
 @answers(p.AXES_STOP)
 def stop(twin: TwinServer, client: Client, params: Empty) -> w.Stopped:
-    """Bring the motors to rest; a running scan pauses, and a way around obstacles is cancelled.
+    """Bring the motors to rest; a running scan pauses, and a way around obstacles is canceled.
 
     It counts as a stop even if nothing moves. X-rays stay as they are.
     Returns the state with the stopping motion.

@@ -26,7 +26,7 @@ async def set_sample(
     twin: TwinServer, client: h.Client, params: p.SampleSet
 ) -> p.SampleResult:
     """Put a shipped phantom, an upload or nothing on the stage; without an offset it is
-    centred.
+    centered.
 
     It needs control and an idle twin, after the reading and when it is done. The sample
     is read first, in a thread.

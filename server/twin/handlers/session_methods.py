@@ -64,7 +64,7 @@ def control(twin: TwinServer, client: Client, params: p.Control) -> p.ControlRes
 
     Acquire renews the controller's own lease. Release by another than the controller
     changes nothing. Force takes control from a controller and logs that. When a
-    controller loses or releases control, its way around obstacles is cancelled.
+    controller loses or releases control, its way around obstacles is canceled.
 
     Returns:
         The controller (None: nobody), and whether it is the client.

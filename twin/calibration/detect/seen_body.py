@@ -1,7 +1,7 @@
 """The phantom's own body in the images: its attenuation and its place.
 
 The body is printed or glued together, and its description states neither its attenuation
-in this beam nor, to a hundredth of a millimetre, its place relative to the beads:
+in this beam nor, to a hundredth of a millimeter, its place relative to the beads:
 `see_body` estimates both from the surroundings of some beads, by least squares with
 rendered bodies, before the body is subtracted.
 """
@@ -162,7 +162,7 @@ def adjusted(
     `ADJUSTED_SAMPLE` uncrowded beads, by one linear step.
 
     The noise of the few windows of `see_body` leaves its place some thousandths of a
-    millimetre off, in all frames alike.
+    millimeter off, in all frames alike.
 
     Args:
         images: (n, k, side, side) line integrals.
@@ -272,7 +272,7 @@ def _shift_of_beads(
     """Compute how the spot of a bead moves with the bead, by a difference of 1 mm.
 
     `cone`: m views; `model`: the beads; `beads`: (m,) number of the bead in each view; `shape`:
-    (rows, cols). Returns (m, 2, 3) pixels (column, row) for a millimetre along x, y and z."""
+    (rows, cols). Returns (m, 2, 3) pixels (column, row) for a millimeter along x, y and z."""
     one = np.arange(len(beads))
     there = cone.project_points(model.beads, shape)[one, beads]
     moved = [cone.project_points(model.beads + e, shape)[one, beads] for e in np.eye(3)]
@@ -310,7 +310,7 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 def _shifted(shape: Shape, shift: tuple[float, float, float]) -> Shape:
-    """Return a copy of a shape (a polyhedron, or one with a centre) moved by `shift` (x,
+    """Return a copy of a shape (a polyhedron, or one with a center) moved by `shift` (x,
     y, z) [mm].
     """
     if isinstance(shape, ConvexPolyhedron):

@@ -68,12 +68,12 @@ _Tried = tuple[FloatArray, FloatArray, FloatArray]
 def balls_of(model: BeadModel, contrast: FloatArray, size: float = 1.0) -> Scene:
     """Make a scene of the beads alone, in the order of the model.
 
-    Each attenuates so that its line integral through the centre is the contrast, at least
+    Each attenuates so that its line integral through the center is the contrast, at least
     0.001.
 
     Args:
         model: the phantom's beads.
-        contrast: (k,) line integrals through their centres.
+        contrast: (k,) line integrals through their centers.
         size: factor on the radii.
     """
     return Scene(
@@ -354,7 +354,7 @@ def sharpness(patches: Patches, sample: npt.NDArray[np.intp], blur: float) -> Sh
     among `BLURS` and `VEILS` and a parabola about it.
 
     A bead of another size than described shows here too; a spot cut by the edge has its
-    centre where its radius puts it.
+    center where its radius puts it.
 
     Args:
         patches: the windows.

@@ -188,15 +188,15 @@ def solve(matrix, right, out):  # type: ignore[no-untyped-def]
 def background(image, x0, y0, inner, outer, plane):  # type: ignore[no-untyped-def]
     """Fit a robust plane through the ring around (x0, y0), and return its noise.
 
-    The ring's median and spread come first, so that a neighbour or an edge in the ring
+    The ring's median and spread come first, so that a neighbor or an edge in the ring
     does not pull the plane; then two fits without pixels beyond 3 and 2.5 spreads. NaN
     pixels are left out.
 
     Args:
         image: (rows, cols) line integrals.
-        x0, y0: centre [px].
+        x0, y0: center [px].
         inner, outer: radii of the ring [px].
-        plane: (3,) value at the centre, d/dx and d/dy, written; the median without slope
+        plane: (3,) value at the center, d/dx and d/dy, written; the median without slope
             if a fit fails.
 
     Returns:
@@ -521,7 +521,7 @@ def _level(image, mask, masked, x, y, inner, outer):  # type: ignore[no-untyped-
         image: (rows, cols).
         mask: (rows, cols), 0 where a pixel must not be used.
         masked: whether the mask counts.
-        x, y: centre [px].
+        x, y: center [px].
         inner, outer: radii of the ring [px].
     """
     rows, cols = image.shape
@@ -558,7 +558,7 @@ def fit_ball(  # type: ignore[no-untyped-def]
     Args:
         image: (rows, cols) line integrals.
         mask: (rows, cols) uint8, 0 where a pixel must not be used; or (0, 0): all may.
-        x0, y0: start [px]; the centre may be outside the image.
+        x0, y0: start [px]; the center may be outside the image.
         radius: minor semi-axis of the spot [px]; peak: line integral that is seen in its
             middle.
         stretch: (3,) direction of the major semi-axis (unit, column and row) and its

@@ -1,6 +1,6 @@
 """Windows around the predicted positions of the beads: planned, cut out, mended, rendered.
 
-With them the second measurement can subtract the phantom's body and the neighbouring
+With them the second measurement can subtract the phantom's body and the neighboring
 beads without processing entire images.
 """
 
@@ -33,7 +33,7 @@ LEAST_SEEN = 4
 MAX_STILL_SPREAD = 0.1
 """Largest spread of a dead pixel's values over the frames, in units of the noise."""
 DEAD_SIGMAS = 5.0
-"""Least difference of a dead pixel from its neighbours in some frame, in units of the noise."""
+"""Least difference of a dead pixel from its neighbors in some frame, in units of the noise."""
 EVEN_STEPS = (0.7548776662466927, 0.5698402909980532)
 """Parts of a pixel from one window's lattice to the next one's: multiples of them are spread
 evenly over a square (powers of 1 / 1.3247..., the root of x^3 = x + 1)."""
@@ -64,7 +64,7 @@ class Windows:
     Attributes:
         corner: (n, k, 2) column and row of each window's first pixel.
         side: windows are side x side pixels.
-        predicted: (n, k, 2) expected spot centres [px].
+        predicted: (n, k, 2) expected spot centers [px].
         radii: (n, k) minor semi-axes of the spots [px].
         stretch: (n, k, 3) direction of the major semi-axis and its ratio to the minor.
         share: (n, k) share of each spot in the image, 0 to 1.
@@ -158,7 +158,7 @@ def shadow_ellipses(
     Args:
         model: k beads.
         cone: geometry of n frames.
-        predicted: (n, k, 2) centres of the spots [px].
+        predicted: (n, k, 2) centers of the spots [px].
         shape: (rows, cols) of the detector.
 
     Returns:
@@ -189,7 +189,7 @@ def _semi_axes(model: BeadModel, cone: ConeVec) -> tuple[FloatArray, FloatArray]
 
 def _disc_share(t: FloatArray) -> FloatArray:
     """Compute the share of a unit disc on the near side of a line at signed distance `t`
-    from its centre: 0 for -1 and less, 1 for 1 and more."""
+    from its center: 0 for -1 and less, 1 for 1 and more."""
     s = np.clip(t, -1.0, 1.0)
     return np.asarray(0.5 + (s * np.sqrt(1.0 - s * s) + np.arcsin(s)) / math.pi)
 
@@ -240,10 +240,10 @@ def overlap(windows: Windows, frame: int, bead: int) -> tuple[Part, Part]:
 
 
 def mended(images: Float32Array, windows: Windows) -> Float32Array:
-    """Fill dead pixels of the windows from their neighbours.
+    """Fill dead pixels of the windows from their neighbors.
 
     A dead pixel is constant over `LEAST_SEEN` frames or more (within `MAX_STILL_SPREAD`
-    of the noise), which noise allows no other pixel, and differs from its neighbours by
+    of the noise), which noise allows no other pixel, and differs from its neighbors by
     `DEAD_SIGMAS` in some frame. Areas wider than `WIDEST_DEAD` pixels both ways are left:
     they may be starved.
 
@@ -288,7 +288,7 @@ def mended(images: Float32Array, windows: Windows) -> Float32Array:
 
 
 def _filled(image: Float32Array, dead: npt.NDArray[np.bool_]) -> Float32Array:
-    """Fill dead pixels by the mean of their finite neighbours (of four), from the edges
+    """Fill dead pixels by the mean of their finite neighbors (of four), from the edges
     of each dead area inwards.
 
     Args:
@@ -319,7 +319,7 @@ def without_beads(scene: Scene, model: BeadModel) -> Scene:
 
 def _is_bead(solid: Solid, model: BeadModel) -> bool:
     """Check whether a solid of the scene is one of the phantom's beads: a sphere whose
-    centre is within half a radius of the nearest bead's; False for any other shape.
+    center is within half a radius of the nearest bead's; False for any other shape.
     """
     if not isinstance(solid.shape, Sphere):
         return False
@@ -533,7 +533,7 @@ def ways(windows: Windows, model: BeadModel, turning: Turning) -> FloatArray:
 
 
 def lattice(fine: int) -> list[tuple[float, float]]:
-    """Return places (column, row) of fine^2 rays in a pixel, from its centre.
+    """Return places (column, row) of fine^2 rays in a pixel, from its center.
 
     A square grid turned so that no two rays share a column or a row: an edge along either is
     placed to 1 / fine^2 pixels, where a straight grid places it to 1 / fine.
@@ -565,7 +565,7 @@ def spread_lattice(
         moment: number of a moment of the exposure; others have another shift.
 
     Returns:
-        For each ray its place (column, row) from the pixel's centre, (n, k, 2), and its
+        For each ray its place (column, row) from the pixel's center, (n, k, 2), and its
         weight (n, k), of sum 1 over the rays.
     """
     n, k = windows.corner.shape[:2]
@@ -606,7 +606,7 @@ def window_rays(
         scene: to render.
         cone: geometry of n frames.
         windows: k windows a frame.
-        place: right and down from the pixel's centre, (2,) or (n, k, 2) [px].
+        place: right and down from the pixel's center, (2,) or (n, k, 2) [px].
 
     Returns:
         (n, k, side, side) line integrals.
@@ -728,7 +728,7 @@ def free_of_others(windows: Windows, frame: int, bead: int) -> npt.NDArray[np.bo
 
 
 def pixel_noise(flat: Float32Array, edge: int, width: int) -> FloatArray:
-    """Estimate the noise of each window's pixels from the median difference of neighbours
+    """Estimate the noise of each window's pixels from the median difference of neighbors
     in six rows at its top and bottom.
 
     Args:

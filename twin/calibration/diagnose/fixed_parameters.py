@@ -204,7 +204,7 @@ def _unchecked(
 def judge_priors(loose: FitResult, exact: Container[str] = ()) -> PriorsJudged:
     """Compare priors with the images.
 
-    In units of its loose prior an estimate of covariance C moves from the prior's centre
+    In units of its loose prior an estimate of covariance C moves from the prior's center
     by K = 1 - C times the error of the parameter, and by noise of covariance C K.
     Directions whose variance the images lower by less than `MIN_VARIANCE_DROP` are left
     out.
@@ -371,7 +371,7 @@ def _priors_off(
 ) -> Finding:
     """Make the error that images contradict priors, of which each of these may be wrong.
 
-    Told lengths are witnesses of one millimetre: freed together they would say nothing.
+    Told lengths are witnesses of one millimeter: freed together they would say nothing.
     """
     told = [one for one in believed if one.is_told]
     if told:
@@ -413,7 +413,7 @@ def _without_each(
     Args:
         values, vectors: eigenvalues and vectors of the estimates' covariance, (p,), (p, p).
         some: (p,) which directions the images tell.
-        moved: (p,) estimates less the priors' centres.
+        moved: (p,) estimates less the priors' centers.
 
     Returns:
         How much the squared residuals fall without each prior, and value and standard

@@ -3,7 +3,7 @@
 The number of the pose that a frame shows, less its own number, is hidden and mostly
 stays from frame to frame. The most likely sequence (Viterbi, IEEE Trans. Inf. Theory 13
 (1967) 260) is found from the distances of each frame's spots from the beads' places at
-neighbouring poses: a stage that rises as it turns is at another angle and height.
+neighboring poses: a stage that rises as it turns is at another angle and height.
 """
 
 from __future__ import annotations

@@ -297,7 +297,7 @@ def _changes(model: BeadModel, poses: Poses, sizes: FloatArray) -> dict[str, _Pl
 def _foreseen(problem: FitProblem, known: Known) -> Stated:
     """Draw what scans of a plan state; the same in every call.
 
-    The fit is linearised where a scanner and a phantom are (small offsets turn the image of
+    The fit is linearized where a scanner and a phantom are (small offsets turn the image of
     the axis by more than it is known), what causes add at the plan.
 
     Args:

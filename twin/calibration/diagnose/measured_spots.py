@@ -30,7 +30,7 @@ BLURRED_FIRST = 0.4
 """The same before blur is measured: blurred spots are wider."""
 SIZE_TOLERANCE = 0.008
 """Standard deviation of the beads' radii from the stated ones, as a share (assumed: that of
-moulded balls; balls of bearings have a tenth of it)."""
+molded balls; balls of bearings have a tenth of it)."""
 MAX_BODY_LOG = 0.5
 """Logarithm of the body's seen over its described attenuation from which it is reported:
 beam hardening alone stays below."""
@@ -268,7 +268,7 @@ def exposure_arc(arc_deg: float, share: float, done: str) -> Finding:
 
 
 def shadows_drawn_out(name: str, share: float, step_rad: float, found: float) -> Finding:
-    """Make the error that exposures draw shadows out so much that beads are not recognised.
+    """Make the error that exposures draw shadows out so much that beads are not recognized.
 
     `name`: of the scan; `share`: of a step that an exposure lasts; `step_rad`: of the stage,
     from frame to frame; `found`: share of the beads in view with a round shadow.

@@ -8,7 +8,7 @@ from typing import Final
 
 SAME_SCALE: Final = math.log(1.25)
 """Logarithm of the ratio of two lengths that may be the same in a nominal geometry, whose SOD may
-be off by centimetres."""
+be off by centimeters."""
 LIKELY_SCALE: Final = 0.5 * SAME_SCALE
 """The same, of two that are likely to be: at half of what may be. So 1.6 is no 2."""
 OF_LENGTHS: Final[Mapping[float, str]] = {

@@ -476,7 +476,7 @@ def estimate_geometry(
 
     Args:
         tracks: (n, k, 2) pixels (column, row), nan where a bead was not seen.
-        phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centres (k, 3)
+        phantom: k beads: anything with `beads` and `bead_radius_mm`, or their centers (k, 3)
             [mm].
         geometry: nominal geometry of each of the n frames.
         free: parameters to estimate, of `told_lengths.PARAMETERS`; parameters without a
@@ -492,7 +492,7 @@ def estimate_geometry(
         bead_tolerance_mm: the standard deviation of their prior; None is the phantom's own.
         start: start values, and the values of parameters that are not free.
         reading: of eq. 5.4.
-        centre: kind of the positions: projected centres or outline centres; or the bias
+        centre: kind of the positions: projected centers or outline centers; or the bias
             factor of each position, (n, k), such as 0.8 for a centroid weighted by chord
             length.
         sampling_px: see `certify`; 0 for points, about 0.001 for centroids in images.
@@ -503,7 +503,7 @@ def estimate_geometry(
             known. A parameter that is not in `free` is estimated along with them. None:
             all parameters that are not free are exactly at `start` (`fit.priors` has
             widths for scanners).
-        prior_centre: the offsets those priors are centred on; None is the start of the first
+        prior_centre: the offsets those priors are centered on; None is the start of the first
             group.
         bound: sigma [mm, deg] beyond which a direction counts as not determined.
         panel: terms of a distortion of the panel, estimated too; None: no distortion.
@@ -826,7 +826,7 @@ def axis_in_image(pose: Poses, offsets: Offsets, middle: FloatArray) -> FloatArr
     Args:
         pose: one frame.
         offsets: of the geometry.
-        middle: the detector's centre (column, row) [px].
+        middle: the detector's center (column, row) [px].
 
     Returns:
         (3,): column where the axis crosses the middle row [px], its angle to the columns

@@ -10,11 +10,11 @@ here is flipped. `fit.problem` builds and checks the arguments.
 Forward model of frame n and bead b, in the world frame: q = c + T R (b + m - tau), c = O
 + dO + pivot * tau (pivot 1: eq. 5.4 as printed; 0: R(b - tau) + O), R clockwise from
 above by alpha + angle_scale * phi, T the axis tilt, m the place of a stage on the
-turntable. With w = q - S, g = D - S and the pixel steps u, v the bead's centre is
-projected to column w.P / w.n and row w.Q / w.n from the detector's centre, P = v x g, Q =
+turntable. With w = q - S, g = D - S and the pixel steps u, v the bead's center is
+projected to column w.P / w.n and row w.Q / w.n from the detector's center, P = v x g, Q =
 g x u, n = u x v: Cramer's rule, valid for any u, v. The spot of a ball is displaced from
-the projection of its centre: spot = a + bias * (r / depth)^2 (a - foot), bias 1 for the
-outline's centre, 0.8 for the chord-weighted centroid, 0 for points (calibration.md,
+the projection of its center: spot = a + bias * (r / depth)^2 (a - foot), bias 1 for the
+outline's center, 0.8 for the chord-weighted centroid, 0 for points (calibration.md,
 "Images").
 
 All of a frame is in a matrix from beads to columns, rows and depths: the product of three
@@ -304,7 +304,7 @@ class Data(NamedTuple):
         middle: (3,) point of the phantom about which it grows [mm].
         radius: (k,) [mm].
         bias: (n, k) factor of the sphere-centre bias.
-        measured: (n, k, 2) pixels from the detector's centre.
+        measured: (n, k, 2) pixels from the detector's center.
         whiten: (n, k, 3): rows (w0, w1; 0, w2) that turn residuals into unit variance.
         active: indices of the parameters to differentiate by.
         colmap: (groups, 28) column of each parameter or -1.
@@ -339,12 +339,12 @@ def evaluate(  # type: ignore[no-untyped-def]
     Args:
         data: see `Data`.
         params: (groups, 28) values [mm, rad, 1], in the order of `told_lengths.PARAMETERS`.
-        beads: (k, 3) centres in the object's frame [mm].
+        beads: (k, 3) centers in the object's frame [mm].
         panel: (t,) coefficients of the panel's distortion.
         use: (n, k) which observations count; others are predicted alone.
         huber: threshold on the whitened residual's length; inf for plain least squares.
         want: 0 cost only, 1 normal equations into hess, grad, 2 unweighted rows into jac.
-        predicted: (n, k, 2) out, pixels from the detector's centre.
+        predicted: (n, k, 2) out, pixels from the detector's center.
         norms: (n, k) out: length of the whitened residual; -1 where not used.
         jac: (2 n k, columns) out when want = 2 (rows of unused observations stay zero).
         hess: (columns, columns), grad: (columns,): set to 0; out when want = 1.

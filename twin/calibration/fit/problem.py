@@ -93,7 +93,7 @@ class Centre(enum.Enum):
     """Kind of a measured bead position; the value is the sphere-centre bias factor."""
 
     POINT = 0.0
-    """The projection of the bead's centre itself (simulated points)."""
+    """The projection of the bead's center itself (simulated points)."""
     OUTLINE = 1.0
     """Centre of the spot's elliptic outline."""
 
@@ -310,7 +310,7 @@ class FitProblem:
     Attributes:
         poses: nominal geometry of the n frames.
         model: the phantom's beads.
-        measured: (n, k, 2) pixels from the detector's centre, 0 where unseen.
+        measured: (n, k, 2) pixels from the detector's center, 0 where unseen.
         whiten: (n, k, 3) upper triangle (w0, w1; 0, w2) that makes residuals unit variance.
         seen: (n, k) which positions were measured.
         group: (n,) group of each frame.
@@ -319,7 +319,7 @@ class FitProblem:
         layout: columns.
         reading: of eq. 5.4.
         bias: (n, k) sphere-centre bias factor of each position.
-        origin: (n, 2) pixel coordinates (column, row) of the detector's centre.
+        origin: (n, 2) pixel coordinates (column, row) of the detector's center.
         prior_mean, prior_sigma: of each column, internal units; sigma inf without a
             prior.
         panel: terms of the panel's distortion; None: no distortion.
@@ -555,7 +555,7 @@ class FitProblem:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Evaluate the problem at `x`; see `evaluate`, also for the arguments.
 
-        Returns predictions from the detector's centre, norms of the whitened residuals, and the
+        Returns predictions from the detector's center, norms of the whitened residuals, and the
         Jacobian. Raises TwinError: a bead is at or behind the source."""
         cost, predicted, norms, jac, _, _ = self.evaluate(x, use, want)
         if not np.isfinite(cost):
@@ -835,8 +835,8 @@ def panel_heights(measured: FloatArray, origin: FloatArray) -> FloatArray:
     """Compute the row of each position, from the panel's middle, in panel heights, (n, k).
 
     Args:
-        measured: (n, k, 2) pixels from the panel's centre.
-        origin: (n, 2) pixel coordinates of that centre.
+        measured: (n, k, 2) pixels from the panel's center.
+        origin: (n, 2) pixel coordinates of that center.
     """
     return np.asarray(measured[..., 1] / (2.0 * origin[:, None, 1] + 1.0))
 
@@ -864,7 +864,7 @@ def turning_shifts(
 
     Args:
         poses: nominal geometry of the n frames.
-        beads: (k, 3) centres [mm].
+        beads: (k, 3) centers [mm].
         base: (groups, 28) values of PARAMETERS, internal units, in the reading.
         group: (n,) of each frame.
         reading: of eq. 5.4.

@@ -74,7 +74,7 @@ def correlation_length(
     Args:
         residual: (n, k, 2) px.
         use: (n, k).
-        group: (n,) frames of different groups are not neighbours.
+        group: (n,) frames of different groups are not neighbors.
 
     Returns:
         1 or more [frames].

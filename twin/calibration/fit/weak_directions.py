@@ -177,8 +177,8 @@ def weak_direction(
     """Name one direction of the column-scaled parameter space.
 
     Columns below a tenth of the largest share are left out. The column that is most
-    uncertain against its tolerance leads with factor 1; others are its change relative to
-    it.
+    uncertain relative to its tolerance comes first, with factor 1; each other factor is
+    that column's change relative to the first.
 
     Args:
         vector: (columns,) direction.

@@ -1,7 +1,7 @@
 """What is there where a scan's spots are not those of the phantom as it was said to stand.
 
 The balls that turn together (`constellation`) are compared with the phantom's beads. A phantom
-that leans or is aslant, one that was moved between two frames, and two of them are recognised and
+that leans or is aslant, one that was moved between two frames, and two of them are recognized and
 identified; another unit, other pixels and a mirror image are named.
 """
 
@@ -104,7 +104,7 @@ BEAD_SPREAD_MM: Final = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Recognised:
-    """What was recognised.
+    """What was recognized.
 
     Attributes:
         model: the beads as they stand.

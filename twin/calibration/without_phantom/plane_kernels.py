@@ -3,7 +3,7 @@
 Let b be the line through the sources of two views. In a plane through b the rays of either
 source cover the plane, and the integral of the views' line integrals g over sin(t) dt, where t
 is the angle between ray and b, is that of the object divided by the distance from b: the same
-for both, as long as b stays clear of the object. So is the integral over a bin of neighbouring
+for both, as long as b stays clear of the object. So is the integral over a bin of neighboring
 planes, which nothing needs to be smoothed for. A plane is known by its height over the source
 at the axis.
 """
@@ -40,7 +40,7 @@ def sum_planes(
 
     Args:
         sums: (n, cols, rows + 1), sums of g from the first row down.
-        views: (n, 12) source, panel's centre, u, v; the axis is z through the origin
+        views: (n, 12) source, panel's center, u, v; the axis is z through the origin
             [mm].
         pairs: (q, 2) indices of views.
         inwards: (q, 2) horizontal unit vector from the line through the sources to the

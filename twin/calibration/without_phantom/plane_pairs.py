@@ -182,7 +182,7 @@ class PlanePairs:
         to all bins (air that is not 0) or to all pairs as far apart (the flat image's
         noise); bins that are not valid do not count.
 
-        Each coarser level adds up neighbouring bins and pairs before it squares, and gives
+        Each coarser level adds up neighboring bins and pairs before it squares, and gives
         each pair the mean of its group. A group counts only its bins that are valid in all
         of its pairs, and is 0 with fewer than `FEWEST_BINS` of them.
 
@@ -301,7 +301,7 @@ class PlanePairs:
 
             def heights(at: FloatArray, v: FloatArray = v) -> FloatArray:
                 """Compute dz over the distance inwards, times `away`, of rays from each source
-                to points on its panel. `at`: (k, 2) columns and rows from the panel's centre;
+                to points on its panel. `at`: (k, 2) columns and rows from the panel's center;
                 `v`: (q, 12) views. Returns (q, k) [mm]."""
                 to = v[:, None, 3:6] - v[:, None, :3] + at[:, :1] * v[:, None, 6:9]
                 to = to + at[:, 1:] * v[:, None, 9:12]
@@ -322,7 +322,7 @@ class PlanePairs:
 
 
 def _widened(of_bins: FloatArray | npt.NDArray[np.bool_], bins: int) -> FloatArray:
-    """Sum up values of bins, (q, k), over so many neighbours each."""
+    """Sum up values of bins, (q, k), over so many neighbors each."""
     k = of_bins.shape[1] // bins
     return np.asarray(of_bins[:, : k * bins].reshape(len(of_bins), k, bins).sum(axis=2))
 
@@ -415,7 +415,7 @@ def _support(
         view: (12,) of the first frame.
 
     Returns:
-        Its radius about the axis [mm], and places (column, row) about the panel's centre
+        Its radius about the axis [mm], and places (column, row) about the panel's center
         at its upper end, its lower end and its sides where the image shows no air at the
         panel's edge.
 

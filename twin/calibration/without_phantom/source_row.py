@@ -23,11 +23,11 @@ GRID_HEIGHTS: Final = 25
 """Number of heights that are tried first."""
 MIN_LEAD_SIGMAS: Final = 2.0
 """Standard deviations by which the best of them must be better than any that is not its
-neighbour."""
+neighbor."""
 MIN_BEND_SIGMAS: Final = 2.5
 """Least curvature of the minimum, in its own standard deviations."""
 MIN_BEND_SHARE: Final = 0.05
-"""Least share of the curvature left without any two neighbouring blocks of heights."""
+"""Least share of the curvature left without any two neighboring blocks of heights."""
 ROUNDS: Final = 8
 FREE_ROUNDS: Final = 3
 """In which the level may change."""
@@ -150,7 +150,7 @@ def _first(
     """Find the height on a grid at which the views agree best.
 
     A minimum at the grid's end, or in a spike, does not count. Of the levels the surest
-    one is taken; it must be better than any height but its neighbours by
+    one is taken; it must be better than any height but its neighbors by
     `MIN_LEAD_SIGMAS`.
 
     Args:

@@ -3,7 +3,7 @@
 Structures in a gap are missing: beyond it everything appears nearer by its width, and the
 columns next to it differ as columns do that are further apart. The change of columns with
 their distance is seen in the frames themselves, everywhere else. Where edges of the
-turning object pass a border, the differences of neighbouring columns about it are
+turning object pass a border, the differences of neighboring columns about it are
 compared with those expected for a gap of each width: the likelihood of normal
 differences, each row of each frame at its own scale. The outline of the object looks like
 a gap, too, where its edges turn back, but it does so on both sides of the axis: the gain
@@ -170,7 +170,7 @@ def _gains(
     """Compute gains in log likelihood of gaps of all WIDTHS at each border over none, less the
     scatter of frames.
 
-    `edges`: differences of neighbouring columns, (k, 2 SIDE - 1); `place`: of each in a table of
+    `edges`: differences of neighboring columns, (k, 2 SIDE - 1); `place`: of each in a table of
     frames and borders, (k,); `shape`: of that table.
     Returns (w, b).
     """
@@ -189,7 +189,7 @@ def squares_by_distance(edges: FloatArray) -> PchipInterpolator:
     [px]; continued linearly beyond the columns compared.
 
     Args:
-        edges: differences of neighbouring columns, (k, 2 SIDE - 1).
+        edges: differences of neighboring columns, (k, 2 SIDE - 1).
 
     Returns:
         Function of the distance.
@@ -213,7 +213,7 @@ def likelihood(
     (k,), but for a constant and whatever the row's scale (Student).
 
     Args:
-        edges: differences of neighbouring columns, each row at its own scale, (k, 2 SIDE
+        edges: differences of neighboring columns, each row at its own scale, (k, 2 SIDE
             - 1).
         of_distance: as `squares_by_distance` gives it.
         width: of the gap [px]; 0: none.

@@ -2,7 +2,7 @@
 
 Over a full turn the mean projection is that of a body of revolution. Its possible faults
 are looked for here: frames that are repeated, gaps between angles, and a step between
-neighbours, which after a drift is the one between the last frame and the first; a slip
+neighbors, which after a drift is the one between the last frame and the first; a slip
 during the scan leaves both.
 """
 
@@ -34,7 +34,7 @@ DARKEST: Final = 8.0
 MEDIAN_OF_CHI_SQUARE: Final = 0.4549
 """Of one degree of freedom."""
 MIN_STEP_RATIO: Final = 5.0
-"""Least ratio of a step between neighbours to the usual spread (assumed)."""
+"""Least ratio of a step between neighbors to the usual spread (assumed)."""
 MIN_LEAD_RATIO: Final = 1.5
 """Least ratio of it to the next largest elsewhere: faces along the beam leave several."""
 MIN_DIRECTIONS: Final = 24
@@ -42,7 +42,7 @@ MIN_DIRECTIONS: Final = 24
 MAX_RETURN_SHARE: Final = 0.3
 """Sum of two steps relative to one below which they are one to and fro (assumed)."""
 WIDEST_GAP: Final = 4.5
-"""Largest gap between neighbouring angles, relative to the usual one: three frames missing."""
+"""Largest gap between neighboring angles, relative to the usual one: three frames missing."""
 BAND = 12
 BAND_PART = 20
 GROUPS = 7
@@ -71,7 +71,7 @@ class Turn:
         band_rows: middle row of each group.
         band_frames: frame of each of these views.
         repeated: indices of frames left out as repeated.
-        step_px: (columns, rows) by which the images step at most between neighbouring
+        step_px: (columns, rows) by which the images step at most between neighboring
             frames; 0 where no step is significant or separable.
         step_after: the frame before that step.
     """
@@ -285,9 +285,9 @@ def _thumb(image: Float32Array) -> Float32Array:
 def _step(
     views: Float32Array, gaps: FloatArray, first: int
 ) -> tuple[tuple[float, float], int]:
-    """Find the largest step between neighbours.
+    """Find the largest step between neighbors.
 
-    Each frame is compared with the third-order interpolation of its four neighbours on
+    Each frame is compared with the third-order interpolation of its four neighbors on
     the circle. A shift d between frame i - 1 and frame i leaves -d/2 in one of them and
     +d/2 in the other. A step and its return count as one.
 
@@ -342,6 +342,6 @@ def _step(
 
 
 def _far(n: int, place: int) -> npt.NDArray[np.bool_]:
-    """Mark places (n,) on the circle that are no near neighbours of one."""
+    """Mark places (n,) on the circle that are no near neighbors of one."""
     apart = np.abs(np.arange(n) - place)
     return np.asarray(np.minimum(apart, n - apart) > 2)

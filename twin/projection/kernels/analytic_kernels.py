@@ -127,12 +127,12 @@ def project_convex(
     source and at the pixel.
 
     Args:
-        quadric: (k, 13) whether a solid is curved, its matrix and centre.
+        quadric: (k, 13) whether a solid is curved, its matrix and center.
         slabs: slabs of all solids, one after the other.
         slab_range: (k, 2) first slab of each solid and the one after its last.
         shadow: (n, k, 4) rows and columns that a solid can reach, from
             `analytic_solids.shadows`.
-        rays: (n, 12) [mm]: source, first pixel centre minus source, u, v.
+        rays: (n, 12) [mm]: source, first pixel center minus source, u, v.
         weight: (k,) factors on the chord lengths.
         channel: (k,) the solid's channel in `out`.
         out: (channels, n, rows, cols).
@@ -342,7 +342,7 @@ def locate(vertices, g, inverse, p, pixels):
 
 @maker
 def make_band(vertices, cols):
-    """Create a worker's arrays, not initialised: sums (MESH_BAND_ROWS, cols), positions
+    """Create a worker's arrays, not initialized: sums (MESH_BAND_ROWS, cols), positions
     and pixels of the vertices (k, 3) each, edge forms (3, 3), flips (3,), plane (4,).
     """
     return (

@@ -5,7 +5,7 @@ from nothing: prefetching a few steps ahead doubled the projector's speed on one
 deals out the iterations of a parallel loop beforehand; workers that fetch their next job from a
 counter do not wait for the slowest.
 
-numba optimises and assembles each function that it compiles, with all that it calls, and again
+numba optimizes and assembles each function that it compiles, with all that it calls, and again
 as part of each function that calls it: a kernel four calls deep in a parallel loop eight times.
 Here only an entry point (`parallel`, `serial`) is, at the end, with all that was linked into
 it; results are the same to the last bit, and compiling takes less than half the time.

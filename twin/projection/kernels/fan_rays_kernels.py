@@ -403,7 +403,7 @@ def start(grid, fan, rays, work, n):
 
 @maker
 def make_collected(room):
-    """Create arrays, not initialised, for fans of up to `room` pixels."""
+    """Create arrays, not initialized, for fans of up to `room` pixels."""
     return Collected(
         row=np.empty(room),
         column=np.empty(room),
@@ -417,7 +417,7 @@ def make_collected(room):
 
 @maker
 def make_rays(room):
-    """Create arrays (not initialised) for fans of up to `room` rays."""
+    """Create arrays (not initialized) for fans of up to `room` rays."""
     f32 = np.float32
     u32 = np.uint32
     return Rays(
@@ -440,7 +440,7 @@ def make_rays(room):
 @maker
 def make_work(slabs, levels):
     """Create a worker's arrays for a box of up to `slabs` slabs and `levels` levels; sums
-    are zero, the others not initialised.
+    are zero, the others not initialized.
     """
     f32 = np.float32
     return Work(

@@ -628,7 +628,7 @@ def walk(flat, spans, grid, fan, rays, work, n, transposed):
             open, see `siddon_kernels.open_column`.
         grid: the box as seen along the fan.
         fan: of the rays.
-        rays: sorted rays, initialised by `start`.
+        rays: sorted rays, initialized by `start`.
         work: room.
         n: number of rays.
         transposed: see above.

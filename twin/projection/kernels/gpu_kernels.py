@@ -9,8 +9,8 @@ The slab walk. Seen along its faster axis of x and y, called a, a ray goes throu
 voxel thick. All axes are mirrored so that the ray moves up them; then in one slab it crosses at
 most one plane of the other axis b and at most one of z, and meets at most three voxels: before
 both crossings, between them, after both. If shares h >= l of the slab lie behind the crossings,
-the slab gives v + h (m - v) + l (w - m). 32 lanes of a warp are 32 neighbouring rows of a
-detector column: they are in the same slab at the same time and read neighbouring voxels of a
+the slab gives v + h (m - v) + l (w - m). 32 lanes of a warp are 32 neighboring rows of a
+detector column: they are in the same slab at the same time and read neighboring voxels of a
 few columns.
 
 - *Fixed point.* Where a ray is at slab k (b and z in voxels) is kept as an integer with 44 bits

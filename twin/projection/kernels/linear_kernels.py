@@ -1,14 +1,14 @@
-"""Projection of a smooth volume: values between voxel centres are interpolated, and each pixel is
+"""Projection of a smooth volume: values between voxel centers are interpolated, and each pixel is
 an area.
 
-A ray is followed plane by plane, through the centres of the voxels along the axis x or y that it
+A ray is followed plane by plane, through the centers of the voxels along the axis x or y that it
 is nearest to. On a plane the volume is interpolated linearly both ways (Joseph 1982), and averaged
 over the rectangle that the pixel covers there: voxels finer than the pixel all count, and none
 more than the others. Both averages are differences of integrals of the interpolation. Along z the
-integral is a running sum, at the edges between rows, which neighbours share.
+integral is a running sum, at the edges between rows, which neighbors share.
 
 The transpose repeats the same numbers the other way round. A thread owns a plane, so that sums do
-not depend on the number of threads. Coordinates are in voxel units of the box; a voxel's centre is
+not depend on the number of threads. Coordinates are in voxel units of the box; a voxel's center is
 at its index + 0.5.
 """
 

@@ -2,7 +2,7 @@
 line integrals change with the geometry.
 
 Each ray walks from voxel to voxel (Amanatides and Woo 1987), positions and sum in double
-precision, between the focal spot and the pixel centre. Coordinates are in voxel units of the
+precision, between the focal spot and the pixel center. Coordinates are in voxel units of the
 box, derivatives in 1/mm.
 
 A ray from s to e has the integral p = L sum_i mu_i (t[i+1] - t[i]): L its length, mu_i the
@@ -173,7 +173,7 @@ def walk_ray(box, g, r, c, value, transposed):
 def project_rays(box, views, chosen, out, tile, first_job, last_job):
     """Fill the chosen views of `out` with line integrals, each ray on its own.
 
-    `box`: voxels. `views`: (n, 12) source, first pixel centre minus source, u, v in voxel units
+    `box`: voxels. `views`: (n, 12) source, first pixel center minus source, u, v in voxel units
     of the box. `chosen`: (k,) indices of views. `out`: (n, rows, cols). `tile`: columns of a
     job; of each chosen view one job after the other. `first_job`: number of the first job.
     `last_job`: number of the job after the last.
@@ -406,7 +406,7 @@ def gather(box, views, weights, tile, parts, first_job, last_job):
     """Sum weight times derivative over the pixels of a view, with respect to its twelve
     numbers; pixels of weight 0 are skipped.
 
-    A pixel's centre is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what
+    A pixel's center is D + (c - (cols - 1) / 2) u + (r - (rows - 1) / 2) v, so that what
     it gets goes to D, u and v with these factors. Each job, `tile` columns of one view,
     adds into a row of its own of parts (n * tiles, 12): no two write to the same place,
     and the sums do not depend on the number of threads.

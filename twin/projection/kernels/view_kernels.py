@@ -38,12 +38,12 @@ def prepare(row, frame, rows, cols, least_sine, clearance, rise, table):
     Same numbers as `operators.voxel_rays`, and same walk as `gpu.launcher` chooses.
 
     Args:
-        row: (12,) source, detector's centre, u and v [mm].
-        frame: (5, 3) low corner of the occupied box, voxel, centre and half sides of the
+        row: (12,) source, detector's center, u and v [mm].
+        frame: (5, 3) low corner of the occupied box, voxel, center and half sides of the
             whole box [mm]; voxels of the occupied box.
         rows: of the detector.
         cols: of the detector.
-        least_sine: smallest sine of u with v, and of a panel with the ray to its centre.
+        least_sine: smallest sine of u with v, and of a panel with the ray to its center.
         clearance: least distance of the box from source and panel over their distance;
             infinite for a box that the slab walk does not take.
         rise: largest rise of rays in a slab for upright columns [voxels].

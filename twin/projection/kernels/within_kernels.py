@@ -97,7 +97,7 @@ def mark_for_slope(change, error, counts, least=0.0):
 
 @inline
 def rays_aside(k, mark):
-    """Compute the place of ray k of a mark's in its pixel, (columns, rows) from the centre."""
+    """Compute the place of ray k of a mark's in its pixel, (columns, rows) from the center."""
     a = (np.int64(mark) + 1) // 2
     b = np.int64(mark) // 2 + 1
     j = k // a
@@ -113,7 +113,7 @@ def slab_ranges(low, high, at, speed, reach):
     Args:
         low, high: the slab's limits.
         at: the source's height above its plane.
-        speed: height of the ray to the pixel's centre, above the source.
+        speed: height of the ray to the pixel's center, above the source.
         reach: largest change of `speed` within the pixel.
     """
     size = abs(speed)
@@ -140,7 +140,7 @@ def quadric_ranges(q, d, u, v, size_px, side):
 
     Args:
         q: (3,) the source, mapped by the quadric's matrix, as are all others.
-        d: (3,) ray to the pixel's centre.
+        d: (3,) ray to the pixel's center.
         u, v: (3,) sides of a detector pixel.
         size_px: detector pixels along a side.
         side: lengths of u and v together.

@@ -57,7 +57,7 @@ def normalise_coverage(
     A voxel needs `MIN_SEEN_SHARE` of the views' weight. With `cut_off` it also needs
     lines of `MIN_LINES_SHARE` of half a turn, less the widest arc of a view. Does nothing
     if all rows of the grid are on the panel and not `cut_off`. Of more than `MAX_VIEWS`
-    views, one stands for some neighbours. See `fdk_kernels.normalise_coverage`.
+    views, one stands for some neighbors. See `fdk_kernels.normalise_coverage`.
 
     Args:
         data: the volume's, (ny, nx, nz), changed in place.
@@ -100,7 +100,7 @@ def normalise_coverage(
 
 
 def first_and_steps(like: Volume) -> tuple[list[float], list[float]]:
-    """Compute centre of the first voxel and steps (x, y, z) [mm]."""
+    """Compute center of the first voxel and steps (x, y, z) [mm]."""
     return [float(places[0]) for places in like.centers()], list(like.voxel_xyz)
 
 

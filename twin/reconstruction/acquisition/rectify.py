@@ -26,7 +26,7 @@ FINER = 1.3
 """Columns of an upright panel per column of the tilted one, in FDK: resampled twice,
 before the filter and after it, edges would be blurred."""
 SMALL_MM = 0.01
-"""Voxel size below which sizes are not rounded to micrometres [mm]."""
+"""Voxel size below which sizes are not rounded to micrometers [mm]."""
 FLAT = 1e-3
 """Least horizontal part of the normal of a panel that can be made upright."""
 
@@ -71,7 +71,7 @@ def swapped(cone_vec: ConeVec) -> ConeVec:
 
 def upright(cone_vec: ConeVec, finer: float = 1.0) -> ConeVec:
     """Compute upright panels (rows horizontal, columns down) with the same sources,
-    centres and pitches; u points to the right as seen from the source.
+    centers and pitches; u points to the right as seen from the source.
 
     Args:
         cone_vec: n views.
@@ -132,7 +132,7 @@ def homography(
         new_shape: (rows, cols) of the other.
 
     Returns:
-        (3, 3), from homogeneous (column, row) on `new` to those on `old`, pixel centres at
+        (3, 3), from homogeneous (column, row) on `new` to those on `old`, pixel centers at
         integers.
     """
 
@@ -166,7 +166,7 @@ def field_of_view(
             digits where it is below 10 um (`SMALL_MM`).
 
     Returns:
-        Grid with whole voxels, at least one each way, centred on z = (up - down) / 2.
+        Grid with whole voxels, at least one each way, centered on z = (up - down) / 2.
 
     Raises:
         GeometryError: the axis is not in front of the source in every view, a panel lies
@@ -217,7 +217,7 @@ def rows_needed(
     least.
 
     Both are limited to one row beyond the panel on either side, as pixels see beyond their
-    centres: -1 to rows + 1. All rows if a corner of the volume has no finite image.
+    centers: -1 to rows + 1. All rows if a corner of the volume has no finite image.
     `cone_vec`: n views; `shape`: detector (rows, cols); `like`: the volume.
     Returns (first, last), at least two rows.
     """

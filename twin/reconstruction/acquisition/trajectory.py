@@ -7,7 +7,7 @@ those.
 
 What the views cover decides, not the order in which they are listed. Those of a circle are
 sorted by their angle on it, whatever the turn, and each stands for the arc to halfway to its
-neighbours. A step much wider than the usual one is a gap, which the opposite views make up for.
+neighbors. A step much wider than the usual one is a gap, which the opposite views make up for.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAX_HELIX_DEVIATION = 0.05
 """Largest deviation of a helix from a steady rise, relative to the rise in a turn."""
 GAP_STEPS = 3.0
 RANDOM_GAP_STEPS = 8.0
-"""Steps between neighbouring views, relative to the usual one, from which on they are
+"""Steps between neighboring views, relative to the usual one, from which on they are
 gaps. The first holds where the views behind cover all of them, as in a scan that left
 some out; else the second, as for random views."""
 GAP_RAMP_RAD = 0.35
@@ -116,7 +116,7 @@ def no_fdk(why: str, asked: object, allowed: object) -> GeometryError:
 def circle_of(cone_vec: ConeVec) -> Circle:
     """Fit a helix about z, or else a circle, to a scan's sources.
 
-    The centre is fitted by least squares in x and y. A helix is recognised by a steady
+    The center is fitted by least squares in x and y. A helix is recognized by a steady
     rise over a turn or more (`_helix`); else the sources must keep to a horizontal
     circle. Both may deviate from the radius by `MAX_CIRCLE_DEVIATION` of it. "Gaps" are
     arcs without views.
@@ -125,7 +125,7 @@ def circle_of(cone_vec: ConeVec) -> Circle:
         cone_vec: n views.
 
     Returns:
-        Centre, radius, and each view's angle and step of angle; for a circle its gaps,
+        Center, radius, and each view's angle and step of angle; for a circle its gaps,
         for a helix its rise.
 
     Raises:
@@ -217,7 +217,7 @@ def _turn(azimuth: FloatArray, centre: FloatArray, radius: float) -> Circle:
     the gaps leave lines unseen, as for random angles, it must be wider than `RANDOM_GAP_STEPS`.
 
     `azimuth`: (n,) from 0 to 2 pi [rad]; `centre`: (2,) [mm]; `radius`: [mm].
-    Returns the circle; a view's step is half the way to its neighbour on either side, views at
+    Returns the circle; a view's step is half the way to its neighbor on either side, views at
     one angle share it equally, and gaps belong to no view.
     """
     at, same = np.unique(_on_circle(azimuth), return_inverse=True)
@@ -303,7 +303,7 @@ def redundancy(
     47 (2002) 2525), which falls smoothly to nothing towards a gap of the angles, and
     towards the near edge of a panel moved to one side by more than a column; with gaps
     the latter only if an object reaches `beyond` the near edge. In a full turn of a
-    centred panel each counts 1/2.
+    centered panel each counts 1/2.
 
     Args:
         circle: of the sources.
@@ -351,7 +351,7 @@ def redundancy(
 
 def narrow_overlap(circle: Circle, cone_vec: ConeVec, cols: int) -> bool:
     """Return whether a panel moved aside sees few columns beyond the axis: fewer than twice
-    `MIN_TAPER_COLS` on its near side. False for a panel centred within a column. `circle`: of
+    `MIN_TAPER_COLS` on its near side. False for a panel centered within a column. `circle`: of
     the sources; `cone_vec`: n upright views; `cols`: columns of the panel."""
     low, high = panel_reach(circle, cone_vec, cols)
     column = (low + high) / cols
@@ -459,7 +459,7 @@ def columns_beyond(circle: Circle, cone_vec: ConeVec, cols: int) -> tuple[int, i
         cols: columns of the panel.
 
     Returns:
-        (before, after), each 0 for a centred panel.
+        (before, after), each 0 for a centered panel.
     """
     widest = max(panel_reach(circle, cone_vec, cols))
     source = cone_vec.source[:, :2]

@@ -69,7 +69,7 @@ class Prism:
 
     Attributes:
         centre: (x, y) of its axis (2,) [mm].
-        to_disc: lower triangular, takes the ellipse about its centre to the unit disc (2, 2)
+        to_disc: lower triangular, takes the ellipse about its center to the unit disc (2, 2)
             [1/mm].
         attenuation: [1/mm].
     """
@@ -83,7 +83,7 @@ class Prism:
         """Make a prism from the numbers of a fit (6,).
 
         Args:
-            x: in units of `field`: centre, the logarithms of the diagonal of `to_disc`,
+            x: in units of `field`: center, the logarithms of the diagonal of `to_disc`,
                 its other element, logarithm of the attenuation.
             field: radius of the field of view [mm].
         """
@@ -116,7 +116,7 @@ class Prism:
 
     @property
     def numbers(self) -> FloatArray:
-        """Numbers for the kernels, (6,): centre, elements (0, 0), (1, 0), (1, 1),
+        """Numbers for the kernels, (6,): center, elements (0, 0), (1, 0), (1, 1),
         attenuation."""
         (first, _), (low, second) = self.to_disc
         return np.array([*self.centre, first, low, second, self.attenuation])
@@ -494,7 +494,7 @@ def _noise(lines: npt.NDArray[np.floating]) -> float:
 
 
 def _cut_off(band: FloatArray, least: float, usual: float) -> npt.NDArray[np.bool_]:
-    """Find the edges beyond which the object continues, in some neighbouring views or all.
+    """Find the edges beyond which the object continues, in some neighboring views or all.
 
     The middle one of three views counts, and the mean of all, in which less noise hides it.
     Noise is that of every other bin near an edge, as detectors blur it over some columns, or
@@ -531,7 +531,7 @@ def _fit(
 ) -> tuple[Prism | None, Prism | None]:
     """Fit the prism that explains the values, or else the best one.
 
-    Starts from the neighbour, or from circles of 1.1, 1.5 and 2.2 radii of the field of
+    Starts from the neighbor, or from circles of 1.1, 1.5 and 2.2 radii of the field of
     view; narrows the loss until the best quarter of rays decides. A prism explains the
     values if that quarter deviates by at most half of `ACCURACY`, besides noise. If the
     neighbour's start fails, the circles are tried.
@@ -541,7 +541,7 @@ def _fit(
         rays: (n, k, 2) from the source to columns of the panel, in the plane [mm].
         seen: (n, k) line integrals in the plane.
         usual: usual line integral of the object.
-        near: prism of a neighbouring band, or None.
+        near: prism of a neighboring band, or None.
 
     Returns:
         (prism, None) if it explains the values; (None, best one) if not; (None, None) if

@@ -187,7 +187,7 @@ def causes_of(cone_vec: ConeVec, centre: FloatArray, share: FloatArray) -> list[
 
 
 def _tilted(views: ConeVec, sizes: FloatArray, axis: FloatArray) -> ConeVec:
-    """Turn panels about unit vectors (n, 3) through their centres [degrees]: exactly, because
+    """Turn panels about unit vectors (n, 3) through their centers [degrees]: exactly, because
     sheared pixels are larger, too, and large tilts would be told of a wrong distance."""
     from scipy.spatial.transform import Rotation
 

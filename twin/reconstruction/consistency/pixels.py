@@ -1,12 +1,12 @@
-"""Pixels that do not respond as their neighbours do: dead, stuck, hot and flickering ones.
+"""Pixels that do not respond as their neighbors do: dead, stuck, hot and flickering ones.
 
-Suspects are pixels beyond their neighbours in the row, or in the column, by far more than
+Suspects are pixels beyond their neighbors in the row, or in the column, by far more than
 other pixels, in the root of the mean square over all but a few views. They are then
-compared with good neighbours alone, in row and column, view by view. An object turns, so
+compared with good neighbors alone, in row and column, view by view. An object turns, so
 that what it gives to a pixel it gives to others as well: to those between it and the axis
 as often, and, what stands still about the axis, to the pixel as far from it on the other
 side. A suspect is bad if it deviates in nearly all views and its counterpart does not, or
-if it deviates so often, and changes so much, that a pixel like its neighbours does so with
+if it deviates so often, and changes so much, that a pixel like its neighbors does so with
 a probability below `MAX_CHANCE`. A feature on the axis itself stands before one pixel:
 there, only values that no object explains, or a complete column, are bad.
 """
@@ -31,7 +31,7 @@ NEIGHBOURS: Final = 2
 """Columns on either side that a pixel is compared with: each of two bad columns has
 good ones."""
 MAX_GROUP: Final = 5
-"""Largest number of neighbouring bad pixels in a row or column; longer groups are layers and
+"""Largest number of neighboring bad pixels in a row or column; longer groups are layers and
 edges of the object, or complete columns."""
 BAD_RESPONSE_RATIO: Final = 8.0
 """Response of a bad pixel over the usual one about it."""
@@ -44,25 +44,25 @@ MIN_EDGE_RESPONSE: Final = 0.3
 """Least response of a bad pixel at the panel's edges."""
 WORST_RATIO: Final = 0.75
 """Least response of the worst pixels over the largest about them; a good pixel that bad
-neighbours surround in one direction has half of theirs, who deviate in two."""
+neighbors surround in one direction has half of theirs, who deviate in two."""
 VIEWS_AN_OUTLIER: Final = 5
 """One of this many views is left out, that where a pixel is farthest beyond its
-neighbours."""
+neighbors."""
 BLOCK: Final = (8, 16)
 """Rows and columns over which the usual response is found."""
 AXIS_PART: Final = 0.2
 """Distance from the axis within which an object may hardly move, over the panel's columns."""
 MIN_COLUMN_SHARE: Final = 0.9
-"""Least share of a bad column's rows that are beyond their neighbours."""
+"""Least share of a bad column's rows that are beyond their neighbors."""
 MIN_DEVIATION_RATIO: Final = 0.5
-"""Distance beyond its neighbours, over its root mean square, from which a pixel deviates."""
+"""Distance beyond its neighbors, over its root mean square, from which a pixel deviates."""
 MIN_LASTING_SHARE: Final = 0.75
 """Least share of the views in which a dead or hot pixel deviates; a bead at the turn
 of its orbit does so in less than half of them."""
 AXIS_BAND_PX: Final = 2.0
 """Distance from the axis within which a small feature of the object is always there [pixels]."""
 AXIS_REACH_PX: Final = 2
-"""Largest distance from the stated axis at which the centre of symmetry may be [pixels]."""
+"""Largest distance from the stated axis at which the center of symmetry may be [pixels]."""
 EXPLAINED_ABOVE: Final = 0.5
 """Attenuation above all others that a feature at the axis may have, over their range."""
 EXPLAINED_BELOW: Final = 0.1
@@ -70,7 +70,7 @@ EXPLAINED_BELOW: Final = 0.1
 COMPARED_COLUMNS: Final = 4
 """Pixels on either side whose deviations are compared."""
 MIN_SLOPE_RATIO: Final = 0.5
-"""Least distance of a bad pixel beyond its neighbours, over their own range."""
+"""Least distance of a bad pixel beyond its neighbors, over their own range."""
 MIN_ALIKE_RATIO: Final = 0.25
 """Least deviation of a suspect's counterpart across the axis, over its own: a peak between
 two pixels has half of its height in each."""
@@ -78,7 +78,7 @@ MIN_CHANGES_SHARE: Final = 0.25
 """Least share of views at which a flickering pixel changes between deviating and not; a
 feature of the object comes and goes twice a turn, random flicker has half."""
 MAX_CHANCE: Final = 1e-4
-"""Largest probability with which a pixel like its neighbours deviates as often as a
+"""Largest probability with which a pixel like its neighbors deviates as often as a
 flickering one, and varies as much."""
 MAX_PAIRS_CHANCE: Final = 0.05
 """Largest probability with which scattered bad pixels would make as many counterparts
@@ -118,7 +118,7 @@ class BadPixels:
         else:
             columns = ""
         return (
-            f"{self.count} pixels do not respond as their neighbours do (dead, hot or "
+            f"{self.count} pixels do not respond as their neighbors do (dead, hot or "
             f"flickering{columns}): they are interpolated"
         )
 
@@ -128,14 +128,14 @@ Views = Callable[[int], Iterable[Float32Array]]
 
 
 def bad_pixels(views: Views, axis_column: float) -> BadPixels | None:
-    """Find pixels that do not respond as their neighbours do: dead, hot or flickering.
+    """Find pixels that do not respond as their neighbors do: dead, hot or flickering.
 
     Pixels that a feature of the object may explain are left out.
 
     Args:
         views: gives line integrals of a scan; called for `SCREENED_VIEWS` of them and,
             where there may be bad pixels, once more for these, as the worst make their
-            neighbours look bad as well, and once for `JUDGED_VIEWS`.
+            neighbors look bad as well, and once for `JUDGED_VIEWS`.
         axis_column: where the axis falls.
 
     Returns:
@@ -162,9 +162,9 @@ def bad_pixels(views: Views, axis_column: float) -> BadPixels | None:
 def _outliers(
     views: Iterable[Float32Array], axis_column: float
 ) -> tuple[npt.NDArray[np.bool_], Float32Array]:
-    """Find pixels far beyond their neighbours in the root mean square over the views.
+    """Find pixels far beyond their neighbors in the root mean square over the views.
 
-    Neighbours are those in the row; a pixel within a group of two to five in its row, or
+    Neighbors are those in the row; a pixel within a group of two to five in its row, or
     at the panel's sides, is found by its column. Near the axis (`AXIS_PART` of the
     columns) the object's edges stay in a column: there, a pixel must stand out from its
     column as well, or be of at most `MAX_GROUP` that do so one above the other, or in a
@@ -176,7 +176,7 @@ def _outliers(
         axis_column: column of the rotation axis.
 
     Returns:
-        The outliers, and the excess of all pixels over their neighbours in the row plus
+        The outliers, and the excess of all pixels over their neighbors in the row plus
         that over those in the column, (rows, cols) each; (1, 1) of False and 0 without
         views or of too small ones.
     """
@@ -232,7 +232,7 @@ class _Beside:
     Attributes:
         row: of each pixel.
         col: of each pixel.
-        others: columns of its four neighbours, (4, pixels); the two of one side twice
+        others: columns of its four neighbors, (4, pixels); the two of one side twice
             where the other has none.
         known: whether there are any within `MAX_GROUP` + `NEIGHBOURS` columns.
         one_sided: whether they are on one side alone.
@@ -251,7 +251,7 @@ class _Beside:
         row: npt.NDArray[np.intp],
         col: npt.NDArray[np.intp],
     ) -> _Beside:
-        """Find the neighbours.
+        """Find the neighbors.
 
         Args:
             suspects: (rows, cols), passed over.
@@ -270,7 +270,7 @@ class _Beside:
         return cls(row, col, others, known, has_left != has_right)
 
     def residuals(self, view: Float32Array) -> Float32Array:
-        """Subtract from the pixels' transmissions that of their neighbours, (pixels,); 0 where
+        """Subtract from the pixels' transmissions that of their neighbors, (pixels,); 0 where
         these are not known. Noise of a transmission does not grow with attenuation, as that of
         line integrals does. `view`: line integrals (rows, cols)."""
         usual = np.exp(-view[self.row, self.others].mean(axis=0))
@@ -280,12 +280,12 @@ class _Beside:
     def distances(
         self, view: Float32Array, slopes: float = MIN_SLOPE_RATIO
     ) -> Float32Array:
-        """Compute how far pixels are above or below all but one of their neighbours, less how
+        """Compute how far pixels are above or below all but one of their neighbors, less how
         far these may differ as they do among themselves.
 
         On one side alone, the range is widened by `EDGE_SLOPE_FACTOR` times itself.
         `view`: (rows, cols); `slopes`: part of the neighbours' own range that is subtracted.
-        Returns (pixels,); infinite where no neighbours are known."""
+        Returns (pixels,); infinite where no neighbors are known."""
         own = view[self.row, self.col]
         least, low, high, most = np.sort(view[self.row, self.others], axis=0)
         span = np.where(self.one_sided, np.float32(EDGE_SLOPE_FACTOR), 0) * (high - low)
@@ -336,9 +336,9 @@ class _Judged:
         axis_column: where the axis falls.
         views: number of views.
         often: number of views in which a pixel deviates from row and column, or from that
-            of the two in which it has neighbours.
+            of the two in which it has neighbors.
         changes: number of views at which it changes between deviating and not.
-        variance: of its transmission less that of its neighbours, from differences between
+        variance: of its transmission less that of its neighbors, from differences between
             successive views: what an object's edges change, they change slowly.
         mean_distance: distance of its mean over the views beyond its neighbours'.
         mean_peak: the larger one of the distances in row and column, with no regard to
@@ -522,7 +522,7 @@ class _Judged:
         return float(gammainc(least, expected)) if least else 1.0
 
     def _flickering(self, bad: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """Find suspects that deviate and cease often, and more so than their neighbours,
+        """Find suspects that deviate and cease often, and more so than their neighbors,
         (rows, cols).
 
         If a pixel deviates as often as each of `COMPARED_COLUMNS` others, one of so many
@@ -713,14 +713,14 @@ def _outlying(response: Float32Array) -> npt.NDArray[np.bool_]:
 
 
 def _neighbours(view: Float32Array) -> list[Float32Array]:
-    """List a pixel's neighbours in its row from left to right, without it, each (rows, cols)."""
+    """List a pixel's neighbors in its row from left to right, without it, each (rows, cols)."""
     cols = view.shape[1]
     wide = np.pad(view, ((0, 0), (NEIGHBOURS, NEIGHBOURS)), "reflect")
     return [wide[:, k : k + cols] for k in range(2 * NEIGHBOURS + 1) if k != NEIGHBOURS]
 
 
 def _beyond_neighbours(view: Float32Array) -> Float32Array:
-    """Compute the distance of pixels above or below all but one of their four neighbours
+    """Compute the distance of pixels above or below all but one of their four neighbors
     in the row, one of which may be bad as well.
 
     0 for pixels within them. In the outermost columns the range is widened on both sides

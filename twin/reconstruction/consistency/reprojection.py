@@ -109,7 +109,7 @@ class Reprojection:
 
     @cached_property
     def arcs(self) -> FloatArray:
-        """Mean squares of the residual in `ARCS` arcs of neighbouring views: of its
+        """Mean squares of the residual in `ARCS` arcs of neighboring views: of its
         values, and of their changes along rows, (2, ARCS); above 0. Views of which no row
         is compared are left out.
         """
@@ -151,12 +151,12 @@ class Reprojection:
 
     @cached_property
     def _noise(self) -> float:
-        """Variance of white noise: differences of neighbours that the reprojection lacks."""
+        """Variance of white noise: differences of neighbors that the reprojection lacks."""
         return max(self.image_noise - self.noise_again, 0.0)
 
     @cached_property
     def noise_again(self) -> float:
-        """Variance that neighbours in the projections show as noise."""
+        """Variance that neighbors in the projections show as noise."""
         return noise_of(self.again) if self.own_noise is None else self.own_noise
 
 
@@ -199,6 +199,6 @@ def _mean_square(values: Float32Array) -> float:
 
 
 def _changes(images: Float32Array) -> Float32Array:
-    """Return the changes between neighbouring columns of smoothed rows."""
+    """Return the changes between neighboring columns of smoothed rows."""
     smooth = 0.25 * images[..., :-2] + 0.5 * images[..., 1:-1] + 0.25 * images[..., 2:]
     return np.diff(smooth, axis=-1)

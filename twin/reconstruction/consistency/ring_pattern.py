@@ -1,11 +1,11 @@
 """Errors of single pixels in all views, from which FDK makes rings, separated from object
 and noise.
 
-In each view a pixel is compared with its neighbours in the row. The constant part of the
+In each view a pixel is compared with its neighbors in the row. The constant part of the
 medians of groups of views is the pixel's error, or an object that hardly moves about the
 rotation axis. In a full turn columns at equal distances on both sides of the axis see the
 same rays, so that an object's part is alike on both sides, and mostly alike in
-neighbouring rows; pixels' errors are not. The distance of the groups is the noise. An
+neighboring rows; pixels' errors are not. The distance of the groups is the noise. An
 error is subtracted as far as it stands out from both (Wiener's filter, by block): of a
 panel without errors nothing is. Equal errors of two columns as far from the axis are
 taken for the object.
@@ -25,11 +25,11 @@ from flexdt.twin.errors import LimitError
 from flexdt.twin.geometry.conventions import Float32Array
 
 NEIGHBOURHOOD_COLS: Final = 9
-"""Columns over which a pixel is compared with its neighbours."""
+"""Columns over which a pixel is compared with its neighbors."""
 GROUP_VIEWS: Final = 6
 """Views in a group, whose median is computed first."""
 MAX_GROUPS: Final = 48
-"""Largest number of groups; beyond it, neighbouring groups are averaged in pairs."""
+"""Largest number of groups; beyond it, neighboring groups are averaged in pairs."""
 MIN_GROUPS: Final = 6
 """Least number of groups from whose distances noise is estimated."""
 COLUMN_ROWS: Final = 15
@@ -37,7 +37,7 @@ COLUMN_ROWS: Final = 15
 BLOCK_PX: Final = 9
 """Rows and columns over which variances are computed."""
 AXIS_REACH_PX: Final = 2
-"""Largest distance from the stated axis at which the centre of symmetry is searched
+"""Largest distance from the stated axis at which the center of symmetry is searched
 [px]."""
 MEDIAN_VARIANCE: Final = 1.571
 """Variance of a median over that of the mean of as many normal deviates."""
@@ -58,7 +58,7 @@ def ring_errors(
     shared by the rows above and below, or by the other side of the axis, is the object's.
     `views`: (rows, cols) line integrals of all views, in order. `axis_column`: where the axis
     falls, of a full turn; None where columns on both sides of it do not see the same rays: then
-    complete columns are left unchanged. `width`: columns of the neighbourhood; made odd, 3 at
+    complete columns are left unchanged. `width`: columns of the neighborhood; made odd, 3 at
     least.
     Returns (rows, cols); 0 where nothing stands out from object and noise, and everywhere with
     fewer than `MIN_GROUPS` groups of `GROUP_VIEWS` views.
@@ -77,7 +77,7 @@ def ring_errors(
 
 
 def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Array]:
-    """Compute medians of pixels' excess over neighbours in groups of `GROUP_VIEWS` views.
+    """Compute medians of pixels' excess over neighbors in groups of `GROUP_VIEWS` views.
 
     Groups are joined in pairs when there are `MAX_GROUPS`, so that memory is bounded;
     later groups then have twice as many views. A last incomplete group is dropped unless
@@ -85,7 +85,7 @@ def _group_medians(views: Iterable[Float32Array], width: int) -> list[Float32Arr
 
     Args:
         views: line integrals (rows, cols).
-        width: columns of the neighbourhood.
+        width: columns of the neighborhood.
 
     Returns:
         Medians (rows, cols), at least one.
@@ -207,7 +207,7 @@ def _columns_seen_twice(cols: int, axis_column: float) -> npt.NDArray[np.bool_]:
 def _other_side(values: Float32Array, axis_column: float) -> Float32Array:
     """Return values of the columns as far from the axis on the other side, 0 off the panel.
 
-    The centre of symmetry is the one within `AXIS_REACH_PX` of the stated axis, in half columns,
+    The center of symmetry is the one within `AXIS_REACH_PX` of the stated axis, in half columns,
     at which both sides correlate best.
     `values`: (rows, cols); `axis_column`: the stated axis [px]."""
     stated = round(2.0 * axis_column)

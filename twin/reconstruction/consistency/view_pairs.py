@@ -341,7 +341,7 @@ def _bend(
 
 
 def _about(values: FloatArray) -> FloatArray:
-    """Average over `NEIGHBOURS` neighbouring pairs."""
+    """Average over `NEIGHBOURS` neighboring pairs."""
     from scipy.ndimage import uniform_filter1d
 
     return np.asarray(uniform_filter1d(values, NEIGHBOURS, axis=0, mode="nearest"))

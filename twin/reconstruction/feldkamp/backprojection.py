@@ -396,7 +396,7 @@ class OnDevice:
             ready: filtered images (n, cols, rows) on the device.
             size: (cols, rows).
             table: (n, 11) of `view_table`.
-            grid: centre of the first voxel and steps, on the device.
+            grid: center of the first voxel and steps, on the device.
             flat: the volume's voxels, changed in place.
             shape: (ny, nx, nz).
         """

@@ -2,7 +2,7 @@
 
 Nothing has to be known of the camera. What differs from view to view: the views are added up
 once more, every second one with a minus (in the order of their angles). What the object gives
-to neighbouring views cancels, what noise gives does not, and has the variance that it has in
+to neighboring views cancels, what noise gives does not, and has the variance that it has in
 the volume. What all views share, the noise of the flat and dark images: its spectrum is that of
 the views' mean, less that of their alternating mean. A voxel's variance follows from where the
 views see it. On a grid of every few voxels, both cost little.
@@ -42,7 +42,7 @@ VALUED_VIEWS: Final = 4
 SHAPE_VIEWS: Final = 24
 """Views, at most, from which the variance's shape is computed."""
 MIN_ROW_DISTANCE: Final = 3
-"""Least distance of two compared rows of the panel: blur correlates neighbours."""
+"""Least distance of two compared rows of the panel: blur correlates neighbors."""
 BANDS: Final = 16
 """Bands of the spectrum over which it is averaged."""
 AVERAGED_POINTS: Final = 8
@@ -340,7 +340,7 @@ class NoiseMeter:
         """Compute the noise.
 
         The variance of the views' own noise has the shape that the rays give it, times a
-        factor from differences of neighbouring layers of the alternating sum, if there are
+        factor from differences of neighboring layers of the alternating sum, if there are
         more than two; that common to all views is given over the radius from the rotation
         axis.
         """

@@ -41,7 +41,7 @@ class NoiseByValue:
 
     @classmethod
     def of(cls, images: Float32Array) -> NoiseByValue:
-        """Measure it in single views: from mixed second differences of neighbouring rows and
+        """Measure it in single views: from mixed second differences of neighboring rows and
         columns. Blur makes these too small, by a factor that all values share.
 
         `images`: (n, rows, cols), two rows and columns at least.

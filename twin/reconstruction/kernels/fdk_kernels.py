@@ -310,7 +310,7 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
         g: (11,) row of the views' table, or (13,) of a helix.
         x: [mm].
         y: [mm].
-        z0: lowest voxel's centre [mm].
+        z0: lowest voxel's center [mm].
         dz: step along z [mm].
         line: room for a column of the image, overwritten.
     """
@@ -351,7 +351,7 @@ def _add_view(acc, image, rows, shares, g, x, y, z0, dz, line):
 
 @fused
 def _places(at, across, down, weight, size, base, zero, depth, slope, c, turn, row, rise):
-    """Compute where a view sees neighbouring voxels.
+    """Compute where a view sees neighboring voxels.
 
     Numbers that differ little are float32. Places are limited to the image, so that those
     without weight can be read.
@@ -416,7 +416,7 @@ def _add_places(acc, image, rows, at, across, down, weight):
 
 @kernel
 def _add_few(acc, image, rows, g, x, y, z0, dx, dz, at, parts):
-    """Add one view to neighbouring voxels along x, layer by layer: for few rows, for
+    """Add one view to neighboring voxels along x, layer by layer: for few rows, for
     which full registers would not pay.
 
     Nothing is added if the farthest voxel is behind the source; single voxels behind it
@@ -549,7 +549,7 @@ def _entry_point(lanes: int):  # type: ignore[no-untyped-def]
                 distance in pitches of columns; column of the foot point; distance in
                 pitches of rows; row of the foot point; of a helix (n, 13): first depth of
                 the shares, and how many a mm.
-            x0, y0, z0: centre of the first voxel [mm].
+            x0, y0, z0: center of the first voxel [mm].
             dx, dy, dz: steps [mm].
             volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
             workers: threads.
@@ -606,7 +606,7 @@ def _cover(g, weights, rows, on_panel, radius, x, y, z0, dz, seen):
         on_panel: first and last column of the panel.
         radius: from the axis to the source [mm].
         x, y: [mm].
-        z0, dz: centre of the lowest voxel and step along z [mm].
+        z0, dz: center of the lowest voxel and step along z [mm].
         seen: (nz + 1,) differences of the weight from one voxel to the next, changed in
             place.
 
@@ -666,7 +666,7 @@ def normalise_coverage(
         rows: of the images.
         on_panel: first and last column of the panel.
         radius: from the axis to the source [mm].
-        x0, y0, z0: centre of the first voxel [mm].
+        x0, y0, z0: center of the first voxel [mm].
         dx, dy, dz: steps [mm].
         least: share of the weight.
         half_turn: pi, or nearly so [rad]; 0 where nothing is beside the panel.
@@ -709,7 +709,7 @@ def room(n: int, cols: int, rows: int, few: bool) -> Float32Array:
 
     Args:
         n, cols, rows: size of the images.
-        few: of a panel of few rows: no more rows, by which the kernel recognises it.
+        few: of a panel of few rows: no more rows, by which the kernel recognizes it.
     """
     shape = (n, cols, rows if few else (rows // LANES + 1) * LANES)
     return aligned_zeros(math.prod(shape)).reshape(shape)

@@ -1,6 +1,6 @@
 """CUDA kernels of FDK, and of total variation, as the processor does them.
 
-FDK: weights, filter, and backprojection. Neighbouring threads take neighbouring rows of one
+FDK: weights, filter, and backprojection. Neighboring threads take neighboring rows of one
 detector column (weights and filter), or voxels above one another, which read such rows.
 
 Total variation, see `tv_kernels`: lengths of differences, and both half-steps, one thread a
@@ -26,7 +26,7 @@ RUN = 8
 """Voxels of a thread, BLOCK[0] apart along z; columns of a thread of the filter."""
 PLANE = (32, 8)
 """Threads a block of `weigh` and `convolve`: rows, and columns, of which eight are one sector
-of memory in an image whose columns are neighbours."""
+of memory in an image whose columns are neighbors."""
 BITS = 32
 """Bits of a row's number behind the point."""
 FIXED = float(2**BITS)
@@ -72,7 +72,7 @@ def convolve(weighted, taps, start, out):
     """Convolve rows with symmetric taps: out[n, c, r] = sum over j of weighted[n, j, r] *
     taps[|start + c - j|].
 
-    A thread computes RUN neighbouring columns: from one j to the next the taps move on by
+    A thread computes RUN neighboring columns: from one j to the next the taps move on by
     one place, so that two numbers are read for RUN products.
 
     Args:
@@ -363,7 +363,7 @@ def backproject(images, cols, rows, views, first, size, volume):
             2^32.
         cols, rows: of an image.
         views: float64 (n, 11), as `fdk_views.view_table` makes them.
-        first, size: centre of the first voxel and steps, (3,) x, y, z [mm].
+        first, size: center of the first voxel and steps, (3,) x, y, z [mm].
         volume: float32 (ny, nx, nz), added to; a value counts with 1 / depth^2.
     """
     lane, warp = cuda.threadIdx.x, cuda.threadIdx.y

@@ -35,7 +35,7 @@ def _chord(prism, source_x, source_y, x, y):
     """Compute path length times attenuation through a prism, over the ray's horizontal length; 0
     for a ray that misses it.
 
-    `prism`: (6,) centre x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc;
+    `prism`: (6,) center x, y; lower triangle (0, 0), (1, 0), (1, 1) to the unit disc;
     attenuation. `source_x`: [mm]. `source_y`: [mm]. `x`: horizontal direction of the ray, of any
     length. `y`: likewise.
     """

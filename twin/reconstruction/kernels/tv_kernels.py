@@ -3,7 +3,7 @@
 The variation is the sum over all voxels of the length of the vector of differences to the next
 voxel along z, y and x, each multiplied by `scale` (1 where voxels are cubes); behind the last
 voxel the difference is 0. Arrays are C-ordered [z, y, x], dual ones [axis, z, y, x]. Each job
-writes one layer, first <= z < last, and reads its neighbours from an array that no job writes.
+writes one layer, first <= z < last, and reads its neighbors from an array that no job writes.
 Arguments are not checked.
 """
 

@@ -153,7 +153,7 @@ class ScanPlan(WithProblems, ArrayValue, JsonValue):
         return report
 
     def plot(self, report: CheckReport | None = None) -> Any:
-        """Plot motors, X-rays, exposures and clearance over time (needs the extra `plots`).
+        """Plot motors, X-rays, exposures and clearance over time.
 
         `report`: from `check`; None checks now. Returns matplotlib's figure."""
         return backend("plots").plot_plan(

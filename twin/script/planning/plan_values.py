@@ -57,8 +57,8 @@ class PlanStep:
         index: place in `ScanPlan.steps`.
         line: line of the script.
         start_s: when the command starts to take effect.
-        duration_s: how long it takes; a move goes on after the script did when it does
-            not wait.
+        duration_s: how long it takes; a move for which the script does not wait continues
+            while the script goes on.
         holds_s: how long the script waits for it; the next step starts then.
         assumed_s: the part of `holds_s` from the machine's timing and not from moves,
             pauses and exposures.
@@ -173,7 +173,7 @@ class BeamOn:
 class SampleSize:
     """A cylinder about the rotation axis that contains the sample [mm]; height 0 is unknown.
 
-    It is centred at the sample's reference height.
+    It is centered at the sample's reference height.
 
     Attributes:
         diameter_mm, height_mm: of the cylinder.

@@ -54,9 +54,9 @@ def plan_poses(
     script. The settings file is written at the first pose. Line i + 1 of problems and
     steps is pose i; line 0 is everything before.
 
-    A plan without a flat has the warning `no_flat` (also without poses), and one whose
-    way to the flat is not free `flat_path`: it goes there all the same, all motors at
-    once.
+    A plan without a flat has the warning `no_flat` (also without poses), and one
+    with a blocked path to the flat position has `flat_path`, and moves there anyway, all
+    motors at once.
 
     Args:
         poses: axis -> position [mm, deg]; axes left out stay where they are.

@@ -40,7 +40,7 @@ FLOOR = Paint((120, 127, 138), 0.0, 0.95)
 DOOR = Paint((232, 236, 241), 0.0, 0.7)
 GLASS = Paint((58, 92, 104), 0.1, 0.25)
 LAMP = {False: (92, 98, 106), True: (255, 243, 196)}
-"""X-rays on or not -> colour of the lamp: no red, in which the page draws parts that touch."""
+"""X-rays on or not -> color of the lamp: no red, in which the page draws parts that touch."""
 
 
 def ground_of(machine: Machine) -> Component:

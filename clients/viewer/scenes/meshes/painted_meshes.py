@@ -23,7 +23,7 @@ Vector = Sequence[float]
 
 @dataclass(frozen=True)
 class Paint:
-    """A surface: colour (r, g, b in 0 to 255), metalness and roughness in 0 to 1."""
+    """A surface: color (r, g, b in 0 to 255), metalness and roughness in 0 to 1."""
 
     color: tuple[int, int, int]
     metal: float = 0.0
@@ -50,7 +50,7 @@ def bevelled(
     Args:
         size: sides [mm].
         center: [mm].
-        paint: colour and gloss.
+        paint: color and gloss.
         bevel: width that is cut off [mm]; less for thin boxes.
     """
     h = np.asarray(size, dtype=float) / 2.0
@@ -74,9 +74,9 @@ def cylinder(
     axis: str = "z",
     sections: int = 48,
 ) -> PaintedMesh:
-    """Build a cylinder about an axis through its centre, as a painted mesh [mm].
+    """Build a cylinder about an axis through its center, as a painted mesh [mm].
 
-    `diameter`: [mm]; `height`: along its axis [mm]; `center`: [mm]; `paint`: colour and gloss;
+    `diameter`: [mm]; `height`: along its axis [mm]; `center`: [mm]; `paint`: color and gloss;
     `axis`: "z" or "y"; `sections`: sides of the mesh."""
     mesh = trimesh.creation.cylinder(
         radius=diameter / 2, height=height, sections=sections
@@ -98,7 +98,7 @@ def lathe(
 def _standing(
     mesh: trimesh.Trimesh, center: Vector, paint: Paint, axis: str
 ) -> PaintedMesh:
-    """Turn a mesh made about z, move it to its centre and paint it.
+    """Turn a mesh made about z, move it to its center and paint it.
 
     The mesh is changed in place: turned by -90 degrees about x (z becomes y) only if
     `axis` is "y", then moved by `center` (x, y, z) [mm]."""
@@ -109,7 +109,7 @@ def _standing(
 
 
 def glb(pieces: Iterable[PaintedMesh]) -> bytes:
-    """Encode pieces as one binary glTF file (bytes), scaled from mm to metres.
+    """Encode pieces as one binary glTF file (bytes), scaled from mm to meters.
 
     Pieces of equal paint are joined to one mesh, in order of their first use; nodes are
     named part0, part1, ...; normals are included.
@@ -132,11 +132,11 @@ def _painted(meshes: Sequence[trimesh.Trimesh], paint: Paint) -> trimesh.Trimesh
     """Join meshes [mm] of one paint to one mesh [m], smooth but for sharp edges.
 
     The mesh has the paint as its material, and no metadata. Edges of more than
-    `SMOOTH_RAD` stay sharp. Colours are converted from sRGB to linear; opacity is 1.
+    `SMOOTH_RAD` stay sharp. Colors are converted from sRGB to linear; opacity is 1.
 
     Args:
         meshes: of one paint.
-        paint: colour, metal, roughness and glow.
+        paint: color, metal, roughness and glow.
     """
     shaded = [trimesh.graph.smooth_shade(m, angle=SMOOTH_RAD) for m in meshes]
     mesh: Any = trimesh.util.concatenate(shaded)

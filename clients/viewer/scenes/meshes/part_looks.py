@@ -1,4 +1,4 @@
-"""The scanner's components as painted meshes: recognisable machine parts, from the
+"""The scanner's components as painted meshes: recognizable machine parts, from the
 machine file's boxes alone (mm).
 
 `data/parts.toml` has the pieces of each look. Components of other names and roles become
@@ -38,7 +38,7 @@ LOOKS: Final[Mapping[str, Any]] = tomllib.loads(_TABLE.read_text(encoding="utf-8
 def own_looks(machine: Machine, folder: Path) -> dict[str, bytes]:
     """Read the parts' own meshes as GLB files [m].
 
-    A .glb file is passed on unchanged, with its colours; any other mesh [mm] is painted
+    A .glb file is passed on unchanged, with its colors; any other mesh [mm] is painted
     `ALUMINIUM` and encoded as GLB [m]. Parts without a mesh are left out.
 
     `machine`: with the parts; `folder`: of its machine file and the meshes.
@@ -63,7 +63,7 @@ def pieces_of(part: Component) -> list[PaintedMesh]:
     points if it has any, else the look of its name, role or shape.
 
     A hull is painted `ALUMINIUM` and not moved; the pieces of a look are sized to the
-    part's box and moved to its centre. The look is that of the part's name, else of its
+    part's box and moved to its center. The look is that of the part's name, else of its
     role if `LOOKS` has one, else of its shape.
     """
     if part.points_mm:

@@ -185,7 +185,7 @@ def _is_true(dataset: Any) -> bool:
 
 
 def _from_middle(scan: NxScan, place: str, count: int) -> float | None:
-    """Take a place of the axis in pixels from the first pixel's centre; None without one.
+    """Take a place of the axis in pixels from the first pixel's center; None without one.
 
     Values of 0 and below count from the middle, as ESRF's nxtomomill writes them.
 
@@ -212,7 +212,7 @@ def _axis_column(scan: NxScan, columns: int) -> tuple[float, str]:
         columns: of an image.
 
     Returns:
-        The column, from the first one's centre, and where the axis is, in words.
+        The column, from the first one's center, and where the axis is, in words.
     """
     name = f"{DETECTOR}/x_rotation_axis_pixel_position"
     other = f"{DETECTOR}/estimated_cor_from_motor"

@@ -77,19 +77,19 @@ NXTOMO: Final = FormatTable(
         used(f"{DETECTOR}/y_flipped", "rows are mirrored", "the geometry", of=GEOMETRY),
         used(
             f"{DETECTOR}/transformations/rz",
-            "180 deg mirror columns",
+            "a rotation by 180 deg mirrors the columns",
             "the geometry",
             of=GEOMETRY,
         ),
         used(
             f"{DETECTOR}/transformations/ry",
-            "180 deg mirror rows",
+            "a rotation by 180 deg mirrors the rows",
             "the geometry",
             of=GEOMETRY,
         ),
         used(
             f"{DETECTOR}/field_of_view",
-            "Half: the axis stands at a side",
+            "Half: the axis is near one side of the panel",
             "it is compared with the axis",
             of=GEOMETRY,
         ),
@@ -115,7 +115,8 @@ NXTOMO: Final = FormatTable(
             dropped(
                 f"sample/{axis}_translation",
                 f"movement of the sample {way}, where it differs between views [m]",
-                "whether it is above or below the rotation is not said; give geometry=",
+                "the file does not say whether this stage sits on or under the rotation stage; "
+                "pass geometry=",
                 of=GEOMETRY,
             )
             for axis, way in (("x", "along the beam"), ("y", "across the beam"))
@@ -176,7 +177,7 @@ NXTOMO: Final = FormatTable(
             "experiment_identifier entry_identifier scan_command group_size "
             "sample/name sample/description sample/chemical_formula sample/type "
             "instrument/name bliss_original_files",
-            "words and times",
+            "descriptive text, dates and counts",
         ),
         *noted_all(
             _at(
@@ -193,8 +194,8 @@ NXTOMO: Final = FormatTable(
         noted("data/image_key", "the keys once more"),
         noted("other entry/*", "of another scan in the file", "one scan is read"),
     ),
-    "flexdt's cone_vec before all other figures; x_flipped and y_flipped before "
-    "transformations; x_rotation_axis_pixel_position before estimated_cor_from_motor; the "
-    "figures beside the images before those of the entry.",
+    "the first of these wins: flexdt's cone_vec over everything else; x_flipped and y_flipped "
+    "over transformations; x_rotation_axis_pixel_position over estimated_cor_from_motor; "
+    "figures beside the images over those of the entry.",
     example='fx.open("scan.nxs")',
 )

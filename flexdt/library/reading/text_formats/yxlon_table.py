@@ -113,6 +113,6 @@ YXLON: Final = FormatTable(
             "`tube=` of reconstruct takes it",
         ),
     ),
-    "There are no two statements of one thing.",
+    "this format states nothing twice.",
     example='fx.open("part/ScanParameter.xml")',
 )

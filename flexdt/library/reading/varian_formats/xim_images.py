@@ -2,7 +2,7 @@
 
 As pylinac, TIGRE and RTK have it: whole numbers of 4 bytes, least first. Of a compressed image the
 first row and one pixel are plain; each further pixel is its step from the plane through its left,
-upper and upper left neighbours, where the left one of a row's first pixel is the last of the row
+upper and upper left neighbors, where the left one of a row's first pixel is the last of the row
 above. A table has the bytes of each step: 1, 2 or 4, in two bits, the lowest first.
 """
 

@@ -1,6 +1,6 @@
 """Blocks of frames left out: do the others predict where they show the beads?
 
-The one alarm that has no cause in mind. In a right model the residuals of a bead in neighbouring
+The one alarm that has no cause in mind. In a right model the residuals of a bead in neighboring
 frames have nothing in common, so that the mean place of each bead in a block of frames is
 predicted from the scatter within blocks and the posterior of everything else. All blocks make one
 F test, in closed form: to leave a block's mean out is to give it a column of its own.

@@ -114,7 +114,7 @@ class Evidence:
 
 
 class Differences(NamedTuple):
-    """Differences of neighbouring columns about borders, and those that count.
+    """Differences of neighboring columns about borders, and those that count.
 
     Attributes:
         around: (m, c, 2 SIDE - 1) in m rows of frames.
@@ -167,7 +167,7 @@ class Taken(NamedTuple):
     """Differences that count, each row at its own scale.
 
     Attributes:
-        steps: of neighbouring columns, of power 1, (k, 2 SIDE - 1).
+        steps: of neighboring columns, of power 1, (k, 2 SIDE - 1).
         frame, border: of each, (k,).
     """
 
@@ -243,7 +243,7 @@ def frame_evidence(images: FloatArray) -> Evidence:
 
 
 def _about_borders(table: FloatArray, gap: int) -> FloatArray:
-    """Give the differences of neighbouring columns about each border, with the columns left out
+    """Give the differences of neighboring columns about each border, with the columns left out
     that a gap there would hide. `table`: rows of frames, (m, c + 2 SIDE - 1); `gap`: number of
     columns. Returns (m, c - gap, 2 SIDE - 1)."""
     border = np.arange(SIDE, table.shape[1] - SIDE + 1 - gap)
@@ -266,7 +266,7 @@ def _is_smooth(here: Differences) -> npt.NDArray[np.bool_]:
 def _evidence_of(
     here: Taken, behind: Sequence[Taken], shape: tuple[int, int], evenly: bool
 ) -> Evidence:
-    """Judge gaps by differences of neighbouring columns, for all WIDTHS_PX; likelihoods of
+    """Judge gaps by differences of neighboring columns, for all WIDTHS_PX; likelihoods of
     a gap are averaged over BLURS_PX.
 
     Args:

@@ -82,11 +82,11 @@ def find_gap(
 
     A gap counts if single frames show it and both ends of rays agree, if it is a likely
     hidden one, or if both ends of rays show a significant step that the mean shows or
-    single frames favour over none; others are left open. Its width is that of both
+    single frames favor over none; others are left open. Its width is that of both
     ends of rays. The gap is marked as beside the axis if its place leaves the width to
     the prior. Hidden ones are judged only if none is closed; a likely one does not count
     if both ends of rays show another step behind it. A second gap is one that single frames
-    show and the mean, or rays; not where the mean favours none.
+    show and the mean, or rays; not where the mean favors none.
 
     Args:
         rays: both ends of rays of a turn.
@@ -96,7 +96,7 @@ def find_gap(
         closed: columns of borders next to which the images are filled in.
 
     Returns:
-        The gap and the plane behind it, None without; and the judgement of gaps that stay
+        The gap and the plane behind it, None without; and the judgment of gaps that stay
         hidden, None with a gap that both ends of rays certify.
 
     Raises:

@@ -22,7 +22,7 @@ from flexdt.twin.calibration.without_phantom.turn import MEDIAN_OF_CHI_SQUARE
 from flexdt.twin.geometry.conventions import FloatArray
 
 BLOCK_FRAMES: Final = 4
-"""Number of neighbouring frames whose errors are taken as one: they show the same bodies."""
+"""Number of neighboring frames whose errors are taken as one: they show the same bodies."""
 CURVATURE_SHARE: Final = 0.25
 """Part of the squared difference of both sides' gradients that counts as variance of the
 gradient at the border: half of their difference, squared."""
@@ -60,7 +60,7 @@ def gradient_steps(
     beside it.
 
     Args:
-        around: differences of neighbouring columns about each border, without what all
+        around: differences of neighboring columns about each border, without what all
             frames share, (m, c, 7); the fourth is that across the border.
         smooth: the places that count, (m, c).
         frames: number of frames, of m / frames rows each.
@@ -125,7 +125,7 @@ def _usual_line(power: FloatArray, excess: FloatArray) -> UsualLine:
 
 def scatter_of_sums(values: FloatArray) -> FloatArray:
     """Compute the standard deviation of sums over frames, (c,), from those of blocks of
-    `BLOCK_FRAMES` neighbours: frames beside each other show the same edges.
+    `BLOCK_FRAMES` neighbors: frames beside each other show the same edges.
 
     Args:
         values: (n, c) of n frames.

@@ -44,7 +44,7 @@ MODES_PER_COLUMN: Final = 3.3
 CORRELATION_COLUMNS: Final = 20.0
 """Length of the exponential covariance of the object, in columns at the axis."""
 RADIUS_GROWTH: Final = 1.05
-"""Ratio of neighbouring radii beyond the columns that are compared."""
+"""Ratio of neighboring radii beyond the columns that are compared."""
 BOX: Final = np.array([0.5, 1.0, 1.0, 1.0, 0.5]) / 4.0
 """Shares of rays over a column's width, from one edge to the other."""
 SCALES: Final = np.exp(np.arange(-24.0, 4.0, 0.5))

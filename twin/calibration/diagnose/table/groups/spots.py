@@ -39,7 +39,7 @@ WITHIN: Final = "within their pixels"
 PIXEL_HARMONICS: Final = 2
 """Of the distance between pixels, of errors that repeat from pixel to pixel."""
 MOST_WITHIN_PX: Final = 0.5
-"""Largest of them: a centre lies in its pixel."""
+"""Largest of them: a center lies in its pixel."""
 BEAD_ERROR_SPREADS: Final = 1.0
 """Errors, in standard deviations of a position, up to which they widen the intervals alone and are
 no finding."""
@@ -104,7 +104,7 @@ def families(table: Linearised, known: Known) -> Iterator[Family]:
 
 def _within_pixels(places: FloatArray) -> FloatArray:
     """Make shifts of spots (n, k, 2, c) that repeat from pixel to pixel along each axis: what
-    sampling by pixels does to the centre of a shadow.
+    sampling by pixels does to the center of a shadow.
     """
     phase = 2.0 * math.pi * places[..., None] * np.arange(1, PIXEL_HARMONICS + 1)
     waves = np.concatenate([np.cos(phase), np.sin(phase)], axis=3)

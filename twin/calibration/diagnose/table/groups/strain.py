@@ -214,7 +214,7 @@ def told(found: Found) -> list[Finding]:
         warning(
             CalibrationCode.PHANTOM_STRAINED,
             f"{', and '.join(said)}{rival}. Its shape was fitted, its size is not in the "
-            "images: lengths, dO_z and the magnification hold as far as its millimetre; "
+            "images: lengths, dO_z and the magnification hold as far as its millimeter; "
             + (
                 "measure it, or give --bead-tolerance MM"
                 if strains
