@@ -197,6 +197,11 @@ def _fitted(
     return Edges(sigma[good], error[good], normals[good], sums[good], counts[good])
 
 
+def _mean_where(values: FloatArray, chosen: npt.NDArray[np.bool_]) -> FloatArray:
+    """Return the mean of the chosen values of each row, (n,); 0 without one."""
+    return (values * chosen).sum(axis=1) / np.maximum(chosen.sum(axis=1), 1)
+
+
 def _fitted_some(
     data: Float32Array, places: npt.NDArray[np.intp], normals: FloatArray
 ) -> tuple[FloatArray, ...]:
@@ -232,12 +237,9 @@ def _fitted_some(
     weight &= np.isfinite(values)
     values = np.where(weight, values, 0.0)
     shape = np.stack([u, v, 0.5 * u**2, 0.5 * v**2, u * v])
-    low = np.where(weight & (across < -2.0), values, np.nan)
-    high = np.where(weight & (across > 2.0), values, np.nan)
-    with np.errstate(all="ignore"):
-        p = np.zeros((len(places), 9))
-        p[:, 0] = np.nan_to_num(np.nanmean(low, axis=1))
-        p[:, 1] = np.nan_to_num(np.nanmean(high, axis=1)) - p[:, 0]
+    p = np.zeros((len(places), 9))
+    p[:, 0] = _mean_where(values, weight & (across < -2.0))
+    p[:, 1] = _mean_where(values, weight & (across > 2.0)) - p[:, 0]
     count = np.maximum(weight.sum(axis=1), 10)
     damp = np.full(len(places), 1e-2)
     best = np.full(len(places), np.inf)
