@@ -101,7 +101,7 @@ def test_bad_pixels_leave_no_rings(kind: str, seed: int) -> None:
     assert not any("do not respond" in one for one in said)
     made, bad = spoilt(counts, kind, seed)
     found, said = reconstructed(made)
-    (told,) = (one for one in said if "do not respond as their neighbours" in one)
+    (told,) = (one for one in said if "do not respond as their neighbors" in one)
     assert int(told.split()[0]) == pytest.approx(int(bad.sum()), abs=1 + 0.1 * bad.sum())
     assert not any("starved" in one or "saturated" in one for one in said)
     assert body(found).std() <= 1.3 * body(clean).std()

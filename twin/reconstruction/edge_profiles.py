@@ -199,7 +199,7 @@ def _fitted(
 
 def _mean_where(values: FloatArray, chosen: npt.NDArray[np.bool_]) -> FloatArray:
     """Return the mean of the chosen values of each row, (n,); 0 without one."""
-    return (values * chosen).sum(axis=1) / np.maximum(chosen.sum(axis=1), 1)
+    return np.asarray((values * chosen).sum(axis=1) / np.maximum(chosen.sum(axis=1), 1))
 
 
 def _fitted_some(

@@ -53,8 +53,8 @@ LAYERS: Final[tuple[Layer, ...]] = (
     Layer("ranges", "travel ranges", False, ("/ranges",)),
     Layer("bodies", "collision bodies", False, ("/machine/{part}/body",), near=True),
     Layer("margin", "safety margin", False, ("/machine/{part}/margin",), near=True),
-    Layer("sample", "sample", True, ("/sample", "/object/stand")),
-    Layer("machine", "machine", True, ("/machine/{part}/look",)),
+    Layer("sample", "sample", True, ("/sample",)),
+    Layer("machine", "machine", True, ("/machine/{part}/look", "/object/stand")),
     Layer("cabinet", "cabinet", False, ("/cabinet/walls", "/cabinet/lamp")),
     Layer("orbit", "planned trajectory", True, ("/object/plan",)),
     Layer(
