@@ -78,7 +78,7 @@ Velocity = Annotated[float, Ge(-1e6), Le(1e6)]
 Pace = Annotated[float, Ge(1e-6), Le(1e6)]
 """A speed or an acceleration above zero [mm or deg; s]."""
 Setting = Annotated[float, Ge(-1e7), Le(1e7)]
-"""Of a tube or a camera [kV, W or ms]; the machine's own limits are reported by name."""
+"""Of a camera [ms]; the machine's own limits are reported by name."""
 Exposure = Annotated[float, Ge(1e-6), Le(1e7)]
 """[ms]"""
 Voltage = Annotated[float, Ge(1e-3), Le(1e4)]

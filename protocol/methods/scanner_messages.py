@@ -14,10 +14,12 @@ from flexdt.protocol.field_checks import require_extent
 from flexdt.protocol.fields import (
     Integral,
     Params,
+    Power,
     RoiAsked,
     Setting,
     ShortText,
     SpeedUp,
+    Voltage,
 )
 from flexdt.protocol.method import Method, by_hand, command, read
 from flexdt.protocol.methods.document_messages import Averages, Frames, Placement
@@ -134,8 +136,8 @@ class ClockSet(Params):
 class TubeSet(Params):
     """X-ray tube settings; missing ones stay."""
 
-    kV: Setting | None = None
-    power_W: Setting | None = None
+    kV: Voltage | None = None
+    power_W: Power | None = None
     on: bool | None = None
 
 

@@ -463,7 +463,7 @@ OF_THE_TWIN: list[tuple[str, dict[str, object]]] = [
     ("viewer.ray", {"pixel": [1.0, 2.0]}),
     ("viewer.spectrum", {"kV": 90.0}),
     ("viewer.plan", {"text": "tube\txrayon"}),
-    ("viewer.compose", {}),
+    ("viewer.compose", {"frames": 91}),
     ("viewer.scrub", {"time_s": 1.0}),
     ("calibration.apply", {"parameters": {"alpha": 0.2}}),
     ("calibration.fit", {"datasets": ["x"], "phantom": "lego"}),

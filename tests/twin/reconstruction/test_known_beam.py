@@ -108,11 +108,11 @@ def test_a_tube_that_no_roll_changes_is_told_of_none(long_scan: Any) -> None:
     plain, off, _ = told(long_scan)
     assert plain.cause == "hardening"
     assert off / 1.5 < plain.most < 1.9 * off
-    assert (plain.next, plain.doubled) == ("", 0.0)
+    assert (plain.next, plain.doubled_mm) == ("", 0.0)
     corrected, off, said = told(long_scan, CLEAR[1], material="aluminium")
     assert off < corrected.most < 0.01
     assert (corrected.cause, corrected.next) == ("sampling", "")
-    assert corrected.doubled == 0.0
+    assert corrected.doubled_mm == 0.0
     assert said == []
 
 
