@@ -12,7 +12,7 @@ import os
 import stat
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, assert_never
@@ -28,7 +28,6 @@ from flexdt.protocol.messages import Encoded
 from flexdt.protocol.methods import calibration_messages as p
 from flexdt.protocol.methods.calibration_messages import CalibrationAlign, CalibrationFit
 from flexdt.protocol.rpc_errors import too_large
-from flexdt.protocol.state_model import SamplePlacement
 from flexdt.runtime.files import dataset_folder as files
 from flexdt.runtime.files.directory import Directory
 from flexdt.runtime.files.reading_within import confined, opened
@@ -41,6 +40,7 @@ from flexdt.twin.dataset.flexdt_json import (
     DatasetDocument,
     FrameEntry,
     FrameKind,
+    SampleRecord,
     parse_document,
 )
 from flexdt.twin.dataset.normalise import LineIntegrals, binned_mean
@@ -676,17 +676,10 @@ def _get(
 
 def _made(document: DatasetDocument | None) -> p.ScannedSample:
     """Tell the sample of a scan's document, where it stood, and the correction in force."""
-    if document is None:
-        return p.ScannedSample(sample="")
-    sample = document.sample
-    at = None if sample.offset is None else SamplePlacement(**asdict(sample.offset))
-    return p.ScannedSample(
-        sample=sample.name,
-        revision=sample.revision,
-        material=sample.material,
-        offset=at,
-        correction=None if document.correction is None else document.correction.name,
-    )
+    sample = SampleRecord() if document is None else document.sample
+    correction = None if document is None else document.correction
+    name = None if correction is None else correction.name
+    return p.ScannedSample.model_validate(sample.identity() | {"correction": name})
 
 
 def _stated(scan: _Scan) -> list[p.StatedValue]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta
 from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
@@ -76,6 +76,16 @@ class SampleRecord:
     """Content of an upload; None for a shipped phantom."""
     offset: StagePlacement | None = None
     """Place on the stage during the scan; None where it is not known."""
+
+    def identity(self) -> dict[str, Any]:
+        """Return what tells it from another sample, or from itself elsewhere, as JSON:
+        `sample` (its name), `revision`, `material` and `offset`."""
+        return {
+            "sample": self.name,
+            "revision": self.revision,
+            "material": self.material,
+            "offset": None if self.offset is None else asdict(self.offset),
+        }
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ from flexdt.twin.projection.volume import (
     WARNING_BOUND,
     Accuracy,
     Residuals,
+    Width,
     doubt_words,
 )
 from flexdt.twin.reconstruction.acquisition.truncation import Truncation
@@ -168,7 +169,9 @@ class Bias:
             layer[np.isnan(values)] = np.nan
         return out
 
-    def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
+    def accuracy(
+        self, grid: Grid | Volume, width: Width | None = None
+    ) -> Accuracy | None:
         """Compute the relative accuracy of the object's uniform regions in a grid.
 
         Nodes within half a node of the grid count; those of evenness up to `MIN_EVENNESS`
@@ -176,6 +179,7 @@ class Bias:
 
         Args:
             grid: place and size.
+            width: of edges across the axis, as measured.
 
         Returns:
             Within what half and nine of ten regions are, of normal errors with the shift and
@@ -213,7 +217,7 @@ class Bias:
             following = doubling  # it may hardly change values
         elif following and told[following] <= FLOOR:
             following = ""
-        edges, of_edges = self._edges(grid, doubling)
+        edges, of_edges = self._edges(width, doubling)
         return Accuracy(
             half,
             most,
@@ -228,16 +232,15 @@ class Bias:
             edges_cause=of_edges,
         )
 
-    def _edges(self, grid: Grid | Volume, doubling: str) -> tuple[float | None, str]:
+    def _edges(self, width: Width | None, doubling: str) -> tuple[float | None, str]:
         """Compute how wide edges across the axis are at most [mm]: as measured, or as errors
         double them, whichever is more; and the cause, "" of a measured width.
 
-        `doubling`: the cause that doubles edges most."""
+        `width`: measured; `doubling`: the cause that doubles edges most."""
         found: list[tuple[float, str]] = []
         if self.edges is not None:
             told = max(self.doubled.values(), default=0.0)
             found.append((told + self.edges, doubling or "geometry"))
-        width = grid.sharpness.across if isinstance(grid, Volume) else None
         if width is not None:
             found.append((width.mm + SIGMAS * width.error_mm, ""))
         return max(found, default=(None, ""))
@@ -365,8 +368,10 @@ class BiasOnDemand:
         return self.bias.bound(grid)
 
     def accuracy(self, grid: Grid | Volume) -> Accuracy | None:
-        """Compute the relative accuracy of uniform regions in a grid; see `Bias.accuracy`."""
-        return self.bias.accuracy(grid)
+        """Compute the relative accuracy of uniform regions in a grid; see `Bias.accuracy`.
+        A volume's edges are measured."""
+        width = grid.sharpness.across if isinstance(grid, Volume) else None
+        return self.bias.accuracy(grid, width)
 
     def warnings(self, grid: Grid | Volume) -> list[str]:
         """List what is wrong at first sight: another geometry that fits better, or causes of

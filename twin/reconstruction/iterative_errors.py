@@ -427,7 +427,7 @@ def in_order(cone_vec: ConeVec) -> npt.NDArray[np.intp]:
 def noise_in(
     images: Float32Array, order: npt.NDArray[np.intp]
 ) -> tuple[Float32Array, float]:
-    """Find a realisation of the noise in each view, and how much more all views share.
+    """Find a realization of the noise in each view, and how much more all views share.
 
     It is the view less the mean of its neighbors, scaled to the variance of one view. Where that
     has more than noise in a square of `WINDOW` pixels, by the variance of such line integrals,

@@ -230,11 +230,7 @@ function row(info) {
   node.setAttribute("aria-current", String(info.name === told?.info.name));
   if (info.state !== "incomplete" || !lacks(info)) return [node];
   const title = `Make the images of ${info.name} that are missing`;
-  const go = {
-    class: "small data-resume",
-    title,
-    onclick: () => resume(info.name),
-  };
+  const go = { class: "small data-resume", title, onclick: () => resume(info.name) };
   return [node, el("button", go, `Resume ${info.name}`)];
 }
 async function list(start = 0) {
@@ -547,10 +543,9 @@ async function show(wanted) {
     } catch (error) {
       why = words(error);
       if (kind !== "counts")
-        about = await call("viewer.recorded_image", {
-          index: at,
-          kind: "counts",
-        }).catch(() => null);
+        about = await call("viewer.recorded_image", { index: at, kind: "counts" }).catch(
+          () => null,
+        );
     }
     if (!still(name)) break;
     moment = about ? (about.time_s ?? at) : told.times_s ? null : at;

@@ -32,7 +32,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -49,6 +49,7 @@ from flexdt.library.data_set import DataSet
 from flexdt.library.reading.folders import load_dataset
 from flexdt.library.reconstruction.reconstruct import VolumeRequest, reconstruct_volume
 from flexdt.runtime.files.dataset_folder import read_image
+from flexdt.twin.dataset.flexdt_json import SampleRecord
 from flexdt.twin.dataset.normalise import binned_mean
 from flexdt.twin.errors import TwinError
 from flexdt.twin.geometry.cone_vec import ConeVec
@@ -329,19 +330,9 @@ def made_of(data: DataSet) -> dict[str, Any]:
     """Collect what a data set's volume is compared with the stage by: `sample`, `revision`,
     `material`, `offset` (None where it does not say) and `correction`, a name.
     """
-    document = data.document
+    sample = SampleRecord() if data.document is None else data.document.sample
     correction = None if data.correction is None else data.correction.name
-    if document is None:
-        known: dict[str, Any] = {"sample": "", "revision": None, "material": None}
-        return known | {"offset": None, "correction": correction}
-    sample = document.sample
-    return {
-        "sample": sample.name,
-        "revision": sample.revision,
-        "material": sample.material,
-        "offset": None if sample.offset is None else asdict(sample.offset),
-        "correction": correction,
-    }
+    return sample.identity() | {"correction": correction}
 
 
 def _saturated(data: DataSet) -> float | None:

@@ -12,7 +12,7 @@ its estimates differ is part of their standard error.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -572,16 +572,18 @@ def findings(
         Told errors, the first found first, then the others; and the table of the corrected
         scan. None where no two views compare.
     """
-    sizes: dict[Key, float] = {}
     table = CauseTable.of(images, cone_vec, circle, share, FINE_BLUR)
+    if table is None:
+        return None
+    scan = Corrected(table, images, cone_vec, {})
     for blur in BLURS:
-        if blur != FINE_BLUR and (table is None or not table.doubtful):
+        if blur != FINE_BLUR and not scan.table.doubtful:
             continue  # no large error
-        if table is None or table.blur != blur:
-            table = CauseTable.of(images, cone_vec, circle, share, blur)
-        if table is None:
-            return None
-        scan = Corrected(table, images, cone_vec, sizes)
+        if scan.table.blur != blur:
+            table = CauseTable.of(scan.images, scan.cone_vec, circle, share, blur)
+            if table is None:
+                return None
+            scan = replace(scan, table=table)
         for _ in range(MOST_STEPS):
             scan = scan.settled()
             known = _again(scan.table, scan.sizes)
@@ -593,14 +595,7 @@ def findings(
             if closer is None:
                 break  # far from linear
             scan = closer
-        table, images, cone_vec, sizes = (
-            scan.table,
-            scan.images,
-            scan.cone_vec,
-            scan.sizes,
-        )
-    assert table is not None
-    return _findings(table, sizes), table
+    return _findings(scan.table, scan.sizes), scan.table
 
 
 def _findings(table: CauseTable, sizes: dict[Key, float]) -> list[Finding]:
