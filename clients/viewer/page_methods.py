@@ -488,6 +488,7 @@ async def recorded(viewer: Viewer, page: Page, params: Recorded) -> object:
     page.recorded = name
     page.saturated = None if name is None else told["info"]["saturated"]
     page.made = None if name is None else MadeOf.of(told["made"])
+    viewer.show_volumes()
     viewer.show_layers()
     page.plan = page.orbit = None
     lab.plan.unghost(clients)

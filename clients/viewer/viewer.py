@@ -404,11 +404,15 @@ class Viewer:
         """Return the layers that a page's scenes draw: the chosen ones, without the present
         sample and its image while the page shows images of another one.
         """
+        if self.of_another(page):
+            return page.shown.changed(sample=False, panel=False)
+        return page.shown
+
+    def of_another(self, page: Page) -> bool:
+        """Return whether a page shows images of another sample than the present one."""
         if page.made is None or self.state is None:
-            return page.shown
-        if same_sample(page.made, self.state.sample):
-            return page.shown
-        return page.shown.changed(sample=False, panel=False)
+            return False
+        return not same_sample(page.made, self.state.sample)
 
     def _link_changed(self) -> None:
         self._heard_at = time.monotonic()
@@ -718,10 +722,14 @@ class Viewer:
             self.stage.show(clients, page.volume, self._manner(page))
 
     def _manner(self, page: Page) -> Manner | None:
-        """Choose how a page's volume is drawn now; None: not at all."""
+        """Choose how a page's volume is drawn now; None: not at all. Beside images of another
+        sample none stands on the stage.
+        """
         if page.volume is None:
             return None
-        return page.volume.manner(self.state, page.ghost)
+        return page.volume.manner(
+            None if self.of_another(page) else self.state, page.ghost
+        )
 
     def ungrow(self) -> None:
         """Stop the growing volume unless a page still wants it."""

@@ -81,12 +81,20 @@ def test_a_recorded_image_never_stands_beside_another_sample(change: str | None)
     made = MadeOf("gear", "a", "abs", dict(offset), "c")
     now = CHANGES[change](sample, "c") if change else (sample, "c")
     viewer: Any = SimpleNamespace(state=state(*now))
-    page: Any = SimpleNamespace(made=made, shown=Shown())
+    viewer.of_another = lambda page: Viewer.of_another(viewer, page)
+    page: Any = SimpleNamespace(made=made, shown=Shown(), ghost=False)
     own = change in (None, "correction")
     shown = Viewer.shown_by(viewer, page)
     assert ("sample" in shown, "panel" in shown, "machine" in shown) == (own, own, True)
+    # A volume of what stands there now stands beside images of the same alone.
+    there, in_force = now
+    facts = [there[key] for key in ("revision", "material", "offset")]
+    present = MadeOf(there["name"] or "", *facts, in_force)
+    page.volume = StageVolume("v", np.zeros((3, 3)), np.array([[0, 1, 2]]), present)
+    assert Viewer._manner(viewer, page) == ("stands" if own else None)
     page.made = None
     assert Viewer.shown_by(viewer, page) == page.shown
+    assert Viewer._manner(viewer, page) == "stands"
 
 
 class Scene:

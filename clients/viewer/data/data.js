@@ -436,6 +436,8 @@ function apartWords(made) {
     return `${none} now ${store.state?.sample.name || "nothing"} stands there`;
   return differ.length ? `${none} the scan’s has been moved since` : "";
 }
+/** Those words of the data set that is open; "" without one. */
+export const samplesApart = () => (told ? apartWords(told.made) : "");
 function note() {
   if (!told) return "";
   /** @type {string[]} */

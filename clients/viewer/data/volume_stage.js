@@ -1,6 +1,7 @@
 // Whether a volume is of what stands on the stage: only then it is drawn there, else as a ghost
 // that is asked for.
 import { $, $input, setText } from "./dom.js";
+import { samplesApart } from "./data.js";
 import { differences, listed, ofVolume, sampleOf } from "./fingerprint.js";
 import { call, on, store } from "./link.js";
 /** @import { VolumeMessage } from "../web/viewer.d.ts" */
@@ -26,7 +27,8 @@ function words() {
     return "not on the stage: its data set does not say where the sample stood";
   const of = ofVolume(made);
   const differ = differences(of, store.now ?? {});
-  if (!differ.length) return "stands on the stage";
+  if (!differ.length)
+    return samplesApart() ? "not drawn beside images of another sample" : "stands on the stage";
   const what = listed(differ).replace("sample", `sample (${sampleOf(of)})`);
   return `not on the stage: of another ${what}`;
 }
@@ -39,6 +41,7 @@ function draw() {
   row.toggleAttribute("data-apart", said.startsWith("not"));
 }
 on("state", draw);
+on("recorded", draw);
 ghost.addEventListener("change", () => {
   void call("viewer.ghost", { shown: ghost.checked }).catch(() => null);
 });
