@@ -371,6 +371,19 @@ def test_clipped_line_integrals_are_told_and_nothing_is_claimed() -> None:
     assert said(right)._clipped is None
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_a_cause_adds_to_gray_values_is_finite() -> None:
+    """Line integrals that are none, at which no photon passes: unscaled gray values."""
+    rows = ConeVec(claims.circle(ANGLES, SOD, SDD, PIXEL))
+    share = np.arange(len(rows)) / len(rows)
+    images = np.geomspace(0.01, 65535.0, len(rows) * 12).reshape(-1, 3, 4)
+    images = images.astype(np.float32)
+    for one in causes_of(rows, np.zeros(2), share):
+        for size in (0.0, 1.0, -1.0):
+            changed, _ = one.corrected(images, rows, np.full(len(rows), size * one.step))
+            assert np.isfinite(changed).all(), (one.name, size)
+
+
 def test_the_error_of_sampling_is_that_of_thin_rays() -> None:
     """Rays through pixels' middles, beside means of 9 x 9 rays."""
     drawn = scan(counts=0.0)

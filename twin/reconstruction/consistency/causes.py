@@ -10,6 +10,7 @@ import numpy as np
 
 from flexdt.twin.geometry.cone_vec import ConeVec
 from flexdt.twin.geometry.conventions import Float32Array, FloatArray
+from flexdt.twin.reconstruction.beam_hardening import BLACK
 
 Views = Callable[[ConeVec, FloatArray], ConeVec]
 Images = Callable[[Float32Array, FloatArray], Float32Array]
@@ -228,9 +229,9 @@ def _hazed(images: Float32Array, sizes: FloatArray) -> Float32Array:
 
     The constant is at most half of what a pixel has."""
     share = 0.01 * sizes[:, None, None]
-    light = np.exp(-images)
-    constant = np.minimum(share * (1.0 - light), 0.5 * light)
-    return np.asarray(-constant / light, np.float32)
+    # What a pixel lacks of the open beam, over what it has.
+    lacking = np.expm1(np.minimum(images, np.float32(BLACK)))
+    return np.asarray(-np.minimum(share * lacking, 0.5), np.float32)
 
 
 def _bulged(images: Float32Array, sizes: FloatArray) -> Float32Array:
