@@ -77,6 +77,16 @@ def test_negative_whole_numbers_without_a_flat_image_are_refused() -> None:
         fx.DataSet.from_arrays(np.full((4, *SHAPE), np.nan), SCAN, flat=np.ones(SHAPE))
 
 
+def test_line_integrals_that_are_not_finite_are_counted_and_the_first_is_named() -> None:
+    values = np.ones((4, *SHAPE))
+    values[2, 1, 3:5] = np.nan, np.inf
+    with pytest.raises(
+        DatasetFormatError,
+        match=f"^2 of {values.size} line integrals .* at image 2, row 1, column 3; allowed",
+    ):
+        fx.DataSet.from_arrays(values, SCAN)
+
+
 def test_transmissions_taken_for_line_integrals_are_named() -> None:
     shape, phantom = (190, 239), load_phantom("normal-4")
     scan = fx.ConeVec.circular(sod=600, sdd=1059, angles=6, shape=shape, pixel=0.6)

@@ -544,9 +544,9 @@ class ImageSet:
         flat = self._mean(self.flats, None if self.arrays is None else self.arrays.flats)
         if flat is None:
             raise DatasetMissingError(
-                f"{self.where}: no flat field (io000000.tif, images of key 1 in an NXtomo "
-                "file), and without one there are no line integrals; allowed: flat images or "
-                "the count of an open beam, said to fx.open or in a scan file",
+                f"{self.where}: no flat field and no count of an open beam, so that counts "
+                "have no line integrals; allowed: a flat image (`flat`; io000000.tif of a "
+                "folder, key 1 of an NXtomo file) or the count of an open beam (`open_beam`)",
                 {"path": self.where, "missing": ["io000000.tif"]},
             )
         return flat
@@ -726,9 +726,15 @@ def _counts_of(integrals: npt.NDArray[Any]) -> tuple[Counts, float, list[str]]:
     Raises:
         DatasetFormatError: line integrals that are not finite.
     """
-    if not np.isfinite(integrals).all():
-        message = "line integrals hold values that are not finite"
-        raise DatasetFormatError.instead(message, "NaN or infinity", "finite")
+    finite = np.isfinite(integrals)
+    if not finite.all():
+        image, row, column = map(int, np.unravel_index(np.argmin(finite), finite.shape))
+        message = (
+            f"{finite.size - np.count_nonzero(finite)} of {finite.size} line integrals are not "
+            f"finite, the first of them at image {image}, row {row}, column {column}"
+        )
+        allowed = "finite ones; for a dead pixel, the mean of its neighbors"
+        raise DatasetFormatError.instead(message, "NaN or infinity", allowed)
     top = np.iinfo(np.uint16).max
     images = np.exp(-np.maximum(integrals.astype(np.float32), -80.0))
     # Brighter pixels than the open beam, as noise makes them, need room above it.
